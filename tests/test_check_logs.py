@@ -398,7 +398,7 @@ def test_no_coupling_is_found_by_luck(loaded, log):
     """Torques that no parameters explain: of all couplings one is the best, and none is told."""
     for seed in range(10):
         noise = np.random.default_rng(seed).standard_normal(log.tau.shape).cumsum(axis=0)
-        problem = drive_problem(loaded, drive_log(replace(log, tau=noise)))
+        problem = drive_problem(loaded, drive_log(replace(log, tau=noise)).motion())
         assert find_coupling(problem) is None
 
 
@@ -417,7 +417,7 @@ def test_of_many_trajectories_an_even_part_is_filtered(monkeypatch):
         q = np.sin(t)[:, None] + 10.0 * number
         collected.add(Trajectory(t, q, np.cos(t)[:, None], q, str(number)))
     assert len(filtered) < 50
-    steps = np.diff(np.unique(collected.samples().q.round(-1)))
+    steps = np.diff(np.unique(collected.motion()[0].round(-1)))
     assert steps.max() <= 1.5 * steps.min()
 
 

@@ -73,9 +73,10 @@ def identify(
     log_mapping = options.accepting(log_source(arm, mapping).mapping, accept)
     logs = read_logs(paths, arm, log_mapping, role="train")
     # least squares would fit wrong units without a word
-    for diagnostic in require_sound_logs(logs, arm, log_mapping):
+    findings = require_sound_logs(logs, arm, log_mapping)
+    for diagnostic in findings:
         note(diagnostic)
-    result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
+    result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter).beside(findings))
     for diagnostic in result.diagnostics:
         note(diagnostic)
     # pages and charts are imported where they are asked for

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from spelgen.logs.dynamics_samples import TUNING, dynamics_samples
@@ -11,19 +9,6 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.tuning.identification import DriveHintTuning
 
 HINTS = DriveHintTuning()
-
-
-class DriveSamples(NamedTuple):
-    """Hold samples (S, n) of motion with the torques at the joints."""
-
-    q: np.ndarray
-    qd: np.ndarray
-    qdd: np.ndarray
-    tau: np.ndarray
-
-    def thinned(self, stride: int) -> DriveSamples:
-        """Return one of so many samples."""
-        return DriveSamples(*(column[::stride] for column in self))
 
 
 class DriveLog:
@@ -35,7 +20,7 @@ class DriveLog:
     def __init__(self, inputs: np.ndarray) -> None:
         """inputs: G, (n, n)."""
         self._inputs = inputs
-        self._samples: list[DriveSamples] = []
+        self._motions: list[np.ndarray] = []  # (4, T, n)
         self._every = self._step = 1
         self._number = 0
 
@@ -46,28 +31,23 @@ class DriveLog:
         self._number += 1
         if self._number % self._step:
             return
-        samples = dynamics_samples([trajectory])
-        if not samples:
-            return
-        motion = samples[0]
-        tau = motion.tau @ self._inputs.T
-        self._samples.append(DriveSamples(motion.q, motion.qd, motion.qdd, tau).thinned(self._every))
+        for x in dynamics_samples([trajectory]):
+            motion = np.stack([x.q, x.qd, x.qdd, x.tau @ self._inputs.T])
+            self._motions.append(motion[:, :: self._every])
         while self._count > 2 * HINTS.samples:
-            if len(self._samples) > HINTS.trajectories:
-                self._samples = self._samples[1::2]
+            if len(self._motions) > HINTS.trajectories:
+                self._motions = self._motions[1::2]
                 self._step *= 2
             else:
-                self._samples = [x.thinned(2) for x in self._samples]
+                self._motions = [x[:, ::2] for x in self._motions]
                 self._every *= 2
 
     @property
     def _count(self) -> int:
-        return sum(len(x.q) for x in self._samples)
+        return sum(x.shape[1] for x in self._motions)
 
-    def samples(self) -> DriveSamples | None:
-        """Return all together; None where there are too few to tell anything."""
-        count = self._count
-        if count < HINTS.fewest_samples:
+    def motion(self) -> np.ndarray | None:
+        """Return q, qd, qdd and joint torques of all, (4, S, n); None where there are too few to tell anything."""
+        if self._count < HINTS.fewest_samples:
             return None
-        columns = zip(*self._samples, strict=True)
-        return DriveSamples(*map(np.concatenate, columns)).thinned(-(-count // HINTS.samples))
+        return np.concatenate(self._motions, axis=1)[:, :: -(-self._count // HINTS.samples)]

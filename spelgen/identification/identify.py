@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.regressor import regressor
+from spelgen.dynamics.rigid_bodies import body_chain
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.base_parameters import BaseParameters, base_parameters
 from spelgen.identification.friction import FrictionModel
@@ -64,7 +65,7 @@ def identify_by(
         reach = reach_of(kinds, drives.speeds)
     late = TorqueDelay(preprocessing.torque_delay or 0.0)
     if preprocessing.torque_delay is None:
-        late = torque_delay(arm, logs, preprocessing)
+        late = find_torque_delay(logs, kinds, drives, body_chain(arm.arm), preprocessing)
         preprocessing = replace(preprocessing, torque_delay=late.delay)
         notes += late.notes
     samples = dynamics_samples(logs, preprocessing=preprocessing, reach=reach)
@@ -80,13 +81,6 @@ def identify_by(
         found = _least_squares(bodies, method, drives)
         results.append(replace(found, diagnostics=tuple(notes), torque_delay=late))
     return results
-
-
-def torque_delay(arm: LoadedArm, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> TorqueDelay:
-    """Return how much later than positions these logs show torques; see `find_torque_delay`."""
-    drives = arm.actuation.drives()
-    kinds, body_rows = arm.arm.joint_types, partial(regressor, arm.arm)
-    return find_torque_delay(logs, kinds, drives.inputs, drives.speeds, body_rows, preprocessing)
 
 
 def least_squares(

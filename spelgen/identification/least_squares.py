@@ -52,6 +52,17 @@ def reduce(blocks: Iterable[Columns]) -> Triangles:
     return Triangles(padded, count, deviation)
 
 
+def block_products(rows: np.ndarray, blocks: int) -> np.ndarray:
+    """Return the products of the columns of rows (S, n, C) with one another, (n, blocks, C, C).
+
+    By joint and block of time; samples that do not fill the last block are left out.
+    """
+    by_joint = rows[: len(rows) // blocks * blocks].swapaxes(0, 1)
+    by_joint = by_joint.reshape(rows.shape[1], blocks, -1, rows.shape[2])
+    products: np.ndarray = by_joint.swapaxes(2, 3) @ by_joint
+    return products
+
+
 @dataclass(frozen=True, eq=False)
 class Solution:
     """Parameters (K,) of least squares, of which those of some columns (r,) were fitted and the others are zero.

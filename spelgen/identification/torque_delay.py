@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 from scipy.stats import t as student
 
+from spelgen.arm.actuation import Drives
+from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.bristles import reach_of
 from spelgen.errors import Diagnostic
 from spelgen.identification.friction import FrictionModel
-from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
+from spelgen.identification.least_squares import block_products
+from spelgen.logs.dynamics_samples import FREQUENCY, dynamics_samples, is_moving, long_pieces
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
+from spelgen.runtime.body_chain import BodyChain
 from spelgen.settings.tuning.identification import DriveHintTuning, IdentificationTuning
 
 HINTS, TUNING = DriveHintTuning(), IdentificationTuning()
-SHIFTS = np.array(HINTS.shifts)
+STEPS = max(HINTS.shifts)
+SHIFTS = np.array(HINTS.shifts) / FREQUENCY  # [s]
 FRICTION = FrictionModel(memory=True)
-
-BodyRows = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""Of q, qd, qdd (T, n) the rows (T, n, K) by the bodies' parameters."""
+COLUMNS = ("q", "qd", "qdd", "z", "direction")
 
 
 @dataclass(frozen=True)
@@ -59,43 +64,43 @@ class _Estimate:
 def find_torque_delay(
     logs: Sequence[Trajectory],
     kinds: Sequence[str],
-    inputs: np.ndarray,
-    speeds: np.ndarray,
-    body_rows: BodyRows,
+    drives: Drives,
+    chain: BodyChain,
     preprocessing: Preprocessing,
 ) -> TorqueDelay:
     """Return the delay that least squares with and without friction's memory both show, where both fit.
 
-    kinds: the joints' types. inputs: G, (n, n), of logged torques. speeds: C, (n, n), of the drives. The value is that
-    of the form of friction that leaves less of the torque.
+    kinds: the joints' types. chain: of the bodies. The value is that of the form of friction that leaves less of the
+    torque.
     """
-    reach = replace(
-        reach_of(kinds, speeds), smoothing_velocity=np.full(len(kinds), FRICTION.coulomb_smoothing_velocity)
-    )
-    samples, moved = [], []
+    smoothing = np.full(len(kinds), FRICTION.coulomb_smoothing_velocity)
+    reach = replace(reach_of(kinds, drives.speeds), smoothing_velocity=smoothing)
+    as_logged = replace(preprocessing, torque_delay=0.0)
+    pieces = []
     for log in logs[:: -(-len(logs) // HINTS.trajectories)]:
-        shifted: list[DynamicsSamples] = []
-        for shift in SHIFTS.tolist():
-            how = replace(preprocessing, torque_delay=shift)
-            shifted += dynamics_samples([log], preprocessing=how, reach=None if shifted else reach)
-        if shifted:
-            samples.append(shifted[0])
-            moved.append(np.stack([x.tau @ inputs.T for x in shifted], axis=2))
-    if not samples or not any(x.any() for x in moved):
+        for piece in long_pieces(log, preprocessing.gap):
+            # without a hole and pauses included, a filtered torque is moved by whole samples
+            for x in dynamics_samples([piece], pauses=True, preprocessing=as_logged, reach=reach):
+                if len(x.q) > 2 * STEPS:
+                    torques = sliding_window_view(x.tau @ drives.inputs.T, len(SHIFTS), axis=0)
+                    middle = slice(STEPS, -STEPS)
+                    moving = is_moving(x.qd[middle])
+                    columns = [getattr(x, name)[middle][moving] for name in COLUMNS]
+                    pieces.append([*columns, torques[moving]])
+    stride = -(-sum(len(x[0]) for x in pieces) // HINTS.samples)
+    if not stride:
         return NO_DELAY
-    stride = -(-sum(map(len, moved)) // HINTS.samples)
-    columns = ("q", "qd", "qdd", "z", "direction")
-    q, qd, qdd, z, direction = (
-        np.concatenate([getattr(x, name)[::stride] for x in samples]) for name in columns
-    )
-    tau = np.concatenate([x[::stride] for x in moved])
-    bodies = body_rows(q, qd, qdd)
+    q, qd, qdd, z, direction, tau = (np.concatenate(x)[::stride] for x in zip(*pieces, strict=True))
+    if tau.std(axis=0).max() <= TUNING.negligible * np.abs(tau).max():  # a constant, with rounding
+        return NO_DELAY
+    with torch.no_grad():
+        bodies = regressor_of(chain, *map(torch.from_numpy, (q, qd, qdd))).numpy()
     estimates = []
     # dry friction with and without memory, through the filter of the torques: a delay that only one form shows is its
     # error
     for dry in (z / reach.values, direction[..., None]):
-        drives = FRICTION.columns(qd, qdd, dry, speeds)
-        estimates.append(_estimate(np.concatenate([bodies, drives], axis=2), tau))
+        friction = FRICTION.columns(qd, qdd, dry, drives.speeds)
+        estimates.append(_estimate(np.concatenate([bodies, friction], axis=2), tau))
     quantile = student.isf(HINTS.delay_chance / 2, HINTS.blocks - 1)
     # a lag of friction passes for one of torques with memory, not without: its errors are alike to both sides
     memory, direct = estimates
@@ -112,56 +117,46 @@ def find_torque_delay(
 def _estimate(rows: np.ndarray, tau: np.ndarray) -> _Estimate:
     """Return the delay of the least squares that rows (S, n, K) leave of torques moved by `SHIFTS`, (S, n, D).
 
-    Between shifts a torque is a cubic in the shift: filtered torques are smooth over one step. The standard error is
-    that of a jackknife over blocks of time, for what a model misses errs alike for long.
+    The standard error is that of a jackknife over blocks of time, for what a model misses errs alike for long.
     """
-    length = np.sqrt(np.square(rows).sum(axis=(0, 1)))
-    rows = rows / np.where(length > 0, length, 1.0)
+    products = block_products(np.concatenate([rows, tau], axis=2), HINTS.blocks)
     deviation = tau.std(axis=(0, 2))
     least = np.maximum(deviation, 1e-3 * deviation.max())
     noise = least
     for _ in range(TUNING.rounds):
-        sums = _sums(rows / noise[:, None], tau / noise[:, None])
-        total = [x.sum(axis=0) for x in sums]
-        delay, parameters = _least(*total)
-        left = np.tensordot(rows, parameters, 1) - np.tensordot(tau, _spline(delay), 1)
-        noise = np.maximum(left.std(axis=0), TUNING.least_noise * least)
-    delays = []
-    for block in range(HINTS.blocks):
-        delays.append(_least(*(whole - part[block] for whole, part in zip(total, sums, strict=True)))[0])
-    spread = np.var(delays) * (HINTS.blocks - 1)
+        by_block = np.tensordot(1 / noise**2, products, 1)
+        total = by_block.sum(axis=0)
+        delay, unexplained = _least(total)
+        squares = unexplained @ products.sum(axis=1) @ unexplained
+        noise = np.sqrt(np.maximum(squares / len(rows), np.square(TUNING.least_noise * least)))
+    spread = np.var([_least(total - block)[0] for block in by_block]) * (HINTS.blocks - 1)
     at_end = abs(delay) > SHIFTS[-2]  # nothing says that it ends there
     standard_error = np.inf if at_end else float(np.sqrt(spread))
-    return _Estimate(delay, standard_error, float(np.square(left / least).sum()))
+    return _Estimate(delay, standard_error, float((squares / least**2).sum()))
 
 
-def _sums(rows: np.ndarray, tau: np.ndarray) -> list[np.ndarray]:
-    """Return the sums of products of rows with rows, rows with torques and torques with torques, by block of time."""
-    products: list[list[np.ndarray]] = [[], [], []]
-    for samples in np.array_split(np.arange(len(rows)), HINTS.blocks):
-        row = rows[samples].reshape(-1, rows.shape[2])
-        torque = tau[samples].reshape(-1, tau.shape[2])
-        for kind, product in zip(products, (row.T @ row, row.T @ torque, torque.T @ torque), strict=True):
-            kind.append(product)
-    return list(map(np.stack, products))
+def _least(products: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the delay of the least squares by products (K + D, K + D), and what is unexplained then, (K + D,).
 
-
-def _least(
-    row_squares: np.ndarray, products: np.ndarray, torque_squares: np.ndarray
-) -> tuple[float, np.ndarray]:
-    """Return the delay of the least squares, and the parameters (K,)."""
-    size = TUNING.negligible * np.trace(row_squares)
-    parameters = np.linalg.solve(row_squares + size * np.eye(len(row_squares)), products)
-    left = torque_squares - products.T @ parameters
+    Between shifts a torque is a cubic in the shift: filtered torques are smooth over one step.
+    """
+    moved = len(SHIFTS)
+    length = np.sqrt(np.diag(products))[:-moved]
+    length = np.where(length > 0, length, 1.0)
+    normal = products[:-moved, :-moved] / np.outer(length, length) + TUNING.negligible * np.eye(len(length))
+    crossed = products[:-moved, -moved:]
+    parameters = np.linalg.solve(normal, crossed / length[:, None]) / length[:, None]
+    left = products[-moved:, -moved:] - crossed.T @ parameters
 
     def squares(delay: float) -> float:
         shape = _spline(delay)
         return float(shape @ left @ shape)
 
     nearest = int(np.argmin(np.diag(left)))
-    low, high = SHIFTS[max(nearest - 1, 0)], SHIFTS[min(nearest + 1, len(SHIFTS) - 1)]
+    low, high = SHIFTS[max(nearest - 1, 0)], SHIFTS[min(nearest + 1, moved - 1)]
     best = minimize_scalar(squares, bounds=(low, high), method="bounded", options={"xatol": 1e-6})
-    return float(best.x), parameters @ _spline(best.x)
+    shape = _spline(best.x)
+    return float(best.x), np.append(parameters @ shape, -shape)
 
 
 _cardinal = CubicSpline(SHIFTS, np.eye(len(SHIFTS)))

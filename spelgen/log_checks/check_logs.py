@@ -8,24 +8,27 @@ from functools import reduce
 from operator import add
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from spelgen.arm.arm import Coordinate
+from spelgen.dynamics.rigid_bodies import body_chain
 from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.identification.drive_hints import coupling_hint, drive_problem, find_coupling, find_wrong_torques
 from spelgen.identification.drive_samples import DriveLog
-from spelgen.identification.identify import torque_delay
+from spelgen.identification.torque_delay import find_torque_delay
 from spelgen.log_checks.check_servo_logs import check_servo_logs
 from spelgen.log_checks.gravity import (
     GravityFit,
-    StateSamples,
     find_opposed_inertia,
     fit_gravity,
+    joined,
     state_samples,
 )
 from spelgen.log_checks.report import TUNING, JointReport, LogReport, range_fraction
 from spelgen.log_checks.robot_checks import CHECKS, JointEvidence
 from spelgen.log_checks.statistics import Statistics, joint_statistics, statistics
-from spelgen.logs.checks import Finding, clock_diagnostics, findings, run_checks, summarised
-from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.checks import Finding, Findings, clock_diagnostics, findings, run_checks, summarised
+from spelgen.logs.preprocessing import COUPLED, Preprocessing
 from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 
@@ -38,7 +41,7 @@ ORDER = replace(
     SENSE, code="torque-order", expected="its own", do="change the names of the columns under 'logs'"
 )
 WRONG_TORQUES = {"torque-sense": SENSE, "torque-order": ORDER}
-ABOUT_ARM = {check.code for check in CHECKS} | {"coupled-motors"}
+ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED}
 
 
 def check_logs(
@@ -55,11 +58,10 @@ def check_logs(
     if arm.settings.input == "position":
         return check_servo_logs(logs, arm)
     mapping = mapping or arm.settings.logs
-    coordinates, inputs = arm.arm.coordinates, arm.actuation.matrix()
-    joints, kinds = arm.arm.joint_names, arm.arm.joint_types
+    joints, kinds, inputs = arm.arm.joint_names, arm.arm.joint_types, arm.actuation.matrix()
     drives = DriveLog(inputs)
     measured: list[Statistics] = []
-    samples: list[StateSamples] = []
+    samples: list[np.ndarray] = []
     examples: list[Trajectory] = []
     notes: list[Diagnostic] = []
     odd: list[Finding] = []
@@ -81,9 +83,10 @@ def check_logs(
     # what files declare by themselves holds where all of them do
     accepted = set(mapping.accept) | set.intersection(*declared_codes)
     summary = summarised(odd, joints, len(measured))
+    motion = joined(samples)
     reports = []
     for index, (coordinate, gravity) in enumerate(
-        zip(coordinates, fit_gravity(arm.arm, samples), strict=True)
+        zip(arm.arm.coordinates, fit_gravity(arm.arm, motion), strict=True)
     ):
         report = _joint_report(index, coordinate, gravity, measured)
         reports.append(report)
@@ -96,23 +99,15 @@ def check_logs(
         for check, message in run_checks(CHECKS, evidence, passed):
             place = f"{where}, tau" if check.severity == "error" else where
             summary.add(check, message, place)
-    problem = drive_problem(arm, drives)
-    is_odd = any(note.code == "velocity-is-no-derivative" for note in summary.notes)
     # beside wrong velocities friction is wrong too, and of wrong torques hints about drives would be wrong
-    if not summary.errors and not is_odd:
-        opposed = find_opposed_inertia(arm.arm, samples, arm.actuation.drives().speeds)
-        if opposed is not None and SENSE.code not in accepted:
-            summary.add(SENSE, opposed, "tau")
-    if problem is not None and not summary.errors and not is_odd:
-        for wrong in find_wrong_torques(problem, joints):
-            if wrong.code not in accepted:
-                summary.add(WRONG_TORQUES[wrong.code], wrong.got, f"joint {joints[wrong.joint]!r}, tau")
-        if not summary.errors:
-            coupled = find_coupling(problem)
-            if coupled is not None:  # without it any delay would be wrong
-                summary.notes.append(coupling_hint(arm, *coupled))
-            elif delay:
-                summary.notes.extend(torque_delay(arm, examples, Preprocessing()).notes)
+    if not any(note.code == "velocity-is-no-derivative" for note in summary.notes):
+        _check_all_torques(arm, motion, drives.motion(), accepted, summary)
+        is_coupled = any(note.code == COUPLED for note in summary.notes)
+        # without a coupling that the logs show any delay would be wrong
+        if delay and not summary.errors and not is_coupled:
+            chain, preprocessing = body_chain(arm.arm), Preprocessing()
+            late = find_torque_delay(examples, kinds, arm.actuation.drives(), chain, preprocessing)
+            summary.notes.extend(late.notes)
     return LogReport(
         robot=arm.arm.name,
         files=len({x.clock.file for x in measured} - {None}),
@@ -133,6 +128,29 @@ def require_sound_logs(
     collect(report.errors)
     # a fit itself tells what logs show without the arm, and finds the delay of torques
     return [note for note in report.findings if note.code in ABOUT_ARM]
+
+
+def _check_all_torques(
+    arm: LoadedArm, motion: np.ndarray, filtered: np.ndarray | None, accepted: set[str], summary: Findings
+) -> None:
+    """Add what is wrong with the torques of all joints together, or else the coupling of motors that they show.
+
+    motion, filtered: samples (4, S, n), see `state_samples` and `DriveLog.motion`.
+    """
+    if not summary.errors and SENSE.code not in accepted:
+        opposed = find_opposed_inertia(arm.arm, motion, arm.actuation.drives().speeds)
+        if opposed is not None:
+            summary.add(SENSE, opposed, "tau")
+    if filtered is None or summary.errors:
+        return
+    problem, joints = drive_problem(arm, filtered), arm.arm.joint_names
+    wrong = find_wrong_torques(problem, joints)
+    if wrong is not None and wrong.code not in accepted:
+        summary.add(WRONG_TORQUES[wrong.code], wrong.got, f"joint {joints[wrong.joint]!r}, tau")
+        return
+    coupled = find_coupling(problem)
+    if coupled is not None:
+        summary.notes.append(coupling_hint(arm, *coupled))
 
 
 def _joint_report(

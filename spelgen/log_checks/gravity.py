@@ -10,24 +10,13 @@ from scipy.linalg import orth
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor, urdf_parameters
-from spelgen.identification.drive_hints import make_problem
-from spelgen.identification.drive_samples import DriveSamples
+from spelgen.identification.drive_hints import drive_rows
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.settings.tuning.identification import IdentificationTuning
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 TUNING = LogCheckTuning()
 MOVING = IdentificationTuning().moving
-
-
-@dataclass(frozen=True, eq=False)
-class StateSamples:
-    """Hold evenly thinned samples of logs, each (S, n); tau are joint torques."""
-
-    q: np.ndarray
-    qd: np.ndarray
-    qdd: np.ndarray
-    tau: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -47,22 +36,31 @@ class GravityFit:
     relative_deviation: float | None = None
 
 
-def state_samples(trajectory: Trajectory, inputs: np.ndarray) -> StateSamples:
-    """Return samples of one trajectory, accelerations by differences within gap-free pieces. inputs: G, (n, n)."""
+def state_samples(trajectory: Trajectory, inputs: np.ndarray) -> np.ndarray:
+    """Return q, qd, qdd and joint torques of one trajectory, thinned evenly, (4, S, n).
+
+    Accelerations are differences within gap-free pieces. inputs: G, (n, n).
+    """
     pieces = [piece for piece in split_at_gaps(trajectory) if len(piece) > 2]
     if not pieces:
-        return StateSamples(*np.zeros((4, 0, trajectory.q.shape[1])))
+        return np.zeros((4, 0, trajectory.q.shape[1]))
     stride = -(-sum(map(len, pieces)) // TUNING.gravity_samples)
-    columns = []
+    motions = []
     for piece in pieces:
         qdd = np.gradient(piece.qd, piece.t, axis=0)
-        columns.append([x[::stride] for x in (piece.q, piece.qd, qdd, piece.tau @ inputs.T)])
-    return StateSamples(*map(np.concatenate, zip(*columns, strict=True)))
+        motions.append(np.stack([piece.q, piece.qd, qdd, piece.tau @ inputs.T])[:, ::stride])
+    return np.concatenate(motions, axis=1)
 
 
-def fit_gravity(arm: Arm, samples: Sequence[StateSamples]) -> list[GravityFit]:
-    """Return by joint what gravity explains of the torques of these samples."""
-    q, qd, qdd, tau = _thinned(samples)
+def joined(samples: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the samples (4, S, n) of all trajectories together, thinned evenly."""
+    motion = np.concatenate(samples, axis=1)
+    return motion[:, :: -(-motion.shape[1] // TUNING.all_gravity_samples) or 1]
+
+
+def fit_gravity(arm: Arm, motion: np.ndarray) -> list[GravityFit]:
+    """Return by joint what gravity explains of the torques of these samples, (4, S, n)."""
+    q, qd, qdd, tau = motion
     # fewer cannot tell gravity from friction
     if len(q) < TUNING.gravity_samples / 4:
         return [GravityFit()] * q.shape[1]
@@ -75,22 +73,23 @@ def fit_gravity(arm: Arm, samples: Sequence[StateSamples]) -> list[GravityFit]:
     for joint in range(q.shape[1]):
         speed = qd[:, joint]
         coulomb = np.tanh(speed / MOVING)
-        motion = np.stack([np.ones(len(q)), speed, coulomb, qdd[:, joint]], axis=1)
-        fits.append(_fit(tau[:, joint], motion, rows[:, joint], None if load is None else load[:, joint]))
+        friction = np.stack([np.ones(len(q)), speed, coulomb, qdd[:, joint]], axis=1)
+        fits.append(_fit(tau[:, joint], friction, rows[:, joint], None if load is None else load[:, joint]))
     return fits
 
 
-def find_opposed_inertia(arm: Arm, samples: Sequence[StateSamples], speeds: np.ndarray) -> str | None:
+def find_opposed_inertia(arm: Arm, motion: np.ndarray, speeds: np.ndarray) -> str | None:
     """Find torques that all have the opposite sign: by least squares the mass matrix then is negative.
 
-    speeds: C, (n, n), of the motors. Friction does not tell: a drive may compensate it after its torque was measured.
+    motion: samples, (4, S, n). speeds: C, (n, n), of the motors. Friction does not tell: a drive may compensate it
+    after its torque was measured.
     """
-    q, qd, qdd, tau = _thinned(samples)
+    q, qd, qdd, tau = motion
     if len(q) < TUNING.gravity_samples / 4 or not np.ptp(tau, axis=0).all():
         return None
     unit = tau.std(axis=0)
-    moving = make_problem(arm, DriveSamples(q, qd, qdd, tau), speeds).rows
-    steady = make_problem(arm, DriveSamples(q, qd, np.zeros_like(qdd), tau), speeds).rows
+    moving, _ = drive_rows(arm, motion[:3], speeds)
+    steady, _ = drive_rows(arm, np.stack([q, qd, np.zeros_like(qdd)]), speeds)
     flat = (moving / unit[:, None]).reshape(tau.size, -1)
     parameters = np.linalg.lstsq(flat, (tau / unit).ravel(), rcond=TUNING.dependent)[0]
     inertia = (moving - steady) @ parameters
@@ -100,15 +99,6 @@ def find_opposed_inertia(arm: Arm, samples: Sequence[StateSamples], speeds: np.n
     if product.sum() >= -TUNING.opposed * np.abs(product).sum():
         return None
     return "torques of all joints that act against acceleration"
-
-
-def _thinned(samples: Sequence[StateSamples]) -> list[np.ndarray]:
-    """Return q, qd, qdd and tau of all trajectories together, each (S, n)."""
-    signals = []
-    for name in ("q", "qd", "qdd", "tau"):
-        values = np.concatenate([getattr(x, name) for x in samples])
-        signals.append(values[:: -(-len(values) // TUNING.all_gravity_samples) or 1])
-    return signals
 
 
 def _fit(tau: np.ndarray, motion: np.ndarray, columns: np.ndarray, load: np.ndarray | None) -> GravityFit:

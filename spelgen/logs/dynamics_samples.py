@@ -60,7 +60,7 @@ def dynamics_samples(
     for trajectory in preprocessing.moved(trajectories):
         if not shows_accelerations(trajectory.sample_rate):
             continue
-        pieces = _long_pieces(trajectory, preprocessing.gap)
+        pieces = long_pieces(trajectory, preprocessing.gap)
         if not pieces:
             continue
         columns = [_columns(piece, pauses, preprocessing, reach) for piece in pieces]
@@ -71,7 +71,7 @@ def dynamics_samples(
     return samples
 
 
-def _long_pieces(trajectory: Trajectory, gap: float) -> list[Trajectory]:
+def long_pieces(trajectory: Trajectory, gap: float) -> list[Trajectory]:
     """Return the pieces between holes of which a filter leaves something."""
     steps = np.diff(trajectory.t)
     if not steps.size:

@@ -8,10 +8,9 @@ from dataclasses import replace
 from itertools import chain
 from typing import TYPE_CHECKING, ClassVar
 
-import numpy as np
 import torch
 
-from spelgen.dynamics.body_regressor import regressor_of
+from spelgen.arm.actuation import Drives
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import Diagnostic, LogError
@@ -117,14 +116,10 @@ def torque_delay(model: EmittedModel, logs: Logs, preprocessing: Preprocessing) 
     if isinstance(logs, LargeLogs):
         chunks = logs.contents.chunks
         logs = [chunk.load() for chunk in chunks[:: -(-len(chunks) // HINTS.trajectories)]]
-
-    def body_rows(*motion: np.ndarray) -> np.ndarray:
-        rows = regressor_of(model.chain, *map(torch.from_numpy, motion))
-        return np.asarray(rows.detach())
-
     with torch.no_grad():
         inputs = model.input_matrix(torch.zeros(1, model.n).double())[0].numpy()
-    return find_torque_delay(logs, model.joint_types, inputs, model.motors.numpy(), body_rows, preprocessing)
+    drives = Drives(inputs, model.motors.numpy())
+    return find_torque_delay(logs, model.joint_types, drives, model.chain, preprocessing)
 
 
 def torque_samples(model: EmittedModel, data: TrainingData) -> TorqueSamples | None:

@@ -36,8 +36,7 @@ class DriveHintTuning:
     """Numbers from which on logs are said to show late torques or coupled motors."""
 
     blocks: int = 10  # of time, each judged by what the others say
-    coarse: int = 4  # one of so many samples begins the search for couplings
-    refined: int = 4  # couplings whose ratio is searched for
+    coarse: int = 4  # one of so many samples chooses among candidates
     coupling_gain: float = (
         0.5  # of the squared error, what a coupling leaves at most; the TX40's wrist leaves 0.05
     )
@@ -48,8 +47,8 @@ class DriveHintTuning:
     simple_ratio: float = 0.02  # of the squared error, what a ratio of small numbers may cost
     # that begin the search for couplings: each covers half of it to twice
     ratios: tuple[float, ...] = (1.0, -1.0, 0.4, -0.4, 2.5, -2.5)
-    # [s] by which a fit moves torques to find a delay: of loggers and field buses; friction passes for longer ones
-    shifts: tuple[float, ...] = (-0.03, -0.02, -0.01, 0.0, 0.01, 0.02, 0.03)
+    # [samples of 10 ms] by which torques are moved to find a delay: of loggers and field buses; more may be friction's
+    shifts: tuple[int, ...] = (-3, -2, -1, 0, 1, 2, 3)
     # [1] of the squares without friction's memory: memory that leaves more does not count (recorded arms: 0.3 to 0.8)
     unlikely_form: float = 2.0
     delay_chance: float = 0.01  # [1] outside a delay's interval: a log without delay must not get one
