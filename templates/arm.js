@@ -5,6 +5,10 @@ const arm = (() => {
   const told = document.getElementById("scene");
   if (!canvas || !told) return null;
   const scene = JSON.parse(told.textContent);
+  const millimetres = (point) => point.map((x) => 1000 * x);
+  for (const link of scene.links) Object.assign(link, {
+    R: link.rotation.flat(), p: millimetres(link.position), v: link.shape.vertices.map(millimetres), f: link.shape.faces,
+  });
   const context = canvas.getContext("2d");
   const state = { motion: 0, time: 0, playing: false, yaw: 2.3, pitch: 0.36, lit: null };
   state.colour = scene.motions[0].error ? "error" : "known";
@@ -157,7 +161,7 @@ const arm = (() => {
     report(motion);
   };
   const ground = (eye, size, wide, high) => {
-    const { middle, ground: z } = scene.motions[state.motion], step = scene.reach / 4;
+    const { middle, ground: z } = scene.motions[state.motion], step = 1000 * scene.reach / 4;
     context.strokeStyle = css(ink.ground, 1);
     context.lineWidth = 1;
     context.beginPath();

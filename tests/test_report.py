@@ -242,5 +242,5 @@ def test_meshes_are_drawn_where_the_robot_is_named(run, robots, tmp_path):
     plain, drawn = render_report(run), render_report(run, tmp_path / "rpr.urdf")
     assert "links are drawn as tubes" in plain and "links are drawn as tubes" not in drawn
     scene = json.loads(re.search(r'id="scene">(.*?)</script>', drawn)[1])
-    assert 200 < sum(len(link["f"]) for link in scene["links"]) <= 4100
+    assert 200 < sum(len(link["shape"]["faces"]) for link in scene["links"]) <= 4100
     assert len(drawn) < 2_000_000

@@ -1,8 +1,8 @@
 """Write a polynomial in cosines, sines and distances the shortest of several equal candidates.
 
 Tried are: cosines and sines of each angle, or multiple-angle sums of products along runs of joints with parallel
-axes; squares of the sine or of the cosine; and then what terms have in common. Multiple angles of one run alone, of
-squares, and common factors of the second best were tried too: over 22 arms they made formulas 0.4 % shorter.
+axes; and then what terms have in common. Multiple angles of one run alone, of squares, common factors of the second
+best, and squares of the sine for those of the cosine were tried too: they made formulas 0.4 and 0.9 % shorter.
 """
 
 from __future__ import annotations
@@ -37,7 +37,16 @@ class Shortener:
     def reduced(self, polynomial: fmpq_mpoly) -> fmpq_mpoly:
         """Return the same function with every sine to the first power at most."""
         for joint in self._angles:
-            polynomial = self._without_square(polynomial, 3 * joint + 1, 3 * joint)
+            cosine, sine = self._gens[3 * joint], 3 * joint + 1
+            if polynomial.degrees()[sine] < 2:
+                continue
+            total = 0 * polynomial
+            for exponents, coefficient in polynomial.terms():
+                powers = list(exponents)
+                powers[sine] %= 2
+                term = self._context.from_dict({tuple(powers): coefficient})
+                total += term * (1 - cosine**2) ** (exponents[sine] // 2)
+            polynomial = total
         return polynomial
 
     def shortest(self, polynomial: fmpq_mpoly) -> Terms:
@@ -45,33 +54,11 @@ class Shortener:
         plain = self._expanded(polynomial)
         if len(polynomial) > TUNING.most_terms_shortened:
             return plain
-        # s^2 for 1 - c^2 often merges two terms, and never changes the value
-        with_squares = self._expanded(self._with_sines_squared(polynomial))
-        sum_of_products = min(plain, with_squares, self._multiple_angles(polynomial), key=length)
+        sum_of_products = min(plain, self._multiple_angles(polynomial), key=length)
         candidates = [sum_of_products]
         for run in self._runs:
             candidates.append(collected(sum_of_products, set(run)))
         return min(candidates, key=length)
-
-    def _with_sines_squared(self, polynomial: fmpq_mpoly) -> fmpq_mpoly:
-        """Return it with squares of sines in place of those of cosines wherever that is shorter."""
-        for joint in self._angles:
-            swapped = self._without_square(polynomial, 3 * joint, 3 * joint + 1)
-            if len(swapped) < len(polynomial):
-                polynomial = swapped
-        return polynomial
-
-    def _without_square(self, polynomial: fmpq_mpoly, variable: int, partner: int) -> fmpq_mpoly:
-        """Use c^2 + s^2 = 1 until ``variable`` stands to the first power at most."""
-        if polynomial.degrees()[variable] < 2:
-            return polynomial
-        total = 0 * polynomial
-        for exponents, coefficient in polynomial.terms():
-            powers = list(exponents)
-            powers[variable] %= 2
-            term = self._context.from_dict({tuple(powers): coefficient})
-            total += term * (1 - self._gens[partner] ** 2) ** (exponents[variable] // 2)
-        return total
 
     def _expanded(self, polynomial: fmpq_mpoly) -> Terms:
         terms: Terms = {}

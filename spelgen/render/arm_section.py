@@ -112,7 +112,7 @@ def arm_section(
         colours.append("error")
     if unseen is not None:
         colours.append("known")
-    data = drawn.to_dict() | {"motions": list(map(record, motions)), "identifiability": unseen}
+    data = record(drawn) | {"motions": list(map(record, motions)), "identifiability": unseen}
     labels = tuple(motion.label for motion in motions)
     return ArmSection(json_data(data), labels, tuple(colours), drawn.has_meshes)
 

@@ -19,8 +19,8 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.labels import named_joints
 from spelgen.render.charts import Chart, Line, line_chart
 from spelgen.render.page import render_page
-from spelgen.render.plots import QUANTITIES, Panel, Row, mass_panels, numbers, stack
-from spelgen.spec import Facts, read_facts
+from spelgen.render.plots import Panel, mass_panels, numbers, trajectory_panels
+from spelgen.spec import read_facts
 
 STYLES = ("c1", "c2", "c3", "gravity", "c4", "c5", "c6")
 
@@ -34,7 +34,7 @@ def write_comparison(study: Study, tables: Sequence[Table]) -> Path:
     examples = {result.variant: result.example for result in results if result.example is not None}
     panels, entries = [], []
     if examples:
-        panels = _prediction_panels(examples, styles, facts)
+        panels = trajectory_panels(examples, styles, named_joints(facts.joints, facts.joint_types))
         entries = _mass_panels(study, examples, results, styles, facts.joint_types)
     text = render_page(
         "comparison.html.jinja",
@@ -91,21 +91,3 @@ def _mass_panels(
     rows, columns = np.tril_indices(len(joint_types))
     entries = {name: mass[:, rows, columns].T for name, mass in masses.items()}
     return mass_panels(along.t, entries, {"true": "truth", **styles}, joint_types, width=400)
-
-
-def _prediction_panels(
-    examples: Mapping[str, PredictedMotion], styles: Mapping[str, str], facts: Facts
-) -> list[Panel]:
-    """Return the first test trajectory of the results: what was measured, and what every variant predicts."""
-    measured = next(iter(examples.values()))
-    panels = []
-    for k, joint in enumerate(named_joints(facts.joints, facts.joint_types)):
-        rows = []
-        for key, quantity in QUANTITIES.items():
-            lines = [Line("measured", measured.t, getattr(measured, key)[:, k], "truth")]
-            for name, example in examples.items():
-                predicted = getattr(example, f"predicted_{key}")[:, k]
-                lines.append(Line(name, example.t, predicted, styles[name]))
-            rows.append(Row(lines, f"{quantity} of {joint.name}", joint.axis(quantity), 150))
-        panels.append(stack(joint.name, rows))
-    return panels

@@ -58,7 +58,11 @@ def curves(traces: Traces, facts: Facts) -> Curves:
     for trace in traces.torques[:1]:
         drawn.energy = energy_chart(trace)
     for example in traces.trajectories:
-        drawn.trajectories[_prediction_title(example, facts)] = trajectory_panels(example, joints)
+        title = _prediction_title(example, facts)
+        motion = f"prediction {example.which}"
+        drawn.trajectories[title] = trajectory_panels(
+            {"predicted": example}, {"predicted": "predicted"}, joints, motion
+        )
     if mass is not None and mass.by:
         entries = {name: curves.entries for name, curves in mass.by.items()}
         drawn.mass = mass_panels(mass.t, entries, {name: style(name) for name in entries}, facts.joint_types)

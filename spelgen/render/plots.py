@@ -19,7 +19,7 @@ from spelgen.baselines.names import (
     observed,
 )
 from spelgen.evaluation.torque_traces import TorqueTrace
-from spelgen.evaluation.traces import FrictionTrace, Growth, MassTrace, PredictedExample, Quantiles
+from spelgen.evaluation.traces import FrictionTrace, Growth, MassTrace, PredictedMotion, Quantiles
 from spelgen.labels import UNITS, NamedJoint, entry_name
 from spelgen.render.charts import MARGINS, Band, Chart, Dots, Line, Mark, Values, line_chart
 from spelgen.settings.tuning.render import TUNING
@@ -185,29 +185,37 @@ def torque_panels(trace: TorqueTrace, joints: Sequence[NamedJoint]) -> list[Pane
     return panels
 
 
-def trajectory_panels(example: PredictedExample, joints: Sequence[NamedJoint]) -> list[Panel]:
-    """Return by joint position and, where it is known, velocity: measured, predicted and, of servos, commanded, each
-    above the difference of the first two.
+def trajectory_panels(
+    predictions: Mapping[str, PredictedMotion],
+    styles: Mapping[str, str],
+    joints: Sequence[NamedJoint],
+    motion: str = "",
+) -> list[Panel]:
+    """Return by joint position and, where it is known, velocity: measured and predicted, each above what the
+    predictions miss; of servos the commands, too.
+
+    predictions: of one motion, by the names of lines, whose styles stand in `styles`. motion: see `line_chart`.
     """
-    quantities = [("position", example.q, example.predicted_q)]
-    if example.qd is not None and example.predicted_qd is not None:
-        quantities.append(("velocity", example.qd, example.predicted_qd))
-    t = example.t
+    measured = next(iter(predictions.values()))
     panels = []
     for k, joint in enumerate(joints):
         rows = []
-        for quantity, measured, predicted in quantities:
-            lines = [
-                Line("measured", t, measured[:, k], "truth"),
-                Line("predicted", t, predicted[:, k], "predicted"),
-            ]
-            if example.u is not None:
-                lines.insert(0, Line("commanded", t, example.u[:, k], "hold"))
+        for key, quantity in QUANTITIES.items():
+            values = getattr(measured, key)
+            if values is None:
+                continue
+            lines = [Line("measured", measured.t, values[:, k], "truth")]
+            if measured.u is not None:
+                lines.insert(0, Line("commanded", measured.t, measured.u[:, k], "hold"))
+            errors = []
+            for name, prediction in predictions.items():
+                predicted = getattr(prediction, f"predicted_{key}")[:, k]
+                lines.append(Line(name, measured.t, predicted, styles[name]))
+                errors.append(Line(name, measured.t, predicted - values[:, k], styles[name]))
             title, axis = f"{quantity} of {joint.name}", joint.axis(quantity)
-            error = Line("error", t, (predicted - measured)[:, k], "model")
             rows.append(Row(lines, title, axis))
-            rows.append(Row([error], f"Error of the {title}", axis.replace(quantity, "error"), 100))
-        panels.append(stack(joint.name, rows, f"prediction {example.which}"))
+            rows.append(Row(errors, f"Error of the {title}", axis.replace(quantity, "error"), 100))
+        panels.append(stack(joint.name, rows, motion))
     return panels
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spelgen.dynamics.constraint import Constraint, mimic_constraint
+from spelgen.evaluation.plain import Curve
 from spelgen.render.shapes import Shape, drum, joined, slide, tube, visual_shapes
 from spelgen.settings.tuning.render import TUNING
 from spelgen.urdf.read import read_urdf
@@ -28,29 +29,14 @@ class SceneLink:
 
     name: str
     parent: int
-    rotation: np.ndarray
-    position: np.ndarray
-    axis: np.ndarray
+    rotation: Curve
+    position: Curve
+    axis: Curve
     slides: bool
     joint: int
     ratio: float
     offset: float
     shape: Shape
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the link for a script, in millimetres and short names."""
-        return {
-            "parent": self.parent,
-            "R": self.rotation.ravel().round(6).tolist(),
-            "p": _mm(self.position),
-            "axis": self.axis.round(6).tolist(),
-            "slides": self.slides,
-            "joint": self.joint,
-            "ratio": self.ratio,
-            "offset": self.offset,
-            "v": _mm(self.shape.vertices),
-            "f": self.shape.faces.tolist(),
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +46,6 @@ class Scene:
     links: tuple[SceneLink, ...]
     reach: float
     has_meshes: bool
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the scene for a script, in millimetres and short names."""
-        links = [link.to_dict() for link in self.links]
-        return {"reach": round(1000 * self.reach), "links": links}
 
 
 def scene(urdf: Path, joints: Sequence[str]) -> Scene:
@@ -161,8 +142,3 @@ def _rotation(joint: Joint) -> np.ndarray:
     """Return the rotation of roll, pitch and yaw, about fixed axes."""
     matrix: np.ndarray = Rotation.from_euler("xyz", joint.rpy).as_matrix()
     return matrix
-
-
-def _mm(vectors: np.ndarray) -> list[float]:
-    rounded: list[float] = (1000 * vectors).round(1).tolist()
-    return rounded

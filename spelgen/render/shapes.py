@@ -9,10 +9,12 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from pydantic import PlainSerializer, PlainValidator
 
+from spelgen.evaluation.plain import Curve
 from spelgen.render import mesh_child
 from spelgen.settings.tuning.render import TUNING
 
@@ -25,8 +27,8 @@ if TYPE_CHECKING:
 class Shape:
     """Vertices (V, 3) [m] in the link's frame, and triangles of them (F, 3), seen from outside counterclockwise."""
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    vertices: Curve
+    faces: Annotated[np.ndarray, PlainValidator(np.array), PlainSerializer(np.ndarray.tolist)]
 
 
 def joined(meshes: Sequence[Trimesh]) -> Shape:
