@@ -70,46 +70,10 @@ class _Words:
         return why(self.axes, self.structure, *subject)
 
     def zeros(self) -> Iterator[Fact]:
-        """Yield zeros along an axis by the joint that slides, right angles by the joint nearer to the root, then the
-        others.
-        """
-        along: dict[int, list[Entry]] = {}
-        across: dict[int, list[Entry]] = {}
-        unexplained: list[Entry] = []
-        for entry in self.structure.entries:
-            if entry.kind != "zero":
-                continue
-            slider = self._slides_along(entry)
-            if slider is not None:
-                along.setdefault(slider, []).append(entry)
-            elif self._slide_across(entry):
-                across.setdefault(entry.column, []).append(entry)
-            else:
-                unexplained.append(entry)
-        for slider, group in sorted(along.items()):
-            axes = axes_told(_other_joints(group, slider))
-            yield _zero(
-                group,
-                f"joint {slider + 1} slides along {axes}, and what turns about an axis never moves along it",
-            )
-        for joint, group in sorted(across.items()):
-            which = joints_told(_other_joints(group, joint))
-            yield _zero(group, f"joint {joint + 1} slides at right angles to {which}")
-        for reason, group in self._by_reason(unexplained, reasons.balance_reason):
-            yield _zero(group, reason)
-
-    def _slides_along(self, entry: Entry) -> int | None:
-        """Return the joint of the two that slides along the axis about which the other one turns."""
-        axes, a, b = self.axes, entry.row, entry.column
-        if axes is None or axes.slides[a] == axes.slides[b] or not axes.parallel(a, b):
-            return None
-        if axes.slides[a]:
-            return a
-        return b
-
-    def _slide_across(self, entry: Entry) -> bool:
-        axes, a, b = self.axes, entry.row, entry.column
-        return axes is not None and axes.slides[a] and axes.slides[b] and axes.perpendicular(a, b)
+        zeros = [entry for entry in self.structure.entries if entry.kind == "zero"]
+        for reason, group in self._by_reason(zeros, reasons.zero_reason):
+            means = f"Nothing is learned for {_pronoun(group)}"
+            yield Fact(f"{_names_are(group)} always zero", means, reason)
 
     def constants(self) -> Iterator[Fact]:
         constant = [entry for entry in self.structure.entries if entry.kind == "constant"]
@@ -127,8 +91,12 @@ class _Words:
         for entry in entries:
             groups.setdefault(self._reason(why, entry), []).append(entry)
         for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
-            if reason is not None:
-                reason = reason.format(axes=axes_told(sorted({entry.column for entry in group})))
+            if reason is not None and self.axes is not None:
+                # the joint that a reason is about comes second only where it slides, and is nearer to the root
+                slides = self.axes.slides
+                others = {entry.row if slides[entry.column] else entry.column for entry in group}
+                told = sorted(others)
+                reason = reason.format(axes=axes_told(told), joints=joints_told(told))
             yield reason, group
 
     def equalities(self) -> Iterator[Fact]:
@@ -180,17 +148,6 @@ class _Words:
         for reason, group in groups.items():
             means = f"The network of V does not read {_pronoun(group)}"
             yield Fact(f"V does not depend on {joints_told(group)}", means, reason)
-
-
-def _zero(group: Sequence[Entry], reason: Reason) -> Fact:
-    return Fact(f"{_names_are(group)} always zero", f"Nothing is learned for {_pronoun(group)}", reason)
-
-
-def _other_joints(entries: Sequence[Entry], joint: int) -> list[int]:
-    joints: set[int] = set()
-    for entry in entries:
-        joints.update((entry.row, entry.column))
-    return sorted(joints - {joint})
 
 
 def _names_are(entries: Sequence[Entry]) -> str:

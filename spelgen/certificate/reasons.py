@@ -1,8 +1,8 @@
-"""Give the reason why an entry is constant, or equal to another, and why a joint does not matter: the arm's geometry.
+"""Give the reason why an entry is zero, constant or equal to another, and why a joint does not matter: the geometry.
 
 M couples joints a and b by the integral of v_a . v_b over the mass that both move, v being the velocity field
 of a unit rate: that integral is what the reasons speak of. Each function gives None where it finds none.
-``{axes}`` in a reason stands for the axes of the other joints concerned.
+``{joints}`` and ``{axes}`` in a reason stand for the other joints concerned, and for their axes.
 """
 
 from __future__ import annotations
@@ -12,6 +12,17 @@ from collections.abc import Sequence
 from spelgen.certificate.axes import Axes
 from spelgen.labels import axes_told, entry_name, joints_told
 from spelgen.structure.structure import Entry, Structure
+
+
+def zero_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None:
+    """Return why ``entry`` is zero."""
+    later, earlier = entry.row, entry.column
+    slider = later if axes.slides[later] else earlier
+    if axes.slides[later] != axes.slides[earlier] and axes.parallel(later, earlier):
+        return f"joint {slider + 1} slides along {{axes}}, and what turns about an axis never moves along it"
+    if axes.slides[later] and axes.slides[earlier] and axes.perpendicular(later, earlier):
+        return f"joint {earlier + 1} slides at right angles to {{joints}}"
+    return balance_reason(axes, structure, entry)
 
 
 def constant_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None:

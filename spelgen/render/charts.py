@@ -91,22 +91,18 @@ class Line:
         # every so many samples, and the last one, so that the line ends where the data do
         stride = max(1, math.ceil(len(x) / TUNING.points))
         rows = np.unique([*range(0, len(x), stride), max(len(x) - 1, 0)])[: len(x)]
-        x, y = x[rows], y[rows]
-        drawable = np.isfinite(x) & np.isfinite(y)
+        drawable = np.isfinite(x[rows]) & np.isfinite(y[rows])
         if y_axis.log:
-            drawable &= y > 0
-        columns, heights = np.round(10 * x_axis.pixels(x)), np.round(10 * y_axis.pixels(y))
-        steps, pen = [], None
-        for column, height, visible in zip(columns, heights, drawable, strict=True):
-            if not visible:
-                pen = None
-                continue
-            if pen is None:
-                steps.append(f"M{column / 10:g} {height / 10:g}")
-            else:
-                steps.append(f"l{(column - pen[0]) / 10:g} {(height - pen[1]) / 10:g}")
-            pen = column, height
-        return "".join(steps)
+            drawable &= y[rows] > 0
+        gaps = np.flatnonzero(np.diff(np.flatnonzero(drawable)) > 1) + 1
+        rows = rows[drawable]
+        points = np.stack([x_axis.pixels(x[rows]), y_axis.pixels(y[rows])], axis=1)
+        pieces = []
+        for piece in np.split(np.round(10 * points), gaps):
+            for command, numbers in (("M", piece[:1]), ("l", np.diff(piece, axis=0))):
+                if numbers.size:
+                    pieces.append(command + " ".join(f"{number / 10:g}" for number in numbers.ravel()))
+        return "".join(pieces)
 
 
 @dataclass(frozen=True, eq=False)
