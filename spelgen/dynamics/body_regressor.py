@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 
 from spelgen.runtime.body_chain import BodyChain
-from spelgen.runtime.joints import blocks
-from spelgen.runtime.port_hamiltonian import combined
-from spelgen.runtime.rigid_body import inertia_basis, pushed_along
+from spelgen.runtime.port_hamiltonian import applied
+from spelgen.runtime.rigid_body import pushed_along, spatial_inertia
 
 
 def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
@@ -16,14 +15,14 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
 
     ``chain`` is that of this package or of an emitted module.
     """
-    basis = inertia_basis().to(q)
+    basis = spatial_inertia(torch.eye(10).to(q))
     pose = chain.forward(q)
-    rises = chain.accelerations(pose, qd, chain.turning(pose, qd)[1]) + combined(qdd, pose.twists)
-    rises, twists = (blocks(rows, 6) for rows in (rises, combined(qd, pose.twists)))
+    rises = chain.accelerations(pose, qd, chain.turning(pose, qd)[1]) + applied(pose.twists.mT, qdd)
+    rises, twists = (torch.unflatten(rows, -1, (-1, 6)) for rows in (rises, applied(pose.twists.mT, qd)))
     # by body and parameter: (..., bodies, 6, 10)
     momenta = torch.tensordot(twists, basis, dims=([-1], [2])).mT
     wrenches = torch.tensordot(rises, basis, dims=([-1], [2])).mT
     wrenches = wrenches + pushed_along(twists.unsqueeze(-1), momenta)
-    columns = blocks(pose.twists, 6).transpose(-3, -2)  # (..., bodies, n, 6)
+    columns = torch.unflatten(pose.twists, -1, (-1, 6)).transpose(-3, -2)  # (..., bodies, n, 6)
     rows: Tensor = (columns @ wrenches).transpose(-3, -2)
     return rows.reshape(*q.shape, 10 * len(chain.parents))

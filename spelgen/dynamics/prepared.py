@@ -48,7 +48,7 @@ class PreparedModel:
         self._model = reduced
         self._weights, self._tip = reduced.prepare(), tip
         self.n: int = reduced.n
-        self.elements: int = reduced.elements
+        self.elements: int = getattr(reduced, "elements", 0)
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M(q), (..., n, n) [kg m^2, kg m, kg]."""

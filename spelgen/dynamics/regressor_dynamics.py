@@ -14,7 +14,7 @@ from spelgen.arm.arm import Arm
 from spelgen.dynamics.pose import Pose
 from spelgen.dynamics.rigid_bodies import RigidBodies
 from spelgen.runtime.bristles import moved_bristles
-from spelgen.runtime.port_hamiltonian import applied, solved
+from spelgen.runtime.port_hamiltonian import applied
 
 
 class RegressorDynamics:
@@ -74,12 +74,14 @@ class RegressorDynamics:
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """qdd, (..., n), under the inputs tau."""
         pose = self.pose_at(q)
-        return solved(pose.mass, pose.force(qd, tau, z))
+        qdd: Tensor = torch.linalg.solve(pose.mass, pose.force(qd, tau, z))
+        return qdd
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
         passive = (self.inputs == 0).all(dim=1).double()
-        return solved(self.inputs + torch.diag(passive), self.joint_torque(q, qd, qdd, z))
+        inverse: Tensor = torch.linalg.inv(self.inputs + torch.diag(passive))
+        return self.joint_torque(q, qd, qdd, z) @ inverse.mT
 
     def joint_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """What all joints, passive ones too, need for qdd, (..., n) [Nm, N]."""

@@ -11,7 +11,7 @@ import torch
 from spelgen.arm.arm import Arm
 from spelgen.runtime.body_chain import BodyChain
 from spelgen.runtime.parts import Row
-from spelgen.runtime.rigid_body import Bodies, inertia_basis
+from spelgen.runtime.rigid_body import Bodies, spatial_inertia
 
 PER_BODY = 10  # inertial parameters
 
@@ -34,7 +34,7 @@ class RigidBodies:
     def __init__(self, arm: Arm, parameters: np.ndarray) -> None:
         self.chain = body_chain(arm)
         ten = torch.from_numpy(np.asarray(parameters, dtype=float)).reshape(-1, PER_BODY)
-        self.inertia = torch.block_diag(*torch.tensordot(ten, inertia_basis(), dims=1))
+        self.inertia = torch.block_diag(*spatial_inertia(ten))
 
     def at(self, q: torch.Tensor) -> tuple[torch.Tensor, Callable[[torch.Tensor], torch.Tensor]]:
         """Return M, (T, n, n), at q, (T, n), and the function that gives Coriolis, centrifugal and gravity torques,

@@ -40,4 +40,4 @@ class Trained:
     @property
     def memory(self) -> int:
         """How many numbers the memory of friction has."""
-        return self.model.n * self.model.elements
+        return self.model.n * int(getattr(self.model, "elements", 0))

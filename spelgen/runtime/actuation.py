@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from spelgen.runtime.joints import Joints
 from spelgen.runtime.network_dynamics import NetworkDynamics, NetworkPose, NetworkPrepared
 from spelgen.runtime.parts import Friction, Mass, Network, Pose
-from spelgen.runtime.port_hamiltonian import PortHamiltonian, solved
+from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 
 class MotorInput(PortHamiltonian):
@@ -50,7 +50,9 @@ class MotorInput(PortHamiltonian):
 
     def input_torque(self, pose: Pose, qd: Tensor, force: Tensor) -> Tensor:
         """Return the inputs, (..., n), that make this force; a passive joint shows the torque it lacks."""
-        return solved(self.gains() + torch.diag(1 - self.actuated), force)
+        matrix = self.gains() + torch.diag(1 - self.actuated)
+        tau: Tensor = torch.linalg.solve(matrix, force.unsqueeze(-1))
+        return tau.squeeze(-1)
 
 
 class DenseInput(NetworkDynamics):

@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.joints import blocks, vector
-from spelgen.runtime.port_hamiltonian import applied, combined
+from spelgen.runtime.joints import vector
+from spelgen.runtime.port_hamiltonian import applied
 from spelgen.runtime.rigid_body import Bodies, crossed, motion_table, pushed_along
 
 
@@ -59,14 +59,14 @@ class BodyChain(nn.Module):
         """The bodies at q, (..., n)."""
         value = q @ self.ratios.mT + self.offset
         features = torch.cat([value.cos(), value.sin(), value], dim=-1)
-        relative = blocks(F.linear(features, self.table, self.fixed), 6, 6).unbind(dim=-3)
+        relative = torch.unflatten(F.linear(features, self.table, self.fixed), -1, (-1, 6, 6)).unbind(dim=-3)
         placed: list[Tensor] = []
         for index, parent in enumerate(self.parents):
             placed.append(relative[index] if parent < 0 else placed[parent] @ relative[index])
         frames = torch.cat(placed, dim=-1)
         axes = (frames @ self.reading).roll(3, dims=-2)
         twists = self.ratios.mT @ ((axes.mT @ frames) * self.carried)
-        return Chain(frames, axes, twists, combined(self.base, frames))
+        return Chain(frames, axes, twists, self.base @ frames)
 
     def turning(self, pose: Chain, qd: Tensor) -> tuple[Tensor, Tensor]:
         """The bodies' twists, and how these turn the bodies' axes; in the base's frame, (..., 6, bodies)."""
@@ -76,12 +76,12 @@ class BodyChain(nn.Module):
     def accelerations(self, pose: Chain, qd: Tensor, turning: Tensor) -> Tensor:
         """The bodies' accelerations at steady qd, gravity taken as one, (..., 6 bodies)."""
         steady = (turning * (qd @ self.ratios.mT).unsqueeze(-2)) @ self.carriers
-        bodies = blocks(pose.frames, 6) * steady.unsqueeze(-1)
+        bodies = torch.unflatten(pose.frames, -1, (-1, 6)) * steady.unsqueeze(-1)
         return bodies.sum(dim=-3).flatten(-2) + pose.weight
 
     def at_base(self, pose: Chain, momenta: Tensor) -> Tensor:
         """Momenta of the bodies, (..., 6 bodies), in the base's frame, (..., 6, bodies)."""
-        return blocks(pose.frames * momenta.unsqueeze(-2), 6).sum(dim=-1)
+        return torch.unflatten(pose.frames * momenta.unsqueeze(-2), -1, (-1, 6)).sum(dim=-1)
 
     def by_joints(self, axes: Tensor, wrenches: Tensor) -> Tensor:
         """What joints feel along ``axes`` of wrenches on all that they carry, (..., n)."""
@@ -94,7 +94,7 @@ class BodyChain(nn.Module):
         """
         twists, turning = self.turning(pose, qd)
         rising = applied(momenta, self.accelerations(pose, qd, turning))
-        pushed = pushed_along(twists, self.at_base(pose, combined(qd, momenta)))
+        pushed = pushed_along(twists, self.at_base(pose, applied(momenta.mT, qd)))
         return rising + self.by_joints(pose.axes, pushed)
 
     def energy(self, pose: Chain, inertia: Tensor) -> Tensor:

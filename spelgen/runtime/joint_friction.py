@@ -49,17 +49,15 @@ class JointFriction(nn.Module):
         """Torque per velocity, (n,) [Nm s/rad, N s/m]."""
         return self.nominal * F.softplus(self.raw_viscous) / self.speed
 
-    def coulomb_smoothing_velocity(self) -> Tensor:
-        """Where dry friction has turned around, (n,) [rad/s, m/s]."""
-        return self.speed * (LEAST_SMOOTHING**2 + (SMOOTHING * self.raw_smoothing.exp()) ** 2).sqrt()
-
     def prepare(self) -> tuple[Layers, Tensor, Tensor]:
-        """Return all joints' networks as one, the viscous friction and the smoothing velocity squared."""
+        """Return all joints' networks as one, viscous friction, and the smoothing velocity squared."""
         # block matrices are faster than a loop over joints
         hidden = (self.weight.mT @ self.matrix).flatten(0, 1), self.bias.flatten()
         identity = torch.eye(len(self.out), dtype=self.out.dtype, device=self.out.device)
         out = (identity.unsqueeze(-1) * self.out).flatten(1), self.offset
-        return (hidden, out), self.viscous(), self.coulomb_smoothing_velocity() ** 2
+        # of the velocity at which dry friction has turned around
+        smoothing = self.speed**2 * (LEAST_SMOOTHING**2 + (SMOOTHING * self.raw_smoothing.exp()) ** 2)
+        return (hidden, out), self.viscous(), smoothing
 
     def forward(
         self, encoded: Tensor, qd: Tensor, prepared: tuple[Layers, Tensor, Tensor], right: Tensor

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -32,8 +31,3 @@ class Joints(NamedTuple):
 def vector(values: Iterable[float]) -> Tensor:
     """The values as a float64 tensor."""
     return torch.tensor(list(values), dtype=torch.float64)
-
-
-def blocks(rows: Tensor, *shape: int) -> Tensor:
-    """(..., m) as (..., m / size, *shape), size the product of the shape."""
-    return rows.reshape(*rows.shape[:-1], rows.shape[-1] // math.prod(shape), *shape)

@@ -11,13 +11,6 @@ from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.parts import Pose, Prepared
 
 
-def solved(matrix: Tensor, right: Tensor) -> Tensor:
-    """Return matrix^-1 right, (..., n)."""
-    # its derivative costs one more solution; a Cholesky factor's would cost several times that
-    solution: Tensor = torch.linalg.solve(matrix, right.unsqueeze(-1))
-    return solution.squeeze(-1)
-
-
 def applied(matrix: Tensor, vector: Tensor) -> Tensor:
     """Return matrix vector, (..., n)."""
     if vector.dim() == 1:  # fewer steps, which is what one state costs
@@ -25,24 +18,16 @@ def applied(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
-def combined(weights: Tensor, rows: Tensor) -> Tensor:
-    """Return the sum of weighted rows, weights^T rows, (..., m)."""
-    return (weights.unsqueeze(-2) @ rows).squeeze(-2)
-
-
 class PortHamiltonian(nn.Module):
     """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, with H = 1/2 p^T M(q)^-1 p + V(q).
 
     The port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014).
-    q, qd, qdd, tau and p are (..., n). In place of q methods take a pose, too: all that depends on q, M as
-    ``mass``, which ``at`` works out once for several of them. ``prepared`` is what ``prepare`` gave: all
-    that depends on the weights alone, worked out once for many poses.
+    q, qd, qdd, tau and p are (..., n), with any leading dimensions; rad and Nm, m and N if prismatic. In
+    place of q methods take a pose, too: all that depends on q, M as ``mass``, which ``at`` works out once
+    for several of them. ``prepared`` is what ``prepare`` gave: all that depends on the weights alone.
     """
 
     n: int
-    joint_names: tuple[str, ...]
-    joint_types: tuple[str, ...]  # "revolute" or "prismatic"
-    elements = 0  # K, the numbers of friction's state at a joint
     # networks and rigid bodies have these each of their own
     prepare: Callable[..., Prepared]
     configuration: Callable[[Tensor, Prepared], Pose]
@@ -96,7 +81,9 @@ class PortHamiltonian(nn.Module):
 
     def velocity(self, q: Tensor | Pose, p: Tensor) -> Tensor:
         """Return qd = M(q)^-1 p, (..., n)."""
-        return solved(self.at(q, p).mass, p)
+        # a derivative of this costs one more solution; a Cholesky factor's would cost several times that
+        qd: Tensor = torch.linalg.solve(self.at(q, p).mass, p.unsqueeze(-1))
+        return qd.squeeze(-1)
 
     def hamiltonian(self, q: Tensor | Pose, p: Tensor) -> Tensor:
         """Return H, (...) [J]."""
@@ -107,7 +94,9 @@ class PortHamiltonian(nn.Module):
         """Return qdd, (..., n), under the input tau."""
         pose = self.at(q, qd, tau)
         force = self.input_force(pose, qd, tau) - self.nonlinear_effects(pose, qd)
-        return solved(pose.mass, force - self.friction_torque(pose, qd, *state))
+        force = force - self.friction_torque(pose, qd, *state)
+        qdd: Tensor = torch.linalg.solve(pose.mass, force.unsqueeze(-1))
+        return qdd.squeeze(-1)
 
     def inverse_dynamics(self, q: Tensor | Pose, qd: Tensor, qdd: Tensor, *state: Tensor | None) -> Tensor:
         """Return the input tau, (..., n), that gives qdd."""
@@ -120,7 +109,7 @@ class PortHamiltonian(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Return q' and p', (..., n), under the input tau; without one, of the arm left to itself."""
         pose = self.at(q, p, p if tau is None else tau, prepared=prepared)
-        qd = solved(pose.mass, p)
+        qd = self.velocity(pose, p)
         force = self.lagrangian_gradient(pose, qd) - self.friction_torque(pose, qd, *state)
         return qd, force if tau is None else force + self.input_force(pose, qd, tau)
 

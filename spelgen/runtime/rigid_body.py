@@ -30,8 +30,8 @@ def skew(a: Tensor) -> Tensor:
     """[a]x, (..., 3, 3), with [a]x b = a x b."""
     x, y, z = a.unbind(dim=-1)
     zero = torch.zeros_like(x)
-    rows = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
-    return rows.reshape(*a.shape[:-1], 3, 3)
+    entries = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
+    return torch.unflatten(entries, -1, (3, 3))
 
 
 def motion_table(bodies: Bodies) -> tuple[Tensor, Tensor]:
@@ -74,15 +74,12 @@ def pushed_along(twists: Tensor, momenta: Tensor) -> Tensor:
     return torch.cat([angular, torch.linalg.cross(w, f, dim=-2)], dim=-2)
 
 
-def inertia_basis() -> Tensor:
-    """Spatial inertias of bodies with one parameter one and the others zero, (10, 6, 6)."""
-    basis = torch.zeros(10, 6, 6, dtype=torch.float64)
-    basis[0, 3:, 3:] = torch.eye(3)
-    for axis, unit in enumerate(torch.eye(3, dtype=torch.float64)):
-        basis[1 + axis, :3, 3:], basis[1 + axis, 3:, :3] = skew(unit), -skew(unit)
-    for component, (row, column) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
-        basis[4 + component, row, column] = basis[4 + component, column, row] = 1
-    return basis
+def spatial_inertia(ten: Tensor) -> Tensor:
+    """[[I, [m c]x], [-[m c]x, m]], (..., 6, 6), of (m, m c, I), (..., 10)."""
+    m, _, _, _, xx, xy, xz, yy, yz, zz = ten.unbind(dim=-1)
+    inertia = torch.unflatten(torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=-1), -1, (3, 3))
+    moment, mass = skew(ten[..., 1:4]), m[..., None, None] * torch.eye(3).to(ten)
+    return torch.cat([torch.cat([inertia, moment], dim=-1), torch.cat([-moment, mass], dim=-1)], dim=-2)
 
 
 def pseudo_inertia(ten: Tensor) -> Tensor:

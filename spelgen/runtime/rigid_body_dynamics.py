@@ -11,8 +11,8 @@ from spelgen.runtime.body_chain import BodyChain, Chain
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
 from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.parts import Row, Rows
-from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied, combined
-from spelgen.runtime.rigid_body import Bodies, InertialParameters, inertia_basis
+from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
+from spelgen.runtime.rigid_body import Bodies, InertialParameters, spatial_inertia
 
 
 class RigidPrepared(NamedTuple):
@@ -56,7 +56,7 @@ class RigidBodyDynamics(PortHamiltonian):
         zeros = torch.zeros(joints.n, dtype=torch.float64)
         self.elements = len(reach[0]) if reach else 0
         self.chain = BodyChain(joints.n, bodies, gravity)
-        self.basis = nn.Buffer(inertia_basis())
+        self.basis = nn.Buffer(spatial_inertia(torch.eye(10).double()))
         self.bodies, self.friction = InertialParameters(bodies), FrictionLaws(joints, reach)
         self.nominal_armature = nn.Buffer(vector(joints.armature))
         self.raw_armature = nn.Parameter(zeros.clone())  # its logarithm
@@ -129,7 +129,7 @@ class RigidBodyDynamics(PortHamiltonian):
         their twist.
         """
         pose: Motion = self.at(q, qd)
-        momenta = self.chain.at_base(pose.chain, combined(qd, pose.momenta))
+        momenta = self.chain.at_base(pose.chain, applied(pose.momenta.mT, qd))
         return self.chain.by_joints(self.chain.turning(pose.chain, qd)[1], momenta) - pose.gravity
 
     def nonlinear_effects(self, q: Tensor | Motion, qd: Tensor) -> Tensor:

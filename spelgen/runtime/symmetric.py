@@ -10,10 +10,8 @@ from torch import Tensor
 
 def symmetric(*rows: Sequence[Tensor | float]) -> Tensor:
     """Return the matrix, (..., n, n), with these rows as its lower triangle; entries are (...) or numbers."""
-    entries = [entry for row in rows for entry in row]
-    like = next(entry for entry in entries if isinstance(entry, Tensor))
-    lower = [entry if isinstance(entry, Tensor) else torch.full_like(like, entry) for entry in entries]
     n = len(rows)
-    index = [max(i, j) * (max(i, j) + 1) // 2 + min(i, j) for i in range(n) for j in range(n)]
-    entries_of_matrix = torch.stack(lower, dim=-1)[..., index]
-    return entries_of_matrix.reshape(*like.shape, n, n)
+    entries = [rows[max(i, j)][min(i, j)] for i in range(n) for j in range(n)]
+    like = next(entry for entry in entries if isinstance(entry, Tensor))
+    filled = [entry if isinstance(entry, Tensor) else torch.full_like(like, entry) for entry in entries]
+    return torch.stack(filled, dim=-1).reshape(*like.shape, n, n)

@@ -19,7 +19,6 @@ Joints, in the order of q, qd and tau:
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -75,8 +74,7 @@ Prepared = RigidPrepared
 class Model(RigidBodyDynamics):
     """The arm's dynamics: 3 rigid bodies with trained inertial parameters.
 
-    q, qd, qdd, tau and p are (..., n), with any leading dimensions; rad and Nm, m and N if prismatic. For all
-    weights M is positive definite, D positive semi-definite.
+    For all weights M is positive definite, D positive semi-definite.
     z, (..., n, 4), friction's memory, is how far its bristles are bent [rad, m]; None: they slide as qd goes.
     """
 

@@ -100,8 +100,7 @@ Prepared = RigidPrepared
 class Model(ResidualDynamics):
     """The arm's dynamics: 3 rigid bodies with trained inertial parameters, and residual networks.
 
-    q, qd, qdd, tau and p are (..., n), with any leading dimensions; rad and Nm, m and N if prismatic. For all
-    weights M is positive definite, D positive semi-definite.
+    For all weights M is positive definite, D positive semi-definite.
     z, (..., n, 4), friction's memory, is how far its bristles are bent [rad, m]; None: they slide as qd goes.
     """
 

@@ -85,8 +85,7 @@ Friction = JointFriction
 class Model(NetworkDynamics):
     """The arm's dynamics: 3 learned functions of q and 2 constants make the mass matrix.
 
-    q, qd, qdd, tau and p are (..., n), with any leading dimensions; rad and Nm, m and N if prismatic. For all
-    weights M is positive definite, D positive semi-definite.
+    For all weights M is positive definite, D positive semi-definite.
     """
 
     n = 3

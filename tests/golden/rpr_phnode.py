@@ -87,8 +87,7 @@ Friction = DenseFriction
 class Model(DenseInput):
     """The arm's dynamics: 45 learned functions of q make M^-1 over all axes.
 
-    q, qd, qdd, tau and p are (..., n), with any leading dimensions; rad and Nm, m and N if prismatic. For all
-    weights M is positive definite, D positive semi-definite.
+    For all weights M is positive definite, D positive semi-definite.
     """
 
     n = 3
