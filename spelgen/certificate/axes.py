@@ -31,10 +31,13 @@ def is_plain(arm: Arm) -> bool:
 
 @dataclass(frozen=True)
 class _Configuration:
-    """Hold the directions and origins of all axes in the root's frame, at one configuration."""
+    """Hold of all joints, in the root's frame at one configuration, the axes and the twists.
+
+    A twist is how a unit rate moves a body: the velocity of its point at the root's origin, then its angular velocity.
+    """
 
     axes: list[np.ndarray]
-    origins: list[np.ndarray]
+    twists: list[np.ndarray]
 
 
 class Axes:
@@ -59,12 +62,6 @@ class Axes:
     def _cosines(self, a: int, b: int) -> set[Fraction]:
         return {pose.axes[a] @ pose.axes[b] for pose in self._configurations}
 
-    def same_line(self, a: int, b: int) -> bool:
-        if not self.parallel(a, b):
-            return False
-        levers = [(pose.origins[a] - pose.origins[b], pose.axes[a]) for pose in self._configurations]
-        return all(_are_parallel(lever, axis) for lever, axis in levers)
-
     def opposed(self, a: int, b: int) -> bool:
         """Whether the two point against each other, for axes that are always parallel."""
         # parallel unit vectors have a cosine of 1 or -1, at every configuration the same
@@ -72,17 +69,15 @@ class Axes:
 
     def move_alike(self, a: int, b: int) -> bool:
         """Whether unit rates of the two joints give the same velocity field, or opposite ones."""
-        if self.slides[a] and self.slides[b]:
-            return self.parallel(a, b)
-        return self.slides[a] == self.slides[b] and self.same_line(a, b)
+        return all(_are_parallel(pose.twists[a], pose.twists[b]) for pose in self._configurations)
 
     def commute(self, a: int, b: int) -> bool:
-        """Whether moving one joint leaves the other's axis where it was."""
-        if self.slides[a] and self.slides[b]:
-            return True
-        if self.slides[a] or self.slides[b]:
-            return self.parallel(a, b)
-        return self.same_line(a, b)
+        """Whether moving one joint leaves the other's axis where it was: the twists' Lie bracket is zero."""
+        for pose in self._configurations:
+            (v, w), (v_b, w_b) = np.split(pose.twists[a], 2), np.split(pose.twists[b], 2)
+            if np.cross(w, w_b).any() or (np.cross(w, v_b) - np.cross(w_b, v)).any():
+                return False
+        return True
 
     def keep_offset(self, slider: int, turner: int) -> bool:
         """Whether no joint moves the mass behind ``slider`` across the plane of the two directions."""
@@ -90,13 +85,9 @@ class Axes:
             return False  # a turn between the two may turn the plane
         for pose in self._configurations:
             normal = np.cross(pose.axes[slider], pose.axes[turner])
-            for joint in range(turner + 1, len(self.slides)):
-                if joint == slider:
-                    continue
-                if self.slides[joint] and pose.axes[joint] @ normal:
-                    return False
-                if not self.slides[joint] and not _are_parallel(pose.axes[joint], normal):
-                    return False
+            others = [joint for joint in range(turner + 1, len(self.slides)) if joint != slider]
+            if not all(_moves_nothing(pose.twists[joint], normal) for joint in others):
+                return False
         return True
 
     @cached_property
@@ -132,24 +123,22 @@ class Axes:
     def lifts_nothing(self, joint: int) -> bool:
         """Whether the joint slides level, or turns about the vertical."""
         gravity = np.array(self.arm.gravity)
-        for pose in self._configurations:
-            if self.slides[joint] and pose.axes[joint] @ gravity:
-                return False
-            if not self.slides[joint] and not _are_parallel(pose.axes[joint], gravity):
-                return False
-        return True
+        return all(_moves_nothing(pose.twists[joint], gravity) for pose in self._configurations)
 
 
 def _configuration(arm: Arm, generator: random.Random) -> _Configuration:
     """Place a plain arm's joints at a random rational configuration."""
-    axes, origins = [], []
+    axes, twists = [], []
     rotation, origin = IDENTITY, ZERO
     for body in arm.bodies:
         origin = origin + rotation @ np.array(body.translation)
         rotation = rotation @ np.array(body.rotation)
         axis = rotation[:, 2]
         axes.append(axis)
-        origins.append(origin)
+        twist = [axis, ZERO]
+        if body.kind == "revolute":
+            twist = [np.cross(origin, axis), axis]
+        twists.append(np.concatenate(twist))
         t = Fraction(generator.randrange(1, _GRID), generator.randrange(1, _GRID))
         if body.kind == "prismatic":
             origin = origin + t * axis
@@ -157,8 +146,15 @@ def _configuration(arm: Arm, generator: random.Random) -> _Configuration:
             # t is the tangent of half the angle: so cosine and sine are rational too
             norm = 1 + t * t
             rotation = rotation @ turn_about(2, (1 - t * t) / norm, 2 * t / norm)
-    return _Configuration(axes, origins)
+    return _Configuration(axes, twists)
 
 
 def _are_parallel(a: np.ndarray, b: np.ndarray) -> bool:
-    return not np.cross(a, b).any()
+    products = np.outer(a, b)
+    return not (products - products.T).any()
+
+
+def _moves_nothing(twist: np.ndarray, direction: np.ndarray) -> bool:
+    """Whether a joint moves no point of a body along the direction."""
+    v, w = np.split(twist, 2)
+    return not v @ direction and not np.cross(w, direction).any()

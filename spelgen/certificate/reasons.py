@@ -38,7 +38,7 @@ def constant_reason(axes: Axes, structure: Structure, entry: Entry) -> str | Non
             f"{axes_told([earlier])} along its slide"
         )
     turn = not axes.slides[later] and not axes.slides[earlier]
-    if turn and axes.same_line(later, earlier) and _diagonal_reason(axes, structure, later):
+    if turn and axes.move_alike(later, earlier) and _diagonal_reason(axes, structure, later):
         same = entry_name(later, later)
         if axes.opposed(later, earlier):
             same = f"-{same}"
