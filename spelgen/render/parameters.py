@@ -12,10 +12,11 @@ from spelgen.dynamics.protocol import has_rigid_bodies, has_servos
 from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
 from spelgen.exporting.urdf_file import about_center
-from spelgen.fitting.run_folder import RunFolder, trained_model
+from spelgen.fitting.run_folder import RunFolder
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.friction import FrictionModel
 from spelgen.labels import UNITS, entry_name
+from spelgen.listing import Listing
 from spelgen.loaded_arm import LoadedArm
 from spelgen.render.plots import Record, inertia_unit
 from spelgen.settings.tuning.render import TUNING
@@ -28,32 +29,21 @@ DETERMINED = ("firm", "fair")
 
 
 @dataclass(frozen=True)
-class ParameterTable:
-    """title, heads and rows of text; the first column is a name. folded: rows that are folded away. note: below it."""
+class ParameterTable(Listing):
+    """A table whose first column is a name. folded: rows that are folded away."""
 
-    title: str
-    head: tuple[str, ...]
-    rows: Rows
-    note: str = ""
     folded: Rows = ()
     folded_title: str = ""
 
 
-@dataclass(frozen=True)
-class Constant:
-    """A trained constant of M: where it enters, its value before training and after, in that entry's unit."""
-
-    where: str
-    start: float
-    learned: float
-    unit: str
-
-
 def parameter_tables(
-    model: EmittedModel | None, arm: LoadedArm | None, identified: Record | None
-) -> list[ParameterTable]:
-    """Return the tables of a run's parameters; `identified`: by least squares on the same logs."""
-    tables = []
+    run: RunFolder, model: EmittedModel | None, arm: LoadedArm | None, identified: Record | None
+) -> list[Listing]:
+    """Return the tables of a run's parameters; `identified`: by least squares on the same logs.
+
+    Raises ModuleError or RunError when the run cannot be read.
+    """
+    tables: list[Listing] = []
     if arm is not None and identified and "base_parameters" in identified:
         tables.append(base_table(model, arm, identified))
     if model is None:
@@ -64,6 +54,8 @@ def parameter_tables(
     joints = _joint_table(model, arm)
     if joints is not None:
         tables.append(joints)
+    if hasattr(model, "mass") and hasattr(model.mass, "constants"):
+        tables.append(_constant_table(run.load_module(), model))
     return tables
 
 
@@ -118,8 +110,8 @@ def base_table(model: EmittedModel | None, arm: LoadedArm, identified: Record) -
         tuple(head),
         tuple(sure),
         f"{note}.",
-        tuple(unsure),
-        f"{len(unsure)} more, not significantly different from zero",
+        folded=tuple(unsure),
+        folded_title=f"{len(unsure)} more, not significantly different from zero",
     )
 
 
@@ -138,7 +130,7 @@ def _learned(model: EmittedModel | None, combination: np.ndarray) -> np.ndarray 
     return learned
 
 
-def _body_table(values: np.ndarray, arm: LoadedArm | None) -> ParameterTable:
+def _body_table(values: np.ndarray, arm: LoadedArm | None) -> Listing:
     names = [f"body {k + 1}" for k in range(len(values))]
     nominal = None
     if arm is not None:
@@ -151,7 +143,7 @@ def _body_table(values: np.ndarray, arm: LoadedArm | None) -> ParameterTable:
         rows.append((name, "model", *_about_center(values[k])))
         if nominal is not None:
             rows.append(("", "URDF", *_about_center(nominal[k])))
-    return ParameterTable(
+    return Listing(
         "Masses, centres of mass and inertias",
         ("moves with", "by", "m [kg]", "centre of mass x, y, z [m]", "principal moments about it [kg m²]"),
         tuple(rows),
@@ -172,7 +164,7 @@ def _listed(values: np.ndarray) -> str:
     return ", ".join(f"{value:.3g}" for value in values)
 
 
-def _joint_table(model: EmittedModel, arm: LoadedArm | None) -> ParameterTable | None:
+def _joint_table(model: EmittedModel, arm: LoadedArm | None) -> Listing | None:
     """Return armature, friction and torque offset of each joint; None of a model without armature."""
     if not hasattr(model, "armature"):
         return None
@@ -203,25 +195,23 @@ def _joint_table(model: EmittedModel, arm: LoadedArm | None) -> ParameterTable |
             cells["torque offset"] = f"{model.torque_offset[k]:.3g} {units.torque}"
         rows.append(cells)
     head = tuple(rows[0])
-    return ParameterTable("Drives and friction", head, tuple(tuple(cells.values()) for cells in rows), note)
+    return Listing("Drives and friction", head, tuple(tuple(cells.values()) for cells in rows), note)
 
 
-def mass_constants(run: RunFolder) -> list[Constant]:
-    """Return the constants of M that the best model of a run has learned; none where its preset has none.
-
-    Raises ModuleError or RunError when the run cannot be read.
-    """
-    untrained, trained = run.load_module(), trained_model(run)
-    mass: Any = getattr(trained, "mass", None)
-    if not hasattr(mass, "constants"):
-        return []
-    constants = []
-    values = zip(untrained.mass.constants().tolist(), mass.constants().tolist(), strict=True)
-    for basis, (start, learned) in zip(_constant_basis(mass), values, strict=True):
+def _constant_table(untrained: Any, trained: Any) -> Listing:
+    """Return the constants of M that a model has learned, in the units of the first entries that they are in."""
+    rows = []
+    values = zip(untrained.mass.constants().tolist(), trained.mass.constants().tolist(), strict=True)
+    for basis, (start, learned) in zip(_constant_basis(trained.mass), values, strict=True):
         row, column = basis.tril().nonzero()[0].tolist()
         unit = inertia_unit(trained.joint_types[row], trained.joint_types[column])
-        constants.append(Constant(_entry_sum(basis), start, learned, unit))
-    return constants
+        rows.append((_entry_sum(basis), f"{start:.4g}", f"{learned:.4g}", unit))
+    return Listing(
+        "Constants of the mass matrix",
+        ("entries", "before training", "learned", "unit"),
+        tuple(rows),
+        "An entry of M is the sum of its constants and learned functions.",
+    )
 
 
 def _constant_basis(mass: Any) -> torch.Tensor:

@@ -20,11 +20,12 @@ from spelgen.files import write_json, write_text
 from spelgen.fitting.objectives import fit_summary
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.labels import UNITS
+from spelgen.listing import Listing
 from spelgen.loaded_arm import LoadedArm
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.curves import coverage, curves
 from spelgen.render.page import render_page
-from spelgen.render.parameters import body_parameters, mass_constants, parameter_tables
+from spelgen.render.parameters import body_parameters, parameter_tables
 from spelgen.render.plots import Limits, Record
 from spelgen.render.reproduction import commands, files
 from spelgen.render.run_facts import head_numbers, training_facts
@@ -61,6 +62,11 @@ class Run:
         return limits
 
     @property
+    def parameters(self) -> list[Listing]:
+        """Return the tables of what is learned that is a number."""
+        return parameter_tables(self.folder, self.model, self.arm, self.identified)
+
+    @property
     def verdict(self) -> Verdict | None:
         """Return what the model is good for; None before it is evaluated."""
         if self.results is None:
@@ -94,8 +100,7 @@ def report_data(folder: Path | str) -> Record:
         bodies = body_parameters(run.model)
         if bodies is not None:
             data["bodies"] = bodies.tolist()
-    tables = parameter_tables(run.model, run.arm, run.identified)
-    data["tables"] = list(map(asdict, tables))
+    data["tables"] = list(map(asdict, run.parameters))
     evaluation = _json(run.folder, run.folder.evaluation)
     return data | {"evaluation": evaluation, "least_squares": run.identified}
 
@@ -147,13 +152,11 @@ def _json(folder: RunFolder, path: Path) -> Record | None:
 def _rendered(run: Run, robot: Path | str | None) -> str:
     facts, config = run.facts, run.config or {}
     traces = Traces({}) if run.results is None else run.results.traces
-    arm, cells, training, tables, constants = None, None, None, [], []
+    arm, cells, training, tables = None, None, None, []
     if config:
         training = training_facts(config, run.metrics, run.identified)
     if run.results is not None:
         tables = result_tables(run.results)
-    if run.model is not None:
-        constants = mass_constants(run.folder)
     if run.arm is not None:
         arm = arm_section(run.arm.arm, Path(robot or run.arm.robot.path), traces, run.identified)
         cells = matrix(run.arm.arm, run.arm.structure_for(facts.options.assume))
@@ -173,10 +176,9 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         curves=curves(traces, facts),
         coverage=coverage(traces, run.identified, facts, run.limits),
         trained=run.model is not None,
-        constants=constants,
         under_servos=config.get("mapping", {}).get("input") == "position",
         summary=fit_summary(config),
-        parameters=parameter_tables(run.model, run.arm, run.identified),
+        parameters=run.parameters,
         files=files(run.folder.path),
         commands=commands(run.folder, facts, run.config),
     )

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from rich.filesize import decimal
+
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.render.plots import Record
@@ -37,7 +39,7 @@ def files(folder: Path) -> list[File]:
             if size <= HASHED:
                 with path.open("rb") as content:
                     digest = hashlib.file_digest(content, "sha256").hexdigest()
-            entries.append(File(path.name, _size(size), digest))
+            entries.append(File(path.name, decimal(size), digest))
     return entries
 
 
@@ -76,11 +78,3 @@ def _changed(options: Mapping[str, object], defaults: Mapping[str, object]) -> d
         if value is not None and value != defaults.get(key) and not isinstance(value, Mapping):
             changed[key] = value
     return changed
-
-
-def _size(count: int) -> str:
-    if count < 1000:
-        return f"{count} B"
-    if count < 1e6:
-        return f"{count / 1000:.1f} kB"
-    return f"{count / 1e6:.1f} MB"
