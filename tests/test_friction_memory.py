@@ -21,7 +21,7 @@ from spelgen.runtime.joints import Joints
 
 JOINTS = Joints(
     revolute=(True, False), center=(0.0, 0.0), reach=(3.0, 1.0), speed=(2.0, 0.5), friction=(1.5, 4.0),
-    armature=(0.0, 0.0), gear=(1.0, 1.0), actuated=(True, True),
+    armature=(0.0, 0.0), actuated=(True, True),
 )  # fmt: skip
 REACH = [[3e-4, 3e-3, 3e-2], [3e-5, 3e-4, 3e-3]]
 

@@ -51,7 +51,6 @@ JOINTS = Joints(
     speed=(1.0, 0.5, 2.0),
     friction=(1.0, 2.0, 0.0),
     armature=(0.1, 0.2, 0.3),
-    gear=(1.0, 10.0, 50.0),
     actuated=(True, True, True),
 )
 
@@ -127,14 +126,14 @@ def residual_terms(joints: Joints = JOINTS, size: float = 0.0, *, networks: bool
     if networks:
         mass = MaskedMLP(inputs, (hidden, hidden, outputs), generator)
         potential = MaskedMLP(inputs, (hidden, [(0, 1, 2)]), generator)
-    terms = ResidualTerms(joints, entries, 2, 1, mass, potential, scale=2.0)
+    terms = ResidualTerms(joints, (1.0, 10.0, 101.0), entries, 2, 1, mass, potential, scale=2.0)
     for weight in terms.parameters():
         weight.data = size * draw(*weight.shape, seed=weight.numel())
     return terms
 
 
 def test_residual_terms_are_a_gradient_and_vanish_outside_the_range():
-    joints = JOINTS._replace(friction=(1.0, 2.0, 0.5), gear=(1.0, 10.0, 101.0))
+    joints = JOINTS._replace(friction=(1.0, 2.0, 0.5))
     terms, armature = residual_terms(joints, 1.0), torch.diag(vector((0.1, 20.0, 3.0)))
     q, qd = draw(50, 3), draw(50, 3, seed=1)
     weights = terms.prepare(armature)

@@ -28,9 +28,7 @@ def emit(spec: ModelSpec) -> str:
     )
     model = render(
         "model.py.jinja",
-        n=len(spec.joints),
-        names=tailored.names("joint_names", [joint.identifier for joint in spec.joints]),
-        types=tailored.names("joint_types", [joint.kind for joint in spec.joints]),
+        attributes=tailored.attributes(spec),
         class_summary=docstring.class_summary(spec),
         bases=tailored.bases(spec),
         roles=tailored.roles(spec),

@@ -116,9 +116,16 @@ def mass_entries(spec: ModelSpec) -> str:
     return indent("\n".join(lines) + "\n", " " * _INDENT) + " " * _INDENT + statement
 
 
-def names(target: str, values: Iterable[str]) -> str:
-    """A class attribute of the model that holds these names."""
-    return assignment(target, tuple(values), 4)
+def attributes(spec: ModelSpec) -> list[str]:
+    """Return the class attributes of the model."""
+    values: dict[str, object] = {
+        "n": len(spec.joints),
+        "joint_names": tuple(joint.identifier for joint in spec.joints),
+        "joint_types": tuple(joint.kind for joint in spec.joints),
+    }
+    if spec.inputs:
+        values["motor_gains"] = spec.inputs
+    return [assignment(name, value, _INDENT) for name, value in values.items()]
 
 
 def units(spec: ModelSpec) -> int:
@@ -194,18 +201,12 @@ def _joints(spec: ModelSpec) -> Call:
     armature = _columns(spec.joints, "armature")
     if spec.bodies:
         armature["armature"] = _known_armature(spec)
-    optional: dict[str, object] = {}
-    if spec.inputs:
-        optional["gains"] = spec.inputs
-    if spec.bodies and spec.design.net != "none":
-        optional |= _columns(spec.joints, "gear")
     return call(
         "Joints",
         revolute=_revolute(spec.joints),
         **_columns(spec.joints, "center", "reach", "speed", "friction"),
         **armature,
         **_columns(spec.joints, "actuated"),
-        **optional,
     )
 
 
@@ -255,6 +256,7 @@ def _residuals(body: _Body, spec: ModelSpec) -> None:
     residuals = call(
         "ResidualTerms",
         Code("joints"),
+        tuple(joint.gear for joint in spec.joints),
         Code("mass_entries"),
         functions=len(spec.outputs),
         constants=len(spec.constants),

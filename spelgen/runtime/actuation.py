@@ -19,16 +19,17 @@ class MotorInput(PortHamiltonian):
 
     kinds = (("raw_gains", "gains", "1"),)
 
+    motor_gains: tuple[tuple[int, int, float, bool], ...]  # joint, motor, torque by torque, whether trained
     raw_gains: nn.Parameter | None
 
     def __init__(self, joints: Joints) -> None:
         super().__init__(joints)
         constant, trained = torch.zeros(2, joints.n, joints.n, dtype=torch.float64)
-        for joint, motor, value, is_trained in joints.gains:
+        for joint, motor, value, is_trained in self.motor_gains:
             (trained if is_trained else constant)[joint, motor] = value
         self.constant_gains = nn.Buffer(constant)
         self.trained_gains = nn.Buffer(trained)
-        rows = [joint for joint, _, _, is_trained in joints.gains if is_trained]
+        rows = [joint for joint, _, _, is_trained in self.motor_gains if is_trained]
         self.gain_rows = nn.Buffer(torch.tensor(rows, dtype=torch.long))  # the joints of the trained gains
         raw = nn.Parameter(torch.zeros(len(rows), dtype=torch.float64)) if rows else None
         self.register_parameter("raw_gains", raw)

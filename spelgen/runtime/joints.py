@@ -19,8 +19,6 @@ class Joints(NamedTuple):
     friction: tuple[float, ...]  # usual size of the friction torque
     armature: tuple[float, ...]  # nominal rotor inertia times gear squared [kg m^2, kg]
     actuated: tuple[bool, ...]
-    gains: tuple[tuple[int, int, float, bool], ...] = ()  # joint, motor, torque by torque, whether trained
-    gear: tuple[float, ...] = ()  # turns of the motor in a turn of the joint
 
     @property
     def n(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -45,21 +46,12 @@ class ResidualPose(NamedTuple):
     weights: ResidualWeights
 
 
-def ripple_frequencies(joints: Joints) -> Tensor:
-    """Return how often in a turn of the joint a ripple may come again, (n, HARMONICS + 2)."""
-    frequencies = torch.arange(1.0, HARMONICS + 3).double().repeat(joints.n, 1)
-    for joint, gear in enumerate(joints.gear):
-        if gear > HARMONICS:
-            frequencies[joint, HARMONICS:] = vector((gear, 2 * gear))
-    return frequencies
-
-
 class ResidualTerms(nn.Module):
     """R(q) in M, terms of V, and a factor on friction; zero, and one, while the weights are zero.
 
     Of each joint alone: a torque dV/dq, a sum of cubic B-splines over its range and, if it is revolute, of
-    harmonics of its turns and of its motor's, in units of usual friction; and the factor, the exponential
-    of such a spline, between a tenth and ten. Splines vanish where the range ends.
+    harmonics of its turns and of its motor's, ``gear`` times as many, in units of usual friction; and the
+    factor, the exponential of such a spline, between a tenth and ten. Splines vanish where the range ends.
 
     R has functions and constants, where ``entries`` has them, and a network ``potential`` in units of
     ``scale`` [J] adds to V. Each function is its bound times the tanh of a network's output, each constant
@@ -76,6 +68,7 @@ class ResidualTerms(nn.Module):
     def __init__(
         self,
         joints: Joints,
+        gear: Sequence[float],
         entries: Entries,
         functions: int,
         constants: int,
@@ -92,7 +85,12 @@ class ResidualTerms(nn.Module):
         self.middles = nn.Buffer(vector(joints.center).unsqueeze(-1) + spacing * knots)
         self.unit = nn.Buffer(vector(joints.friction).unsqueeze(-1))
         self.revolute = nn.Buffer(vector(float(revolute) for revolute in joints.revolute).unsqueeze(-1))
-        self.frequencies = nn.Buffer(ripple_frequencies(joints))
+        # how often in a turn of the joint a ripple may come again, (n, HARMONICS + 2)
+        frequencies = torch.arange(1.0, HARMONICS + 3).double().repeat(n, 1)
+        for joint, ratio in enumerate(gear):
+            if ratio > HARMONICS:
+                frequencies[joint, HARMONICS:] = vector((ratio, 2 * ratio))
+        self.frequencies = nn.Buffer(frequencies)
         self.raw_torque_splines = nn.Parameter(zeros.clone())
         self.raw_torque_ripple = nn.Parameter(torch.zeros(n, 2 * (HARMONICS + 2), dtype=torch.float64))
         self.raw_friction_splines = nn.Parameter(zeros)

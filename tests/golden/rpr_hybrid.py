@@ -52,7 +52,7 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualTerm
     joints = Joints(
         revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
         speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
-        actuated=(True, True, True), gear=(1.0, 1.0, 1.0),
+        actuated=(True, True, True),
     )  # fmt: skip
     bodies = Bodies(
         parent=(-1, 0, 1), joint=(0, 1, 2), revolute=(True, False, True), ratio=(1.0, 1.0, 1.0),
@@ -82,8 +82,9 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualTerm
         generator,
     )  # fmt: skip
     residuals = ResidualTerms(
-        joints, mass_entries, functions=3, constants=2, network=network, potential=potential, scale=0.703291
-    )
+        joints, (1.0, 1.0, 1.0), mass_entries, functions=3, constants=2, network=network, potential=potential,
+        scale=0.703291,
+    )  # fmt: skip
     return (
         joints, bodies, (0.0, 0.0, -9.81),
         ((0.0001, 0.001, 0.01, 0.1), (1e-05, 0.0001, 0.001, 0.01), (0.0001, 0.001, 0.01, 0.1)), (), residuals,

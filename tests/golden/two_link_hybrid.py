@@ -50,7 +50,7 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualTerm
     """Return what this arm's `Model` is made of, with random weights of this seed."""
     joints = Joints(
         revolute=(True, True), center=(0.0, 0.0), reach=(3.14159, 3.14159), speed=(10.0, 10.0),
-        friction=(1.0, 1.0), armature=(0.1, 0.1), actuated=(True, True), gear=(1.0, 1.0),
+        friction=(1.0, 1.0), armature=(0.1, 0.1), actuated=(True, True),
     )  # fmt: skip
     bodies = Bodies(
         parent=(-1, 0), joint=(0, 1), revolute=(True, True), ratio=(1.0, 1.0), offset=(0.0, 0.0),
@@ -77,8 +77,9 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualTerm
         generator,
     )  # fmt: skip
     residuals = ResidualTerms(
-        joints, mass_entries, functions=1, constants=2, network=network, potential=potential, scale=10.8194
-    )
+        joints, (1.0, 1.0), mass_entries, functions=1, constants=2, network=network, potential=potential,
+        scale=10.8194,
+    )  # fmt: skip
     return (
         joints, bodies, (0.0, -9.81, 0.0), ((0.0001, 0.001, 0.01, 0.1), (0.0001, 0.001, 0.01, 0.1)), (),
         residuals,
