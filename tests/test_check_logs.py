@@ -3,7 +3,6 @@
 import json
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +22,8 @@ from spelgen.log_checks import robot_checks
 from spelgen.log_checks.check_logs import check_logs, require_sound_logs
 from spelgen.log_checks.statistics import noise_level, quantisation_step, statistics
 from spelgen.logs import checks, chunks
+from spelgen.logs.dynamics_samples import dynamics_samples
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.render.logs_page import page
@@ -398,7 +399,7 @@ def test_no_coupling_is_found_by_luck(loaded, log):
     """Torques that no parameters explain: of all couplings one is the best, and none is told."""
     for seed in range(10):
         noise = np.random.default_rng(seed).standard_normal(log.tau.shape).cumsum(axis=0)
-        problem = drive_problem(loaded, drive_log(replace(log, tau=noise)).motion())
+        problem = drive_problem(loaded, drive_log(3, replace(log, tau=noise)).samples())
         assert find_coupling(problem) is None
 
 
@@ -406,24 +407,26 @@ def test_of_many_trajectories_an_even_part_is_filtered(monkeypatch):
     """A long log is read in chunks: to filter each of them for every delay took minutes of a log of 10^7 samples."""
     filtered = []
 
-    def unfiltered(moved):
+    def counted(moved, **options):
         filtered.append(moved[0].name)
-        return [SimpleNamespace(q=x.q, qd=x.qd, qdd=x.qd, tau=x.tau) for x in moved]
+        return dynamics_samples(moved, **options)
 
-    monkeypatch.setattr(drive_samples, "dynamics_samples", unfiltered)
-    collected = DriveLog(np.eye(1))
+    monkeypatch.setattr(drive_samples, "dynamics_samples", counted)
+    collected = drive_log(1)
     t = np.arange(0.0, 6.0, 0.02)
     for number in range(100):
         q = np.sin(t)[:, None] + 10.0 * number
         collected.add(Trajectory(t, q, np.cos(t)[:, None], q, str(number)))
     assert len(filtered) < 50
-    steps = np.diff(np.unique(collected.motion()[0].round(-1)))
+    steps = np.diff(np.unique(collected.samples().q.round(-1)))
     assert steps.max() <= 1.5 * steps.min()
 
 
-def drive_log(log):
-    collected = DriveLog(np.eye(3))
-    collected.add(log)
+def drive_log(joints, *logs):
+    alone = Drives(np.eye(joints), np.eye(joints))
+    collected = DriveLog(["revolute"] * joints, alone, Preprocessing())
+    for log in logs:
+        collected.add(log)
     return collected
 
 

@@ -65,7 +65,11 @@ def base_parameters(
     for effect in friction.effects:
         names += [f"{effect}{joint + 1}" for joint in range(n)]
     columns = _columns(arm, friction, motors, len(names), seed)
-    chosen = _chosen_columns(columns, [parameter.index for parameter in exact], inertial)
+    candidates = np.array([parameter.index for parameter in exact] + list(range(inertial, len(names))))
+    # what is left of each column beside all before it
+    remainder = np.abs(np.diag(np.linalg.qr(columns[:, candidates], mode="r")))
+    length = np.maximum(np.linalg.norm(columns[:, candidates], axis=0), 1.0)
+    chosen = candidates[remainder > TUNING.dependent * length]
     combination = np.zeros((len(chosen), len(names)))
     for row, parameter in enumerate(exact):
         for k, weight in parameter.weights:
@@ -73,23 +77,8 @@ def base_parameters(
     drives = np.linalg.lstsq(columns[:, chosen], columns[:, inertial:], rcond=None)[0]
     drives[np.abs(drives) < TUNING.rounding * np.abs(drives).max(initial=1.0)] = 0.0
     combination[:, inertial:] = drives
-    base_names = [parameter.name for parameter in exact] + [names[k] for k in chosen[len(exact) :]]
-    return BaseParameters(tuple(base_names), np.array(chosen), combination, tuple(names), len(exact))
-
-
-def _chosen_columns(columns: np.ndarray, exact: list[int], inertial: int) -> list[int]:
-    """Return the base parameters' columns: those of the bodies, and of drives what no columns before it span."""
-    chosen = list(exact)
-    basis = np.linalg.qr(columns[:, chosen])[0]
-    for k in range(inertial, columns.shape[1]):
-        remainder = columns[:, k]
-        for _ in range(2):  # once more takes away what rounding left
-            remainder = remainder - basis @ (basis.T @ remainder)
-        length = float(np.linalg.norm(remainder))
-        if length > TUNING.dependent * max(float(np.linalg.norm(columns[:, k])), 1.0):
-            chosen.append(k)
-            basis = np.column_stack([basis, remainder / length])
-    return chosen
+    base_names = [parameter.name for parameter in exact] + [names[k] for k in chosen[len(exact) :].tolist()]
+    return BaseParameters(tuple(base_names), chosen, combination, tuple(names), len(exact))
 
 
 def _columns(

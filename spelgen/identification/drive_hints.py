@@ -23,6 +23,7 @@ from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor
 from spelgen.errors import Diagnostic
 from spelgen.identification.base_parameters import base_parameters
+from spelgen.identification.drive_samples import DriveSamples
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.least_squares import block_products
 from spelgen.logs.preprocessing import COUPLED
@@ -65,28 +66,33 @@ class WrongTorque:
     got: str
 
 
-def drive_rows(arm: Arm, motion: np.ndarray, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the regressor (S, n, K) of the parameters that torques show, at q, qd and qdd, (3, S, n).
+def drive_rows(
+    arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, speeds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the regressor (S, n, K) of the parameters that torques show, at q, qd and qdd, each (S, n).
 
     Beside it of each parameter (K,) the number of its friction column, below zero those of bodies: effect e of drive j
     has n e + j. speeds: C, (n, n), of the motors, by the couplings that are known.
     """
-    bodies = regressor(arm, *motion)
-    friction = FRICTION.columns(motion[1], motion[2], None, speeds)
+    bodies = regressor(arm, q, qd, qdd)
+    friction = FRICTION.columns(qd, qdd, None, speeds)
     columns = base_parameters(arm, FRICTION, speeds).columns
     return np.concatenate([bodies, friction], axis=2)[..., columns], columns - bodies.shape[2]
 
 
-def drive_problem(arm: LoadedArm, motion: np.ndarray) -> DriveProblem:
-    """Return least squares of q, qd, qdd and joint torques, (4, S, n)."""
-    speeds, tau = arm.actuation.drives().speeds, motion[3]
-    regressors, numbers = drive_rows(arm.arm, motion[:3], speeds)
+def drive_problem(arm: LoadedArm, samples: DriveSamples) -> DriveProblem | None:
+    """Return least squares of the joint torques; None where there are too few samples."""
+    if len(samples.q) < TUNING.fewest_samples:
+        return None
+    speeds, tau = arm.actuation.drives().speeds, samples.tau
+    regressors, numbers = drive_rows(arm.arm, samples.q, samples.qd, samples.qdd, speeds)
     rows = np.concatenate([regressors, tau[..., None]], axis=2)
     is_coupled = ((speeds != 0) | (speeds != 0).T).sum(axis=0) > 1
     # what is no more than a constant with rounding shows nothing
     varies = tau.std(axis=0) > NEGLIGIBLE * np.abs(tau).max(axis=0)
     free = np.flatnonzero(varies & ~is_coupled).tolist()
     products = block_products(rows, TUNING.blocks)
+    motion = np.stack([samples.qd, samples.qdd])
     return DriveProblem(motion, rows, products, products[..., -1, -1].mean(axis=1), numbers, free)
 
 
@@ -94,7 +100,7 @@ def drive_problem(arm: LoadedArm, motion: np.ndarray) -> DriveProblem:
 class DriveProblem:
     """Hold least squares of the torques of n joints by K parameters, in B blocks of time.
 
-    motion: see `drive_problem`. rows: (S, n, K + 1), of each joint the columns of the parameters and the torque.
+    motion: qd and qdd, (2, S, n). rows: (S, n, K + 1), of each joint the columns of the parameters and the torque.
     products: (n, B, K + 1, K + 1), of these. size: (n,) of the squares of the torques. numbers: see `drive_rows`. free:
     the joints that no known coupling joins and whose torques vary.
     """
@@ -154,7 +160,7 @@ class DriveProblem:
     def coupled(self, coupling: Coupling) -> DriveProblem:
         """Return the problem where a motor turns with another joint, too."""
         joint, moved_by, ratio = coupling.joint, coupling.moved_by, coupling.ratio
-        qd, qdd = self.motion[1:3, :, [joint]] + ratio * self.motion[1:3, :, [moved_by]]
+        qd, qdd = self.motion[..., [joint]] + ratio * self.motion[..., [moved_by]]
         n = self.rows.shape[1]
         of_motor = np.flatnonzero((self.numbers >= 0) & (self.numbers % n == joint))
         columns = FRICTION.columns(qd, qdd)[:, 0, self.numbers[of_motor] // n]

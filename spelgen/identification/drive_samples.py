@@ -1,14 +1,48 @@
-"""Hold samples of motion, thinned while logs go by, for `drive_hints`."""
+"""Hold samples of motion, thinned while logs go by, for `drive_hints` and `torque_delay`."""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
-from spelgen.logs.dynamics_samples import TUNING, dynamics_samples
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from spelgen.arm.actuation import Drives
+from spelgen.dynamics.bristles import reach_of
+from spelgen.identification.friction import FrictionModel
+from spelgen.logs.dynamics_samples import FREQUENCY, TUNING, dynamics_samples, is_moving, long_pieces
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.tuning.identification import DriveHintTuning
 
 HINTS = DriveHintTuning()
+STEPS = max(HINTS.shifts)
+SHIFTS = np.array(HINTS.shifts) / FREQUENCY  # [s]
+
+
+class DriveSamples(NamedTuple):
+    """Hold S samples of motion with the torques at n joints.
+
+    q, qd, qdd: (S, n). z, direction: see `DynamicsSamples`. torques: (S, n, D), moved by each of the D `SHIFTS`.
+    """
+
+    q: np.ndarray
+    qd: np.ndarray
+    qdd: np.ndarray
+    z: np.ndarray
+    direction: np.ndarray
+    torques: np.ndarray
+
+    @property
+    def tau(self) -> np.ndarray:
+        """Torques as logged, (S, n)."""
+        return self.torques[..., STEPS]
+
+    def thinned(self, stride: int) -> DriveSamples:
+        """Return one of so many samples."""
+        return DriveSamples(*(column[::stride] for column in self))
 
 
 class DriveLog:
@@ -17,10 +51,12 @@ class DriveLog:
     Of many trajectories only every second, fourth, ... is looked at: to filter all of a long log takes minutes.
     """
 
-    def __init__(self, inputs: np.ndarray) -> None:
-        """inputs: G, (n, n)."""
-        self._inputs = inputs
-        self._motions: list[np.ndarray] = []  # (4, T, n)
+    def __init__(self, kinds: Sequence[str], drives: Drives, preprocessing: Preprocessing) -> None:
+        """kinds: the joints' types. preprocessing: its filter and gap."""
+        self._inputs, self._preprocessing = drives.inputs, replace(preprocessing, torque_delay=0.0)
+        smoothing = np.full(len(kinds), FrictionModel().coulomb_smoothing_velocity)
+        self._reach = replace(reach_of(kinds, drives.speeds), smoothing_velocity=smoothing)
+        self._samples: list[DriveSamples] = []
         self._every = self._step = 1
         self._number = 0
 
@@ -31,23 +67,33 @@ class DriveLog:
         self._number += 1
         if self._number % self._step:
             return
-        for x in dynamics_samples([trajectory]):
-            motion = np.stack([x.q, x.qd, x.qdd, x.tau @ self._inputs.T])
-            self._motions.append(motion[:, :: self._every])
+        middle = slice(STEPS, -STEPS)
+        for piece in long_pieces(trajectory, self._preprocessing.gap):
+            # without a hole and pauses included, a filtered torque is moved by whole samples
+            for x in dynamics_samples(
+                [piece], pauses=True, preprocessing=self._preprocessing, reach=self._reach
+            ):
+                if len(x.q) > 2 * STEPS:
+                    torques = sliding_window_view(x.tau @ self._inputs.T, len(SHIFTS), axis=0)
+                    moving = is_moving(x.qd[middle])
+                    columns = [getattr(x, name)[middle][moving] for name in DriveSamples._fields[:-1]]
+                    columns.append(torques[moving])
+                    self._samples.append(DriveSamples(*columns).thinned(self._every))
         while self._count > 2 * HINTS.samples:
-            if len(self._motions) > HINTS.trajectories:
-                self._motions = self._motions[1::2]
+            if len(self._samples) > HINTS.trajectories:
+                self._samples = self._samples[1::2]
                 self._step *= 2
             else:
-                self._motions = [x[:, ::2] for x in self._motions]
+                self._samples = [x.thinned(2) for x in self._samples]
                 self._every *= 2
 
     @property
     def _count(self) -> int:
-        return sum(x.shape[1] for x in self._motions)
+        return sum(len(x.q) for x in self._samples)
 
-    def motion(self) -> np.ndarray | None:
-        """Return q, qd, qdd and joint torques of all, (4, S, n); None where there are too few to tell anything."""
-        if self._count < HINTS.fewest_samples:
+    def samples(self) -> DriveSamples | None:
+        """Return all together; None where nothing moves."""
+        if not self._count:
             return None
-        return np.concatenate(self._motions, axis=1)[:, :: -(-self._count // HINTS.samples)]
+        columns = zip(*self._samples, strict=True)
+        return DriveSamples(*map(np.concatenate, columns)).thinned(-(-self._count // HINTS.samples))

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 from scipy.stats import t as student
@@ -16,19 +15,16 @@ from spelgen.arm.actuation import Drives
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.bristles import reach_of
 from spelgen.errors import Diagnostic
+from spelgen.identification.drive_samples import SHIFTS, DriveLog, DriveSamples
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.least_squares import block_products
-from spelgen.logs.dynamics_samples import FREQUENCY, dynamics_samples, is_moving, long_pieces
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.runtime.body_chain import BodyChain
 from spelgen.settings.tuning.identification import DriveHintTuning, IdentificationTuning
 
 HINTS, TUNING = DriveHintTuning(), IdentificationTuning()
-STEPS = max(HINTS.shifts)
-SHIFTS = np.array(HINTS.shifts) / FREQUENCY  # [s]
 FRICTION = FrictionModel(memory=True)
-COLUMNS = ("q", "qd", "qdd", "z", "direction")
 
 
 @dataclass(frozen=True)
@@ -73,24 +69,16 @@ def find_torque_delay(
     kinds: the joints' types. chain: of the bodies. The value is that of the form of friction that leaves less of the
     torque.
     """
-    smoothing = np.full(len(kinds), FRICTION.coulomb_smoothing_velocity)
-    reach = replace(reach_of(kinds, drives.speeds), smoothing_velocity=smoothing)
-    as_logged = replace(preprocessing, torque_delay=0.0)
-    pieces = []
+    collected = DriveLog(kinds, drives, preprocessing)
     for log in logs[:: -(-len(logs) // HINTS.trajectories)]:
-        for piece in long_pieces(log, preprocessing.gap):
-            # without a hole and pauses included, a filtered torque is moved by whole samples
-            for x in dynamics_samples([piece], pauses=True, preprocessing=as_logged, reach=reach):
-                if len(x.q) > 2 * STEPS:
-                    torques = sliding_window_view(x.tau @ drives.inputs.T, len(SHIFTS), axis=0)
-                    middle = slice(STEPS, -STEPS)
-                    moving = is_moving(x.qd[middle])
-                    columns = [getattr(x, name)[middle][moving] for name in COLUMNS]
-                    pieces.append([*columns, torques[moving]])
-    stride = -(-sum(len(x[0]) for x in pieces) // HINTS.samples)
-    if not stride:
-        return NO_DELAY
-    q, qd, qdd, z, direction, tau = (np.concatenate(x)[::stride] for x in zip(*pieces, strict=True))
+        collected.add(log)
+    samples = collected.samples()
+    return NO_DELAY if samples is None else delay_of(samples, kinds, drives, chain)
+
+
+def delay_of(samples: DriveSamples, kinds: Sequence[str], drives: Drives, chain: BodyChain) -> TorqueDelay:
+    """Return the delay that samples show; see `find_torque_delay`."""
+    q, qd, qdd, z, direction, tau = samples
     if tau.std(axis=0).max() <= TUNING.negligible * np.abs(tau).max():  # a constant, with rounding
         return NO_DELAY
     with torch.no_grad():
@@ -98,7 +86,7 @@ def find_torque_delay(
     estimates = []
     # dry friction with and without memory, through the filter of the torques: a delay that only one form shows is its
     # error
-    for dry in (z / reach.values, direction[..., None]):
+    for dry in (z / reach_of(kinds).values, direction[..., None]):
         friction = FRICTION.columns(qd, qdd, dry, drives.speeds)
         estimates.append(_estimate(np.concatenate([bodies, friction], axis=2), tau))
     quantile = student.isf(HINTS.delay_chance / 2, HINTS.blocks - 1)

@@ -14,8 +14,8 @@ from spelgen.arm.arm import Coordinate
 from spelgen.dynamics.rigid_bodies import body_chain
 from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.identification.drive_hints import coupling_hint, drive_problem, find_coupling, find_wrong_torques
-from spelgen.identification.drive_samples import DriveLog
-from spelgen.identification.torque_delay import find_torque_delay
+from spelgen.identification.drive_samples import DriveLog, DriveSamples
+from spelgen.identification.torque_delay import delay_of
 from spelgen.log_checks.check_servo_logs import check_servo_logs
 from spelgen.log_checks.gravity import (
     GravityFit,
@@ -44,22 +44,19 @@ WRONG_TORQUES = {"torque-sense": SENSE, "torque-order": ORDER}
 ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED}
 
 
-def check_logs(
-    logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None, *, delay: bool = True
-) -> LogReport:
+def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None) -> LogReport:
     """Report all about the logs of an arm, read once, one trajectory after another; nothing is repaired or raised.
 
     The report's `errors` prevent training. mapping: that of the logs, by default from the arm's settings; units that
     it declares and errors that it accepts are not checked. The arm's input matrix converts logged torques to those of
     the joints. Raises LogError without any trajectory, or with one of another number of joints, and
     where an arm's settings say 'input: position', without commands.
-    delay: whether that of the torques is looked for too.
     """
     if arm.settings.input == "position":
         return check_servo_logs(logs, arm)
     mapping = mapping or arm.settings.logs
-    joints, kinds, inputs = arm.arm.joint_names, arm.arm.joint_types, arm.actuation.matrix()
-    drives = DriveLog(inputs)
+    joints, kinds, drives = arm.arm.joint_names, arm.arm.joint_types, arm.actuation.drives()
+    moving = DriveLog(kinds, drives, Preprocessing())
     measured: list[Statistics] = []
     samples: list[np.ndarray] = []
     examples: list[Trajectory] = []
@@ -71,8 +68,8 @@ def check_logs(
         require_joints(trajectory, joints)
         require_torques([trajectory])
         measured.append(statistics(trajectory))
-        samples.append(state_samples(trajectory, inputs))
-        drives.add(trajectory)
+        samples.append(state_samples(trajectory, drives.inputs))
+        moving.add(trajectory)
         declared_codes.append(set(trajectory.accepted))
         odd += findings(trajectory, joints, kinds, measured[-1].agreement)
         notes += clock_diagnostics(trajectory)
@@ -101,13 +98,7 @@ def check_logs(
             summary.add(check, message, place)
     # beside wrong velocities friction is wrong too, and of wrong torques hints about drives would be wrong
     if not any(note.code == "velocity-is-no-derivative" for note in summary.notes):
-        _check_all_torques(arm, motion, drives.motion(), accepted, summary)
-        is_coupled = any(note.code == COUPLED for note in summary.notes)
-        # without a coupling that the logs show any delay would be wrong
-        if delay and not summary.errors and not is_coupled:
-            chain, preprocessing = body_chain(arm.arm), Preprocessing()
-            late = find_torque_delay(examples, kinds, arm.actuation.drives(), chain, preprocessing)
-            summary.notes.extend(late.notes)
+        _check_all_torques(arm, motion, moving.samples(), accepted, summary)
     return LogReport(
         robot=arm.arm.name,
         files=len({x.clock.file for x in measured} - {None}),
@@ -124,33 +115,38 @@ def require_sound_logs(
 ) -> list[Diagnostic]:
     """Return what `check_logs` finds of logs beside their arm; raise LogError where they cannot be trained on."""
     # the same checks as the command, so that a fit refuses what `spelgen logs` refuses
-    report = check_logs(logs, arm, mapping, delay=False)
+    report = check_logs(logs, arm, mapping)
     collect(report.errors)
     # a fit itself tells what logs show without the arm, and finds the delay of torques
     return [note for note in report.findings if note.code in ABOUT_ARM]
 
 
 def _check_all_torques(
-    arm: LoadedArm, motion: np.ndarray, filtered: np.ndarray | None, accepted: set[str], summary: Findings
+    arm: LoadedArm, motion: np.ndarray, moving: DriveSamples | None, accepted: set[str], summary: Findings
 ) -> None:
-    """Add what is wrong with the torques of all joints together, or else the coupling of motors that they show.
+    """Add what is wrong with the torques of all joints together, or else a coupling of motors, or else a delay.
 
-    motion, filtered: samples (4, S, n), see `state_samples` and `DriveLog.motion`.
+    motion: samples (4, S, n), see `state_samples`.
     """
+    joints, drives = arm.arm.joint_names, arm.actuation.drives()
     if not summary.errors and SENSE.code not in accepted:
-        opposed = find_opposed_inertia(arm.arm, motion, arm.actuation.drives().speeds)
+        opposed = find_opposed_inertia(arm.arm, motion, drives.speeds)
         if opposed is not None:
             summary.add(SENSE, opposed, "tau")
-    if filtered is None or summary.errors:
+    if moving is None or summary.errors:
         return
-    problem, joints = drive_problem(arm, filtered), arm.arm.joint_names
-    wrong = find_wrong_torques(problem, joints)
-    if wrong is not None and wrong.code not in accepted:
-        summary.add(WRONG_TORQUES[wrong.code], wrong.got, f"joint {joints[wrong.joint]!r}, tau")
-        return
-    coupled = find_coupling(problem)
-    if coupled is not None:
-        summary.notes.append(coupling_hint(arm, *coupled))
+    problem = drive_problem(arm, moving)
+    if problem is not None:
+        wrong = find_wrong_torques(problem, joints)
+        if wrong is not None and wrong.code not in accepted:
+            summary.add(WRONG_TORQUES[wrong.code], wrong.got, f"joint {joints[wrong.joint]!r}, tau")
+            return
+        coupled = find_coupling(problem)
+        if coupled is not None:  # without it any delay would be wrong
+            summary.notes.append(coupling_hint(arm, *coupled))
+            return
+    late = delay_of(moving, arm.arm.joint_types, drives, body_chain(arm.arm))
+    summary.notes.extend(late.notes)
 
 
 def _joint_report(

@@ -88,8 +88,8 @@ def find_opposed_inertia(arm: Arm, motion: np.ndarray, speeds: np.ndarray) -> st
     if len(q) < TUNING.gravity_samples / 4 or not np.ptp(tau, axis=0).all():
         return None
     unit = tau.std(axis=0)
-    moving, _ = drive_rows(arm, motion[:3], speeds)
-    steady, _ = drive_rows(arm, np.stack([q, qd, np.zeros_like(qdd)]), speeds)
+    moving, _ = drive_rows(arm, q, qd, qdd, speeds)
+    steady, _ = drive_rows(arm, q, qd, np.zeros_like(qdd), speeds)
     flat = (moving / unit[:, None]).reshape(tau.size, -1)
     parameters = np.linalg.lstsq(flat, (tau / unit).ravel(), rcond=TUNING.dependent)[0]
     inertia = (moving - steady) @ parameters
