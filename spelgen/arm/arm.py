@@ -39,6 +39,13 @@ class Coordinate:
     friction: float
     passive: bool
 
+    @property
+    def limits(self) -> tuple[float, float] | None:
+        """Return lower and upper limit of a joint that has both and cannot turn on and on."""
+        if self.continuous or self.lower is None or self.upper is None:
+            return None
+        return self.lower, self.upper
+
 
 @dataclass(frozen=True)
 class Body:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import csv
 import io
 
-from spelgen.evaluation.figures import Figures
+from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import result_tables
 
 HEAD = ("table", "row", "predictor", "value")
 
 
-def csv_text(results: Figures) -> str:
+def csv_text(results: Results) -> str:
     """Return the numbers of all tables, which name the units; an empty value stands for one that is not known."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")

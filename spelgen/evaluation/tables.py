@@ -11,7 +11,7 @@ from spelgen.labels import UNITS, thousandths
 from spelgen.listing import Listing, number
 
 if TYPE_CHECKING:
-    from spelgen.evaluation.figures import Figures
+    from spelgen.evaluation.results import Results
 
 OBSERVER = (
     "+ observer: with the constant disturbance that a momentum observer estimates from the 0.1 s before; "
@@ -83,7 +83,7 @@ def table(title: str, labels: Sequence[str], rows: Iterable[Numbers], note: str 
     return Table(title, tuple(map(Row, labels, rows)), note)
 
 
-def result_tables(results: Figures) -> list[Table]:
+def result_tables(results: Results) -> list[Table]:
     """Return the tables of an evaluation: commands replayed, errors by horizon and by joint, torques."""
     tables = [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
     return list(map(_without_empty_columns, tables))
@@ -105,7 +105,7 @@ def _values(errors: Mapping[str, Errors], value: Callable[[Errors], Value]) -> d
     return {name: value(of_predictor) for name, of_predictor in errors.items()}
 
 
-def _horizon_tables(results: Figures) -> list[Table]:
+def _horizon_tables(results: Results) -> list[Table]:
     if not results.horizons:
         return []
     heads, relative, tips, note = [], [], [], ""
@@ -130,7 +130,7 @@ def _horizon_tables(results: Figures) -> list[Table]:
     return tables
 
 
-def _torque_tables(results: Figures) -> list[Table]:
+def _torque_tables(results: Results) -> list[Table]:
     torque = results.torque
     if not torque:
         return []
@@ -154,7 +154,7 @@ def known(values: Iterable[float | None]) -> list[float]:
     return [value for value in values if value is not None]
 
 
-def _replay_tables(results: Figures) -> list[Table]:
+def _replay_tables(results: Results) -> list[Table]:
     """Return those of commands replayed: by trajectory and by joint."""
     tables, unit = [], thousandths(results.joint_types)
     for replay in results.replays:
@@ -176,7 +176,7 @@ def _replay_tables(results: Figures) -> list[Table]:
 
 
 def _by_joint(
-    results: Figures, title: str, quantity: str, values: Mapping[str, Sequence[float | None]], note: str = ""
+    results: Results, title: str, quantity: str, values: Mapping[str, Sequence[float | None]], note: str = ""
 ) -> list[Table]:
     """Return a row for each joint; the unit stands in the title where all have the same, else beside each joint.
 

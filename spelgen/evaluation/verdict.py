@@ -17,7 +17,7 @@ from spelgen.listing import number
 from spelgen.settings.tuning.evaluation import EvaluationTuning
 
 if TYPE_CHECKING:
-    from spelgen.evaluation.figures import Figures
+    from spelgen.evaluation.results import Results
     from spelgen.evaluation.state_errors import StateErrors
 
 TUNING = EvaluationTuning()
@@ -61,7 +61,7 @@ class _Recommendation:
     reason: str
 
 
-def verdict(results: Figures, identified: Mapping[str, Any] | None = None, limits: Limits = ()) -> Verdict:
+def verdict(results: Results, identified: Mapping[str, Any] | None = None, limits: Limits = ()) -> Verdict:
     """Judge an evaluation. identified: least_squares.json, of the training logs. limits: of the joints."""
     uses = _Uses()
     _judge_torques(results, uses)
@@ -102,7 +102,7 @@ def verdict(results: Figures, identified: Mapping[str, Any] | None = None, limit
     return Verdict(f"{sentence}.", " ".join(statement for statement in because if statement))
 
 
-def _judge_torques(results: Figures, uses: _Uses) -> None:
+def _judge_torques(results: Results, uses: _Uses) -> None:
     """Judge by the joint whose torque is explained least: a mean hides it."""
     torque = results.torque.get(MODEL)
     if torque is None or torque.mean_nmse is None:
@@ -130,7 +130,7 @@ def _explained(nmse: float) -> str:
     return share(1 - nmse) if nmse < 1 else "none"
 
 
-def _worst_torque(results: Figures) -> tuple[str, float] | None:
+def _worst_torque(results: Results) -> tuple[str, float] | None:
     """Return the joint of the model's largest nMSE, and this; of joints whose torque is not logged in coarse steps."""
     torque = results.torque.get(MODEL)
     errors: dict[str, float] = {}
@@ -141,7 +141,7 @@ def _worst_torque(results: Figures) -> tuple[str, float] | None:
     return max(errors.items(), key=itemgetter(1), default=None)
 
 
-def _judge_motion(results: Figures, uses: _Uses) -> None:
+def _judge_motion(results: Results, uses: _Uses) -> None:
     # a long horizon may blow up where a short one tells something
     finite = [x for x in results.horizons if x.errors[MODEL].mean_relative_rms is not None]
     if not finite:
@@ -167,7 +167,7 @@ def _judge_motion(results: Figures, uses: _Uses) -> None:
     uses.proofs.append(proof)
 
 
-def _judge_replays(results: Figures, uses: _Uses) -> None:
+def _judge_replays(results: Results, uses: _Uses) -> None:
     if not results.replays:
         return
     replay = results.replays[0]
@@ -189,7 +189,7 @@ def _relative(errors: StateErrors | None) -> float:
     return errors.mean_relative_rms
 
 
-def _constant_velocity(results: Figures) -> str:
+def _constant_velocity(results: Results) -> str:
     """Say at which times ahead a constant velocity is better than the model, with an observer and without."""
     times = []
     for horizon in results.horizons:
@@ -203,7 +203,7 @@ def _constant_velocity(results: Figures) -> str:
     )
 
 
-def _better_baselines(results: Figures) -> str:
+def _better_baselines(results: Results) -> str:
     """Say which other baselines are better, at what."""
     better: dict[str, list[str]] = {}
     for horizon in results.horizons:
@@ -227,7 +227,7 @@ def _better_baselines(results: Figures) -> str:
     return f"But {listed(statements)}."
 
 
-def _worst_joint(results: Figures) -> _Failure:
+def _worst_joint(results: Results) -> _Failure:
     """Return the joint whose torque is explained least, else the one whose motion is."""
     worst = _worst_torque(results)
     if worst is not None:
@@ -247,7 +247,7 @@ def _worst_joint(results: Figures) -> _Failure:
     return _Failure(joint, "", f"At {joint} the error after {last.name} is {amount}.")
 
 
-def _slow_or_fast(results: Figures, k: int) -> str:
+def _slow_or_fast(results: Results, k: int) -> str:
     """Return at which speed of joint k the residuals of its torque are larger, where they differ."""
     residuals, speeds = [np.zeros(0)], [np.zeros(0)]
     for trace in results.traces.torques:
@@ -265,7 +265,7 @@ def _slow_or_fast(results: Figures, k: int) -> str:
 
 
 def _recommendations(
-    results: Figures, identified: Mapping[str, Any], limits: Limits, worst: _Failure
+    results: Results, identified: Mapping[str, Any], limits: Limits, worst: _Failure
 ) -> list[_Recommendation]:
     """Return what to record, the most useful first."""
     recommendations = []

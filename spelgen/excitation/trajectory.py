@@ -79,9 +79,9 @@ def _limits(index: int, arm: Arm, joints: Mapping[str, Joint]) -> tuple[float, f
 
 def _range(coordinate: Coordinate) -> tuple[float, float]:
     reach = REACHES[coordinate.kind]
-    if coordinate.continuous or coordinate.lower is None or coordinate.upper is None:
+    if coordinate.limits is None:
         return -reach, reach
-    return min(coordinate.lower, coordinate.upper), max(coordinate.lower, coordinate.upper)
+    return min(coordinate.limits), max(coordinate.limits)
 
 
 @dataclass(frozen=True, eq=False)

@@ -86,8 +86,8 @@ def _joint(projection: RigidBodyProjection, body: Body) -> dict[str, str]:
     # MuJoCo has one Coulomb friction for both directions
     attributes["frictionloss"] = _number((projection.forward[k] - projection.backward[k]) / 2)
     attributes["solimpfriction"] = _SOLIMPFRICTION
-    if not coordinate.continuous and coordinate.lower is not None and coordinate.upper is not None:
-        attributes["range"] = _numbers((coordinate.lower, coordinate.upper))
+    if coordinate.limits is not None:
+        attributes["range"] = _numbers(coordinate.limits)
     return attributes
 
 

@@ -191,8 +191,8 @@ def _counted(count: int, singular: str, plural: str) -> str:
 
 def range_fraction(coordinate: Coordinate, low: float, high: float) -> float | None:
     """Return the part of a joint's range that lies between these positions; None where it has no range."""
-    if coordinate.continuous or coordinate.lower is None or coordinate.upper is None:
+    if coordinate.limits is None:
         return None
     # limits of a URDF may be equal or swapped
-    width = coordinate.upper - coordinate.lower
+    width = coordinate.limits[1] - coordinate.limits[0]
     return (high - low) / width if width > 0 else None

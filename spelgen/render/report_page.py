@@ -54,12 +54,9 @@ class Run:
     @property
     def limits(self) -> Limits:
         """Return the joints' limits, None of a joint without."""
-        limits: list[tuple[float, float] | None] = [None] * len(self.facts.joints)
-        if self.arm is not None:
-            for k, joint in enumerate(self.arm.arm.coordinates):
-                if not joint.continuous and joint.lower is not None and joint.upper is not None:
-                    limits[k] = joint.lower, joint.upper
-        return limits
+        if self.arm is None:
+            return [None] * len(self.facts.joints)
+        return [joint.limits for joint in self.arm.arm.coordinates]
 
     @property
     def parameters(self) -> list[Listing]:
