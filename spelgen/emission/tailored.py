@@ -118,14 +118,13 @@ def mass_entries(spec: ModelSpec) -> str:
 
 def attributes(spec: ModelSpec) -> list[str]:
     """Return the class attributes of the model."""
-    values: dict[str, object] = {
-        "n": len(spec.joints),
-        "joint_names": tuple(joint.identifier for joint in spec.joints),
-        "joint_types": tuple(joint.kind for joint in spec.joints),
-    }
+    columns = _columns(spec.joints, "identifier", "kind")
+    lines = [f"    n = {len(spec.joints)}"]
+    lines.append(assignment("joint_names", columns["identifier"], _INDENT))
+    lines.append(assignment("joint_types", columns["kind"], _INDENT))
     if spec.inputs:
-        values["motor_gains"] = spec.inputs
-    return [assignment(name, value, _INDENT) for name, value in values.items()]
+        lines.append(assignment("motor_gains", spec.inputs, _INDENT))
+    return lines
 
 
 def units(spec: ModelSpec) -> int:
@@ -256,7 +255,7 @@ def _residuals(body: _Body, spec: ModelSpec) -> None:
     residuals = call(
         "ResidualTerms",
         Code("joints"),
-        tuple(joint.gear for joint in spec.joints),
+        _columns(spec.joints, "gear")["gear"],
         Code("mass_entries"),
         functions=len(spec.outputs),
         constants=len(spec.constants),

@@ -152,7 +152,10 @@ def _network(network: object, layers: Layers | None, functions: np.ndarray | Non
     # an emitted module brings classes of its own
     if type(network).__name__ != "MaskedMLP":
         raise _unsupported("Kolmogorov-Arnold networks beside rigid bodies")
-    weights, biases = map(list, zip(*((array(weight), array(bias)) for weight, bias in layers), strict=True))
+    weights, biases = [], []
+    for weight, bias in layers:
+        weights.append(array(weight))
+        biases.append(array(bias))
     if functions is not None:
         # outputs that are always zero would be units of the last hidden layer
         used = weights[-1].any(axis=1) | (biases[-1] != 0)
