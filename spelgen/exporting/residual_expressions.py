@@ -5,11 +5,13 @@ M's entries that a network reaches (m of them) there are, by name: ``mass`` (m, 
 ``kinetic``, d/dq of their 1/2 qd^T M qd (n, 1); of V's network ``energy`` and ``gravity``, dV/dq (n, 1); of single
 joints ``torque`` (n, 1) and ``torque_energy``; of the joints whose friction varies the logarithms ``factor`` (k, 1).
 
-Derivatives need, in place of rate and kinetic, ``first`` (m, n) and ``second`` (m, n (n + 1) / 2) by q, second ones by
-row and column of the upper triangle; ``stiffness`` (n (n + 1) / 2, 1) of V; ``torque_slope`` and ``factor_slope``.
+Derivatives need, in place of rate and kinetic, ``first`` (m, n) and ``second`` (m, n n) by q, n columns for each joint;
+``stiffness`` (n, n) of V; ``torque_slope`` and ``factor_slope``.
 """
 
 from __future__ import annotations
+
+from typing import TypeVar
 
 import casadi as ca
 import numpy as np
@@ -19,13 +21,13 @@ from spelgen.exporting.description import Encoding, Network, Residuals, TrainedM
 from spelgen.exporting.rigid_expressions import constant
 
 Symbols = dict[str, ca.SX]
+Scalars = TypeVar("Scalars", ca.SX, ca.MX)
 
 
 def residual_symbols(model: TrainedModel) -> Symbols:
     """Return symbols for all that a model may have; those of what it has not are empty."""
     n = model.n
     entries = len(model.residuals.entries)
-    pairs = n * (n + 1) // 2
     potential = int(model.residuals.potential is not None)
     torque = int(model.residuals.has_torque)
     factors = len(model.residuals.friction)
@@ -36,10 +38,10 @@ def residual_symbols(model: TrainedModel) -> Symbols:
         "kinetic": (n if entries else 0, 1),
         # jets: second derivatives of forces need these
         "first": (entries, n),
-        "second": (entries, pairs),
+        "second": (entries, n * n),
         "energy": (potential, 1),
         "gravity": (potential * n, 1),
-        "stiffness": (potential * pairs, 1),
+        "stiffness": (potential * n, n),
         "torque": (torque * n, 1),
         "torque_slope": (torque * n, 1),
         "torque_energy": (torque, 1),
@@ -61,37 +63,34 @@ def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: b
     """Return dR/dt qd - d/dq (1/2 qd^T R qd), (n, 1), of the networks' part R of M."""
     if not derivatives:
         return symmetric(model, symbols["rate"]) @ qd - symbols["kinetic"]
-    kinetic = ca.SX(model.n, 1)
-    for joint in range(model.n):
-        slope = symmetric(model, symbols["first"][:, joint])
-        kinetic[joint] = 0.5 * ca.dot(qd, slope @ qd)
+    kinetic = symbols["first"].T @ _in_kinetic_energy(model, qd)
     return symmetric(model, symbols["first"] @ qd) @ qd - kinetic
+
+
+def _in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
+    """Return what each entry of M is multiplied by in 1/2 qd^T M qd, (entries, 1)."""
+    products = []
+    for row, column in model.residuals.entries:
+        # an entry beside the diagonal stands in M twice
+        weight = 0.5 if row == column else 1.0
+        products.append(weight * qd[row] * qd[column])
+    return ca.vertcat(*products)
 
 
 def symbol_slopes(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX, ca.SX]]:
     """Return the symbols that depend on q, (k, 1) each, with their derivatives by it, (k, n)."""
-    pairs = [_second_derivatives(model.n, joint) for joint in range(model.n)]
     # the factor of a joint depends on that joint alone
     joints = np.eye(model.n)[list(model.residuals.friction)]
     slopes = [(symbols["factor"], symbols["factor_slope"] * ca.SX(joints))]
     if model.residuals.mass is not None:
-        second = [symbols["second"][:, pair] for pair in pairs]
+        by_joint = ca.horzsplit(symbols["second"], model.n)
         slopes.append((symbols["mass"], symbols["first"]))
-        slopes.append((ca.vec(symbols["first"]), ca.vertcat(*second)))
+        slopes.append((ca.vec(symbols["first"]), ca.vertcat(*by_joint)))
     if model.residuals.potential is not None:
-        stiffness = [symbols["stiffness"][pair].T for pair in pairs]
-        slopes.append((symbols["gravity"], ca.vertcat(*stiffness)))
+        slopes.append((symbols["gravity"], symbols["stiffness"]))
     if model.residuals.has_torque:
         slopes.append((symbols["torque"], ca.diag(symbols["torque_slope"])))
     return slopes
-
-
-def _second_derivatives(n: int, joint: int) -> list[int]:
-    """Return where the second derivatives by a joint and each other stand in rows of an upper triangle."""
-    indices = np.zeros((n, n), dtype=int)
-    indices[np.triu_indices(n)] = np.arange(n * (n + 1) // 2)
-    row: list[int] = (indices + np.triu(indices, 1).T)[joint].tolist()
-    return row
 
 
 def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
@@ -103,12 +102,7 @@ def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str
         mass = values["mass"] = _network(residuals.mass, encoded)
         if qd is not None:
             values["rate"] = ca.jtimes(mass, q, qd)
-            # an entry beside the diagonal stands in M twice
-            products = []
-            for row, column in residuals.entries:
-                weight = 0.5 if row == column else 1.0
-                products.append(weight * qd[row] * qd[column])
-            values["kinetic"] = ca.jtimes(mass, q, ca.vertcat(*products), True)
+            values["kinetic"] = ca.jtimes(mass, q, _in_kinetic_energy(model, qd), True)
     if residuals.potential is not None:
         values["energy"] = _network(residuals.potential, encoded)
         # reverse sweep of CasADi: as cheap as the network itself
