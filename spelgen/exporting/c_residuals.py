@@ -62,14 +62,10 @@ def network_source(model: TrainedModel) -> list[str]:
     networks = {name: network for name, network in named.items() if network is not None}
     if not networks:
         return []
-    encoding = residuals.encoding
-    encoded = (3 if encoding.prismatic else 2) * n
     tables: list[str] = []
-    if encoding.prismatic:
-        tables += [_table("center", encoding.center), _table("reach", encoding.reach)]
     layers: dict[str, list[str]] = {}
     # buffers are of one size, that of the widest layer
-    width = encoded
+    width = encoded = next(iter(networks.values())).weights[0].shape[1]
     for name, network in networks.items():
         layers[name] = []
         for k, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True), start=1):
@@ -86,7 +82,7 @@ def network_source(model: TrainedModel) -> list[str]:
         width=width,
         encoded=encoded,
         lanes=1 + n + n * (n + 1) // 2,
-        scaled=encoding.prismatic,
+        slides=encoded > 2 * n,
         tables=tables,
         networks=layers,
         entries=len(residuals.entries),

@@ -22,7 +22,6 @@ from spelgen.dynamics.protocol import (
 from spelgen.errors import RunError
 from spelgen.exporting.description import (
     Bristles,
-    Encoding,
     FrictionLaw,
     Harmonics,
     Network,
@@ -51,7 +50,7 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
     tip_link, tip, end = tip_chain(loaded)
     # what does not depend on q is one matrix, whatever it comes from
     constant_mass = array(weights.armature)
-    residuals = Residuals(Encoding(False, np.zeros(0), np.zeros(0)), (), None, None, {}, (), {})
+    residuals = Residuals((), None, None, {}, (), {})
     bristles = None
     if has_friction_state(exact):
         reach: Tensor = exact.friction.bristles.reach
@@ -120,8 +119,8 @@ def _friction(constants: Any) -> FrictionLaw:
 def _residuals(model: ResidualModel) -> Residuals:
     """Return the residuals without those that are zero. Raises RunError for Kolmogorov-Arnold networks."""
     terms, weights = model.residuals, model.prepare().residual
-    mass = _network(terms.mass, weights.mass, array(weights.functions))
-    potential = _network(terms.potential, weights.potential)
+    mass = _network(terms.mass, weights.mass, terms.encoding, array(weights.functions))
+    potential = _network(terms.potential, weights.potential, terms.encoding)
     entries: np.ndarray = np.zeros((0, 2), dtype=int)
     if mass is not None:
         reached = mass.weights[-1].any(axis=1).reshape(model.n, model.n)
@@ -130,9 +129,6 @@ def _residuals(model: ResidualModel) -> Residuals:
     if potential is not None:
         potential = _with_outputs(potential, np.zeros(1, dtype=int))
     return Residuals(
-        encoding=Encoding(
-            terms.encoding.columns == 3, array(terms.encoding.center), array(terms.encoding.reach)
-        ),
         entries=tuple(map(tuple, entries.tolist())),
         mass=mass,
         potential=potential,
@@ -142,7 +138,9 @@ def _residuals(model: ResidualModel) -> Residuals:
     )
 
 
-def _network(network: object, layers: Layers | None, functions: np.ndarray | None = None) -> Network | None:
+def _network(
+    network: object, layers: Layers | None, encoding: Any, functions: np.ndarray | None = None
+) -> Network | None:
     """Return a network y, None where there is none or its last layer is zero; with functions, tanh(y) @ functions.
 
     Its units are sigmoids, which C computes faster than tanh.
@@ -156,6 +154,11 @@ def _network(network: object, layers: Layers | None, functions: np.ndarray | Non
     for weight, bias in layers:
         weights.append(array(weight))
         biases.append(array(bias))
+    if encoding.columns == 3:
+        # positions come as (q - center) / reach
+        slopes = weights[0][:, 2 * len(encoding.center) :]
+        slopes /= array(encoding.reach)
+        biases[0] -= slopes @ array(encoding.center)
     if functions is not None:
         # outputs that are always zero would be units of the last hidden layer
         used = weights[-1].any(axis=1) | (biases[-1] != 0)

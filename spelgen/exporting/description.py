@@ -55,22 +55,13 @@ class Bristles:
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """A network of q: layers of sigmoids of the encoding, the last one linear.
+    """A network of cos q, sin q and, where some joint is prismatic, q: layers of sigmoids, the last one linear.
 
     weights: by layer, (units, units below).
     """
 
     weights: tuple[np.ndarray, ...]
     biases: tuple[np.ndarray, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Encoding:
-    """The inputs of networks: cos q, sin q and, where some joint is prismatic, (q - center) / reach."""
-
-    prismatic: bool
-    center: np.ndarray
-    reach: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +83,6 @@ class Residuals:
     with zero where they begin and end, and beyond.
     """
 
-    encoding: Encoding
     entries: tuple[tuple[int, int], ...]
     mass: Network | None
     potential: Network | None

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 from scipy.interpolate import BSpline
 
-from spelgen.exporting.description import Encoding, Network, Residuals, TrainedModel, spline_energy
+from spelgen.exporting.description import Network, Residuals, TrainedModel, spline_energy
 from spelgen.exporting.rigid_expressions import constant
 
 Symbols = dict[str, ca.SX]
@@ -97,7 +97,7 @@ def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str
     """Return what the symbols stand for at q, without derivatives, as expressions of matrices."""
     residuals = model.residuals
     values: dict[str, ca.MX] = {}
-    encoded = _encoded(residuals.encoding, q)
+    encoded = ca.vertcat(ca.cos(q), ca.sin(q), q)
     if residuals.mass is not None:
         mass = values["mass"] = _network(residuals.mass, encoded)
         if qd is not None:
@@ -116,17 +116,8 @@ def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str
     return values
 
 
-def _encoded(encoding: Encoding, q: ca.MX) -> ca.MX:
-    """Return the inputs of the networks."""
-    # by cos and sin a turn later is the same position
-    waves = ca.vertcat(ca.cos(q), ca.sin(q))
-    if not encoding.prismatic:
-        return waves
-    return ca.vertcat(waves, (q - encoding.center) / encoding.reach)
-
-
 def _network(network: Network, encoded: ca.MX) -> ca.MX:
-    layer = encoded
+    layer = encoded[: network.weights[0].shape[1]]
     for weight, bias in zip(network.weights[:-1], network.biases[:-1], strict=True):
         # CasADi has no sigmoid
         layer = 1 / (1 + ca.exp(-(constant(weight) @ layer + bias)))
