@@ -46,10 +46,13 @@ def run_fleet(fleet: Fleet, folder: Path, run_tasks: RunTasks, note: Callable[[s
     progress = _Progress(run_tasks, note)
     arms = _prepare(fleet, folder, progress)
     # arm by arm, so that the first rankings can be read while the rest runs
-    choices = product(arms, fleet.presets, range(fleet.seeds), range(fleet.splits))
-    jobs = [_job(fleet, folder, *choice) for choice in choices]
-    results = {job.name: job.result() for job in jobs}
-    waiting = [job for job in jobs if results[job.name] is None]
+    results: dict[str, RunResult | None] = {}
+    waiting: list[Job] = []
+    for choice in product(arms, fleet.presets, range(fleet.seeds), range(fleet.splits)):
+        job = _job(fleet, folder, *choice)
+        results[job.name] = job.result()
+        if results[job.name] is None:
+            waiting.append(job)
     for job, result in progress.succeeded("training", run_job, waiting):
         results[job.name] = result
     ended = [result for result in results.values() if result is not None]

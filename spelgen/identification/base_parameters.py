@@ -61,7 +61,7 @@ def base_parameters(
     """Return the base parameters of ``arm`` and of this friction of its drives (see ``FrictionModel.columns``)."""
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     exact = body_base_parameters(arm, base_parameter_count(arm))
-    names = [parameter_name(k) for k in range(inertial)]
+    names = list(map(parameter_name, range(inertial)))
     for effect in friction.effects:
         names += [f"{effect}{joint + 1}" for joint in range(n)]
     columns = _columns(arm, friction, motors, len(names), seed)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from math import nan
+from typing import Literal
 
 from spelgen.arm.arm import Coordinate
 from spelgen.labels import UNITS
@@ -62,24 +64,15 @@ def find_beyond_limits(joint: JointEvidence) -> str | None:
     return "; ".join(findings) or None
 
 
-def find_speed_above(joint: JointEvidence) -> str | None:
-    """Find speeds above the limit."""
-    return _above(
-        "velocity", joint.largest("qd"), joint.coordinate.velocity, UNITS[joint.coordinate.kind].velocity
-    )
-
-
-def find_effort_above(joint: JointEvidence) -> str | None:
-    """Find torques above the limit."""
-    return _above(
-        "effort", joint.largest("tau"), joint.coordinate.effort, UNITS[joint.coordinate.kind].torque
-    )
-
-
-def _above(name: str, value: float, limit: float | None, unit: str) -> str | None:
-    if not limit or value <= limit * (1 + TUNING.limit_noise):
+def find_above(limit: Literal["velocity", "effort"], joint: JointEvidence) -> str | None:
+    """Find speeds or torques above the limit."""
+    units, bound = UNITS[joint.coordinate.kind], joint.coordinate.effort
+    largest, unit = joint.largest("tau"), units.torque
+    if limit == "velocity":
+        largest, unit, bound = joint.largest("qd"), units.velocity, joint.coordinate.velocity
+    if not bound or largest <= bound * (1 + TUNING.limit_noise):
         return None
-    return f"{name} up to {value:.4g} {unit}, the limit is {limit:.4g}"
+    return f"{limit} up to {largest:.4g} {unit}, the limit is {bound:.4g}"
 
 
 def find_wrong_sense(joint: JointEvidence) -> str | None:
@@ -180,8 +173,8 @@ CHECKS: list[Check[JointEvidence]] = [
         expected="Nm or N at the joint", do=SAY_UNIT,
     ),
     *POSITION_CHECKS,
-    Check("beyond-velocity-limit", "warning", find_speed_above),
-    Check("beyond-effort-limit", "warning", find_effort_above),
+    Check("beyond-velocity-limit", "warning", partial(find_above, "velocity")),
+    Check("beyond-effort-limit", "warning", partial(find_above, "effort")),
     Check("at-a-stop", "warning", find_stop),
     Check("coarse", "warning", find_coarse),
     Check("torque-without-gravity", "warning", find_no_gravity, unless=TORQUE_ERRORS),

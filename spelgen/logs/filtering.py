@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache
 
 import numpy as np
 
@@ -50,34 +50,33 @@ def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:
 def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndarray:
     """Return signals (T, ...) at a regular rate [Hz] through that filter."""
     # to import it takes the better part of a second, which most commands can do without
-    from scipy.signal import butter, sosfiltfilt
+    from scipy.signal import sosfiltfilt
 
-    sections = butter(TUNING.filter_order, cutoff, fs=rate, output="sos")
     # three periods of the cutoff settle the ends
     padding = min(len(signals) - 1, int(3 * rate / cutoff))
-    filtered: np.ndarray = sosfiltfilt(sections, signals, axis=0, padlen=padding)
+    filtered: np.ndarray = sosfiltfilt(_sections(rate, cutoff), signals, axis=0, padlen=padding)
     return filtered
+
+
+@cache
+def _sections(rate: float, cutoff: float) -> np.ndarray:
+    """Return the filter's second-order sections: to design them takes as long as to filter a minute of a joint."""
+    from scipy.signal import butter
+
+    sections: np.ndarray = butter(TUNING.filter_order, cutoff, fs=rate, output="sos")
+    return sections
 
 
 def resample(trajectory: Trajectory, frequency: float) -> Trajectory:
     """Return one gap-free piece at a regular rate [Hz]: between dense samples on lines, between others on a cubic."""
+    from scipy.interpolate import interp1d  # takes long to import, as in `low_pass_regular`
+
     t = np.arange(trajectory.t[0], trajectory.t[-1], 1.0 / frequency)
-    if is_dense(trajectory.sample_rate):
-        at = partial(_on_lines, t, trajectory.t)
-    else:
-        # a line from sample to sample would cut off the peaks of the motion
-        at = partial(_on_cubic, t, trajectory.t)
-    return replace(trajectory, t=t, q=at(trajectory.q), qd=at(trajectory.qd), tau=at(trajectory.tau))
-
-
-def _on_lines(t: np.ndarray, samples: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.stack([np.interp(t, samples, column) for column in values.T], axis=1)
-
-
-def _on_cubic(t: np.ndarray, samples: np.ndarray, values: np.ndarray) -> np.ndarray:
-    from scipy.interpolate import CubicSpline  # takes long to import, as in `low_pass`
-
-    return np.asarray(CubicSpline(samples, values)(t))
+    # a line between samples that are far apart would cut off the peaks of the motion
+    kind = "linear" if is_dense(trajectory.sample_rate) else "cubic"
+    signals = (trajectory.q, trajectory.qd, trajectory.tau)
+    q, qd, tau = (interp1d(trajectory.t, x, kind, axis=0)(t) for x in signals)
+    return replace(trajectory, t=t, q=q, qd=qd, tau=tau)
 
 
 def prepare(
