@@ -154,8 +154,8 @@ def test_residual_terms_are_a_gradient_and_vanish_outside_the_range():
     near(terms.splines(inside).sum(dim=-1), torch.ones(20, 3).double(), 1e-12)
     far = 100 * torch.ones(1, 3, dtype=torch.float64)
     near(terms.splines(far), torch.zeros(1, 3, SPLINES).double())
-    assert not terms.ripple(q)[:, 1].any(), "a prismatic joint has no turns"
-    near(terms.ripple(q)[:, 2, HARMONICS + 1], (202 * q[:, 2]).cos())
+    assert not weights.ripple[1].any(), "a prismatic joint has no turns"
+    near(terms.waves(q)[:, 2, HARMONICS + 1], (202 * q[:, 2]).cos())
 
 
 def test_friction_stays_between_a_tenth_and_ten_times_for_all_weights():

@@ -147,7 +147,7 @@ class ResidualTerms(nn.Module):
         encoded = self.encoding.forward(q)
         splines = torch.einsum("...ik,ikm->...im", self.splines(q), weights.splines)
         smooth, friction = splines.unbind(-1)
-        torque = smooth + (self._waves(q) * weights.ripple).sum(dim=-1)
+        torque = smooth + (self.waves(q) * weights.ripple).sum(dim=-1)
         mass, slope, intermediates = weights.constant.expand(*q.shape[:-1], -1), None, None
         if self.mass is not None and weights.mass is not None:
             y, intermediates = self.mass.forward(encoded, weights.mass)
@@ -162,7 +162,7 @@ class ResidualTerms(nn.Module):
         away = distance.abs()
         step = 0.5 - (2 - away).relu() ** 4 / 24 + (1 - away).relu() ** 4 / 6
         smooth = (self.spacing * distance.sign() * step * pose.weights.splines[..., 0]).sum(dim=-1)
-        by_cos, by_sin = (self._waves(pose.q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
+        by_cos, by_sin = (self.waves(pose.q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
         ripple = (torch.cat([by_sin, -by_cos], dim=-1) * pose.weights.ripple).sum(dim=-1)
         energy = (smooth + ripple).sum(dim=-1)
         if self.potential is not None and pose.weights.potential is not None:
@@ -193,11 +193,8 @@ class ResidualTerms(nn.Module):
         wide = (2 - self._places(q).abs()).relu()
         return torch.sub(wide**3, (wide - 1).relu() ** 3, alpha=4) / 6
 
-    def ripple(self, q: Tensor) -> Tensor:
-        """Return cosines, then sines of frequency times q, (..., n, 2 HARMONICS + 4); zero if prismatic."""
-        return self._waves(q) * self.revolute
-
-    def _waves(self, q: Tensor) -> Tensor:
+    def waves(self, q: Tensor) -> Tensor:
+        """Return cosines, then sines of frequency times q, (..., n, 2 HARMONICS + 4)."""
         phase = q.unsqueeze(-1) * self.frequencies
         return torch.cat([phase.cos(), phase.sin()], dim=-1)
 

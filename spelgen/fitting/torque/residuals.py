@@ -132,7 +132,7 @@ def _candidates(model: Any, samples: ResidualSamples) -> Iterator[_Candidate]:
     """Yield what could be selected: smooth torques first, then friction that varies, then ripple."""
     functions, motors = model.residuals, model.motors
     with torch.no_grad():
-        splines, ripple = functions.splines(samples.q), functions.ripple(samples.q)
+        splines, ripple = functions.splines(samples.q), functions.revolute * functions.waves(samples.q)
     joints, unit = torch.eye(len(motors)).to(motors), functions.unit.flatten()
     common = torch.zeros(splines.shape[-1])
     pairs = torch.arange(ripple.shape[-1] // 2).repeat(2)
