@@ -104,40 +104,28 @@ def replays(
     predictors = {MODEL: ServoModel(model), **baselines}
     # logs begin before the arm moves; within them windows begin in motion
     logs_from_rest: list[LogRows] = [(piece, slice(0, len(piece))) for piece in pieces]
-    q = np.stack([piece.q[0] for piece in pieces])
-    whole, missed = _replay("whole log", predictors, logs_from_rest, q, np.zeros_like(q))
+    rest = np.zeros((len(pieces), pieces[0].q.shape[1]))
+    whole, missed = _replay("whole log", predictors, logs_from_rest, rest)
     results = [whole]
     if windows:
         smooth_velocities = {id(piece): velocities(piece) for piece in pieces}
-        q = np.stack([log.q[rows.start] for log, rows in windows])
         qd = np.stack([smooth_velocities[id(log)][rows.start] for log, rows in windows])
-        results.append(_replay(f"windows of {TUNING.replay_window:g} s", predictors, windows, q, qd)[0])
+        results.append(_replay(f"windows of {TUNING.replay_window:g} s", predictors, windows, qd)[0])
     return tuple(results), list(zip(pieces, missed, strict=True))
 
 
 def _replay(
-    name: str,
-    predictors: Mapping[str, CommandFollower],
-    parts: Sequence[LogRows],
-    q: np.ndarray,
-    qd: np.ndarray,
+    name: str, predictors: Mapping[str, CommandFollower], parts: Sequence[LogRows], qd: np.ndarray
 ) -> tuple[Replay, list[np.ndarray]]:
-    """Return how wrong each predictor is, and the model's errors."""
-    errors, summaries = {}, {}
+    """Return how wrong each predictor is from velocities qd (parts, n) on, and by how much the model misses, (K, n)."""
+    q = np.stack([log.q[rows.start] for log, rows in parts])
+    errors: dict[str, list[np.ndarray]] = {}
     for predictor, follower in predictors.items():
-        errors[predictor] = _errors(follower, parts, q, qd)
-        summaries[predictor] = _summary(parts, errors[predictor])
+        errors[predictor] = []
+        for (log, rows), predicted in zip(parts, follower.positions(parts, q, qd), strict=True):
+            errors[predictor].append(predicted - log.q[rows][1:])
+    summaries = {predictor: _summary(parts, missed) for predictor, missed in errors.items()}
     return Replay(name, summaries), errors[MODEL]
-
-
-def _errors(
-    predictor: CommandFollower, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray
-) -> list[np.ndarray]:
-    """Return predicted less measured positions of each part, (K, n)."""
-    errors = []
-    for (log, rows), predicted in zip(parts, predictor.positions(parts, q, qd), strict=True):
-        errors.append(predicted - log.q[rows][1:])
-    return errors
 
 
 def _summary(parts: Sequence[LogRows], errors: Sequence[np.ndarray]) -> ReplayErrors:
