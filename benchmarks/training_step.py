@@ -30,7 +30,7 @@ from published_phnode import ByJvp, Published
 
 from spelgen.building import build
 from spelgen.design import Design
-from spelgen.dynamics.unbounded import whole_part
+from spelgen.dynamics.unbounded import unbounded
 from spelgen.fitting.rollout import position_difference
 
 if TYPE_CHECKING:
@@ -73,12 +73,12 @@ def rk4(rate: Callable[..., tuple[Tensor, Tensor]], q: Tensor, p: Tensor) -> tup
     return q, p, k1[0]
 
 
-def unbounded(model: EmittedModel) -> EmittedModel | None:
+def plain_mass(model: EmittedModel) -> EmittedModel | None:
     """The model with M as it comes; None where nothing is done to it."""
-    if not hasattr(getattr(model, "mass", None), "part"):
+    if not hasattr(getattr(model, "mass", None), "fraction"):
         return None
     plain = copy.deepcopy(model)
-    plain.mass.part = whole_part
+    plain.mass.fraction = unbounded
     return plain
 
 
@@ -169,7 +169,7 @@ def main() -> None:
     torch.manual_seed(0)
     data = Data(WINDOWS)
     models = {name: build(ROBOT, preset, net=net, width=WIDTH) for name, (preset, net) in PRESETS.items()}
-    plain = {name: unbounded(model) for name, model in models.items()}
+    plain = {name: plain_mass(model) for name, model in models.items()}
     steps, floors, bare = ({name: list[float]() for name in models} for _ in range(3))
     for _ in range(REPEATS):
         for name, model in models.items():

@@ -208,8 +208,8 @@ def test_bound_leaves_what_is_positive_definite_and_mends_what_is_not():
     )
 
     def bound(matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        part = mass.part(matrix)
-        return torch.lerp(center, matrix, part[:, None, None]), part
+        fraction = mass.fraction(matrix)
+        return torch.lerp(center, matrix, fraction[:, None, None]), fraction
 
     near(mass.center, center)
     root = draw(500, 3, 3)

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from torch import Tensor, nn
 
 
-def whole_part(mass: Tensor) -> Tensor:
-    """Return one for every matrix: all of M's changes stand, see ``DerivedMass.part``."""
+def unbounded(mass: Tensor) -> Tensor:
+    """Return one for every matrix: all of M's changes stand, see ``DerivedMass.fraction``."""
     return mass.new_ones(mass.shape[:-2])
 
 
@@ -17,11 +17,11 @@ def whole_part(mass: Tensor) -> Tensor:
 def mass_as_learned(model: nn.Module) -> Iterator[None]:
     """Let the model's M be indefinite where its network says so; a model that bounds nothing stays as it is."""
     mass = getattr(model, "mass", None)
-    if mass is None or not hasattr(mass, "part"):
+    if mass is None or not hasattr(mass, "fraction"):
         yield
         return
-    mass.part = whole_part
+    mass.fraction = unbounded
     try:
         yield
     finally:
-        del mass.part
+        del mass.fraction

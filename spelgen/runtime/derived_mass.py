@@ -48,9 +48,9 @@ class DerivedMass(nn.Module):
         self.center, self.smallest = nn.Buffer(center), nn.Buffer(margin * center)  # C and margin C
         size = center.diagonal().rsqrt()
         relative = size.unsqueeze(-1) * size
-        least = torch.linalg.eigvalsh(relative * center)[0]
+        eigenvalue = torch.linalg.eigvalsh(relative * center)[0]
         # an entry's largest part in the norm relative to C, divided by 1 - margin
-        self.unit = nn.Buffer(relative / least / (1 - margin))
+        self.unit = nn.Buffer(relative / eigenvalue / (1 - margin))
 
     def armature(self) -> Tensor:
         """Return the drives' part of M's diagonal, (n,) [kg m^2, kg]."""
@@ -76,10 +76,10 @@ class DerivedMass(nn.Module):
         """Return M'(q), and, for its derivatives, what those of the network need and t."""
         rows, intermediates = self.network.forward(encoded, layers)
         mass = rows.reshape(*rows.shape[:-1], *self.center.shape)
-        part = self.part(mass.detach())
-        return torch.lerp(self.center, mass, part[..., None, None]), (intermediates, part)
+        fraction = self.fraction(mass.detach())
+        return torch.lerp(self.center, mass, fraction[..., None, None]), (intermediates, fraction)
 
-    def part(self, mass: Tensor) -> Tensor:
+    def fraction(self, mass: Tensor) -> Tensor:
         """Return t, (...)."""
         indefinite = torch.linalg.cholesky_ex(mass - self.smallest).info != 0
         norm = torch.linalg.vector_norm(self.unit * (mass - self.center), dim=(-2, -1))
@@ -87,12 +87,12 @@ class DerivedMass(nn.Module):
 
     def kinetic_vjp(self, qd: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
         """Return the derivative of 1/2 qd^T M(q) qd by the encoding."""
-        network, part = intermediates
-        half = 0.5 * part.unsqueeze(-1) * qd
+        network, fraction = intermediates
+        half = 0.5 * fraction.unsqueeze(-1) * qd
         return self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))
 
     def jvp(self, rate: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
         """Return dM/dt, (..., n, n), where the encoding changes at this rate."""
-        network, part = intermediates
-        rows = part.unsqueeze(-1) * self.network.jvp(network, rate)
+        network, fraction = intermediates
+        rows = fraction.unsqueeze(-1) * self.network.jvp(network, rate)
         return rows.reshape(*rows.shape[:-1], *self.center.shape)
