@@ -39,14 +39,12 @@ def to_dict(formulas: Formulas) -> dict[str, object]:
 
 
 def _entry(formula: Formula) -> dict[str, object]:
-    entry: dict[str, object] = {"name": formula.name, "row": None, "col": None, "terms": formula.terms}
+    row = column = text = None
     if formula.place is not None:
-        entry["row"] = formula.place[0] + 1
-        entry["col"] = formula.place[1] + 1
-    entry["expression"] = None
+        row, column = formula.place[0] + 1, formula.place[1] + 1
     if formula.expression is not None:
-        entry["expression"] = Text().whole(formula.expression)
-    return entry
+        text = Text().whole(formula.expression)
+    return {"name": formula.name, "row": row, "col": column, "terms": formula.terms, "expression": text}
 
 
 def _notes(formulas: Formulas) -> list[str]:

@@ -25,6 +25,7 @@ SEEN = "tested-on-training-data"
 STANDSTILL = "near standstill"
 EXCITE = "(as spelgen excite proposes)"
 Limits = Sequence[tuple[float, float] | None]
+"""Lowest and highest position of each joint; None: it has no limits."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +54,6 @@ class _Failure:
     proof: str = ""
 
 
-@dataclass(frozen=True)
-class _Recommendation:
-    """What to record next, and why."""
-
-    motion: str
-    reason: str
-
-
 def verdict(results: Results, identified: Mapping[str, Any] | None = None, limits: Limits = ()) -> Verdict:
     """Judge an evaluation. identified: least_squares.json, of the training logs. limits: of the joints."""
     uses = _Uses()
@@ -83,7 +76,7 @@ def verdict(results: Results, identified: Mapping[str, Any] | None = None, limit
     if worst.joint:
         details.append(f"worst at {worst.joint}{worst.when}")
     if recommendations:
-        details.append(f"next, record {recommendations[0].motion}")
+        details.append(f"next, record {next(iter(recommendations))}")
     because = []
     for detail in details:
         longer = f"{sentence}; {detail}"
@@ -98,7 +91,7 @@ def verdict(results: Results, identified: Mapping[str, Any] | None = None, limit
         worst.proof,
         _better_baselines(results),
     ]
-    because += [f"{recommendation.reason}." for recommendation in recommendations]
+    because += [f"{reason}." for reason in recommendations.values()]
     return Verdict(f"{sentence}.", " ".join(statement for statement in because if statement))
 
 
@@ -266,35 +259,31 @@ def _slow_or_fast(results: Results, k: int) -> str:
 
 def _recommendations(
     results: Results, identified: Mapping[str, Any], limits: Limits, worst: _Failure
-) -> list[_Recommendation]:
-    """Return what to record, the most useful first."""
-    recommendations = []
-
-    def recommend(motion: str, reason: str) -> None:
-        recommendations.append(_Recommendation(motion, reason))
-
+) -> dict[str, str]:
+    """Return which motions to record, the most useful first, and why."""
+    recommendations = {}
     trained = identified.get("coverage") or {}
     unseen = identified.get("unseen_directions")
     if unseen:
         reason = f"The training logs do not excite {unseen} directions of the base parameters"
-        recommend(f"a richer motion {EXCITE}", reason)
+        recommendations[f"a richer motion {EXCITE}"] = reason
     outside = _outside(trained, results.traces.coverage, results.joints)
     if outside:
         reason = f"The test logs exceed the range of the training logs: {shortened(outside, 3)}"
-        recommend(f"motion with the {outside[0]} that the test logs have", reason)
+        recommendations[f"motion with the {outside[0]} that the test logs have"] = reason
     if worst.when.endswith(STANDSTILL):
-        recommend(f"slow reversals of {worst.joint}", "Dry friction is learned from slow reversals")
+        recommendations[f"slow reversals of {worst.joint}"] = "Dry friction is learned from slow reversals"
     fractions = _range_fractions(trained, results.joints, limits)
     if fractions:
         joint = min(fractions, key=fractions.__getitem__)
         if fractions[joint] < TUNING.narrow_range:
             reason = f"{joint} has moved over {share(fractions[joint], 'its range')}"
-            recommend(f"wider motion of {joint}", reason)
+            recommendations[f"wider motion of {joint}"] = reason
     base = identified.get("base_parameters", ())
     weak = [parameter for parameter in base if parameter["determined"] in ("weak", "may be zero")]
     if weak:
         reason = f"{len(weak)} of {len(base)} base parameters are not significantly different from zero"
-        recommend(f"faster motion of all joints together {EXCITE}", reason)
+        recommendations[f"faster motion of all joints together {EXCITE}"] = reason
     return recommendations
 
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 
 from spelgen.baselines.names import LEAST_SQUARES, MODEL
 from spelgen.evaluation.traces import PredictedExample, Traces
+from spelgen.evaluation.verdict import Limits
 from spelgen.labels import named_joints, thousandths
 from spelgen.listing import number
 from spelgen.render.charts import Chart
 from spelgen.render.plots import (
-    Limits,
     Panel,
     Record,
     coverage_panels,

@@ -20,14 +20,13 @@ from spelgen.baselines.names import (
 )
 from spelgen.evaluation.torque_traces import TorqueTrace
 from spelgen.evaluation.traces import FrictionTrace, Growth, MassTrace, PredictedMotion, Quantiles
+from spelgen.evaluation.verdict import Limits
 from spelgen.labels import UNITS, NamedJoint, entry_name
 from spelgen.render.charts import MARGINS, Band, Chart, Dots, Line, Mark, Values, line_chart
 from spelgen.settings.tuning.render import TUNING
 
 Record = Mapping[str, Any]
 """A record of JSON."""
-Limits = Sequence[tuple[float, float] | None]
-"""Lowest and highest position of each joint; None: it has no limits."""
 
 QUANTITIES = {"q": "position", "qd": "velocity"}
 STYLES = {

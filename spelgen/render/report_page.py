@@ -15,7 +15,7 @@ from spelgen.errors import RunError, SpelgenError
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.traces import Traces
-from spelgen.evaluation.verdict import Verdict, verdict
+from spelgen.evaluation.verdict import Limits, Verdict, verdict
 from spelgen.files import write_json, write_text
 from spelgen.fitting.objectives import fit_summary
 from spelgen.fitting.run_folder import RunFolder, trained_model
@@ -26,7 +26,7 @@ from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.curves import coverage, curves
 from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, parameter_tables
-from spelgen.render.plots import Limits, Record
+from spelgen.render.plots import Record
 from spelgen.render.reproduction import commands, files
 from spelgen.render.run_facts import head_numbers, training_facts
 from spelgen.spec import Facts, read_facts

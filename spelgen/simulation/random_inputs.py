@@ -51,14 +51,8 @@ def random_inputs(
         if progress is not None:
             progress(number + 1, protocol.trajectories)
     tested = _tested(protocol.trajectories, protocol.test_fraction, np.random.default_rng(split_seed))
-    train: list[Trajectory] = []
-    test: list[Trajectory] = []
-    for number, trajectory in enumerate(trajectories):
-        if number in tested:
-            test.append(trajectory)
-        else:
-            train.append(trajectory)
-    return SimulatedLogs(train, test)
+    train = [log for number, log in enumerate(trajectories) if number not in tested]
+    return SimulatedLogs(train, [trajectories[number] for number in sorted(tested)])
 
 
 def _torques(coordinate: Coordinate, settings: Settings) -> np.ndarray:
