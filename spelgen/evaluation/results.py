@@ -23,7 +23,7 @@ SCHEMA = 9
 
 @dataclass(frozen=True, repr=False)
 class Results:
-    """Hold what `evaluate` measures; `to_dict` is evaluation.json.
+    """Gather what `evaluate` measures; `to_dict` is evaluation.json.
 
     cutoff: of the filter on the test logs [Hz], None without. substeps: of the integrator between samples, for the
     model. parameters: its trained numbers. torque: by predictor, empty where the logs are too sparse. traces: the

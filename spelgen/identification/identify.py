@@ -162,13 +162,13 @@ class _Fit:
     weights: np.ndarray
     noise: np.ndarray
 
-    def covariance(self) -> np.ndarray:
-        """Return that of the fitted parameters, for errors as large as they are, whatever the weights were."""
+    def deviations(self, combination: np.ndarray) -> np.ndarray:
+        """Return those of combinations (r, K) of the fitted parameters, for errors as large as they are."""
         variance = np.square(self.weights**2 * self.noise)
-        # the sandwich of weights that need not be the inverse of what the errors turned out to be
+        # a sandwich, for weights need not be the inverse of what the errors turned out to be: a sum of squares
         rows = self.triangles.factors[..., self.solution.columns]
-        inner = np.einsum("j,jka,jkb->ab", variance, rows, rows)
-        return np.asarray(self.solution.covariance @ inner @ self.solution.covariance)
+        effects = (combination @ self.solution.covariance) @ rows.swapaxes(1, 2)
+        return np.asarray(np.sqrt(np.tensordot(variance, np.square(effects).sum(axis=2), 1)))
 
 
 def _fit(rows: _Rows, columns: np.ndarray, method: LeastSquares) -> _Fit:
@@ -194,8 +194,6 @@ def _noise(rows: _Rows, solution: Solution, torque_range: np.ndarray) -> np.ndar
 
 def _result(rows: _Rows, method: LeastSquares, base: BaseParameters, fit: _Fit) -> Identification:
     triangles, solution = fit.triangles, fit.solution
-    combination = base.combination[:, base.columns]
-    of_base = combination @ fit.covariance() @ combination.T
     squares = triangles.squares(solution.parameters) / triangles.count
     return Identification(
         arm=rows.bodies.arm,
@@ -203,7 +201,7 @@ def _result(rows: _Rows, method: LeastSquares, base: BaseParameters, fit: _Fit) 
         base=base,
         parameters=solution.parameters,
         values=base.combination @ solution.parameters,
-        deviations=np.sqrt(np.diag(of_base)),
+        deviations=fit.deviations(base.combination[:, base.columns]),
         condition=solution.condition,
         unseen=len(base) - solution.rank,
         residual=np.sqrt(squares),
