@@ -12,6 +12,7 @@ from spelgen.labels import named_joints, thousandths
 from spelgen.listing import number
 from spelgen.render.charts import Chart
 from spelgen.render.plots import (
+    STYLES,
     Panel,
     Record,
     coverage_panels,
@@ -20,7 +21,6 @@ from spelgen.render.plots import (
     friction_panels,
     growth_panels,
     mass_panels,
-    style,
     torque_panels,
     trajectory_panels,
 )
@@ -50,7 +50,7 @@ def curves(traces: Traces, facts: Facts) -> Curves:
     if growth is not None:
         growths = {name: (growth, name) for name in growth.relative}
         # bands of all would hide one another
-        drawn.growth = growth_panels(growths, {name: style(name) for name in growths}, (MODEL, LEAST_SQUARES))
+        drawn.growth = growth_panels(growths, STYLES, (MODEL, LEAST_SQUARES))
     for trace in traces.torques:
         title = f"{trace.which.capitalize()} trajectory: {trace.trajectory}"
         drawn.torques[title] = torque_panels(trace, joints)
@@ -65,7 +65,7 @@ def curves(traces: Traces, facts: Facts) -> Curves:
         )
     if mass is not None and mass.by:
         entries = {name: curves.entries for name, curves in mass.by.items()}
-        drawn.mass = mass_panels(mass.t, entries, {name: style(name) for name in entries}, facts.joint_types)
+        drawn.mass = mass_panels(mass.t, entries, STYLES, facts.joint_types)
         drawn.eigenvalues = eigenvalue_chart(mass)
     if traces.friction is not None:
         drawn.friction = friction_panels(traces.friction, traces.torques, joints)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -29,15 +30,19 @@ Record = Mapping[str, Any]
 """A record of JSON."""
 
 QUANTITIES = {"q": "position", "qd": "velocity"}
-STYLES = {
-    MODEL: "model",
-    URDF: "urdf",
-    URDF_WITH_DRIVES: "drives",
-    LEAST_SQUARES: "squares",
-    LEAST_SQUARES_WITH_MEMORY: "remembering",
-    CONSTANT_VELOCITY: "hold",
-    observed(MODEL): "going-on",
-}
+STYLES = defaultdict(
+    lambda: "c6",
+    {
+        MODEL: "model",
+        URDF: "urdf",
+        URDF_WITH_DRIVES: "drives",
+        LEAST_SQUARES: "squares",
+        LEAST_SQUARES_WITH_MEMORY: "remembering",
+        CONSTANT_VELOCITY: "hold",
+        observed(MODEL): "going-on",
+    },
+)
+"""The CSS class of a predictor's lines."""
 ERRORS = {
     "relative": ("Relative error", "error / motion"),
     "tip_mm": ("Tip error", "tip error [mm]"),
@@ -71,11 +76,6 @@ def stack(name: str, rows: Sequence[Row], motion: str = "") -> Panel:
             time, height = "t [s]", row.height + MARGINS.bottom - MARGINS.bare
         charts.append(line_chart(row.lines, row.title, time, row.label, motion=motion, height=height))
     return Panel(name, tuple(charts))
-
-
-def style(predictor: str) -> str:
-    """Return the CSS class of a predictor's lines."""
-    return STYLES.get(predictor, "c6")
 
 
 def inertia_unit(a: str, b: str) -> str:
@@ -248,7 +248,7 @@ def eigenvalue_chart(mass: MassTrace) -> Chart:
     lines = []
     for name, curves in mass.by.items():
         for row, label in ((0, "least"), (-1, "largest")):
-            lines.append(Line(f"{name}, {label}", mass.t, curves.eigenvalues[row], style(name)))
+            lines.append(Line(f"{name}, {label}", mass.t, curves.eigenvalues[row], STYLES[name]))
     return line_chart(lines, "Eigenvalues of M", "t [s]", "eigenvalue of M", log=True, width=520, height=230)
 
 
@@ -275,7 +275,7 @@ def friction_panels(
                 Line("model, over time", speeds[1][:, k], trace.parts["friction"][:, k], "loop model")
             )
         for name, curves in friction.by.items():
-            marks.append(Line(name, friction.qd[k], curves[k], style(name)))
+            marks.append(Line(name, friction.qd[k], curves[k], STYLES[name]))
         chart = line_chart(
             marks,
             f"Friction of {joint.name}",
