@@ -47,7 +47,7 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
     if not has_rigid_bodies(exact):
         raise _unsupported(f"the preset {preset}, which is not of rigid bodies")
     weights = exact.prepare()
-    tip_link, tip, end = tip_chain(loaded)
+    _, tip, end = tip_chain(loaded)
     # what does not depend on q is one matrix, whatever it comes from
     constant_mass = array(weights.armature)
     residuals = Residuals((), None, None, {}, (), {})
@@ -73,7 +73,6 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
         actuated=array(exact.actuated),
         torque_offset=array(exact.torque_offset),
         friction_compensation=array(exact.friction_compensation),
-        tip_link=tip_link,
         tip=tip,
         tip_end=end,
         servos=servos_of(exact),

@@ -142,7 +142,6 @@ class TrainedModel:
     actuated: np.ndarray
     torque_offset: np.ndarray
     friction_compensation: np.ndarray
-    tip_link: str
     tip: tuple[TipJoint, ...]
     tip_end: np.ndarray
     servos: Servos | None = None
