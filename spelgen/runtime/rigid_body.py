@@ -98,7 +98,8 @@ class InertialParameters(nn.Module):
     """Trained inertial parameters of rigid bodies, possible ones for all weights; zero is nominal.
 
     A body's pseudo-inertia is C T T^T C^T, with C of the nominal body and T lower triangular, its
-    diagonal exponentials (Rucker and Wensing, IEEE RA-L 7:4352, 2022).
+    diagonal exponentials (Rucker and Wensing, IEEE RA-L 7:4352, 2022), which its rows are scaled
+    with: so the shape that weights stand for is the same for light and heavy bodies.
     """
 
     kinds = (("raw", "bodies", "kg, kg m, kg m^2"),)
@@ -113,9 +114,10 @@ class InertialParameters(nn.Module):
 
     def forward(self) -> Tensor:
         """Return, by body, (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
-        on_diagonal = self.triangle[:, ::5].sum(dim=1) > 0
-        lower = torch.where(on_diagonal, self.raw.exp(), self.raw) @ self.triangle
-        root = self.factors @ lower.reshape(-1, 4, 4)
+        weights = (self.raw @ self.triangle).reshape(-1, 4, 4)
+        shape = weights.tril(-1) + torch.eye(4).to(weights)
+        scale = weights.diagonal(dim1=-2, dim2=-1).exp()
+        root = self.factors @ (scale.unsqueeze(-1) * shape)
         pseudo = root @ root.mT
         second = pseudo[:, :3, :3]
         trace = second.diagonal(dim1=-2, dim2=-1).sum(dim=-1)

@@ -21,14 +21,16 @@ def moved_bodies(raw: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
     is added, or as much of it as keeps S positive definite.
     """
     row, column = torch.tril_indices(4, 4)
-    on_diagonal = row == column
-    factor, change = torch.zeros(2, len(raw), 4, 4).double()
-    factor[:, row, column] = torch.where(on_diagonal, raw.exp(), raw)
-    change[:, row, column] = torch.where(on_diagonal, raw.exp() * step, step)
+    weights, moves = torch.zeros(2, len(raw), 4, 4).double()
+    weights[:, row, column], moves[:, row, column] = raw, step
+    scale = weights.diagonal(dim1=-2, dim2=-1).exp().unsqueeze(-1)
+    factor = scale * (weights.tril(-1) + torch.eye(4).double())
+    change = moves.diagonal(dim1=-2, dim2=-1).unsqueeze(-1) * factor + scale * moves.tril(-1)
     relative = torch.linalg.solve_triangular(factor, change, upper=False)
     added = relative + relative.mT
     smallest = torch.linalg.eigvalsh(added)[:, 0]
     fraction = (TUNING.body_step / (-smallest).clamp(min=1e-12)).clamp(max=1.0)
-    root = torch.linalg.cholesky(torch.eye(4).double() + fraction[:, None, None] * added)
-    entries = (factor @ root)[:, row, column]
-    return torch.where(on_diagonal, entries.abs().log(), entries)
+    factor = factor @ torch.linalg.cholesky(torch.eye(4).double() + fraction[:, None, None] * added)
+    scale = factor.diagonal(dim1=-2, dim2=-1).unsqueeze(-1)
+    weights = (factor / scale).tril(-1) + torch.diag_embed(scale.squeeze(-1).log())
+    return weights[:, row, column]

@@ -16,7 +16,7 @@ from spelgen.settings.fits import GaussianPrior
 Kinds = Mapping[str, str]
 """Of weights by name: what they stand for, as `dynamics.parameters.ParameterInfo` has it."""
 
-ADAPTED = ("bodies", "offset")  # kinds whose deviations the fit finds
+ADAPTED = ("armature", "bodies", "offset")  # kinds whose deviations the fit finds
 
 
 def covariance(prior: GaussianPrior, weights: Mapping[str, torch.Tensor], kinds: Kinds) -> torch.Tensor:
@@ -48,12 +48,12 @@ def most_probable(
     guess: GaussianPrior,
     kinds: torch.Tensor,
     away: torch.Tensor,
-    variance: torch.Tensor,
+    covariance: torch.Tensor,
 ) -> GaussianPrior:
     """Return the prior with the deviations of `ADAPTED` kinds that make the data more probable.
 
     kinds: (K,) of each weight the place of its kind in `ADAPTED`, -1 for others. away: (K,) of the most probable
-    weights from the prior's centre. variance: (K,) of the weights after the fit. A step of MacKay's fixed point
+    weights from the prior's centre. covariance: (K, K) of the weights after the fit. A step of MacKay's fixed point
     (Bayesian Interpolation, Neural Computation 4:415, 1992), whose end is the maximum of the marginal likelihood in
     Laplace's approximation, times a scaled inverse chi-squared density of the deviation's square with c degrees of
     freedom about ``guess``: (|away|^2 + c guess^2) / (g + c) where the data determine g weights.
@@ -61,8 +61,13 @@ def most_probable(
     deviations, freedom = {}, prior.degrees_of_freedom
     for place, kind in enumerate(ADAPTED):
         mask = kinds == place
-        determined = float((1 - variance[mask] / getattr(prior, kind) ** 2).sum())
-        squares = float(away[mask].square().sum()) + freedom * getattr(guess, kind) ** 2
+        count = int(mask.sum())
+        centre = torch.eye(count).double()
+        if kind == "armature" and count:  # what all joints share has a deviation of its own
+            centre -= 1 / count
+        spread = centre @ covariance[mask][:, mask] @ centre
+        determined = float(centre.trace() - spread.trace() / getattr(prior, kind) ** 2)
+        squares = float((centre @ away[mask]).square().sum()) + freedom * getattr(guess, kind) ** 2
         deviations[kind] = (squares / (max(determined, 0.0) + freedom)) ** 0.5
     return prior.model_copy(update=deviations)
 

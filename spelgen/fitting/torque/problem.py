@@ -166,8 +166,8 @@ class TorqueProblem:
             free = self.free
             self.covariance[free[:, None] & free] = torch.linalg.inv(self.curvature).flatten()
             if self.adapt != "load":
-                away, variance = state.x - self.start, self.covariance.diagonal()
-                self.set_prior(most_probable(self.prior, self.guess, self.kinds, away, variance))
+                away = state.x - self.start
+                self.set_prior(most_probable(self.prior, self.guess, self.kinds, away, self.covariance))
             if number + 1 >= rounds and (self.noise > TUNING.noise_settled * previous).all():
                 break
         return state
