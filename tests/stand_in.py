@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 FACTS = """{
-  "format": 5,
+  "format": 6,
   "robot": "stand_in",
   "urdf": "stand_in.urdf",
   "urdf_sha256": "none",

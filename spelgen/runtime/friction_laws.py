@@ -16,7 +16,7 @@ STRIBECK = 0.3  # dry friction that only slow motion has
 STRIBECK_VELOCITY = 0.03  # where that has faded
 SMOOTHING_VELOCITY = 0.006  # over which dry friction turns around
 # the same of joints whose friction has no memory though others' has: a wider turn looks like memory
-SHARP_VELOCITY = 0.003
+SHARP_VELOCITY = 0.001
 SATURATION_VELOCITY = 0.2  # where viscous friction begins to grow more slowly
 LOAD_DEPENDENCE = 0.03  # dry friction by gravity torque
 # below this fraction of usual friction a gravity torque's size is rounded off: at right angles it passes

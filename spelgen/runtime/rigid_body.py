@@ -94,12 +94,27 @@ def pseudo_inertia(ten: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).reshape(*ten.shape[:-1], 4, 4)
 
 
+def upper_cholesky(matrix: Tensor) -> Tensor:
+    """Return the upper triangular U, (..., n, n), with U U^T the matrix."""
+    lower: Tensor = torch.linalg.cholesky(matrix.flip(-1, -2))
+    return lower.flip(-1, -2)
+
+
+def body_factor(weights: Tensor) -> Tensor:
+    """Return T of a body's log-Cholesky parameters, both upper triangular, (..., 4, 4)."""
+    logarithms = weights.diagonal(dim1=-2, dim2=-1)
+    sizes, mass = logarithms[..., :3], logarithms[..., 3:]
+    scale = torch.cat([sizes + mass, mass], dim=-1).exp()
+    return scale.unsqueeze(-1) * (weights.triu(1) + torch.eye(4).to(weights))
+
+
 class InertialParameters(nn.Module):
     """Trained inertial parameters of rigid bodies, possible ones for all weights; zero is nominal.
 
-    A body's pseudo-inertia is C T T^T C^T, with C of the nominal body and T lower triangular, its
-    diagonal exponentials (Rucker and Wensing, IEEE RA-L 7:4352, 2022), which its rows are scaled
-    with: so the shape that weights stand for is the same for light and heavy bodies.
+    A body's pseudo-inertia is C T T^T C^T, with C and T upper triangular, and C of the nominal body.
+    T has the body's log-Cholesky parameters (Rucker and Wensing, IEEE RA-L 7:4352, 2022): logarithms
+    of its sizes along three axes and of the root of its mass, by the nominal ones, and its shear and
+    centre of mass, in its sizes.
     """
 
     kinds = (("raw", "bodies", "kg, kg m, kg m^2"),)
@@ -107,17 +122,14 @@ class InertialParameters(nn.Module):
     def __init__(self, bodies: Bodies) -> None:
         super().__init__()
         nominal = torch.stack([vector(ten) for ten in bodies.inertia])
-        self.factors = nn.Buffer(torch.linalg.cholesky(pseudo_inertia(nominal)))
-        row, column = torch.tril_indices(4, 4)
+        self.factors = nn.Buffer(upper_cholesky(pseudo_inertia(nominal)))
+        row, column = torch.triu_indices(4, 4)
         self.triangle = nn.Buffer(torch.eye(16, dtype=torch.float64)[4 * row + column])
         self.raw = nn.Parameter(torch.zeros(len(nominal), 10, dtype=torch.float64))
 
     def forward(self) -> Tensor:
         """Return, by body, (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
-        weights = (self.raw @ self.triangle).reshape(-1, 4, 4)
-        shape = weights.tril(-1) + torch.eye(4).to(weights)
-        scale = weights.diagonal(dim1=-2, dim2=-1).exp()
-        root = self.factors @ (scale.unsqueeze(-1) * shape)
+        root = self.factors @ body_factor((self.raw @ self.triangle).reshape(-1, 4, 4))
         pseudo = root @ root.mT
         second = pseudo[:, :3, :3]
         trace = second.diagonal(dim1=-2, dim2=-1).sum(dim=-1)

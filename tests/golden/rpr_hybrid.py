@@ -28,7 +28,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 5, "robot": "rpr", "urdf": "rpr.urdf",
+FACTS = r"""{"format": 6, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
  "spec_sha256": "765da56814f8b95376bd87633bc5dfaec8f5161fa9db5448b6d7d871c48b3080",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,

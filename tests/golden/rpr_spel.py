@@ -26,7 +26,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 5, "robot": "rpr", "urdf": "rpr.urdf",
+FACTS = r"""{"format": 6, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
  "spec_sha256": "e2b2672a0a0a3b1db747c3df581d770cde90de47558dd2a7f6cba3fa4a39f7c1",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,

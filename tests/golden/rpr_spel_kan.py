@@ -26,7 +26,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 5, "robot": "rpr", "urdf": "rpr.urdf",
+FACTS = r"""{"format": 6, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
  "spec_sha256": "50674d6bc31873ed115094782325d003f50429f64939f3a15c24e932594e742c",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,

@@ -26,7 +26,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 5, "robot": "two_link", "urdf": "two_link.urdf",
+FACTS = r"""{"format": 6, "robot": "two_link", "urdf": "two_link.urdf",
  "urdf_sha256": "d5393c842e189b72219c5ce02e115de571a94cd406b48898ea64b5431a395232",
  "spec_sha256": "cf4c44ab15d7ac790beed5add4bf06756e7ac55956487a16b62ea4abe6154142",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import torch
 
+from spelgen.runtime.rigid_body import body_factor, upper_cholesky
 from spelgen.settings.tuning.fitting import TorqueTuning
 
 TUNING = TorqueTuning()
@@ -20,17 +21,16 @@ def moved_bodies(raw: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
     A body's pseudo-inertia is C S C^T, S = T T^T. To first order the step adds T (X + X^T) T^T to S, and that is what
     is added, or as much of it as keeps S positive definite.
     """
-    row, column = torch.tril_indices(4, 4)
+    row, column = torch.triu_indices(4, 4)
     weights, moves = torch.zeros(2, len(raw), 4, 4).double()
     weights[:, row, column], moves[:, row, column] = raw, step
-    scale = weights.diagonal(dim1=-2, dim2=-1).exp().unsqueeze(-1)
-    factor = scale * (weights.tril(-1) + torch.eye(4).double())
-    change = moves.diagonal(dim1=-2, dim2=-1).unsqueeze(-1) * factor + scale * moves.tril(-1)
-    relative = torch.linalg.solve_triangular(factor, change, upper=False)
+    factor, change = torch.func.jvp(body_factor, (weights,), (moves,))
+    relative = torch.linalg.solve_triangular(factor, change, upper=True)
     added = relative + relative.mT
     smallest = torch.linalg.eigvalsh(added)[:, 0]
     fraction = (TUNING.body_step / (-smallest).clamp(min=1e-12)).clamp(max=1.0)
-    factor = factor @ torch.linalg.cholesky(torch.eye(4).double() + fraction[:, None, None] * added)
-    scale = factor.diagonal(dim1=-2, dim2=-1).unsqueeze(-1)
-    weights = (factor / scale).tril(-1) + torch.diag_embed(scale.squeeze(-1).log())
+    factor = factor @ upper_cholesky(torch.eye(4).double() + fraction[:, None, None] * added)
+    scale = factor.diagonal(dim1=-2, dim2=-1)
+    weights = (factor / scale.unsqueeze(-1)).triu(1) + scale.log().diag_embed()
+    weights.diagonal(dim1=-2, dim2=-1)[:, :3] -= scale[:, 3:].log()
     return weights[:, row, column]

@@ -17,6 +17,8 @@ Kinds = Mapping[str, str]
 """Of weights by name: what they stand for, as `dynamics.parameters.ParameterInfo` has it."""
 
 ADAPTED = ("armature", "bodies", "offset")  # kinds whose deviations the fit finds
+SHARED = {"armature": "shared_armature", "sizes": "shared_sizes", "velocities": "shared_velocities"}
+"""The options that say how far all joints may be off together, by the option of one joint's own deviation."""
 
 
 def covariance(prior: GaussianPrior, weights: Mapping[str, torch.Tensor], kinds: Kinds) -> torch.Tensor:
@@ -27,14 +29,11 @@ def covariance(prior: GaussianPrior, weights: Mapping[str, torch.Tensor], kinds:
         rows[name] = torch.arange(count, count + weight.numel())
         count += weight.numel()
     matrix = torch.diag(torch.cat(deviations).double().square())
-    shared = {
-        "armature": prior.shared_armature,
-        "sizes": prior.shared_sizes,
-        "velocities": prior.shared_velocities,
-    }
     friction = []
     for name, row in rows.items():
-        matrix[row[:, None], row] += shared.get(prior_field(kinds[name]), 0.0) ** 2
+        own = prior_field(kinds[name])
+        if own in SHARED:
+            matrix[row[:, None], row] += getattr(prior, SHARED[own]) ** 2
         if kinds[name] == "sizes":
             friction.append(row)
     if friction:
@@ -63,7 +62,9 @@ def most_probable(
         mask = kinds == place
         count = int(mask.sum())
         centre = torch.eye(count).double()
-        if kind == "armature" and count:  # what all joints share has a deviation of its own
+        if (
+            kind in SHARED and count
+        ):  # what all joints are off together says nothing of one joint's own deviation
             centre -= 1 / count
         spread = centre @ covariance[mask][:, mask] @ centre
         determined = float(centre.trace() - spread.trace() / getattr(prior, kind) ** 2)
