@@ -352,7 +352,7 @@ def test_values_are_in_units(tmp_path):
 def weights_of_first_stage(bodies):
     """Weights of the bodies whose Cholesky factors, lower triangular then, had exp(0.01) and 0.01 as entries."""
     nominal = bodies.factors @ bodies.factors.mT
-    entries = torch.full((4, 4), 0.01).double().tril(-1)
+    entries = 0.01 * torch.ones(4, 4).double().tril(-1)
     root = torch.linalg.cholesky(nominal) @ (entries + math.exp(0.01) * torch.eye(4).double())
     relative = torch.linalg.solve(bodies.factors, root)
     factor = upper_cholesky(relative @ relative.mT)
