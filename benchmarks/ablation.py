@@ -1,6 +1,6 @@
 """Switch off each mechanism of the torque fits, one after the other, and print what it is worth.
 
-    python benchmarks/ablation.py [--logs ../shared/logs] [--only NAME]
+    python benchmarks/ablation.py [--logs ../shared/logs] [--only NAME] [--case NAME]
 
 Cases: the real logs of benchmarks/arms.py (torque nMSE of `hybrid` on the test logs), three seconds of the UR10e, and
 simulated arms of benchmarks/truth.py (error of M(q), too). A cell is the error without the mechanism by the
@@ -32,13 +32,13 @@ from real_logs import first, mean, samples_of, torque_of
 import spelgen
 from spelgen.fitting import levenberg_marquardt
 from spelgen.fitting.torque import jacobian as torque_jacobian
-from spelgen.fitting.torque import objective as torque_objective
+from spelgen.fitting.torque import prior as torque_prior
 from spelgen.fitting.torque import problem as torque_problem
 from spelgen.fitting.torque import residuals as residual_fit
 from spelgen.fitting.torque.fit import fit_torque
+from spelgen.logs import dynamics_samples
 
 NEVER = float("inf")
-READERS = (torque_problem, torque_jacobian, torque_objective, residual_fit, levenberg_marquardt)
 SIMULATED = (
     truth.PANDA,
     replace(truth.PANDA, number=1_000_001, friction="bristles", seconds=20.0),
@@ -70,13 +70,24 @@ def keep_prior(prior: Any, *_: Any) -> Any:
     return prior
 
 
+def remember_always(problem: Any, state: Any) -> Any:
+    """Stand in for `select_memory`: friction of every joint has memory."""
+    problem.jacobian.model.friction.memoryless.fill_(0.0)
+    return problem.solve(problem._first_fit(state.x, state.steps), torque_jacobian.TUNING.rounds)
+
+
 def mechanisms() -> list[Mechanism]:
     """All that are switched off."""
     return [
-        Mechanism("correlated errors (20 samples)", tuned(torque_jacobian, correlation_length=1.0)),
+        Mechanism("ends of recordings left out", tuned(dynamics_samples, unsettled=0.0)),
+        Mechanism("correlated errors (5 samples)", tuned(torque_jacobian, correlation_length=1.0)),
         Mechanism("steps under the noise of least squares", tuned(torque_jacobian, first_steps=0)),
+        Mechanism("noise that falls with what is missed", tuned(torque_jacobian, first_rounds=0)),
         Mechanism("more rounds while noise falls", tuned(torque_jacobian, longer=1)),
         Mechanism("priors that yield", ((torque_problem, "most_probable", keep_prior),)),
+        Mechanism("that of armatures", ((torque_prior, "ADAPTED", ("bodies", "offset")),)),
+        Mechanism("memory by evidence", ((torque_problem.TorqueProblem, "select_memory", remember_always),)),
+        Mechanism("weak evidence yields to all joints'", tuned(torque_jacobian, memory_evidence=0.0)),
         Mechanism("friction compensated unseen", tuned(torque_jacobian, compensation_explained=NEVER)),
         Mechanism("every second sample alone", tuned(torque_jacobian, decimation=1)),
         Mechanism("few samples first", tuned(torque_jacobian, subset=2**40)),
@@ -84,6 +95,7 @@ def mechanisms() -> list[Mechanism]:
         Mechanism("turns of bodies and residuals", tuned(torque_jacobian, turns=1)),
         Mechanism("residuals beside rigid bodies", tuned(residual_fit, standard_errors=NEVER)),
         Mechanism("significance of residuals", tuned(residual_fit, standard_errors=0.0)),
+        Mechanism("gaps between blocks", tuned(residual_fit, gap=0.0)),
         Mechanism("least gain of residuals", tuned(residual_fit, least_gain=0.0)),
         Mechanism("networks among residuals", ((residual_fit, "_select_networks", lambda *_: iter(())),)),
     ]
@@ -146,12 +158,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--logs", type=Path, default=Path(__file__).parents[2] / "shared" / "logs")
     parser.add_argument("--only", default="", help="mechanisms whose names hold this")
+    parser.add_argument("--case", default="", help="robots whose names hold this")
     options = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     chosen = [each for each in mechanisms() if options.only in each.name]
     cases = [*real_cases(options.logs), *simulated_cases(options.logs.parent / "arms")]
     for name, run in cases:
+        if options.case not in name:
+            continue
         reference = run()
         shown = ", ".join(f"{key} {value:.5f}" for key, value in reference.items())
         print(f"\n{name}: {shown}", flush=True)
