@@ -24,7 +24,7 @@ def moved_bodies(raw: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
     row, column = torch.triu_indices(4, 4)
     weights, moves = torch.zeros(2, len(raw), 4, 4).double()
     weights[:, row, column], moves[:, row, column] = raw, step
-    factor, change = torch.func.jvp(body_factor, (weights,), (moves,))
+    factor, change = torch.func.jvp(body_factor, (weights,), (moves,))[:2]
     relative = torch.linalg.solve_triangular(factor, change, upper=True)
     added = relative + relative.mT
     smallest = torch.linalg.eigvalsh(added)[:, 0]
@@ -33,4 +33,5 @@ def moved_bodies(raw: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
     scale = factor.diagonal(dim1=-2, dim2=-1)
     weights = (factor / scale.unsqueeze(-1)).triu(1) + scale.log().diag_embed()
     weights.diagonal(dim1=-2, dim2=-1)[:, :3] -= scale[:, 3:].log()
-    return weights[:, row, column]
+    entries: torch.Tensor = weights[:, row, column]
+    return entries
