@@ -358,8 +358,8 @@ def weights_of_first_stage(bodies):
     factor = upper_cholesky(relative @ relative.mT)
     scale = factor.diagonal(dim1=-2, dim2=-1)
     shape = factor / scale.unsqueeze(-1)
-    sizes = scale[:, :3] / scale[:, 3:]
-    logarithms = torch.cat([sizes, scale[:, 3:]], dim=-1).log()
+    sizes, mass = scale[:, :3] / scale[:, 3:], scale[:, 3:].square()
+    logarithms = torch.cat([sizes, mass], dim=-1).log()
     row, column = torch.triu_indices(4, 4)
     return (shape.triu(1) + torch.diag_embed(logarithms))[:, row, column]
 

@@ -166,7 +166,7 @@ def test_deviations_are_those_of_the_largest_marginal_likelihood():
 def test_a_urdf_that_is_wrong_is_given_up_and_that_is_said(emitted):
     module = emitted["six_dof"][0]
     true, fixed, found = drawn(module, seed=2, deviation=0.3), module.Model(), module.Model()
-    true.get_parameter(BODIES).data[:, 9] += 1.6  # 25 times the mass
+    true.get_parameter(BODIES).data[:, 9] += 3.2  # 25 times the mass
     few, test = [recorded(true, 3.0, 0.02, seed=1)], recorded(true, 10.0, 0.0, seed=9)
     certain = GaussianPrior(bodies=0.2, degrees_of_freedom=1e9)
     fit_torque(fixed, few, certain)

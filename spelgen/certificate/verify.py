@@ -110,7 +110,8 @@ def verify(robot: Robot, arm: Arm, structure: Structure, *, samples: int = 0, se
     case = _Case(structure, drawn, _is_fine(arm, structure))
     regressor = numeric_samples.regressor(arm, rng)
     checks = (
-        _entries(case),
+        *_zeros(case),
+        _dependence(case),
         *_smallest_form(case),
         *_ranks(case),
         _potential(case),
@@ -124,21 +125,29 @@ def verify(robot: Robot, arm: Arm, structure: Structure, *, samples: int = 0, se
     return Verification(means, count, seed, checks)
 
 
-def _entries(case: _Case) -> Check:
-    """Check that every joint that an entry depends on moves it, and no other does; a constant one no joint moves, and
-    what is always zero is zero.
-    """
-    entries, mass = case.structure.entries, np.abs(case.samples.mass).max(axis=(0, 1))
+def _zeros(case: _Case) -> Iterator[Check]:
+    """Check that what is always zero is zero."""
+    sizes = np.abs(case.samples.mass).max(axis=(0, 1)).tolist()
+    rows = []
+    for entry, size in zip(case.structure.entries, sizes, strict=True):
+        if entry.kind == "zero":
+            rows.append((entry_name(entry.row, entry.column), size, False))
+    if rows:
+        derived = shortened([name for name, _, _ in rows], 8)
+        yield case.movement_check("zero entries", derived, "reaches", rows, TUNING.rounding)
+
+
+def _dependence(case: _Case) -> Check:
+    """Check that every joint that an entry depends on moves it, and no other does; a constant one no joint moves."""
     moves = np.abs(case.samples.changes).max(axis=1)  # (n, entries)
     rows = []
-    for entry, size, sizes in zip(entries, mass.tolist(), moves.T.tolist(), strict=True):
-        name = entry_name(entry.row, entry.column)
-        if entry.kind == "zero":
-            rows.append((f"{name} itself", size, False))
-        for joint, change in enumerate(sizes):
-            rows.append((f"{name} with joint {joint + 1}", change, joint in entry.joints))
-    pairs = sum(len(entry.joints) for entry in entries)
-    derived = f"{pairs} of the {moves.size} pairs of an entry and a joint"
+    pairs = 0
+    for entry, sizes in zip(case.structure.entries, moves.T.tolist(), strict=True):
+        pairs += len(entry.joints)
+        for joint, size in enumerate(sizes):
+            name = f"{entry_name(entry.row, entry.column)} with joint {joint + 1}"
+            rows.append((name, size, joint in entry.joints))
+    derived = f"{pairs} of the {len(rows)} pairs of an entry and a joint"
     return case.movement_check("dependence on joints", derived, "moves by", rows, TUNING.rounding)
 
 

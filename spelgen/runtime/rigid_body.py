@@ -103,7 +103,7 @@ def upper_cholesky(matrix: Tensor) -> Tensor:
 def body_factor(weights: Tensor) -> Tensor:
     """Return T of a body's log-Cholesky parameters, both upper triangular, (..., 4, 4)."""
     logarithms = weights.diagonal(dim1=-2, dim2=-1)
-    sizes, mass = logarithms[..., :3], logarithms[..., 3:]
+    sizes, mass = logarithms[..., :3], logarithms[..., 3:] / 2
     scale = torch.cat([sizes + mass, mass], dim=-1).exp()
     return scale.unsqueeze(-1) * (weights.triu(1) + torch.eye(4).to(weights))
 
@@ -113,8 +113,8 @@ class InertialParameters(nn.Module):
 
     A body's pseudo-inertia is C T T^T C^T, with C and T upper triangular, and C of the nominal body.
     T has the body's log-Cholesky parameters (Rucker and Wensing, IEEE RA-L 7:4352, 2022): logarithms
-    of its sizes along three axes and of the root of its mass, by the nominal ones, and its shear and
-    centre of mass, in its sizes.
+    of its mass and of its sizes along three axes, by the nominal ones, and its shear and centre of
+    mass, in its sizes.
     """
 
     kinds = (("raw", "bodies", "kg, kg m, kg m^2"),)

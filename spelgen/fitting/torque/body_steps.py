@@ -33,5 +33,6 @@ def moved_bodies(raw: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
     scale = factor.diagonal(dim1=-2, dim2=-1)
     weights = (factor / scale.unsqueeze(-1)).triu(1) + scale.log().diag_embed()
     weights.diagonal(dim1=-2, dim2=-1)[:, :3] -= scale[:, 3:].log()
+    weights[:, 3, 3] *= 2
     entries: torch.Tensor = weights[:, row, column]
     return entries

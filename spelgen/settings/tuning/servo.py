@@ -46,7 +46,7 @@ class ServoPriorTuning:
     )
     dead_zone: float = 0.02  # [rad, m] half a dead zone: gears of hobby servos have a few mrad
     delay: float = 0.1  # [s]
-    bodies: float = 0.3  # [1] of the bodies' parameters, some 60 % in mass
+    bodies: float = 0.3  # [1] of the bodies' log-Cholesky parameters: 30 % in mass
     body_directions: int = 6  # that change gravity most; further ones move by less than their prior
 
 
@@ -65,8 +65,8 @@ class ServoSolverTuning:
     sparse_windows: int = 32  # at most, in all rounds but the last
     steps: int = 12  # of a round at most
     last_steps: int = 2  # of the last round, on all windows: it starts near the minimum of few
-    gain: float = 0.1  # [1] of the cost: a step that gains less ends a round, and a comparison of laws
-    relative_gain: float = 1e-3  # [1] likewise, of the cost: where a model's form is wrong costs are high
+    gain: float = 0.01  # [1] of the cost: a step that gains less ends a round, and a comparison of laws
+    relative_gain: float = 1e-4  # [1] likewise, of the cost: where a model's form is wrong costs are high
     later_damping: float = (
         1e-5  # [1] of the first step of a round, after the first round; by 1e-3 kd ends 0.3 % off
     )
