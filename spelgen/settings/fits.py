@@ -34,8 +34,9 @@ class GaussianPrior(Group):
     """How far the weights of a model of rigid bodies may be from where they start: standard deviations.
 
     The weights are logarithms or fractions and so have no unit. bodies: of log-Cholesky parameters, 0.1 is 10 % in
-    mass and in the size along each axis. offset: in usual sizes of friction. armature, sizes and velocities of friction: of each joint by itself;
-    shared_*: of all joints together, of one effect (`shared_sizes`) or of all friction (`shared_friction`).
+    mass and in the size along each axis. offset: in usual sizes of friction. armature, sizes and velocities of
+    friction: of each joint by itself; shared_*: of all joints together, of one effect (`shared_sizes`) or of all
+    friction (`shared_friction`).
     friction_compensation: of a drive, in usual sizes of friction at usual speed, where logs show one.
     bodies, armature and offset are first guesses, which count as `degrees_of_freedom` weights: how far those turn out
     to be from where they start is found by the fit (see `most_probable`).
