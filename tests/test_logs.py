@@ -15,7 +15,7 @@ from spelgen.errors import LogError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.checks import check
 from spelgen.logs.chunks import scan
-from spelgen.logs.filtering import low_pass, prepare
+from spelgen.logs.filtering import low_pass, prepare, resample
 from spelgen.logs.rates import automatic_cutoff, automatic_decimation, shows_accelerations
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.trajectory import split_at_gaps
@@ -371,6 +371,15 @@ def test_a_trajectory_without_a_whole_window_is_refused():
         "trajectory gap: got 120 samples without a gap, expected at least 121, one window; "
         "record longer or train with a shorter window"
     )
+
+
+@pytest.mark.parametrize(("rate", "first"), [(40.0, 1.03), (250.0, 0.12)])
+def test_logs_may_begin_at_any_time(rate, first):
+    t = first + np.arange(41) / rate
+    line = np.stack([t, 2 * t], axis=1)
+    resampled = resample(Trajectory(t, line, line, line), 100.0)
+    assert resampled.t[-1] > t[-1]  # by rounding
+    np.testing.assert_allclose(resampled.q[:, 1], 2 * resampled.t, atol=1e-12)
 
 
 def test_the_filter_has_no_delay_and_takes_out_noise():

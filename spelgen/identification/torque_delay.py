@@ -118,8 +118,9 @@ def _estimate(rows: np.ndarray, tau: np.ndarray) -> _Estimate:
         squares = unexplained @ products.sum(axis=1) @ unexplained
         noise = np.sqrt(np.maximum(squares / len(rows), np.square(TUNING.least_noise * least)))
     spread = np.var([_least(total - block)[0] for block in by_block]) * (HINTS.blocks - 1)
-    at_end = abs(delay) > SHIFTS[-2]  # nothing says that it ends there
-    standard_error = np.inf if at_end else float(np.sqrt(spread))
+    # nothing says that it ends at the last shift; where no error is left too few samples were fitted
+    unknown = abs(delay) > SHIFTS[-2] or spread == 0
+    standard_error = np.inf if unknown else float(np.sqrt(spread))
     return _Estimate(delay, standard_error, float((squares / least**2).sum()))
 
 

@@ -75,7 +75,9 @@ def resample(trajectory: Trajectory, frequency: float) -> Trajectory:
     # a line between samples that are far apart would cut off the peaks of the motion
     kind = "linear" if is_dense(trajectory.sample_rate) else "cubic"
     signals = (trajectory.q, trajectory.qd, trajectory.tau)
-    q, qd, tau = (interp1d(trajectory.t, x, kind, axis=0)(t) for x in signals)
+    # by rounding the last time may lie just behind the last sample
+    ends = "extrapolate"
+    q, qd, tau = (interp1d(trajectory.t, x, kind, axis=0, fill_value=ends)(t) for x in signals)
     return replace(trajectory, t=t, q=q, qd=qd, tau=tau)
 
 
