@@ -178,7 +178,7 @@ def test_a_urdf_that_is_wrong_is_given_up_and_that_is_said(emitted):
     samples = TorqueSamples.of(few)
     told = [next(torque_notes(found, samples, each)).message for each in (wrong, right)]
     assert told == [
-        f"prior standard deviation of URDF inertias: factor {np.exp(2 * each.prior.bodies):.2g}"
+        f"prior standard deviation of URDF masses: factor {np.exp(each.prior.bodies):.2g}"
         for each in (wrong, right)
     ]
 

@@ -62,9 +62,8 @@ def most_probable(
         mask = kinds == place
         count = int(mask.sum())
         centre = torch.eye(count).double()
-        if (
-            kind in SHARED and count
-        ):  # what all joints are off together says nothing of one joint's own deviation
+        if kind in SHARED and count:
+            # how far all joints are off together says nothing about the deviation of a single joint
             centre -= 1 / count
         spread = centre @ covariance[mask][:, mask] @ centre
         determined = float(centre.trace() - spread.trace() / getattr(prior, kind) ** 2)

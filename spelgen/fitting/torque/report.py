@@ -36,9 +36,9 @@ def torque_notes(
 ) -> Iterator[Diagnostic]:
     """Yield what there is to tell of rigid bodies that were fitted to samples."""
     names = np.array(model.joint_names)
-    # a deviation s of a coordinate is a factor e^s in a root of the pseudo-inertia
-    factor = float(np.exp(2 * solution.prior.bodies))
-    message = f"prior standard deviation of URDF inertias: factor {factor:.2g}"
+    # a body's weights are logarithms of its mass and of its sizes
+    factor = float(np.exp(solution.prior.bodies))
+    message = f"prior standard deviation of URDF masses: factor {factor:.2g}"
     yield Diagnostic("info", "urdf-prior", "bodies", None, message)
     if solution.compensated.any():
         yield _compensation(model, solution, names)
