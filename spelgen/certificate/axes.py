@@ -31,7 +31,7 @@ def is_plain(arm: Arm) -> bool:
 
 @dataclass(frozen=True)
 class _Configuration:
-    """Hold of all joints, in the root's frame at one configuration, the axes and the twists.
+    """Hold the axes and the twists of all joints, in the root's frame, at one configuration.
 
     A twist is how a unit rate moves a body: the velocity of its point at the root's origin, then its angular velocity.
     """

@@ -54,7 +54,7 @@ def parameter_tables(
     joints = _joint_table(model, arm)
     if joints is not None:
         tables.append(joints)
-    if hasattr(model, "mass") and hasattr(model.mass, "constants"):
+    if len(getattr(getattr(model, "mass", None), "raw_constants", ())):
         tables.append(_constant_table(run.load_module(), model))
     return tables
 
