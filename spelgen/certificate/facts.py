@@ -94,9 +94,8 @@ class _Words:
             if reason is not None and self.axes is not None:
                 # the joint that a reason is about comes second only where it slides, and is nearer to the root
                 slides = self.axes.slides
-                others = {entry.row if slides[entry.column] else entry.column for entry in group}
-                told = sorted(others)
-                reason = reason.format(axes=axes_told(told), joints=joints_told(told))
+                others = sorted({entry.row if slides[entry.column] else entry.column for entry in group})
+                reason = reason.format(axes=axes_told(others), joints=joints_told(others))
             yield reason, group
 
     def equalities(self) -> Iterator[Fact]:

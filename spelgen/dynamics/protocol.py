@@ -158,7 +158,7 @@ class VelocityState:
         """Nothing."""
 
     def at(self, q: Tensor, prepared: None = None) -> Tensor:
-        """q."""
+        """Return q."""
         return q
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:

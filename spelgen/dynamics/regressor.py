@@ -11,7 +11,7 @@ from spelgen.dynamics.rigid_bodies import body_chain
 
 
 def regressor(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-    """Y (T, n, 10 B) at q, qd, qdd, each (T, n), of the arm's B bodies [Nm, N].
+    """Return Y (T, n, 10 B) of the arm's B bodies at q, qd, qdd, each (T, n): tau = Y pi [Nm, N].
 
     Column 10 b + i belongs to parameter i of ``arm.bodies[b]``, in the order of ``Body.inertia``.
     """

@@ -54,7 +54,7 @@ class Growth:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PredictedMotion:
-    """A piece of a trajectory beside what was measured, (T, n); t counts from its first sample [s].
+    """Hold a piece of a trajectory, measured and predicted, (T, n); t counts from its first sample [s].
 
     u: commands of position servos, whose velocities are not judged.
     """
@@ -69,7 +69,7 @@ class PredictedMotion:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PredictedExample(PredictedMotion):
-    """A prediction of the model, of middle ("typical") or largest ("worst") error, that starts at this time [s].
+    """Hold a prediction of the model, of middle ("typical") or largest ("worst") error, that starts at this time [s].
 
     start: None of a log that is replayed as a whole.
     """

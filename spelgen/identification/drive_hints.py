@@ -53,7 +53,7 @@ class Coupling:
 
     @property
     def pair(self) -> list[int]:
-        """Both joints."""
+        """Return both joints."""
         return [self.joint, self.moved_by]
 
 

@@ -37,7 +37,7 @@ class DriveSamples(NamedTuple):
 
     @property
     def tau(self) -> np.ndarray:
-        """Torques as logged, (S, n)."""
+        """Return torques as logged, (S, n)."""
         return self.torques[..., STEPS]
 
     def thinned(self, stride: int) -> DriveSamples:
@@ -52,7 +52,7 @@ class DriveLog:
     """
 
     def __init__(self, kinds: Sequence[str], drives: Drives, preprocessing: Preprocessing) -> None:
-        """kinds: the joints' types. preprocessing: its filter and gap."""
+        """Begin without samples. kinds: the joints' types. preprocessing: its filter and gap are used."""
         self._inputs, self._preprocessing = drives.inputs, replace(preprocessing, torque_delay=0.0)
         smoothing = np.full(len(kinds), FrictionModel().coulomb_smoothing_velocity)
         self._reach = replace(reach_of(kinds, drives.speeds), smoothing_velocity=smoothing)

@@ -29,8 +29,9 @@ from spelgen.spec import Facts
 
 @dataclass
 class Curves:
-    """All that is drawn of an evaluation's traces; None or empty where there is nothing. torques, trajectories: by
-    their titles.
+    """Hold all that is drawn of an evaluation's traces, None or empty where there is nothing.
+
+    torques, trajectories: panels by their titles.
     """
 
     growth: Sequence[Panel] = ()

@@ -75,7 +75,7 @@ def pushed_along(twists: Tensor, momenta: Tensor) -> Tensor:
 
 
 def spatial_inertia(ten: Tensor) -> Tensor:
-    """[[I, [m c]x], [-[m c]x, m]], (..., 6, 6), of (m, m c, I), (..., 10)."""
+    """Return [[I, [m c]x], [-[m c]x, m]], (..., 6, 6), of (m, m c, I), (..., 10)."""
     m, _, _, _, xx, xy, xz, yy, yz, zz = ten.unbind(dim=-1)
     inertia = torch.unflatten(torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=-1), -1, (3, 3))
     moment, mass = skew(ten[..., 1:4]), m[..., None, None] * torch.eye(3).to(ten)
