@@ -27,9 +27,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import arms
 import truth
-from real_logs import first, mean, samples_of, torque_of
+from real_logs import first, mean, torque_of
 
 import spelgen
+from spelgen.dynamics.bristles import bristle_reach
 from spelgen.fitting import levenberg_marquardt
 from spelgen.fitting.torque import jacobian as torque_jacobian
 from spelgen.fitting.torque import prior as torque_prior
@@ -125,7 +126,8 @@ def fit_and_judge(urdf: Path, training: Any, judged: Any) -> Callable[[], dict[s
 
     def run() -> dict[str, float]:
         model = spelgen.build(urdf, "hybrid")
-        fit_torque(model, samples_of(training))
+        samples = dynamics_samples.dynamics_samples(training, reach=bristle_reach(model))
+        fit_torque(model, samples)
         return {"nMSE": mean(torque_of(model), judged)}
 
     return run
