@@ -151,7 +151,7 @@ def fit_truth(case: truth.Case, folder: Path) -> dict[str, float]:
         arm = truth.Truth(case, urdf, rng)
         logs = truth.record_log(arm, case, rng)
         test = truth.fourier_motion(arm, 10.0, rng)
-        model = truth.fit_preset("hybrid")(given, logs)
+        model = truth.fit_hybrid(given, logs)
         errors = truth.measure(model, arm, test)
     return {"nMSE": errors["nmse"], "M": errors["mass"]}
 
