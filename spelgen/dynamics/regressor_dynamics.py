@@ -74,8 +74,9 @@ class RegressorDynamics:
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """qdd, (..., n), under the inputs tau."""
         pose = self.pose_at(q)
-        qdd: Tensor = torch.linalg.solve(pose.mass, pose.force(qd, tau, z))
-        return qdd
+        force = pose.force(qd, tau, z).unsqueeze(-1)  # one column: vectors would need the same batch
+        qdd: Tensor = torch.linalg.solve(pose.mass, force)
+        return qdd.squeeze(-1)
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
