@@ -76,7 +76,9 @@ def identify(
     findings = require_sound_logs(logs, arm, log_mapping)
     for diagnostic in findings:
         note(diagnostic)
-    result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter).beside(findings))
+    result = identify_arm(
+        arm, logs, method, preprocessing=Preprocessing(cutoff=filter).unless_coupled(findings)
+    )
     for diagnostic in result.diagnostics:
         note(diagnostic)
     # pages and charts are imported where they are asked for

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 
@@ -58,7 +58,7 @@ def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndar
     return filtered
 
 
-@cache
+@lru_cache(maxsize=8)  # logs of a robot have few rates
 def _sections(rate: float, cutoff: float) -> np.ndarray:
     """Return the filter's second-order sections: to design them takes as long as to filter a minute of a joint."""
     from scipy.signal import butter

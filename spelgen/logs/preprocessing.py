@@ -55,7 +55,7 @@ class Preprocessing:
         delay = self.torque_delay or 0.0
         return replace(self, cutoff=cutoff, decimation=decimation, torque_delay=delay)
 
-    def beside(self, findings: Iterable[Diagnostic]) -> Preprocessing:
+    def unless_coupled(self, findings: Iterable[Diagnostic]) -> Preprocessing:
         """Return the same, without a search for a delay where a coupling was found: any delay would be wrong."""
         if self.torque_delay is None and any(finding.code == COUPLED for finding in findings):
             return replace(self, torque_delay=0.0)

@@ -45,7 +45,7 @@ class PortHamiltonian(nn.Module):
     def at(self, q: Tensor | Pose, *others: Tensor, prepared: Prepared | None = None) -> Pose:
         """Return the pose at q. Raises TypeError or ValueError for vectors not as q and the weights."""
         if isinstance(q, tuple):
-            return q  # a pose already
+            return q  # a pose already: what stands beside it is not checked
         expected = self.actuated.dtype
         for x in (q, *others):
             if not isinstance(x, Tensor) or x.dtype != expected:

@@ -128,9 +128,8 @@ def float_energies(arm: Arm, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[np
     result = energies(arm, motions(arm, positions, float), inertias, float)
     shape = np.broadcast_shapes(q.shape[:-1], *map(np.shape, inertias[0]))
     entries = [np.broadcast_to(result.mass[key], shape) for key in triangle(q.shape[-1])]
-    return np.stack(entries, axis=-1).astype(q.dtype), np.broadcast_to(result.potential, shape).astype(
-        q.dtype
-    )
+    potential = np.broadcast_to(result.potential, shape)
+    return np.stack(entries, axis=-1).astype(q.dtype), potential.astype(q.dtype)
 
 
 def motions(arm: Arm, positions: Sequence[Position], number: Callable[[Fraction], Element]) -> list[Motion]:

@@ -31,8 +31,8 @@ def moved_bodies(raw: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
     fraction = (TUNING.body_step / (-smallest).clamp(min=1e-12)).clamp(max=1.0)
     factor = factor @ upper_cholesky(torch.eye(4).double() + fraction[:, None, None] * added)
     scale = factor.diagonal(dim1=-2, dim2=-1)
-    weights = (factor / scale.unsqueeze(-1)).triu(1) + scale.log().diag_embed()
-    weights.diagonal(dim1=-2, dim2=-1)[:, :3] -= scale[:, 3:].log()
-    weights[:, 3, 3] *= 2
+    sizes, mass = scale[:, :3].log(), scale[:, 3:].log()
+    logarithms = torch.cat([sizes - mass, 2 * mass], dim=-1)
+    weights = (factor / scale.unsqueeze(-1)).triu(1) + logarithms.diag_embed()
     entries: torch.Tensor = weights[:, row, column]
     return entries

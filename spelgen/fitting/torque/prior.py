@@ -47,15 +47,15 @@ def most_probable(
     guess: GaussianPrior,
     kinds: torch.Tensor,
     away: torch.Tensor,
-    covariance: torch.Tensor,
+    posterior: torch.Tensor,
 ) -> GaussianPrior:
     """Return the prior with the deviations of `ADAPTED` kinds that make the data more probable.
 
     kinds: (K,) of each weight the place of its kind in `ADAPTED`, -1 for others. away: (K,) of the most probable
-    weights from the prior's centre. covariance: (K, K) of the weights after the fit. A step of MacKay's fixed point
-    (Bayesian Interpolation, Neural Computation 4:415, 1992), whose end is the maximum of the marginal likelihood in
-    Laplace's approximation, times a scaled inverse chi-squared density of the deviation's square with c degrees of
-    freedom about ``guess``: (|away|^2 + c guess^2) / (g + c) where the data determine g weights.
+    weights from the prior's centre. posterior: (K, K) covariance of the weights after the fit. A step of MacKay's
+    fixed point (Bayesian Interpolation, Neural Computation 4:415, 1992), whose end is the maximum of the marginal
+    likelihood in Laplace's approximation, times a scaled inverse chi-squared density of the deviation's square with c
+    degrees of freedom about ``guess``: (|away|^2 + c guess^2) / (g + c) where the data determine g weights.
     """
     deviations, freedom = {}, prior.degrees_of_freedom
     for place, kind in enumerate(ADAPTED):
@@ -65,7 +65,7 @@ def most_probable(
         if kind in SHARED and count:
             # how far all joints are off together says nothing about the deviation of a single joint
             centre -= 1 / count
-        spread = centre @ covariance[mask][:, mask] @ centre
+        spread = centre @ posterior[mask][:, mask] @ centre
         determined = float(centre.trace() - spread.trace() / getattr(prior, kind) ** 2)
         squares = float((centre @ away[mask]).square().sum()) + freedom * getattr(guess, kind) ** 2
         deviations[kind] = (squares / (max(determined, 0.0) + freedom)) ** 0.5
