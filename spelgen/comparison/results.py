@@ -9,9 +9,9 @@ from pydantic import TypeAdapter, ValidationError
 
 from spelgen.comparison.metrics import Prediction, Sizes
 from spelgen.errors import RunError
+from spelgen.evaluation.drawn_motions import PredictedMotion
 from spelgen.evaluation.invariants import Invariants
 from spelgen.evaluation.plain import record
-from spelgen.evaluation.traces import PredictedMotion
 from spelgen.files import read_json, write_json
 
 

@@ -14,9 +14,9 @@ from spelgen.comparison.results import LearnedMass, RunResult
 from spelgen.comparison.study import Study, Variant
 from spelgen.comparison.truth import mass_error, true_mass
 from spelgen.emission.loading import load_module
+from spelgen.evaluation.drawn_motions import PredictedMotion, predicted_motion
 from spelgen.evaluation.invariants import invariants
 from spelgen.evaluation.plain import array, listed
-from spelgen.evaluation.traces import PredictedMotion, predicted_motion
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.rollout import LossScales, loss_scales
 from spelgen.fitting.run_folder import RunFolder, trained_model
@@ -120,7 +120,7 @@ def predict_example(
             window = cut_windows(
                 [log[start : start + span + 1]], steps + 1, decimation=decimation, measured=False
             )
-            return predicted_motion(window, predictor.solver(window))
+            return predicted_motion(log.name, window, predictor.solver(window))
     return None
 
 

@@ -99,8 +99,10 @@ def _evaluate_torques(
         if used is not None and preprocessing.torque_delay is None:  # of the logger, whatever the filter
             preprocessing = replace(preprocessing, torque_delay=used.torque_delay)
         used = preprocessing.resolved([trajectory.sample_rate for trajectory in logs])
+    all_samples = dynamics_samples(logs, pauses=True, preprocessing=used, reach=judged.reach)
+    samples = [sample for sample in all_samples if len(sample.q)]
     # a rollout takes a start and a sample after it
-    tests = JudgedLogs(used.pieces(logs, shortest=2), used, judged.reach, types)
+    tests = JudgedLogs(used.pieces(logs, shortest=2), samples, used, judged.reach, types)
     lengths = horizon_lengths(tests, *ahead, notes)
     probe = tests.windows(judged.window - 1, TUNING.probed_model_windows)
     solver = accurate_solver(model, probe)
@@ -120,7 +122,10 @@ def _evaluate_torques(
         if all(k > shorter.steps for shorter in horizons):
             longest = predictions
         horizons.append(horizon)
-    torque = _torque_errors(predictors, logs, tests)
+    torque: dict[str, TorqueErrors] = {}
+    for predictor in predictors:
+        if samples and predictor.dynamics is not None:
+            torque[predictor.name] = torque_errors(predictor.dynamics, samples)
     if not horizons and not torque:
         raise LogError(
             "no figure: no rollout is evaluated, and torques need accelerations, which these logs do not show",
@@ -151,20 +156,6 @@ def _results(
         diagnostics=tuple(notes),
         traces=traces,
     )
-
-
-def _torque_errors(
-    predictors: Sequence[Predictor], logs: Sequence[Trajectory], tests: JudgedLogs
-) -> dict[str, TorqueErrors]:
-    """Return those of all that has dynamics, where logs move and are dense enough for accelerations."""
-    all_samples = dynamics_samples(logs, pauses=True, preprocessing=tests.used, reach=tests.reach)
-    samples = [sample for sample in all_samples if len(sample.q)]
-    errors: dict[str, TorqueErrors] = {}
-    if samples:
-        for predictor in predictors:
-            if predictor.dynamics is not None:
-                errors[predictor.name] = torque_errors(predictor.dynamics, samples)
-    return errors
 
 
 def _evaluate_servos(judged: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic]) -> Results:

@@ -15,6 +15,7 @@ from spelgen.dynamics.protocol import integrable
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.momentum_observer import observe, past_steps, without_past
 from spelgen.evaluation.state_errors import StateErrors, TipPosition, end_errors
+from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows, joined
@@ -39,9 +40,13 @@ class Horizon:
 
 @dataclass(frozen=True, eq=False)
 class JudgedLogs:
-    """Pieces of test logs, gap-free and filtered, of which windows are cut. reach: of the bristles of friction."""
+    """Pieces of test logs, gap-free and filtered, of which windows are cut, and samples of torques.
+
+    samples: of logs dense enough for accelerations, see `dynamics_samples`. reach: of the bristles of friction.
+    """
 
     pieces: Sequence[Trajectory]
+    samples: Sequence[DynamicsSamples]
     used: Preprocessing
     reach: BristleReach
     joint_types: Sequence[str]

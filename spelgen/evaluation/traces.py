@@ -6,7 +6,7 @@ All are arrays [rad, m, s, Nm, N, kg m^2, J], NaN where a number is not known; J
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,16 +15,24 @@ from torch import Tensor
 
 from spelgen.baselines.names import MODEL, is_drawn
 from spelgen.baselines.predictor import Predictor
-from spelgen.baselines.solver import States
+from spelgen.evaluation.drawn_motions import (
+    DrawnMotion,
+    PredictedMotion,
+    TorqueTrace,
+    predicted_motion,
+    replayed_motion,
+    thinned,
+    torque_motions,
+    torque_trace,
+    typical_and_worst,
+)
 from spelgen.evaluation.horizons import JudgedLogs, Predictions
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.replay import Missed
 from spelgen.evaluation.state_errors import TipPosition
-from spelgen.evaluation.torque_traces import TorqueTrace, torque_traces, typical_and_worst
-from spelgen.fitting.rollout import AT_REST, LossScales, loss_scales, position_difference
+from spelgen.fitting.rollout import AT_REST, loss_scales, position_difference
 from spelgen.logs.coverage import coverage
 from spelgen.logs.trajectory import Trajectory
-from spelgen.logs.windows import Windows
 from spelgen.settings.tuning.evaluation import TraceTuning
 
 if TYPE_CHECKING:
@@ -50,34 +58,6 @@ class Growth:
     windows: int
     relative: dict[str, Quantiles]
     tip_mm: dict[str, Quantiles]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PredictedMotion:
-    """Hold a piece of a trajectory, measured and predicted, (T, n); t counts from its first sample [s].
-
-    u: commands of position servos, whose velocities are not judged.
-    """
-
-    t: Curve
-    q: Curve
-    predicted_q: Curve
-    qd: Curve | None = None
-    predicted_qd: Curve | None = None
-    u: Curve | None = None
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PredictedExample(PredictedMotion):
-    """Hold a prediction of the model, of middle ("typical") or largest ("worst") error, that starts at this time [s].
-
-    start: None of a log that is replayed as a whole.
-    """
-
-    which: str
-    trajectory: str
-    error: float | None
-    start: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +91,7 @@ class Traces:
 
     coverage: dict[str, object]
     growth: Growth | None = None
-    trajectories: tuple[PredictedExample, ...] = ()
+    trajectories: tuple[PredictedMotion, ...] = ()
     torques: tuple[TorqueTrace, ...] = ()
     mass: MassTrace | None = None
     friction: FrictionTrace | None = None
@@ -126,71 +106,67 @@ def motion_traces(
     """Return all curves of an arm under torques. predictions: over the longest horizon."""
     dynamics = {x.name: x.dynamics for x in predictors if x.dynamics is not None}
     growth: Growth | None = None
-    examples: tuple[PredictedExample, ...] = ()
+    predicted: tuple[PredictedMotion, ...] = ()
     # errors are relative to the motion: there is none at rest
     if predictions is not None and predictions.windows.q.diff(dim=1).abs().max() >= AT_REST:
-        growth = _growth(predictions, logs.joint_types, tip)
-        examples = _examples(predictions, logs.joint_types)
-    torques = torque_traces(dynamics, logs)
+        errors = _relative_errors(predictions, logs.joint_types)
+        growth = _growth(predictions, errors, tip)
+        predicted = _predicted_motions(predictions, errors[MODEL][:, -1])
+    torques = typical_and_worst([torque_trace(dynamics, motion) for motion in torque_motions(logs)])
+    drawn: tuple[DrawnMotion, ...] = (*torques, *predicted)
     return Traces(
         coverage=coverage(logs.pieces),
         growth=growth,
-        trajectories=examples,
+        trajectories=predicted,
         torques=torques,
-        mass=_mass_trace(dynamics, (*torques, *examples)),
+        mass=_mass_trace(dynamics, drawn[0]) if drawn else None,
         friction=_friction_trace(dynamics, logs.pieces),
     )
 
 
 def replay_traces(missed: Sequence[Missed]) -> Traces:
     """Return the logs of middle and of largest error of an arm under position servos."""
-    errors = [float(np.sqrt(np.square(error).mean())) for _, error in missed]
-    examples = []
-    for which, k in typical_and_worst(errors).items():
-        log, error = missed[k]
-        assert log.u is not None  # a log without commands cannot be replayed
-        stride = -(-len(log) // TUNING.log_samples)
-        predicted = np.concatenate([log.q[:1], log.q[1:] + error])
-        example = PredictedExample(
-            which=which,
-            trajectory=log.name,
-            error=number(errors[k]),
-            t=(log.t - log.t[0])[::stride],
-            q=log.q[::stride],
-            u=log.u[::stride],
-            predicted_q=predicted[::stride],
-        )
-        examples.append(example)
-    return Traces(coverage([log for log, _ in missed]), trajectories=tuple(examples))
+    motions = [thinned(replayed_motion(log, error), TUNING.log_samples) for log, error in missed]
+    return Traces(coverage([log for log, _ in missed]), trajectories=typical_and_worst(motions))
 
 
-def _growth(predictions: Predictions, joint_types: Sequence[str], tip: TipPosition | None) -> Growth:
+def _relative_errors(predictions: Predictions, joint_types: Sequence[str]) -> dict[str, Tensor]:
+    """Return by predictor the root mean square over joints of errors in units of the motion, (W, K-1)."""
+    windows = predictions.windows
+    scales = loss_scales(windows, joint_types)
+    errors = {}
+    for name, (q, qd) in predictions.states.items():
+        position = position_difference(q, windows.q[:, 1:], joint_types) / scales.q
+        velocity = (qd - windows.qd[:, 1:]) / scales.qd
+        errors[name] = torch.cat([position, velocity], dim=-1).square().mean(dim=-1).sqrt()
+    return errors
+
+
+def _growth(predictions: Predictions, errors: Mapping[str, Tensor], tip: TipPosition | None) -> Growth:
     windows = predictions.windows
     steps = windows.dt.shape[1]
     # errors grow by orders of magnitude: as many points for the first tenth as for the last
     times = np.unique(np.geomspace(1, steps, TUNING.times).round().astype(int)) - 1
-    scales = loss_scales(windows, joint_types)
     relative, tips = {}, {}
-    for name, states in predictions.states.items():
+    for name, (q, _) in predictions.states.items():
         if not is_drawn(name):
             continue
-        errors = _relative_errors(states, windows, scales, joint_types)
-        relative[name] = _quantiles(errors[:, times])
+        relative[name] = _quantiles(errors[name][:, times])
         if tip is not None:
             measured = tip(windows.q[:, 1:][:, times])
-            tips[name] = _quantiles(1000 * (tip(states[0][:, times]) - measured).norm(dim=-1))
+            tips[name] = _quantiles(1000 * (tip(q[:, times]) - measured).norm(dim=-1))
     seconds = windows.dt.cumsum(dim=1).mean(dim=0)[times]
     return Growth(seconds.numpy(), len(windows), relative, tips)
 
 
-def _relative_errors(
-    states: States, windows: Windows, scales: LossScales, joint_types: Sequence[str]
-) -> Tensor:
-    """Return the root mean square over joints of errors in units of the motion, (W, K-1)."""
-    q, qd = states
-    position = position_difference(q, windows.q[:, 1:], joint_types) / scales.q
-    velocity = (qd - windows.qd[:, 1:]) / scales.qd
-    return torch.cat([position, velocity], dim=-1).square().mean(dim=-1).sqrt()
+def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[PredictedMotion, ...]:
+    """Return the windows to draw of the model's predictions, whose errors at their ends are (W,)."""
+    motions = []
+    for k, ((piece, first), error) in enumerate(zip(predictions.starts, errors.tolist(), strict=True)):
+        motion = predicted_motion(piece.name, predictions.windows, predictions.states[MODEL], k)
+        start = number(piece.t[first] - piece.t[0])
+        motions.append(replace(thinned(motion, TUNING.samples), start=start, error=number(error)))
+    return typical_and_worst(motions)
 
 
 def _quantiles(values: Tensor) -> Quantiles:
@@ -200,47 +176,9 @@ def _quantiles(values: Tensor) -> Quantiles:
     return Quantiles(*(ordered[round(part * last)] for part in (0.1, 0.5, 0.9)))
 
 
-def _examples(predictions: Predictions, joint_types: Sequence[str]) -> tuple[PredictedExample, ...]:
-    windows, states = predictions.windows, predictions.states[MODEL]
-    errors = _relative_errors(states, windows, loss_scales(windows, joint_types), joint_types)[:, -1].tolist()
-    stride = -(-windows.dt.shape[1] // TUNING.samples)
-    examples = []
-    for which, k in typical_and_worst(errors).items():
-        piece, first = predictions.starts[k]
-        motion = predicted_motion(windows, states, k, stride)
-        examples.append(
-            PredictedExample(
-                **vars(motion),
-                which=which,
-                trajectory=piece.name,
-                start=number(piece.t[first] - piece.t[0]),
-                error=number(errors[k]),
-            )
-        )
-    return tuple(examples)
-
-
-def predicted_motion(windows: Windows, states: States, k: int = 0, stride: int = 1) -> PredictedMotion:
-    """Return window k with what was predicted of it."""
-    predicted_q, predicted_qd = states
-    return PredictedMotion(
-        t=torch.cat([windows.dt.new_zeros(1), windows.dt[k].cumsum(dim=0)])[::stride].numpy(),
-        q=windows.q[k][::stride].numpy(),
-        qd=windows.qd[k][::stride].numpy(),
-        predicted_q=torch.cat([windows.q[k, :1], predicted_q[k]])[::stride].numpy(),
-        predicted_qd=torch.cat([windows.qd[k, :1], predicted_qd[k]])[::stride].numpy(),
-    )
-
-
-def _mass_trace(
-    dynamics: Mapping[str, RigidDynamics], trajectories: Sequence[TorqueTrace | PredictedExample]
-) -> MassTrace | None:
-    """Return M along the first trajectory that is drawn."""
-    if not trajectories:
-        return None
-    along = trajectories[0]
-    stride = -(-len(along.t) // TUNING.samples)
-    q = torch.from_numpy(along.q[::stride].copy())
+def _mass_trace(dynamics: Mapping[str, RigidDynamics], motion: DrawnMotion) -> MassTrace:
+    """Return M along a motion that is drawn."""
+    q = torch.from_numpy(motion.q.copy())
     row, column = np.tril_indices(q.shape[-1])
     curves = {}
     for name, predictor in dynamics.items():
@@ -248,7 +186,7 @@ def _mass_trace(
             mass = torch.as_tensor(predictor.mass_matrix(q)).numpy()
         if np.isfinite(mass).all():  # else it has no eigenvalues
             curves[name] = MassCurves(mass[:, row, column].T, np.linalg.eigvalsh(mass).T)
-    return MassTrace(along.trajectory, along.t[::stride], curves)
+    return MassTrace(motion.trajectory, motion.t, curves)
 
 
 def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Trajectory]) -> FrictionTrace:

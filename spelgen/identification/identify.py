@@ -128,9 +128,7 @@ class _BodyRows:
     def _computed(self) -> Iterator[tuple[DynamicsSamples, np.ndarray]]:
         for x in self.samples:
             for start in range(0, len(x.q), TUNING.block):
-                rows = slice(start, start + TUNING.block)
-                z = None if x.z is None else x.z[rows]
-                block = DynamicsSamples(x.name, x.q[rows], x.qd[rows], x.qdd[rows], x.tau[rows], z)
+                block = x[start : start + TUNING.block]
                 yield block, regressor(self.arm, block.q, block.qd, block.qdd)
 
 

@@ -28,7 +28,7 @@ class DynamicsSamples:
     """Hold samples (T, n) of one trajectory: q, qd, qdd [rad, s; m, s] and tau [Nm, N] as logged.
 
     z: (T, n, K) [rad, m], states of friction's bristles from the motion before; None: not known.
-    direction: (T, n) of dry friction without memory, through the same filter as tau; None: not known.
+    direction: (T, n) of dry friction without memory, through the same filter as tau; None: not known. rate: [Hz].
     """
 
     name: str
@@ -38,6 +38,14 @@ class DynamicsSamples:
     tau: np.ndarray
     z: np.ndarray | None = None
     direction: np.ndarray | None = None
+    rate: float = FREQUENCY
+
+    def __getitem__(self, rows: slice) -> DynamicsSamples:
+        """Return the samples of these rows."""
+        z = None if self.z is None else self.z[rows]
+        direction = None if self.direction is None else self.direction[rows]
+        motion = self.q[rows], self.qd[rows], self.qdd[rows], self.tau[rows]
+        return DynamicsSamples(self.name, *motion, z, direction, self.rate / (rows.step or 1))
 
 
 def dynamics_samples(

@@ -12,8 +12,8 @@ import torch
 from spelgen.comparison.results import RunResult
 from spelgen.comparison.study import Study
 from spelgen.comparison.truth import true_mass
+from spelgen.evaluation.drawn_motions import PredictedMotion
 from spelgen.evaluation.tables import Table
-from spelgen.evaluation.traces import PredictedMotion
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.labels import named_joints

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from spelgen.baselines.names import LEAST_SQUARES, MODEL
-from spelgen.evaluation.traces import PredictedExample, Traces
+from spelgen.evaluation.drawn_motions import PredictedMotion
+from spelgen.evaluation.traces import Traces
 from spelgen.evaluation.verdict import Limits
 from spelgen.labels import named_joints, thousandths
 from spelgen.listing import number
@@ -73,7 +74,7 @@ def curves(traces: Traces, facts: Facts) -> Curves:
     return drawn
 
 
-def _prediction_title(example: PredictedExample, facts: Facts) -> str:
+def _prediction_title(example: PredictedMotion, facts: Facts) -> str:
     kind, name, error = example.which.capitalize(), example.trajectory, example.error
     if example.start is None:
         distance = None if error is None else 1000 * error

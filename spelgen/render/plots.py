@@ -19,8 +19,8 @@ from spelgen.baselines.names import (
     URDF_WITH_DRIVES,
     observed,
 )
-from spelgen.evaluation.torque_traces import TorqueTrace
-from spelgen.evaluation.traces import FrictionTrace, Growth, MassTrace, PredictedMotion, Quantiles
+from spelgen.evaluation.drawn_motions import PredictedMotion, TorqueTrace
+from spelgen.evaluation.traces import FrictionTrace, Growth, MassTrace, Quantiles
 from spelgen.evaluation.verdict import Limits
 from spelgen.labels import UNITS, NamedJoint, entry_name
 from spelgen.render.charts import MARGINS, Band, Chart, Dots, Line, Mark, Values, line_chart

@@ -1,0 +1,211 @@
+"""The motions that charts draw: among predictions, torques and replays, those of middle and of largest error."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+import torch
+from scipy.integrate import cumulative_trapezoid
+
+from spelgen.baselines.names import MODEL
+from spelgen.baselines.solver import States
+from spelgen.dynamics.bristles import bristles_along
+from spelgen.evaluation.horizons import JudgedLogs
+from spelgen.evaluation.plain import Curve, number
+from spelgen.evaluation.torque import friction_past, mean_nmse, predicted_torques
+from spelgen.logs.dynamics_samples import DynamicsSamples
+from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.windows import Windows, cut_windows
+from spelgen.settings.tuning.evaluation import TraceTuning
+
+if TYPE_CHECKING:
+    from spelgen.dynamics.protocol import RigidDynamics
+
+TUNING = TraceTuning()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DrawnMotion:
+    """Hold positions q (T, n) along a part of a log; t counts from its first sample [s].
+
+    which: "typical" for the middle error of all such motions, "worst" for the largest one. error: None if not finite.
+    """
+
+    which: str = ""
+    trajectory: str
+    error: float | None = None
+    t: Curve
+    q: Curve
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PredictedMotion(DrawnMotion):
+    """Hold a motion beside its prediction, (T, n); error: relative to the motion, or RMS [rad, m] of a replayed log.
+
+    start: its time in the log [s]; None where the log is replayed as a whole. u: commands of position servos, whose
+    velocities are not judged.
+    """
+
+    start: float | None = None
+    predicted_q: Curve
+    qd: Curve | None = None
+    predicted_qd: Curve | None = None
+    u: Curve | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TorqueTrace(DrawnMotion):
+    """Hold torques at the joints (T, n) along ten seconds of a log; error: nMSE of the model.
+
+    predicted: by predictor. parts: of the model's torque. energy: by where the drives' work went since the start, (T,)
+    [J].
+    """
+
+    qd: Curve
+    measured: Curve
+    predicted: dict[str, Curve]
+    parts: dict[str, Curve]
+    energy: dict[str, Curve]
+
+
+Motion = TypeVar("Motion", bound=DrawnMotion)
+
+
+def typical_and_worst(motions: Sequence[Motion]) -> tuple[Motion, ...]:
+    """Return the motion of middle error, and that of the largest where there are several."""
+    # a sort keeps the order of equals: the same logs give the same page
+    ordered = sorted(motions, key=lambda motion: math.inf if motion.error is None else motion.error)
+    chosen = {}
+    if ordered:
+        chosen["typical"] = ordered[(len(ordered) - 1) // 2]
+    if len(ordered) > 1:
+        chosen["worst"] = ordered[-1]
+    return tuple(replace(motion, which=which) for which, motion in chosen.items())
+
+
+def thinned(motion: PredictedMotion, most_samples: int) -> PredictedMotion:
+    """Return the motion at no more samples than a chart can show."""
+    stride = -(-len(motion.t) // most_samples)
+    curves: dict[str, Any] = {}
+    for name, values in vars(motion).items():
+        if isinstance(values, np.ndarray):
+            curves[name] = values[::stride]
+    return replace(motion, **curves)
+
+
+def predicted_motion(trajectory: str, windows: Windows, states: States, k: int = 0) -> PredictedMotion:
+    """Return window k with what was predicted of it."""
+    predicted_q, predicted_qd = states
+    return PredictedMotion(
+        trajectory=trajectory,
+        t=torch.cat([windows.dt.new_zeros(1), windows.dt[k].cumsum(dim=0)]).numpy(),
+        q=windows.q[k].numpy(),
+        qd=windows.qd[k].numpy(),
+        predicted_q=torch.cat([windows.q[k, :1], predicted_q[k]]).numpy(),
+        predicted_qd=torch.cat([windows.qd[k, :1], predicted_qd[k]]).numpy(),
+    )
+
+
+def replayed_motion(log: Trajectory, missed: np.ndarray) -> PredictedMotion:
+    """Return a log of position servos with its replay, which misses these positions (T-1, n) after its first sample."""
+    return PredictedMotion(
+        trajectory=log.name,
+        error=number(float(np.sqrt(np.square(missed).mean()))),
+        t=log.t - log.t[0],
+        q=log.q,
+        u=log.u,
+        predicted_q=np.concatenate([log.q[:1], log.q[1:] + missed]),
+    )
+
+
+def torque_motions(logs: JudgedLogs) -> list[DynamicsSamples]:
+    """Return ten seconds from the middle of each log, for logs begin and end at rest, as thin as charts draw them."""
+    motions = []
+    for samples in logs.samples or [_steps(piece, logs) for piece in logs.pieces]:
+        count = min(len(samples.q), round(TUNING.torque_seconds * samples.rate) + 1)
+        start = (len(samples.q) - count) // 2
+        motions.append(samples[start : start + count : -(-count // TUNING.samples)])
+    return motions
+
+
+def _steps(piece: Trajectory, logs: JudgedLogs) -> DynamicsSamples:
+    """Return the steps of logs too slow for a filter: the motion halfway, and the torque that acted meanwhile."""
+    steps = cut_windows([piece], 2, measured=logs.used.filtered)
+    q = steps.q.mean(dim=1).numpy()
+    qdd = steps.qd.diff(dim=1)[:, 0] / steps.dt
+    return DynamicsSamples(
+        piece.name,
+        q,
+        steps.qd.mean(dim=1).numpy(),
+        qdd.numpy(),
+        steps.tau[:, 0].numpy(),
+        bristles_along(q, logs.reach),
+        rate=piece.sample_rate,
+    )
+
+
+def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples) -> TorqueTrace:
+    """Return what the predictors say of the torques of these samples."""
+    model: Any = dynamics[MODEL]
+    q, qd, qdd = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
+    with torch.no_grad():
+        inputs = np.eye(q.shape[-1])
+        if hasattr(model, "input_matrix"):  # gears may stand between a motor and a joint
+            inputs = model.input_matrix(q).numpy()
+        gravity = model.gravity(q)
+        parts = {
+            "inertia": (model.mass_matrix(q) @ qdd.unsqueeze(-1)).squeeze(-1).numpy(),
+            "Coriolis": (model.nonlinear_effects(q, qd) - gravity).numpy(),
+            "gravity": gravity.numpy(),
+            "friction": model.friction_torque(q, qd, *friction_past(model, samples)).numpy(),
+        }
+    predicted = {}
+    for name, predictor in dynamics.items():
+        predicted[name] = _at_joints(inputs, predicted_torques(predictor, samples))
+    measured = _at_joints(inputs, samples.tau)
+    t = np.arange(len(samples.q)) / samples.rate
+    return TorqueTrace(
+        trajectory=samples.name,
+        error=mean_nmse(predicted[MODEL] - measured, measured),
+        t=t,
+        q=samples.q,
+        qd=samples.qd,
+        measured=measured,
+        predicted=predicted,
+        parts=parts,
+        energy=_energy(t, samples.qd, measured, predicted[MODEL], parts),
+    )
+
+
+def _at_joints(inputs: np.ndarray, torques: np.ndarray) -> np.ndarray:
+    """Return the joints' torques of the motors'."""
+    by_joint: np.ndarray = (inputs @ torques[..., None])[..., 0]
+    return by_joint
+
+
+def _energy(
+    t: np.ndarray,
+    qd: np.ndarray,
+    measured: np.ndarray,
+    predicted: np.ndarray,
+    parts: Mapping[str, np.ndarray],
+) -> dict[str, np.ndarray]:
+    """Return where the drives' work went since the start, (T,) [J]: stored, lost to friction, not explained.
+
+    Powers are of the model's torques on the measured motion; an offset of the torque is with the friction.
+    """
+    stored = parts["inertia"] + parts["Coriolis"] + parts["gravity"]
+    torques = {
+        "work of the drives": measured,
+        "stored": stored,
+        "friction": predicted - stored,
+        "not explained": measured - predicted,
+    }
+    work = {}
+    for name, torque in torques.items():
+        work[name] = cumulative_trapezoid((torque * qd).sum(axis=-1), t, initial=0)
+    return work
