@@ -10,14 +10,11 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from emitted import ROBOTS, import_source
-from typer.testing import CliRunner
 
 from spelgen.arm.actuation import motor_speeds
 from spelgen.building import build
-from spelgen.cli.main import app
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.regressor import regressor, urdf_parameters
-from spelgen.fitting import train
 from spelgen.fitting.fit import fit
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import TorqueJacobian
@@ -25,10 +22,10 @@ from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.identification.identify import identify, least_squares
 from spelgen.identification.method import LeastSquares
 from spelgen.loaded_arm import load_arm
-from spelgen.log_checks.check_logs import check_logs, require_sound_logs
+from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.read import read_logs, write_logs
+from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate, inspect
 from spelgen.settings.log_mapping import LogMapping
@@ -254,28 +251,20 @@ def test_a_fit_moves_late_torques_and_its_evaluation_too(uncoupled):
     assert misses < 1 - replace(fitted, preprocessing=Preprocessing()).score(log)
 
 
-def test_commands_look_for_no_delay_beside_a_coupling_that_no_file_names(uncoupled, tmp_path, monkeypatch):
+def test_no_delay_is_searched_beside_a_coupling_that_no_file_names(uncoupled):
     """Least squares without the coupling finds 5.7 ms of 10, and calls them sure: `logs` suggests neither."""
     log = recorded(uncoupled, "joints", 1.0, late=0.01)
-    assert identify(uncoupled, log).torque_delay.delay > 0.005
     assert not told(check_logs([log], uncoupled), "torque-delay")
-    robot, logs = ROBOTS / "six_dof.urdf", tmp_path / "logs.parquet"
-    write_logs(logs, [log], [x.name for x in uncoupled.arm.coordinates])
-    command = ["identify", robot, "--data", logs, "--accept", "degrees", "--format", "json"]
-    identified = CliRunner().invoke(app, list(map(str, command)))
-    assert identified.exit_code == 0, identified.output
-    assert json.loads(identified.stdout)["torque_delay"]["delay"] == 0.0
-    accepting = LogMapping.model_validate({"accept": ["degrees"]})
-    used = []
-    monkeypatch.setattr(train, "fit", lambda *_, preprocessing, **__: used.append(preprocessing))
-    module = tmp_path / "module.py"
-    module.write_text(generate(robot, preset="closed-form"), encoding="utf-8")
-    for preprocessing in (Preprocessing(), Preprocessing(torque_delay=0.002)):
-        train.train(
-            module, [logs], tmp_path / "run", urdf=robot, preprocessing=preprocessing,
-            require=lambda given: require_sound_logs(given, uncoupled, accepting),
-        )  # fmt: skip
-    assert [x.torque_delay for x in used] == [0.0, 0.002]
+    identified = identify(uncoupled, log)
+    assert json.loads(json.dumps(identified.to_dict()))["torque_delay"] == {"delay": 0.0, "interval": 0.0}
+    fitted = fit(build(ROBOTS / "six_dof.urdf", "closed-form"), [log])
+    assert fitted.preprocessing.torque_delay == 0.0
+    for found in (identified, fitted):
+        (message,) = (x.message for x in found.diagnostics if x.code == "no-torque-delay")
+        assert "the motor of joint 6 seems to turn with joint 5, too" in message
+    assert (
+        identify(uncoupled, log, preprocessing=Preprocessing(torque_delay=0.002)).torque_delay.delay == 0.002
+    )
 
 
 def test_logs_of_plain_drives_suggest_nothing(uncoupled):

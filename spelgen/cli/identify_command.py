@@ -73,12 +73,9 @@ def identify(
     log_mapping = options.accepting(log_source(arm, mapping).mapping, accept)
     logs = read_logs(paths, arm, log_mapping, role="train")
     # least squares would fit wrong units without a word
-    findings = require_sound_logs(logs, arm, log_mapping)
-    for diagnostic in findings:
+    for diagnostic in require_sound_logs(logs, arm, log_mapping):
         note(diagnostic)
-    result = identify_arm(
-        arm, logs, method, preprocessing=Preprocessing(cutoff=filter).unless_coupled(findings)
-    )
+    result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
     for diagnostic in result.diagnostics:
         note(diagnostic)
     # pages and charts are imported where they are asked for

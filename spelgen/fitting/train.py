@@ -77,7 +77,6 @@ def train(
     logs = open_logs(model, data, options.mapping, preprocessing)
     if require is not None and not isinstance(logs, LargeLogs):
         notes += require(logs)
-        preprocessing = preprocessing.unless_coupled(notes)
     if chosen is None and callable(config):
         chosen = config(model, sample_rates(logs))
     return fit(

@@ -7,30 +7,25 @@ the torques better in blocks of time that the parameters were not fitted to.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 from itertools import combinations_with_replacement, permutations
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+import torch
 from scipy.optimize import minimize_scalar
 from scipy.stats import t as student
 
-from spelgen.arm.arm import Arm
-from spelgen.dynamics.regressor import regressor
-from spelgen.errors import Diagnostic
-from spelgen.identification.base_parameters import base_parameters
+from spelgen.arm.actuation import Drives
+from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.identification.drive_samples import DriveSamples
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.least_squares import block_products
-from spelgen.logs.preprocessing import COUPLED
+from spelgen.runtime.body_chain import BodyChain
 from spelgen.settings.tuning.identification import DriveHintTuning, IdentificationTuning
-
-if TYPE_CHECKING:
-    from spelgen.loaded_arm import LoadedArm
 
 TUNING = DriveHintTuning()
 FRICTION = FrictionModel(coulomb_smoothing_velocity=IdentificationTuning().moving)
@@ -67,25 +62,24 @@ class WrongTorque:
 
 
 def drive_rows(
-    arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, speeds: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the regressor (S, n, K) of the parameters that torques show, at q, qd and qdd, each (S, n).
+    chain: BodyChain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, speeds: np.ndarray
+) -> np.ndarray:
+    """Return the regressor (S, n, K) of bodies, then of friction's effects, of all drives each.
 
-    Beside it of each parameter (K,) the number of its friction column, below zero those of bodies: effect e of drive j
-    has n e + j. speeds: C, (n, n), of the motors, by the couplings that are known.
+    q, qd, qdd: (S, n). speeds: C, (n, n), of the motors, by the couplings that are known.
     """
-    bodies = regressor(arm, q, qd, qdd)
-    friction = FRICTION.columns(qd, qdd, None, speeds)
-    columns = base_parameters(arm, FRICTION, speeds).columns
-    return np.concatenate([bodies, friction], axis=2)[..., columns], columns - bodies.shape[2]
+    with torch.no_grad():
+        # copies: torch takes no views that run backwards, as filters give them
+        bodies = regressor_of(chain, *(torch.from_numpy(x.copy()) for x in (q, qd, qdd))).numpy()
+    return np.concatenate([bodies, FRICTION.columns(qd, qdd, None, speeds)], axis=2)
 
 
-def drive_problem(arm: LoadedArm, samples: DriveSamples) -> DriveProblem | None:
+def drive_problem(chain: BodyChain, drives: Drives, samples: DriveSamples) -> DriveProblem | None:
     """Return least squares of the joint torques; None where there are too few samples."""
     if len(samples.q) < TUNING.fewest_samples:
         return None
-    speeds, tau = arm.actuation.drives().speeds, samples.tau
-    regressors, numbers = drive_rows(arm.arm, samples.q, samples.qd, samples.qdd, speeds)
+    speeds, tau = drives.speeds, samples.tau
+    regressors = drive_rows(chain, samples.q, samples.qd, samples.qdd, speeds)
     rows = np.concatenate([regressors, tau[..., None]], axis=2)
     is_coupled = ((speeds != 0) | (speeds != 0).T).sum(axis=0) > 1
     # what is no more than a constant with rounding shows nothing
@@ -93,7 +87,7 @@ def drive_problem(arm: LoadedArm, samples: DriveSamples) -> DriveProblem | None:
     free = np.flatnonzero(varies & ~is_coupled).tolist()
     products = block_products(rows, TUNING.blocks)
     motion = np.stack([samples.qd, samples.qdd])
-    return DriveProblem(motion, rows, products, products[..., -1, -1].mean(axis=1), numbers, free)
+    return DriveProblem(motion, rows, products, products[..., -1, -1].mean(axis=1), free)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,15 +95,14 @@ class DriveProblem:
     """Hold least squares of the torques of n joints by K parameters, in B blocks of time.
 
     motion: qd and qdd, (2, S, n). rows: (S, n, K + 1), of each joint the columns of the parameters and the torque.
-    products: (n, B, K + 1, K + 1), of these. size: (n,) of the squares of the torques. numbers: see `drive_rows`. free:
-    the joints that no known coupling joins and whose torques vary.
+    products: (n, B, K + 1, K + 1), of these. size: (n,) of the squares of the torques. free: the joints that no known
+    coupling joins and whose torques vary.
     """
 
     motion: np.ndarray
     rows: np.ndarray
     products: np.ndarray
     size: np.ndarray
-    numbers: np.ndarray
     free: list[int]
 
     def with_rows(self, joints: list[int], rows: np.ndarray) -> DriveProblem:
@@ -161,9 +154,9 @@ class DriveProblem:
         """Return the problem where a motor turns with another joint, too."""
         joint, moved_by, ratio = coupling.joint, coupling.moved_by, coupling.ratio
         qd, qdd = self.motion[..., [joint]] + ratio * self.motion[..., [moved_by]]
-        n = self.rows.shape[1]
-        of_motor = np.flatnonzero((self.numbers >= 0) & (self.numbers % n == joint))
-        columns = FRICTION.columns(qd, qdd)[:, 0, self.numbers[of_motor] // n]
+        columns = FRICTION.columns(qd, qdd)[:, 0]  # (S, effects)
+        n, effects = self.rows.shape[1], columns.shape[1]
+        of_motor = np.arange(effects) * n + joint - effects * n - 1
         rows = self.rows[:, coupling.pair].copy()
         rows[:, 0, of_motor] = columns
         rows[:, 1, of_motor] = ratio * columns
@@ -231,22 +224,3 @@ def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: in
     # of hundreds of couplings one is always better by chance (Bonferroni's bound)
     needed = float(student.isf(TUNING.chance / candidates, len(ratios) - 1))
     return bool(ratios.mean() > needed * standard_error)
-
-
-def coupling_hint(arm: LoadedArm, coupling: Coupling, remaining: float) -> Diagnostic:
-    """Return a coupling that the logs show, in the sidecar's words."""
-    names = arm.arm.joint_names
-    pair = [coupling.moved_by, coupling.joint]
-    matrix = np.array([[1.0, coupling.ratio], [0.0, 1.0]]) * np.diag(arm.actuation.matrix())[pair]
-    joints = json.dumps([names[k] for k in pair])
-    setting = f"couplings: [{{joints: {joints}, matrix: {matrix.round(6).tolist()}}}]"
-    if coupling.logged_at == "motors" and arm.settings.torque == "joint":
-        uncoupled = [name for k, name in enumerate(names) if k not in pair]
-        gears = ", ".join(f"{json.dumps(name)}: {{gear: 1}}" for name in uncoupled)
-        setting += f", 'torque: motor' and joints: {{{gears}}}"
-    message = (
-        f"its motor turns with {names[coupling.moved_by]!r} too, {coupling.ratio:g} times as fast, and the logged "
-        f"torques are those of the {coupling.logged_at}: least squares then misses {remaining:.0%} of what it missed "
-        f"of both torques (mean square); say {setting} in the robot's YAML"
-    )
-    return Diagnostic("warning", COUPLED, f"joint {names[coupling.joint]!r}", None, message)

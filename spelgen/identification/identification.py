@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -94,7 +94,7 @@ class Identification:
                 "coulomb_smoothing_velocity": friction.coulomb_smoothing_velocity,
                 "effects": list(friction.effects),
             },
-            "torque_delay": asdict(self.torque_delay),
+            "torque_delay": {"delay": self.torque_delay.delay, "interval": self.torque_delay.interval},
             "condition": _finite(self.condition),
             "unseen_directions": self.unseen,
             "base_parameters": self._records(),

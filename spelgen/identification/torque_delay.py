@@ -15,6 +15,7 @@ from spelgen.arm.actuation import Drives
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.bristles import reach_of
 from spelgen.errors import Diagnostic
+from spelgen.identification.drive_hints import Coupling, DriveProblem, drive_problem, find_coupling
 from spelgen.identification.drive_samples import SHIFTS, DriveLog, DriveSamples
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.least_squares import block_products
@@ -29,14 +30,25 @@ FRICTION = FrictionModel(memory=True)
 
 @dataclass(frozen=True)
 class TorqueDelay:
-    """How much later than positions torques are logged, and half of the 99 % interval [s]; zeros: nothing is sure."""
+    """How much later than positions torques are logged, and half of the 99 % interval [s]; zeros: nothing is sure.
+
+    coupling: of motors, see `find_coupling`; where logs show one, no delay is searched: any would be wrong.
+    """
 
     delay: float = 0.0
     interval: float = 0.0
+    coupling: tuple[Coupling, float] | None = None
 
     @property
     def notes(self) -> list[Diagnostic]:
-        """What a user is told of the delay, if there is one."""
+        """Return the message about the delay, or about a coupling that prevents the search; none without either."""
+        if self.coupling is not None:
+            joint, other = (number + 1 for number in self.coupling[0].pair)
+            message = (
+                f"no torque delay is searched: the motor of joint {joint} seems to turn with joint {other}, too; "
+                "`spelgen logs` prints the setting of this coupling"
+            )
+            return [Diagnostic("info", "no-torque-delay", "logs", None, message)]
         if not self.delay:
             return []
         message = (
@@ -64,20 +76,31 @@ def find_torque_delay(
     chain: BodyChain,
     preprocessing: Preprocessing,
 ) -> TorqueDelay:
-    """Return the delay that least squares with and without friction's memory both show, where both fit.
-
-    kinds: the joints' types. chain: of the bodies. The value is that of the form of friction that leaves less of the
-    torque.
-    """
+    """Return the delay that these logs show, see `delay_of`. kinds: the joints' types. chain: of the bodies."""
     collected = DriveLog(kinds, drives, preprocessing)
     for log in logs[:: -(-len(logs) // HINTS.trajectories)]:
         collected.add(log)
     samples = collected.samples()
-    return NO_DELAY if samples is None else delay_of(samples, kinds, drives, chain)
+    if samples is None:
+        return NO_DELAY
+    return delay_of(samples, drive_problem(chain, drives, samples), kinds, drives, chain)
 
 
-def delay_of(samples: DriveSamples, kinds: Sequence[str], drives: Drives, chain: BodyChain) -> TorqueDelay:
-    """Return the delay that samples show; see `find_torque_delay`."""
+def delay_of(
+    samples: DriveSamples,
+    problem: DriveProblem | None,
+    kinds: Sequence[str],
+    drives: Drives,
+    chain: BodyChain,
+) -> TorqueDelay:
+    """Return the delay that least squares with and without friction's memory both show, where both fit.
+
+    The value is that of the form of friction that leaves less of the torque. problem: of these samples, which shows
+    couplings; None: they are too few.
+    """
+    coupling = None if problem is None else find_coupling(problem)
+    if coupling is not None:
+        return TorqueDelay(coupling=coupling)
     q, qd, qdd, z, direction, tau = samples
     if tau.std(axis=0).max() <= TUNING.negligible * np.abs(tau).max():  # a constant, with rounding
         return NO_DELAY

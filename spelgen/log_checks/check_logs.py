@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import reduce
@@ -13,7 +14,7 @@ import numpy as np
 from spelgen.arm.arm import Coordinate
 from spelgen.dynamics.rigid_bodies import body_chain
 from spelgen.errors import Diagnostic, LogError, collect
-from spelgen.identification.drive_hints import coupling_hint, drive_problem, find_coupling, find_wrong_torques
+from spelgen.identification.drive_hints import Coupling, drive_problem, find_wrong_torques
 from spelgen.identification.drive_samples import DriveLog, DriveSamples
 from spelgen.identification.torque_delay import delay_of
 from spelgen.log_checks.check_servo_logs import check_servo_logs
@@ -28,7 +29,7 @@ from spelgen.log_checks.report import TUNING, JointReport, LogReport, range_frac
 from spelgen.log_checks.robot_checks import CHECKS, JointEvidence
 from spelgen.log_checks.statistics import Statistics, joint_statistics, statistics
 from spelgen.logs.checks import Finding, Findings, clock_diagnostics, findings, run_checks, summarised
-from spelgen.logs.preprocessing import COUPLED, Preprocessing
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 
@@ -40,6 +41,7 @@ SENSE = next(check for check in CHECKS if check.code == "torque-sense")
 ORDER = replace(
     SENSE, code="torque-order", expected="its own", do="change the names of the columns under 'logs'"
 )
+COUPLED = "coupled-motors"
 WRONG_TORQUES = {"torque-sense": SENSE, "torque-order": ORDER}
 ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED}
 
@@ -135,18 +137,37 @@ def _check_all_torques(
             summary.add(SENSE, opposed, "tau")
     if moving is None or summary.errors:
         return
-    problem = drive_problem(arm, moving)
+    chain = body_chain(arm.arm)
+    problem = drive_problem(chain, drives, moving)
     if problem is not None:
         wrong = find_wrong_torques(problem, joints)
         if wrong is not None and wrong.code not in accepted:
             summary.add(WRONG_TORQUES[wrong.code], wrong.got, f"joint {joints[wrong.joint]!r}, tau")
             return
-        coupled = find_coupling(problem)
-        if coupled is not None:  # without it any delay would be wrong
-            summary.notes.append(coupling_hint(arm, *coupled))
-            return
-    late = delay_of(moving, arm.arm.joint_types, drives, body_chain(arm.arm))
-    summary.notes.extend(late.notes)
+    late = delay_of(moving, problem, arm.arm.joint_types, drives, chain)
+    if late.coupling is not None:
+        summary.notes.append(_coupling_hint(arm, *late.coupling))
+    else:
+        summary.notes.extend(late.notes)
+
+
+def _coupling_hint(arm: LoadedArm, coupling: Coupling, remaining: float) -> Diagnostic:
+    """Return a coupling that the logs show, in the sidecar's words."""
+    names = arm.arm.joint_names
+    pair = [coupling.moved_by, coupling.joint]
+    matrix = np.array([[1.0, coupling.ratio], [0.0, 1.0]]) * np.diag(arm.actuation.matrix())[pair]
+    joints = json.dumps([names[k] for k in pair])
+    setting = f"couplings: [{{joints: {joints}, matrix: {matrix.round(6).tolist()}}}]"
+    if coupling.logged_at == "motors" and arm.settings.torque == "joint":
+        uncoupled = [name for k, name in enumerate(names) if k not in pair]
+        gears = ", ".join(f"{json.dumps(name)}: {{gear: 1}}" for name in uncoupled)
+        setting += f", 'torque: motor' and joints: {{{gears}}}"
+    message = (
+        f"its motor turns with {names[coupling.moved_by]!r} too, {coupling.ratio:g} times as fast, and the logged "
+        f"torques are those of the {coupling.logged_at}: least squares then misses {remaining:.0%} of what it missed "
+        f"of both torques (mean square); say {setting} in the robot's YAML"
+    )
+    return Diagnostic("warning", COUPLED, f"joint {names[coupling.joint]!r}", None, message)
 
 
 def _joint_report(

@@ -10,6 +10,7 @@ from scipy.linalg import orth
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.dynamics.rigid_bodies import body_chain
 from spelgen.identification.drive_hints import drive_rows
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.settings.tuning.identification import IdentificationTuning
@@ -88,8 +89,9 @@ def find_opposed_inertia(arm: Arm, motion: np.ndarray, speeds: np.ndarray) -> st
     if len(q) < TUNING.gravity_samples / 4 or not np.ptp(tau, axis=0).all():
         return None
     unit = tau.std(axis=0)
-    moving, _ = drive_rows(arm, q, qd, qdd, speeds)
-    steady, _ = drive_rows(arm, q, qd, np.zeros_like(qdd), speeds)
+    chain = body_chain(arm)
+    moving = drive_rows(chain, q, qd, qdd, speeds)
+    steady = drive_rows(chain, q, qd, np.zeros_like(qdd), speeds)
     flat = (moving / unit[:, None]).reshape(tau.size, -1)
     parameters = np.linalg.lstsq(flat, (tau / unit).ravel(), rcond=TUNING.dependent)[0]
     inertia = (moving - steady) @ parameters

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -38,14 +38,14 @@ class DynamicsSamples:
     tau: np.ndarray
     z: np.ndarray | None = None
     direction: np.ndarray | None = None
-    rate: float = FREQUENCY
+    rate: float = field(default=FREQUENCY, kw_only=True)
 
     def __getitem__(self, rows: slice) -> DynamicsSamples:
         """Return the samples of these rows."""
         z = None if self.z is None else self.z[rows]
         direction = None if self.direction is None else self.direction[rows]
         motion = self.q[rows], self.qd[rows], self.qdd[rows], self.tau[rows]
-        return DynamicsSamples(self.name, *motion, z, direction, self.rate / (rows.step or 1))
+        return DynamicsSamples(self.name, *motion, z, direction, rate=self.rate / (rows.step or 1))
 
 
 def dynamics_samples(

@@ -14,7 +14,6 @@ from spelgen.logs.trajectory import GAP, Trajectory
 from spelgen.settings.tuning.logs import LogTuning
 
 TUNING = LogTuning()
-COUPLED = "coupled-motors"  # code of the finding that a motor turns with two joints
 
 
 @dataclass(frozen=True)
@@ -54,12 +53,6 @@ class Preprocessing:
         decimation = self.decimation or automatic_decimation(rates, cutoff or None)
         delay = self.torque_delay or 0.0
         return replace(self, cutoff=cutoff, decimation=decimation, torque_delay=delay)
-
-    def unless_coupled(self, findings: Iterable[Diagnostic]) -> Preprocessing:
-        """Return the same, without a search for a delay where a coupling was found: any delay would be wrong."""
-        if self.torque_delay is None and any(finding.code == COUPLED for finding in findings):
-            return replace(self, torque_delay=0.0)
-        return self
 
     @property
     def acceleration_cutoff(self) -> float | None:
