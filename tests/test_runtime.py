@@ -3,12 +3,13 @@
 import ast
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from emitted import SIX, built, import_source, random_model
+from emitted import ROBOTS, SIX, built, import_source, random_model
 from exported_runs import arm_of
 from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
@@ -18,7 +19,10 @@ from spelgen.design import PRESET_NAMES, load_design
 from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
 from spelgen.dynamics.protocol import has_friction_state, sliding_memory
 from spelgen.emission.bundle import bundle, load_runtime, names_in
+from spelgen.emission.tailored import kinds
 from spelgen.emission.unit_joints import hidden_units
+from spelgen.loaded_arm import load_arm
+from spelgen.pipeline import make_spec
 from spelgen.runtime.derived_mass import DerivedMass
 from spelgen.runtime.encoding import JointEncoding, joint_input, lie_group_input
 from spelgen.runtime.friction_laws import FrictionLaws, turned
@@ -28,6 +32,7 @@ from spelgen.runtime.masked_mlp import MaskedMLP
 from spelgen.runtime.residual_terms import HARMONICS, SPLINES, ResidualTerms
 from spelgen.runtime.rigid_body import Bodies, InertialParameters, pseudo_inertia, upper_cholesky
 from spelgen.runtime.symmetric import symmetric
+from spelgen.spec import Options
 
 NUMBERS = Path(__file__).parent / "golden" / "numbers.json"
 FIRST_STAGE = (  # friction's laws then: |gravity torque|, tanh and exp
@@ -262,21 +267,25 @@ def test_friction_laws_resist_and_read_as_what_they_are():
     near(turned(x, torch.ones(4)), torch.tensor([0.0, 1e-9, 0.6, -1.0], dtype=torch.float64))
 
 
-def test_a_module_takes_what_it_uses_as_it_stands():
-    runtime = load_runtime()
+def test_a_module_takes_what_it_uses_under_the_names_of_kinds():
+    runtime, rpr = load_runtime(), load_arm(ROBOTS / "rpr.urdf")
     for preset, net in PRESETS:
         source = built("rpr", preset=preset, net=net)[0]
         tree = ast.parse(source)
         defined = {node.name for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
         own = defined - {"Model", "make_parts", "mass_entries"}
-        assert own <= set(runtime.definitions)
+        classes = kinds(make_spec(rpr, Options(preset=preset, net=net)))
+        assert set(classes) <= own
         for name in own:
-            assert runtime.definitions[name].text in source
+            text = runtime.definitions[classes.get(name, name)].text
+            for kind, class_name in classes.items():
+                text = re.sub(rf"\b{class_name}\b", kind, text)
+            assert text in source
             users = [
                 node for node in tree.body if name in names_in(node) and getattr(node, "name", "") != name
             ]
             assert users, f"{name} is used by nothing in {preset}"
-    assert bundle("x = 1") == ("", "")
+    assert bundle("x = 1", {}) == ("", "")
 
 
 def test_tailored_part_is_short_and_shows_the_entries():

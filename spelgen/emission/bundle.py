@@ -1,9 +1,10 @@
-"""The parts of the runtime that a module uses, as they stand in ``spelgen/runtime``, and the imports they need."""
+"""The parts of ``spelgen/runtime`` that a module uses, and the imports they need."""
 
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from graphlib import TopologicalSorter
@@ -31,13 +32,16 @@ class Runtime:
     imports: dict[str, str]
 
 
-def bundle(tailored: str) -> tuple[str, str]:
-    """Return the imports, and the runtime's definitions, that the source text ``tailored`` needs."""
+def bundle(tailored: str, kinds: Mapping[str, str]) -> tuple[str, str]:
+    """Return the imports, and the runtime's definitions, that the source text ``tailored`` needs.
+
+    ``kinds``: the runtime's class by kind of part, such as MaskedMLP for Network. A module has one class of each kind,
+    which therefore has the kind's name there.
+    """
     runtime = load_runtime()
     tree = ast.parse(tailored)
-    # a kind of part, such as Network, is in a module the class of its own part
-    defined_here = set(map(_defined, tree.body))
-    used = names_in(tree)
+    defined_here = {*map(_defined, tree.body), *kinds}
+    used = names_in(tree) | set(kinds.values())
     pending = list(used)
     while pending:
         name = pending.pop()
@@ -53,6 +57,8 @@ def bundle(tailored: str) -> tuple[str, str]:
             separate = definition.is_block or previous_is_block
             text += ("\n\n\n" if separate else "\n") + definition.text
             previous_is_block = definition.is_block
+    for kind, name in kinds.items():
+        text = re.sub(rf"\b{name}\b", kind, text)
     return _imports(used, runtime.imports), text.strip()
 
 

@@ -31,12 +31,11 @@ def emit(spec: ModelSpec) -> str:
         attributes=tailored.attributes(spec),
         class_summary=docstring.class_summary(spec),
         bases=tailored.bases(spec),
-        roles=tailored.roles(spec),
         elements=len(BRISTLE_REACH["revolute"]) if spec.design.memory == "bristles" else 0,
         servo=tailored.servo(spec),
         values=_values(spec),
     )
-    imports, runtime = bundle(f"{arm}\n{model}")
+    imports, runtime = bundle(f"{arm}\n{model}", tailored.kinds(spec))
     return render(
         "module.py.jinja",
         title=docstring.title(spec),

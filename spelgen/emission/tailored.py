@@ -52,18 +52,23 @@ def bases(spec: ModelSpec) -> str:
     return f"{dynamics}, MotorInput" if spec.inputs else dynamics
 
 
-def roles(spec: ModelSpec) -> dict[str, str]:
-    """Return the type of each kind of part that the model has, by the name that the runtime has for the kind."""
-    kinds = {"Network": "MaskedKAN" if spec.design.net == "kan" else "MaskedMLP"}
+def kinds(spec: ModelSpec) -> dict[str, str]:
+    """Return the runtime's class for each kind of part that the model has."""
+    network = {"Network": "MaskedKAN" if spec.design.net == "kan" else "MaskedMLP"}
     if spec.bodies:
         if spec.design.net == "none":
-            kinds = {}
-        return kinds | {"Pose": "Motion", "Prepared": "RigidPrepared"}
+            network = {}
+        return network | {"Pose": "Motion", "Prepared": "RigidPrepared"}
     mass = "DerivedMass" if spec.outputs else "ConstantMass"
     if spec.design.mass == "dense-3n":
         mass = "DenseMass"
     friction = "JointFriction" if spec.design.dissipation == "per-joint" else "DenseFriction"
-    return kinds | {"Pose": "NetworkPose", "Prepared": "NetworkPrepared", "Mass": mass, "Friction": friction}
+    return network | {
+        "Pose": "NetworkPose",
+        "Prepared": "NetworkPrepared",
+        "Mass": mass,
+        "Friction": friction,
+    }
 
 
 def parts(spec: ModelSpec) -> tuple[str, str]:
@@ -314,12 +319,12 @@ def _mass(body: _Body, spec: ModelSpec) -> Code:
         outputs = (_all(spec),) * (rows * (rows + 1) // 2)
         sensitivity = _columns(spec.joints, "mass_sensitivity")["mass_sensitivity"]
         network = _network(body, spec, "mass", outputs, _all(spec), sensitivity)
-        return body.let("mass", call("DenseMass", Code("joints"), mean=mean_mass(spec), network=network))
+        return body.let("mass", call("Mass", Code("joints"), mean=mean_mass(spec), network=network))
     constants = tuple(map(attrgetter("start", "scale"), spec.constants))
     if not spec.outputs:
-        return body.let("mass", call("ConstantMass", Code("joints"), Code("mass_entries"), constants))
+        return body.let("mass", call("Mass", Code("joints"), Code("mass_entries"), constants))
     mass = call(
-        "DerivedMass",
+        "Mass",
         Code("joints"),
         Code("mass_entries"),
         functions=tuple(map(attrgetter("mean", "scale"), spec.outputs)),
@@ -380,13 +385,13 @@ def _network(
 
 def _friction(body: _Body, spec: ModelSpec) -> Code:
     if spec.design.dissipation == "per-joint":
-        return body.let("friction", call("JointFriction", Code("joints"), Code("generator")))
+        return body.let("friction", call("Friction", Code("joints"), Code("generator")))
     n, axes = len(spec.joints), _FRICTION_AXES[spec.design.dissipation]
     rows = axes * n
     outputs = (_all(spec),) * (rows * (rows + 1) // 2)
     sensitivity = (TUNING.position_sensitivity,) * n
     network = _network(body, spec, "friction", outputs, _all(spec), sensitivity, axes=axes)
-    return body.let("friction", call("DenseFriction", Code("joints"), network, axes=axes))
+    return body.let("friction", call("Friction", Code("joints"), network, axes=axes))
 
 
 def mean_mass(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:

@@ -1,1 +1,1 @@
-"""What an emitted module computes with: plain torch, tested here, and copied into each module as it stands."""
+"""What an emitted module computes with: plain torch, tested here, and copied into each module that uses it."""

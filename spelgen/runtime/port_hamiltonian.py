@@ -48,8 +48,8 @@ class PortHamiltonian(nn.Module):
             return q  # a pose already: what stands beside it is not checked
         expected = self.actuated.dtype
         for x in (q, *others):
-            if not isinstance(x, Tensor) or x.dtype != expected:
-                kind = x.dtype if isinstance(x, Tensor) else type(x).__name__
+            kind = x.dtype if isinstance(x, Tensor) else type(x).__name__
+            if kind != expected:
                 advice = f"pass torch.as_tensor(x, dtype={expected})"
                 raise TypeError(f"got {kind}, expected a tensor of {expected} like the weights; {advice}")
             if x.shape != (*q.shape[:-1], self.n):

@@ -39,24 +39,23 @@ def motion_table(bodies: Bodies) -> tuple[Tensor, Tensor]:
 
     (36 bodies, 3 bodies), and what is added, (36 bodies,).
     """
-    count, turn = len(bodies.parent), skew(vector((0, 0, 1)))
+    count = len(bodies.parent)
     by_term = torch.zeros(count, 6, 6, 3, count, dtype=torch.float64)
     fixed = torch.zeros(count, 6, 6, dtype=torch.float64)
+    turn = skew(vector((0, 0, 1)))
+    turning, sliding = torch.zeros(2, 3, 6, 6, dtype=torch.float64)
+    turning[1] = torch.ops.aten.block_diag([-turn, -turn])
+    turning[0] = -turning[1] @ turning[1]
+    sliding[2, 3:, :3] = -turn
     for index, revolute in enumerate(bodies.revolute):
         # (w, v) at the frame of a body that has not moved
         rotation = torch.stack([vector(row) for row in bodies.rotation[index]]).mT
         start = torch.ops.aten.block_diag([rotation, rotation])
         start[3:, :3] = -rotation @ skew(vector(bodies.position[index]))
-        # a motion takes it to (constant + cos terms[0] + sin terms[1] + value terms[2]) start
-        constant, terms = torch.eye(6, dtype=torch.float64), torch.zeros(3, 6, 6, dtype=torch.float64)
-        if revolute:
-            terms[1] = torch.ops.aten.block_diag([-turn, -turn])
-            terms[0] = -terms[1] @ terms[1]
-            constant = constant - terms[0]
-        else:
-            terms[2, 3:, :3] = -turn
-        by_term[index, :, :, :, index] = (terms @ start).permute(2, 1, 0)
-        fixed[index] = (constant @ start).mT
+        # a motion takes it to (1 + (cos - 1) terms[0] + sin terms[1] + value terms[2]) start
+        terms = (turning if revolute else sliding) @ start
+        by_term[index, :, :, :, index] = terms.permute(2, 1, 0)
+        fixed[index] = (start - terms[0]).mT
     return by_term.reshape(36 * count, 3 * count), fixed.flatten()
 
 

@@ -65,10 +65,7 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows]:
     )  # fmt: skip
 
 
-# ---- this arm's model, and what its parts are ----
-
-Pose = Motion
-Prepared = RigidPrepared
+# ---- this arm's model ----
 
 
 class Model(RigidBodyDynamics):

@@ -51,7 +51,7 @@ def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction, Netwo
     network = Network(
         lie_group_input(joints, (0.02, 1.0, 0.518)), (mass_hidden, mass_hidden, mass_outputs), generator
     )
-    mass = DenseMass(
+    mass = Mass(
         joints, mean=((139.887,), (-0.00167665, 5.33), (-0.00154309, 0.0, 0.0101411)), network=network
     )
     potential_outputs = ((0, 1, 2),)
@@ -66,7 +66,7 @@ def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction, Netwo
         with_velocities(lie_group_input(joints, (0.1, 0.1, 0.1)), joints, 3),
         (friction_hidden, friction_hidden, friction_outputs), generator,
     )  # fmt: skip
-    friction = DenseFriction(joints, network, axes=3)
+    friction = Friction(joints, network, axes=3)
     input_outputs = ((0, 1, 2),) * 9
     input_hidden = ((0, 1, 2),) * 64
     network = Network(
@@ -75,13 +75,7 @@ def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction, Netwo
     return (joints, mass, potential, 0.703291, friction, network)
 
 
-# ---- this arm's model, and what its parts are ----
-
-Network = MaskedMLP
-Pose = NetworkPose
-Prepared = NetworkPrepared
-Mass = DenseMass
-Friction = DenseFriction
+# ---- this arm's model ----
 
 
 class Model(DenseInput):

@@ -58,7 +58,7 @@ def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction]:
     network = Network(
         lie_group_input(joints, (0.02, 1.0, 0.518)), (mass_hidden, mass_hidden, mass_outputs), generator
     )
-    mass = DerivedMass(
+    mass = Mass(
         joints, mass_entries,
         functions=((-0.00167665, 1.36528), (-0.00154309, 0.0595527), (139.887, 12.6351)),
         constants=((0.0101411, 0.0101411), (5.33, 5.33)), network=network, margin=0.08,
@@ -75,17 +75,11 @@ def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction]:
         with_velocities(lie_group_input(joints, (0.1, 0.1, 0.1)), joints, 1),
         (friction_hidden, friction_hidden, friction_outputs), generator,
     )  # fmt: skip
-    friction = DenseFriction(joints, network, axes=1)
+    friction = Friction(joints, network, axes=1)
     return (joints, mass, potential, 0.703291, friction)
 
 
-# ---- this arm's model, and what its parts are ----
-
-Network = MaskedMLP
-Pose = NetworkPose
-Prepared = NetworkPrepared
-Mass = DerivedMass
-Friction = DenseFriction
+# ---- this arm's model ----
 
 
 class Model(NetworkDynamics):

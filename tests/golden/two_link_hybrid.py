@@ -86,11 +86,7 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualTerm
     )  # fmt: skip
 
 
-# ---- this arm's model, and what its parts are ----
-
-Network = MaskedMLP
-Pose = Motion
-Prepared = RigidPrepared
+# ---- this arm's model ----
 
 
 class Model(ResidualDynamics):
