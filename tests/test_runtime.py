@@ -21,6 +21,7 @@ from spelgen.dynamics.protocol import has_friction_state, sliding_memory
 from spelgen.emission.bundle import bundle, load_runtime, names_in
 from spelgen.emission.tailored import kinds
 from spelgen.emission.unit_joints import hidden_units
+from spelgen.fitting.torque.body_steps import body_weights
 from spelgen.loaded_arm import load_arm
 from spelgen.pipeline import make_spec
 from spelgen.runtime.derived_mass import DerivedMass
@@ -364,13 +365,7 @@ def weights_of_first_stage(bodies):
     entries = 0.01 * torch.ones(4, 4).double().tril(-1)
     root = torch.linalg.cholesky(nominal) @ (entries + math.exp(0.01) * torch.eye(4).double())
     relative = torch.linalg.solve(bodies.factors, root)
-    factor = upper_cholesky(relative @ relative.mT)
-    scale = factor.diagonal(dim1=-2, dim2=-1)
-    shape = factor / scale.unsqueeze(-1)
-    sizes, mass = scale[:, :3] / scale[:, 3:], scale[:, 3:].square()
-    logarithms = torch.cat([sizes, mass], dim=-1).log()
-    row, column = torch.triu_indices(4, 4)
-    return (shape.triu(1) + torch.diag_embed(logarithms))[:, row, column]
+    return body_weights(upper_cholesky(relative @ relative.mT))
 
 
 @pytest.mark.parametrize("case", json.loads(NUMBERS.read_text()))

@@ -30,9 +30,14 @@ def moved_bodies(raw: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
     smallest = torch.linalg.eigvalsh(added)[:, 0]
     fraction = (TUNING.body_step / (-smallest).clamp(min=1e-12)).clamp(max=1.0)
     factor = factor @ upper_cholesky(torch.eye(4).double() + fraction[:, None, None] * added)
+    return body_weights(factor)
+
+
+def body_weights(factor: torch.Tensor) -> torch.Tensor:
+    """Return the weights (B, 10) of which `body_factor` makes this factor (B, 4, 4)."""
     scale = factor.diagonal(dim1=-2, dim2=-1)
     sizes, mass = scale[:, :3].log(), scale[:, 3:].log()
     logarithms = torch.cat([sizes - mass, 2 * mass], dim=-1)
     weights = (factor / scale.unsqueeze(-1)).triu(1) + logarithms.diag_embed()
-    entries: torch.Tensor = weights[:, row, column]
-    return entries
+    row, column = torch.triu_indices(4, 4)
+    return weights[:, row, column]
