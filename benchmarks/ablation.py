@@ -27,16 +27,13 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import arms
 import truth
-from real_logs import first, mean, torque_of
+from real_logs import first, mean, samples_of, torque_of, trained
 
-import spelgen
-from spelgen.dynamics.bristles import bristle_reach
 from spelgen.fitting import levenberg_marquardt
 from spelgen.fitting.torque import jacobian as torque_jacobian
 from spelgen.fitting.torque import prior as torque_prior
 from spelgen.fitting.torque import problem as torque_problem
 from spelgen.fitting.torque import residuals as residual_fit
-from spelgen.fitting.torque.fit import fit_torque
 from spelgen.logs import dynamics_samples
 
 NEVER = float("inf")
@@ -115,20 +112,17 @@ def switched_off(mechanism: Mechanism | None) -> Iterator[None]:
 def real_cases(folder: Path) -> Iterator[tuple[str, Callable[[], dict[str, float]]]]:
     """Fits to recorded logs."""
     for name, urdf, training, tests in arms.splits(folder):
-        judged = arms.judged(tests)
-        yield name, fit_and_judge(urdf, training, judged)
+        yield name, fit_and_judge(urdf, training, tests)
         if name.startswith("UR10e"):
-            yield "UR10e, 3 s", fit_and_judge(urdf, [first(training[0], 3.0)], judged)
+            yield "UR10e, 3 s", fit_and_judge(urdf, [first(training[0], 3.0)], tests)
 
 
-def fit_and_judge(urdf: Path, training: Any, judged: Any) -> Callable[[], dict[str, float]]:
+def fit_and_judge(urdf: Path, training: Any, tests: Any) -> Callable[[], dict[str, float]]:
     """A function that fits `hybrid` and gives its torque nMSE."""
 
     def run() -> dict[str, float]:
-        model = spelgen.build(urdf, "hybrid")
-        samples = dynamics_samples.dynamics_samples(training, reach=bristle_reach(model))
-        fit_torque(model, samples)
-        return {"nMSE": mean(torque_of(model), judged)}
+        fit = trained(urdf, training, "hybrid")
+        return {"nMSE": mean(torque_of(fit.model), samples_of(fit, tests, pauses=True))}
 
     return run
 

@@ -3,10 +3,10 @@
     python benchmarks/arms.py [LOGS]
 
 LOGS is ../shared/logs beside the checkout by default. nMSE: mean squared torque error by the torque's variance, mean of
-the joints, pauses included. Everything is fitted to the same training samples with the defaults of spelgen. Networks
-have two hidden layers of 64 units: one of q, qd and qdd; the same for what least squares leaves; and a Deep Lagrangian
-network (Lutter, Ritter and Peters, ICLR 2019: a factor of M, and V) with viscous and Coulomb friction of each joint
-beside it. They are stopped, and the ridge is chosen, by a fifth of those samples, as a careful user would.
+the joints, pauses included. The presets are fitted as `spelgen train` does, everything else to the same samples.
+Networks have two hidden layers of 64 units: one of q, qd and qdd; the same for what least squares leaves; and a Deep
+Lagrangian network (Lutter, Ritter and Peters, ICLR 2019: a factor of M, and V) with viscous and Coulomb friction of
+each joint beside it. They are stopped, and the ridge is chosen, by a fifth of those samples, as a careful user would.
 States 0.1, 0.5 and 1 s ahead: error relative to the motion, as `spelgen evaluate` has it, open loop and with the
 disturbance held that a momentum observer finds.
 """
@@ -16,7 +16,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,21 @@ sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from motions import smooth_motion
-from real_logs import RIDGES, TESTS, TRAINING, after, first, mean, read, ridge, samples_of, torque_of
+from real_logs import (
+    RIDGES,
+    TESTS,
+    TRAINING,
+    Torque,
+    after,
+    first,
+    least_squares_torque,
+    mean,
+    read,
+    ridge,
+    samples_of,
+    torque_of,
+    trained,
+)
 from torch import Tensor, nn
 from torch.func import grad, jvp
 
@@ -39,18 +53,26 @@ from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.pinocchio_urdf import has_drives, urdf_dynamics
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.identification.friction import FrictionModel
-from spelgen.identification.identify import least_squares
-from spelgen.identification.method import LeastSquares
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory
 
-Torque = Callable[..., np.ndarray]
-Case = tuple[str, Path, list[DynamicsSamples], list[DynamicsSamples]]
-"""Name, URDF, training samples, test samples."""
 Split = tuple[str, Path, list[Trajectory], list[Trajectory]]
 
 PRESETS = ("closed-form", "hybrid")
+
+
+@dataclass(frozen=True)
+class Case:
+    """Training and test samples of an arm, and by preset the model that was fitted, with the seconds that it took."""
+
+    name: str
+    urdf: Path
+    training: list[DynamicsSamples]
+    tests: list[DynamicsSamples]
+    models: dict[str, tuple[Any, float]]
+
+
 AHEAD = (0.1, 0.5, 1.0)  # s
 SMOOTHING = 0.02  # rad/s, of the Deep Lagrangian network's Coulomb friction
 
@@ -88,26 +110,22 @@ def table(cases: Iterator[Case]) -> None:
         "hybrid",
     )
     print(f"{'':18}" + "".join(f"{x:>12}" for x in head) + "    fits [s]")
-    for name, urdf, training, tests in cases:
-        arm, times = load_arm(urdf).arm, []
-        plain = least_squares(arm, training, LeastSquares("range")).torque
-        memory = LeastSquares("range", friction=FrictionModel(memory=True))
+    for case in cases:
+        arm, training = load_arm(case.urdf).arm, case.training
+        plain = least_squares_torque(arm, training, FrictionModel())
         row = [
-            of_the_urdf(urdf, arm),
+            of_the_urdf(case.urdf, arm),
             network(training),
             deep_lagrangian(training),
             best_ridge(arm, training),
             plain,
             network(training, plain),
-            least_squares(arm, training, memory).torque,
+            least_squares_torque(arm, training, FrictionModel(memory=True)),
+            *(torque_of(model) for model, _ in case.models.values()),
         ]
-        for preset in PRESETS:
-            model, since = build(urdf, preset), time.perf_counter()
-            fit_torque(model, training)
-            times.append(f"{time.perf_counter() - since:.0f}")
-            row.append(torque_of(model))
-        errors = "".join(f"{mean(each, tests):12.5f}" for each in row)
-        print(f"{name:18}{errors}{', '.join(times):>12}", flush=True)
+        errors = "".join(f"{mean(each, case.tests):12.5f}" for each in row)
+        times = ", ".join(f"{seconds:.0f}" for _, seconds in case.models.values())
+        print(f"{case.name:18}{errors}{times:>12}", flush=True)
 
 
 def states_ahead(folder: Path) -> None:
@@ -116,7 +134,7 @@ def states_ahead(folder: Path) -> None:
     print(f"{'':30}" + "".join(f"{f'{name}, {ahead:g} s':>30}" for ahead in AHEAD for name in predictors))
     for name, urdf, training, tests in splits(folder):
         for preset in PRESETS:
-            fit = spelgen.fit(build(urdf, preset), training, arm=urdf)
+            fit = trained(urdf, training, preset)
             row = []
             for horizon in spelgen.evaluate(fit, tests, seconds=AHEAD, steps=()).horizons:
                 row += [horizon.errors[x].mean_relative_rms or np.inf for x in predictors]
@@ -147,11 +165,13 @@ def splits(folder: Path) -> Iterator[Split]:
 def real(folder: Path) -> Iterator[Case]:
     """The same, as samples of torque."""
     for name, urdf, training, tests in splits(folder):
-        yield name, urdf, samples_of(training), judged(tests)
-
-
-def judged(logs: Sequence[Any]) -> list[DynamicsSamples]:
-    return samples_of(logs, pauses=True)
+        fits, models = {}, {}
+        for preset in PRESETS:
+            since = time.perf_counter()
+            fits[preset] = trained(urdf, training, preset)
+            models[preset] = fits[preset].model, time.perf_counter() - since
+        fit = fits["closed-form"]
+        yield Case(name, urdf, samples_of(fit, training), samples_of(fit, tests, pauses=True), models)
 
 
 def simulated() -> Iterator[Case]:
@@ -164,7 +184,13 @@ def simulated() -> Iterator[Case]:
             weight += deviation * torch.from_numpy(rng.normal(size=weight.shape))
     for chosen in (*((x,) for x in EFFECTS), tuple(EFFECTS)):
         logs = [recorded(true, chosen, seed, noise=0.02) for seed in (1, 2)]
-        yield " + ".join(chosen) if len(chosen) < 2 else "all", ROBOT, logs, [recorded(true, chosen, 9)]
+        models = {}
+        for preset in PRESETS:
+            model, since = build(ROBOT, preset), time.perf_counter()
+            fit_torque(model, logs)
+            models[preset] = model, time.perf_counter() - since
+        name = " + ".join(chosen) if len(chosen) < 2 else "all"
+        yield Case(name, ROBOT, logs, [recorded(true, chosen, 9)], models)
 
 
 def recorded(model: Any, effects: Sequence[str], seed: int, noise: float = 0.0) -> DynamicsSamples:
@@ -191,7 +217,7 @@ def of_the_urdf(urdf: Path, arm: Arm) -> Torque:
     """The URDF as it is, with the settings' drives where there are any."""
     names = [x.name for x in arm.coordinates]
     dynamics = urdf_dynamics(urdf, names, drives=has_drives(urdf, names))
-    return lambda q, qd, qdd, z=None: dynamics.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd))).numpy()
+    return torque_of(dynamics)
 
 
 def best_ridge(arm: Arm, training: Sequence[DynamicsSamples]) -> Torque:
@@ -207,7 +233,7 @@ def best_ridge(arm: Arm, training: Sequence[DynamicsSamples]) -> Torque:
 def part(x: DynamicsSamples, out: bool) -> DynamicsSamples:
     """The samples of one trajectory that are held out, or the others."""
     rows = held_out(len(x.q)) == out
-    return replace(x, **{k: getattr(x, k)[rows] for k in ("q", "qd", "qdd", "tau", "z")})
+    return DynamicsSamples(x.name, *(column[rows] for column in (x.q, x.qd, x.qdd, x.tau)))
 
 
 def held_out(count: int) -> np.ndarray:
@@ -219,7 +245,7 @@ def network(training: Sequence[DynamicsSamples], beside: Torque | None = None) -
     """A network of q, qd and qdd, fitted to torques, or to what another predictor leaves of them."""
     inputs = [np.concatenate([s.q, s.qd, s.qdd], axis=-1) for s in training]
     moved, scale = np.concatenate(inputs).mean(0), np.concatenate(inputs).std(0) + 1e-9
-    known = [0 * s.tau if beside is None else beside(s.q, s.qd, s.qdd, s.z) for s in training]
+    known = [0 * s.tau if beside is None else beside(s) for s in training]
     torch.manual_seed(0)
     layers = mlp(len(moved), training[0].q.shape[1], nn.Tanh)
 
@@ -230,7 +256,7 @@ def network(training: Sequence[DynamicsSamples], beside: Torque | None = None) -
     learned = fitted(model, layers, training, [s.tau - k for s, k in zip(training, known, strict=True)])
     if beside is None:
         return learned
-    return lambda q, qd, qdd, z=None: learned(q, qd, qdd, z) + beside(q, qd, qdd, z)
+    return lambda x: learned(x) + beside(x)
 
 
 class DeepLagrangian(nn.Module):
@@ -301,9 +327,9 @@ def fitted(
             break
     weights.load_state_dict(kept)
 
-    def torque(q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None = None) -> np.ndarray:
+    def torque(x: DynamicsSamples) -> np.ndarray:
         with torch.no_grad():
-            return model(*map(torch.from_numpy, (q, qd, qdd))).numpy() * scale + moved
+            return model(*map(torch.from_numpy, (x.q, x.qd, x.qdd))).numpy() * scale + moved
 
     return torque
 

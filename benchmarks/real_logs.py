@@ -4,15 +4,18 @@
 
 LOGS is ../shared/logs beside the checkout by default. Torque errors are nMSE (mean squared error by the torque's
 variance, mean of the joints), once over the samples that move and once with the pauses between motions; the second is
-how the baselines' published figures were made. Nothing is chosen here: the settings are the defaults of spelgen.
+how the baselines' published figures were made. Nothing is chosen here: the settings are the defaults of spelgen, and
+fits are those of `spelgen train`, with the delay of torques that it finds; least squares has the same samples.
 """
 
 from __future__ import annotations
 
+import copy
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +27,15 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from characters import TESTS as CHARACTERS
 from characters import read_characters, write_arm
 
+import spelgen
 from spelgen.arm.arm import Arm
 from spelgen.baselines.solver import Solver
 from spelgen.building import build
-from spelgen.dynamics.bristles import BristleReach, reach_of
+from spelgen.dynamics.bristles import bristle_reach, reach_of
 from spelgen.dynamics.regressor import regressor
 from spelgen.evaluation.state_errors import end_errors
+from spelgen.evaluation.torque import mean_nmse, predicted_torques
+from spelgen.fitting.fitted import Fit
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identification import Identification
@@ -42,7 +48,7 @@ from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows, joined
 
-Torque = Callable[..., np.ndarray]
+Torque = Callable[[DynamicsSamples], np.ndarray]
 
 TRAINING = ("20_02_10_30sec_12harm", "20_02_12_50sec_12harm", "20_02_05_20sec_8harm")
 TESTS = (
@@ -69,31 +75,29 @@ def main() -> None:
 
 def ur10e(folder: Path) -> None:
     urdf = folder / "ur10e.urdf"
-    arm, model = load_arm(urdf).arm, build(urdf, "closed-form")
+    arm = load_arm(urdf).arm
     logs = {name: read(folder / f"{name}.parquet", arm) for name in (*TRAINING, *TESTS, OUTSIDE, *LOADED)}
-    training = samples_of([logs[name] for name in TRAINING])
-    tests = [samples_of([logs[x] for x in (*TESTS, OUTSIDE)], pauses=pauses) for pauses in (True, False)]
-    baseline = least_squares(arm, training, LeastSquares("range"))
-    features = FrictionModel(stribeck=True, polynomial=True)
-    more = least_squares(arm, training, LeastSquares("range", friction=features))
-    remembering = least_squares(arm, training, LeastSquares("range", friction=FrictionModel(memory=True)))
     since = time.perf_counter()
-    fit_torque(model, training)
+    fit = trained(urdf, [logs[name] for name in TRAINING])
     print(
         f"UR10e: the closed-form model is fitted to 100 s of three logs in {time.perf_counter() - since:.0f} s\n"
     )
+    training = samples_of(fit, [logs[name] for name in TRAINING])
+    tests = [samples_of(fit, [logs[x] for x in (*TESTS, OUTSIDE)], pauses=pauses) for pauses in (True, False)]
+    baseline = least_squares(arm, training, LeastSquares("range"))
+    features = FrictionModel(stribeck=True, polynomial=True)
     predictors = {
-        "least squares": baseline.torque,
-        "with features": more.torque,
-        "with memory": remembering.torque,
-        "closed-form": torque_of(model),
+        "least squares": torque_of(baseline.dynamics),
+        "with features": least_squares_torque(arm, training, features),
+        "with memory": least_squares_torque(arm, training, FrictionModel(memory=True)),
+        "closed-form": torque_of(fit.model),
     }
     for samples, said in zip(tests, ("pauses included", "moving samples alone"), strict=True):
         table(f"Torque nMSE, {said}", predictors, samples, len(TESTS))
-    rollouts(model, baseline, [logs[name] for name in TESTS])
-    payload(model, logs)
-    other_days(model, logs)
-    few(urdf, arm, logs[TRAINING[0]], [each[: len(TESTS)] for each in tests])
+    rollouts(fit.model, baseline, [logs[name] for name in TESTS])
+    payload(fit, logs)
+    other_days(fit, logs)
+    few(urdf, arm, logs[TRAINING[0]], [logs[name] for name in TESTS])
 
 
 def table(
@@ -108,18 +112,17 @@ def table(
     print()
 
 
-def few(urdf: Path, arm: Arm, long: Trajectory, tests: Sequence[Sequence[DynamicsSamples]]) -> None:
+def few(urdf: Path, arm: Arm, long: Trajectory, tests: Sequence[Trajectory]) -> None:
     print(f"Trained on the first seconds of {long.name}: mean nMSE of the nine, pauses included\n")
     head = ("best ridge", "closed-form", "(moving)")
     print(f"{'seconds':26}" + "".join(f"{x:>15}" for x in head))
     for seconds in SECONDS:
-        samples = samples_of([first(long, seconds)])
-        ridges = [ridge(arm, samples, x) for x in RIDGES]
-        model = build(urdf, "closed-form")
-        fit_torque(model, samples)
-        ours = torque_of(model)
-        best = min(mean(x, tests[0]) for x in ridges)  # by the tests themselves: in its favour
-        row = (best, mean(ours, tests[0]), mean(ours, tests[1]))
+        fit = trained(urdf, [first(long, seconds)])
+        samples, judged = samples_of(fit, [first(long, seconds)]), samples_of(fit, tests, pauses=True)
+        # by the tests themselves: in its favour
+        best = min(mean(ridge(arm, samples, x), judged) for x in RIDGES)
+        moving = mean(torque_of(fit.model), samples_of(fit, tests))
+        row = (best, mean(torque_of(fit.model), judged), moving)
         print(f"{seconds:<26}" + "".join(f"{x:15.5f}" for x in row))
     print()
 
@@ -139,47 +142,43 @@ def ridge(arm: Arm, samples: Sequence[DynamicsSamples], size: float) -> Torque:
     penalised = np.vstack([columns / length, np.sqrt(size) * np.eye(len(length))])
     target = np.append((tau / tau.std(axis=0)).ravel(), np.zeros(len(length)))
     parameters = np.linalg.lstsq(penalised, target, rcond=None)[0] / length
-    return lambda q, qd, qdd, z=None: rows(q, qd, qdd) @ parameters
+    return lambda x: rows(x.q, x.qd, x.qdd) @ parameters
 
 
-def payload(model: Any, logs: dict[str, Trajectory]) -> None:
+def payload(fit: Fit, logs: dict[str, Trajectory]) -> None:
     print("A load at the tip: the last body alone is fitted to the first 10 s, judged on the rest\n")
     print(f"{'':26}{'as trained':>15}{'adapted':>15}{'adapted, 3 s':>15}")
-    trained = {name: value.clone() for name, value in model.state_dict().items()}
     for name in LOADED:
-        row = []
-        for seconds in (0.0, 10.0, 3.0):
-            model.load_state_dict(trained)
-            seen = samples_of([first(logs[name], seconds)]) if seconds else []
-            if sum(len(x.q) for x in seen):
-                fit_torque(model, seen, adapt="load")
-            rest = samples_of([after(logs[name], seconds or 10.0)], pauses=True)
-            row.append(mean(torque_of(model), rest))
+        row = [missed_after(fit, logs[name], 10.0)]
+        for seconds in (10.0, 3.0):
+            row.append(missed_after(adapted(fit, first(logs[name], seconds), "load"), logs[name], seconds))
         print(f"{name:26}" + "".join(f"{x:15.5f}" for x in row))
-    model.load_state_dict(trained)
     print()
 
 
-def other_days(model: Any, logs: dict[str, Trajectory]) -> None:
+def other_days(fit: Fit, logs: dict[str, Trajectory]) -> None:
     """The nine are of other days than the training: what friction and torque offsets of the day are worth."""
     print(
         "Friction and torque offsets fitted to the first 10 s of each, judged on the rest, pauses included\n"
     )
     print(f"{'':26}{'as trained':>15}{'friction':>15}{'another unit':>15}")
-    trained = {name: value.clone() for name, value in model.state_dict().items()}
     rows = []
     for name in TESTS:
-        seen, rest = samples_of([first(logs[name], 10.0)]), samples_of([after(logs[name], 10.0)], pauses=True)
-        row = []
-        for adapt in (None, "friction", "unit"):
-            model.load_state_dict(trained)
-            if adapt is not None:
-                fit_torque(model, seen, adapt=adapt)
-            row.append(mean(torque_of(model), rest))
+        row = [missed_after(fit, logs[name], 10.0)]
+        for adapt in ("friction", "unit"):
+            row.append(missed_after(adapted(fit, first(logs[name], 10.0), adapt), logs[name], 10.0))
         rows.append(row)
         print(f"{name:26}" + "".join(f"{x:15.5f}" for x in row))
     print(f"{'mean':26}" + "".join(f"{x:15.5f}" for x in np.mean(rows, axis=0)) + "\n")
-    model.load_state_dict(trained)
+
+
+def adapted(fit: Fit, log: Trajectory, adapt: Any) -> Fit:
+    """What `spelgen train --from` makes of a log."""
+    return spelgen.fit(copy.deepcopy(fit.model), log, spelgen.TorqueFit(adapt=adapt), arm=fit.urdf)
+
+
+def missed_after(fit: Fit, log: Trajectory, seconds: float) -> float:
+    return mean(torque_of(fit.model), samples_of(fit, [after(log, seconds)], pauses=True))
 
 
 def rollouts(model: Any, found: Identification, logs: Sequence[Trajectory]) -> None:
@@ -199,10 +198,11 @@ def tested(logs: Sequence[Trajectory], steps: int) -> Windows:
     """Evenly spread windows of each trajectory."""
     filtered = Preprocessing(cutoff=8.0)
     pieces = [piece for x in logs for piece in filtered.pieces([x], shortest=steps + 1)]
-    cut = [
-        cut_windows([x], steps + 1, max(1, (len(x) - steps) // WINDOWS), measured=True, reach=reach(x))
-        for x in pieces
-    ]
+    cut = []
+    for x in pieces:
+        reach = reach_of(["revolute"] * x.q.shape[1])
+        stride = max(1, (len(x) - steps) // WINDOWS)
+        cut.append(cut_windows([x], steps + 1, stride, measured=True, reach=reach))
     return joined(cut)
 
 
@@ -213,19 +213,16 @@ def relative_error(dynamics: Any, windows: Windows) -> float:
 
 
 def panda(folder: Path, urdf: Path) -> None:
-    arm, model = load_arm(urdf).arm, build(urdf, "closed-form")
+    arm = load_arm(urdf).arm
     whole = read(folder / "exciting_traj1.parquet", arm)
-    training, test = samples_of([first(whole, 12.0)]), samples_of([after(whole, 12.0)])
-    fit_torque(model, training)
-    predictors = {
-        f"tanh {width:g}": least_squares(
-            arm, training, LeastSquares("range", friction=FrictionModel(width))
-        ).torque
-        for width in (0.02, 0.05)
-    }
-    remembering = LeastSquares("range", friction=FrictionModel(memory=True))
-    predictors["with memory"] = least_squares(arm, training, remembering).torque
-    table("Panda: first 12 s train, last 9 s test", predictors | {"closed-form": torque_of(model)}, test, 1)
+    fit = trained(urdf, [first(whole, 12.0)])
+    training, test = samples_of(fit, [first(whole, 12.0)]), samples_of(fit, [after(whole, 12.0)])
+    frictions = {f"tanh {width:g}": FrictionModel(width) for width in (0.02, 0.05)}
+    frictions["with memory"] = FrictionModel(memory=True)
+    predictors = {name: least_squares_torque(arm, training, friction) for name, friction in frictions.items()}
+    table(
+        "Panda: first 12 s train, last 9 s test", predictors | {"closed-form": torque_of(fit.model)}, test, 1
+    )
 
 
 def characters(folder: Path, scratch: Path) -> None:
@@ -261,12 +258,15 @@ def _torques(
         return model.inverse_dynamics(q, qd, qdd).numpy(), (steady - still - friction).numpy()
 
 
-def samples_of(logs: Sequence[Trajectory], *, pauses: bool = False) -> list[DynamicsSamples]:
-    return dynamics_samples(logs, pauses=pauses, reach=reach(logs[0]))
+def trained(urdf: Path, logs: Sequence[Trajectory], preset: str = "closed-form") -> Fit:
+    """What `spelgen train` makes of these logs."""
+    return spelgen.fit(build(urdf, preset), logs, arm=urdf)
 
 
-def reach(log: Trajectory) -> BristleReach:
-    return reach_of(["revolute"] * log.q.shape[1])
+def samples_of(fit: Fit, logs: Sequence[Trajectory], *, pauses: bool = False) -> list[DynamicsSamples]:
+    """The samples that `spelgen train` and `evaluate` take of logs."""
+    reach = bristle_reach(fit.model)
+    return dynamics_samples(logs, pauses=pauses, preprocessing=fit.preprocessing, reach=reach)
 
 
 def read(path: Path, arm: Arm) -> Trajectory:
@@ -282,18 +282,17 @@ def after(trajectory: Trajectory, seconds: float) -> Trajectory:
     return trajectory[int(np.searchsorted(trajectory.t, trajectory.t[0] + seconds)) :]
 
 
-def torque_of(model: Any) -> Torque:
-    def torque(*state: np.ndarray) -> np.ndarray:
-        with torch.no_grad():
-            found: np.ndarray = model.inverse_dynamics(*map(torch.from_numpy, state)).numpy()
-        return found
+def torque_of(dynamics: Any) -> Torque:
+    return partial(predicted_torques, dynamics)
 
-    return torque
+
+def least_squares_torque(arm: Arm, training: Sequence[DynamicsSamples], friction: FrictionModel) -> Torque:
+    return torque_of(least_squares(arm, training, LeastSquares("range", friction=friction)).dynamics)
 
 
 def nmse(torque: Torque, sample: DynamicsSamples) -> float:
-    error = torque(sample.q, sample.qd, sample.qdd, sample.z) - sample.tau
-    return float((np.square(error).mean(axis=0) / sample.tau.var(axis=0)).mean())
+    found = mean_nmse(torque(sample) - sample.tau, sample.tau)
+    return np.inf if found is None else found
 
 
 def mean(torque: Torque, samples: Sequence[DynamicsSamples]) -> float:

@@ -115,7 +115,7 @@ class Fit:
             )
         scores = []
         for x in samples:
-            squares = np.square(self._torque(x.q, x.qd, x.qdd, x.z) - x.tau).mean(axis=0)
+            squares = np.square(self._torque(x.q, x.qd, x.qdd, x.z, x.direction) - x.tau).mean(axis=0)
             variance = x.tau.var(axis=0)
             varies = variance > 0  # a joint without torque says nothing
             scores.append(1 - (squares[varies] / variance[varies]).mean())
@@ -141,12 +141,10 @@ class Fit:
         cutoff = self.preprocessing.cutoff
         return low_pass(piece, cutoff) if cutoff and len(piece.t) > 3 else piece
 
-    def _torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
+    def _torque(self, *motion: np.ndarray | None) -> np.ndarray:
+        """Return torques (T, n) at q, qd, qdd and, where they are known, z and direction (see `DynamicsSamples`)."""
         like = next(self.model.parameters())
-        arrays = [q, qd, qdd]
-        if z is not None:
-            arrays.append(z)
-        inputs = [torch.as_tensor(np.ascontiguousarray(array)).to(like) for array in arrays]
+        inputs = [torch.as_tensor(np.ascontiguousarray(x)).to(like) for x in motion if x is not None]
         with torch.no_grad():
             return self.model.inverse_dynamics(*inputs).cpu().double().numpy()
 
