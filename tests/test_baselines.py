@@ -17,7 +17,6 @@ from spelgen.baselines.urdf import UrdfValues
 from spelgen.cli.main import app
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
-from spelgen.dynamics.rigid_bodies import RigidBodies
 from spelgen.fitting.fitted import load_run
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import Trajectory, read_logs, write_logs
@@ -114,9 +113,9 @@ def test_torques_by_recursion_are_the_regressors(robots, robot):
     generator = np.random.default_rng(0)
     q, qd, qdd = generator.normal(size=(3, 20, len(arm.coordinates)))
     parameters = generator.normal(size=10 * len(arm.bodies))
-    mass, bias_at = RigidBodies(arm, parameters).at(torch.from_numpy(q))
-    bias = bias_at(torch.from_numpy(qd))
-    torque = (mass @ qdd[..., None])[..., 0] + bias
+    n = len(arm.coordinates)
+    bodies = RegressorDynamics(arm, parameters, np.zeros(n), lambda qd, _: np.zeros_like(qd))
+    torque = bodies.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd)))
     np.testing.assert_allclose(torque, regressor(arm, q, qd, qdd) @ parameters, rtol=1e-10, atol=1e-10)
 
 

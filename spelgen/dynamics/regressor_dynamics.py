@@ -12,9 +12,10 @@ from torch import Tensor
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.pose import Pose
-from spelgen.dynamics.rigid_bodies import RigidBodies
+from spelgen.dynamics.rigid_bodies import body_chain
 from spelgen.runtime.bristles import moved_bristles
 from spelgen.runtime.port_hamiltonian import applied
+from spelgen.runtime.rigid_body import spatial_inertia
 
 
 class RegressorDynamics:
@@ -34,7 +35,9 @@ class RegressorDynamics:
         drives: Drives | None = None,
         bristle_reach: np.ndarray | None = None,
     ) -> None:
-        self.bodies, self.friction = RigidBodies(arm, parameters), friction
+        self.chain, self.friction = body_chain(arm), friction
+        by_body = torch.from_numpy(parameters).double().reshape(-1, 10)
+        self.inertia = torch.block_diag(*spatial_inertia(by_body))
         self.armature = torch.tensor(armature, dtype=torch.float64)
         self.bristle_reach = None if bristle_reach is None else torch.from_numpy(bristle_reach)
         alone = np.eye(len(armature))
@@ -61,8 +64,8 @@ class RegressorDynamics:
 
     def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
         """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
-        _, bias_at = self.bodies.at(q)
-        return bias_at(qd)
+        chain = self.chain.forward(q)
+        return self.chain.steady_torque(chain, qd, chain.twists @ self.inertia)
 
     def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
         """What friction takes, and what the measured torque shows without any, (..., n) [Nm, N]."""
@@ -91,13 +94,15 @@ class RegressorDynamics:
 
     def pose_at(self, q: Tensor) -> Pose:
         """Return the equations of motion at q, (T, n), see `pose.poses`."""
-        mass, bias_at = self.bodies.at(q)
+        chain = self.chain.forward(q)
+        momenta = chain.twists @ self.inertia
 
         def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
-            return tau @ self.inputs.mT - bias_at(qd) - self.friction_torque(q, qd, z)
+            bias = self.chain.steady_torque(chain, qd, momenta)
+            return tau @ self.inputs.mT - bias - self.friction_torque(q, qd, z)
 
-        mass = mass + self.motors.mT @ torch.diag(self.armature) @ self.motors
-        return Pose(mass, force, partial(self.friction_torque, q))
+        rotors = self.motors.mT @ torch.diag(self.armature) @ self.motors
+        return Pose(momenta @ chain.twists.mT + rotors, force, partial(self.friction_torque, q))
 
     def memory(self, qd: Tensor) -> Tensor:
         """z, (..., n, K), of drives that have long gone this way."""

@@ -74,20 +74,19 @@ def torque_rows(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.
     Derivatives by complex steps (Squire and Trapp, SIAM Review 40:110, 1998), which lose no digit. It is `regressor`
     without torch, which a derivation does not load.
     """
-    n, step = q.shape[1], 1e-30
-    units = np.eye(10 * len(arm.bodies))
-    moved = q[:, None] + 1j * step * np.eye(n)  # (S, n, n), row k with coordinate k moved
-    inertias = np.split(units, len(arm.bodies))
-    triangles, potential = float_energies(arm, moved[:, :, None], [list(ten) for ten in inertias])
-    mass = np.zeros((*potential.shape, n, n), dtype=complex)  # (S, n, 10 B, n, n)
+    samples, n = q.shape
+    step = 1e-30
+    # along each coordinate alone, and along the motion
+    ways = np.concatenate([np.tile(np.eye(n), (samples, 1, 1)), qd[:, None]], axis=1)  # (S, n + 1, n)
+    inertias = np.split(np.eye(10 * len(arm.bodies)), len(arm.bodies))
+    moved = q[:, None, None] + 1j * step * ways[:, :, None]
+    triangles, potential = float_energies(arm, moved, [list(ten) for ten in inertias])
+    mass = np.zeros((*potential.shape, n, n), dtype=complex)  # (S, n + 1, 10 B, n, n)
     for entry, (row, column) in enumerate(triangle(n)):
         mass[..., row, column] = mass[..., column, row] = triangles[..., entry]
-    slopes = mass.imag / step
-    accelerated = np.einsum("spij,sj->sip", mass[:, 0].real, qdd)
-    quadratic = (
-        np.einsum("skpij,sk,sj->sip", slopes, qd, qd) - np.einsum("sipjk,sj,sk->sip", slopes, qd, qd) / 2
-    )
-    torque: np.ndarray = accelerated + quadratic + potential.imag / step
+    momentum = np.einsum("spij,sj->sip", mass[:, n], qd + 1j * step * qdd)
+    kinetic = np.einsum("skpij,si,sj->skp", mass[:, :n], qd, qd) / 2
+    torque: np.ndarray = (momentum - kinetic + potential[:, :n]).imag / step
     return torque
 
 
