@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from spelgen.dynamics.protocol import has_servos
 from spelgen.emission.loading import load_module
 from spelgen.errors import Diagnostic, ModuleError, RunError
 from spelgen.fitting.fit import AUTOMATIC, QUIET, RunOptions, fit, sample_rates
@@ -16,6 +15,7 @@ from spelgen.fitting.fitted import Fit
 from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import recorded_config
 from spelgen.fitting.streaming import LargeLogs
+from spelgen.logs.arm_mapping import log_source
 from spelgen.logs.chunks import large_files
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
@@ -91,26 +91,22 @@ def _new_model(module: Path, source: Path | str | None, *, trust: bool) -> Emitt
     return fitted_model(RunFolder(Path(source)), trust=trust)
 
 
-def mapping_of(model: Any, mapping: LogMapping | None) -> LogMapping:
-    """The mapping, by default as spelgen writes logs, for what this model is commanded."""
-    mapping = mapping or LogMapping()
-    return mapping.model_copy(update={"input": "position"}) if has_servos(model) else mapping
-
-
 def open_logs(
     model: EmittedModel,
     paths: Iterable[Path | str],
     mapping: LogMapping | None = None,
     preprocessing: Preprocessing = AUTOMATIC,
 ) -> Sequence[Trajectory] | LargeLogs:
-    """The training part of log files; of Parquet larger than memory one chunk at a time. Raises LogError, and
-    SettingsError where the mapping does not fit.
+    """Return the training part of log files; of Parquet larger than memory one chunk at a time.
+
+    Raises LogError, and SettingsError where the mapping does not fit.
     """
-    paths, joints, mapping = list(paths), model.facts.joints, mapping_of(model, mapping)
-    large = large_files(paths, joints, role="train")
+    paths, source = list(paths), log_source(model, mapping)
+    large = large_files(paths, source.joints, role="train")
     if large:
-        return LargeLogs(tuple(large), joints, tuple(model.joint_types), mapping, preprocessing.gap)
-    return read_logs(paths, joints, mapping, role="train", joint_types=model.joint_types)
+        kinds = tuple(model.joint_types)
+        return LargeLogs(tuple(large), source.joints, kinds, source.mapping, preprocessing.gap)
+    return read_logs(paths, model, mapping, role="train")
 
 
 def robot_of(module: Path, urdf: Path | str | None, facts: Facts) -> tuple[Path | None, list[Diagnostic]]:

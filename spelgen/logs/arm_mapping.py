@@ -60,7 +60,10 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
         return LogSource(joints, joint_types, _mapping(mapping, all_joints))
     if isinstance(arm, JointNames):
         joints = logged_joints(arm)
-        return LogSource(joints, tuple(arm.joint_types), _mapping(mapping, joints))
+        log_mapping = _mapping(mapping, joints)
+        if hasattr(arm, "servo"):  # a model whose inputs are commands
+            log_mapping = log_mapping.model_copy(update={"input": "position"})
+        return LogSource(joints, tuple(arm.joint_types), log_mapping)
     if isinstance(arm, Sequence) and not isinstance(arm, str) and all(isinstance(x, str) for x in arm):
         return LogSource(tuple(arm), None, _mapping(mapping, arm))
     raise LogError(
