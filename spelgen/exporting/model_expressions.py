@@ -16,7 +16,7 @@ from spelgen.exporting.residual_expressions import (
     symbol_slopes,
     symmetric,
 )
-from spelgen.exporting.rigid_expressions import RigidExpressions, constant, mass_and_potential
+from spelgen.exporting.rigid_expressions import body_frames, constant, mass_and_potential, rigid_torque
 from spelgen.exporting.tip_expressions import tip_expressions
 
 RESIDUAL = "residual_"
@@ -39,8 +39,11 @@ class ModelExpressions:
         self.inputs["z"] = ca.SX.sym("z", model.memory)
         self.q, self.qd, self.qdd, self.tau, self.dq, self.u, self.z = self.inputs.values()
         self.residuals = residual_symbols(model)
-        self._rigid = RigidExpressions(model, self.q)
+        self._frames = body_frames(model, self.q)
         self._rest = ca.SX(self.n, 1)
+
+    def _rigid_torque(self, qd: ca.SX, qdd: ca.SX) -> ca.SX:
+        return rigid_torque(self.model, self._frames, qd, qdd)
 
     @cached_property
     def _rigid_energies(self) -> tuple[ca.SX, ca.SX]:
@@ -58,7 +61,7 @@ class ModelExpressions:
 
     @cached_property
     def _rigid_gravity(self) -> ca.SX:
-        return self._rigid.torque(self._rest, self._rest)
+        return self._rigid_torque(self._rest, self._rest)
 
     @cached_property
     def _residual_gravity(self) -> ca.SX:
@@ -81,7 +84,7 @@ class ModelExpressions:
 
     @cached_property
     def bias(self) -> ca.SX:
-        return self._rigid.torque(self.qd, self._rest) + self._residual_bias
+        return self._rigid_torque(self.qd, self._rest) + self._residual_bias
 
     @cached_property
     def friction(self) -> ca.SX:
@@ -125,7 +128,7 @@ class ModelExpressions:
     def _force(self) -> ca.SX:
         """M qdd + h + friction, less what the drives add unseen, (n, 1)."""
         # one pass of Newton and Euler, where M qdd + h would take two
-        rigid = self._rigid.torque(self.qd, self.qdd)
+        rigid = self._rigid_torque(self.qd, self.qdd)
         added = self._added_mass @ self.qdd + self._residual_bias
         return rigid + added + self.friction - self._compensation
 
