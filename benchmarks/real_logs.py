@@ -33,6 +33,7 @@ from spelgen.baselines.solver import Solver
 from spelgen.building import build
 from spelgen.dynamics.bristles import bristle_reach, reach_of
 from spelgen.dynamics.regressor import regressor
+from spelgen.errors import LogError
 from spelgen.evaluation.state_errors import end_errors
 from spelgen.evaluation.torque import mean_nmse, predicted_torques
 from spelgen.fitting.fitted import Fit
@@ -151,7 +152,12 @@ def payload(fit: Fit, logs: dict[str, Trajectory]) -> None:
     for name in LOADED:
         row = [missed_after(fit, logs[name], 10.0)]
         for seconds in (10.0, 3.0):
-            row.append(missed_after(adapted(fit, first(logs[name], seconds), "load"), logs[name], seconds))
+            try:
+                row.append(
+                    missed_after(adapted(fit, first(logs[name], seconds), "load"), logs[name], seconds)
+                )
+            except LogError:  # nothing moves within this time
+                row.append(np.nan)
         print(f"{name:26}" + "".join(f"{x:15.5f}" for x in row))
     print()
 

@@ -78,10 +78,10 @@ class LoadedArm:
     def formulas(
         self, entry: Entry | None = None, assume: Assume = "kinematics", *, longest: int | None = None
     ) -> Formulas:
-        """M(q) and V(q), or one entry ((row, column) from 1, or "V"), as SymPy expressions: ``.entries``,
-        ``.mass_matrix`` and ``.potential`` in ``.q`` and ``.base_parameters``.
+        """Return M(q) and V(q), or one entry ((row, column) from 1, or "V"), as SymPy expressions.
 
-        ``longest``: terms of what is still written out; None: as many as a person reads.
+        They are ``.entries``, ``.mass_matrix`` and ``.potential``, in ``.q`` and ``.base_parameters``. ``longest``:
+        terms of what is still written out; None: as many as a person reads.
         """
         from spelgen.certificate.formulas import formulas
 

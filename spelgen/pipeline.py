@@ -97,8 +97,7 @@ class CheckResult:
 
 
 def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
-    """Generate the module at ``module`` again, with its own options, compare, and prove its structure
-    numerically.
+    """Generate the module at ``module`` again, with its own options, compare it, and test its structure numerically.
 
     Without ``urdf`` the URDF is looked for by name beside the module, in the current folder and in
     ``robots/``. Raises ModuleError when there is none or when the file is no emitted module.

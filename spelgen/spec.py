@@ -1,7 +1,6 @@
-"""ModelSpec: everything an emitted module is made from, as plain frozen data. The wall between deriving and
-training.
+"""Define ModelSpec, everything an emitted module is made from, as plain frozen data.
 
-Also writes, and reads back, the facts that an emitted module carries.
+It is the wall between deriving and training. The facts that an emitted module carries are written and read back here.
 """
 
 from __future__ import annotations

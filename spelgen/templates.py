@@ -30,8 +30,9 @@ def _environment(autoescape: bool) -> Environment:
 
 
 def render(template: str, **context: Any) -> str:
-    """The text of ``template`` with ``context``; an undefined name is an error, and HTML templates escape
-    what they show.
+    """Return the text of ``template`` with ``context``.
+
+    An undefined name is an error, and HTML templates escape what they show.
     """
     return _environment(".html" in template).get_template(template).render(**context)
 

@@ -21,8 +21,10 @@ _SIMPLE, _DIFFERENTIAL = "SimpleTransmission", "DifferentialTransmission"
 
 @dataclass(frozen=True)
 class InputEntry:
-    """Hold an entry of G that is not zero, 0-based: known (``fixed``, or ``coupled`` where one motor moves several
-    joints), or a ``gain`` that is trained and starts at ``value``.
+    """Hold an entry of G that is not zero, 0-based.
+
+    It is known (``fixed``, or ``coupled`` where one motor moves several joints), or a ``gain`` that is trained and
+    starts at ``value``.
     """
 
     row: int

@@ -146,8 +146,10 @@ def lost_zeros(candidate: np.ndarray, rotation: np.ndarray) -> int:
 
 
 def _rotation_with_zero(rotation: np.ndarray, row: int, column: int) -> np.ndarray:
-    """Return the rational rotation near a float64 one of which this element is zero: a turn about axis ``row``,
-    a signed permutation, and a turn about axis ``column``, so that the other zeros are those of the turns.
+    """Return the rational rotation near a float64 one of which this element is zero.
+
+    It is a turn about axis ``row``, a signed permutation, and a turn about axis ``column``, so that the other zeros are
+    those of the turns.
     """
     first = _turn(row, rotation[(row + 1) % 3, column], rotation[(row + 2) % 3, column])
     last = _turn(column, rotation[row, (column + 1) % 3], -rotation[row, (column + 2) % 3])

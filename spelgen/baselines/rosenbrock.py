@@ -1,5 +1,7 @@
-"""Rollouts of dynamics with stiff friction, by ROS2 (Verwer, Spee, Blom and Hundsdorfer, SIAM J. Sci. Comput. 20:1456,
-1999): a Rosenbrock method of order two for any matrix in place of the Jacobian, L-stable where that is the exact one.
+"""Roll out dynamics with stiff friction by ROS2, a Rosenbrock method of order two.
+
+The order is two for any matrix in place of the Jacobian; with the exact one the method is L-stable (Verwer, Spee, Blom
+and Hundsdorfer, SIAM J. Sci. Comput. 20:1456, 1999).
 
 Here the matrix is the Jacobian of friction alone, so that damping and bristles of any stiffness (light links against a
 jump of dry friction) ask for no smaller steps, and what an explicit method would make of it is not taken for an error
@@ -74,8 +76,9 @@ class _Equations:
         self.has_momentum = has_momentum(dynamics)
 
     def step(self, states: _States, tau: Tensor, step: Tensor) -> _States:
-        """Take one step of (q, qd), with A = [[0, 1], [-M^-1 K, -M^-1 D]], D = d friction / d qd and, where friction
-        has a state, K = d friction / d q by the way z follows.
+        """Take one step of (q, qd), with A = [[0, 1], [-M^-1 K, -M^-1 D]].
+
+        D = d friction / d qd and, where friction has a state, K = d friction / d q by the way z follows.
         """
         _, q, qd, z, disturbance = states
         pose = self.pose_at(q)

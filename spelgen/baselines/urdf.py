@@ -1,5 +1,6 @@
-"""The URDF's own values: rigid bodies with its damping and friction, by Pinocchio; and with the drives of the settings
-beside it, where these tell of any.
+"""Judge the URDF's own values: rigid bodies with its damping and friction, by Pinocchio.
+
+A second baseline has the drives of the settings beside the URDF, where these name any.
 """
 
 from __future__ import annotations

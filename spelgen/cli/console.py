@@ -111,8 +111,9 @@ def _message(error: BaseException, debug: bool) -> str:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[..., None]]:
-    """Show a bar on stderr, where that is a terminal; give a function to call with (done, all), and with a title of
-    what runs now.
+    """Show a bar on stderr, where that is a terminal.
+
+    Gives a function to call with (done, all), and with a title of what runs now.
     """
     from rich.console import Console
     from rich.progress import Progress

@@ -18,8 +18,10 @@ def without_inertials(robot: Path) -> bytes:
 
 
 def with_wrong_inertials(robot: Path, error: float) -> bytes:
-    """Return the URDF without friction, whose bodies are other possible ones: each of mass, size of the inertia about
-    the centre of mass, and place of that (relative to the body's own size) errs by this standard deviation.
+    """Return the URDF without friction, whose bodies are other possible ones.
+
+    Mass, size of the inertia about the centre of mass, and the place of that (relative to the body's own size) err by
+    this standard deviation.
 
     Masses and inertias by factors exp(error N(0, 1)): 0.3 is 30 %, 1 a factor of e; drawn anew for each link, the same
     ones in every call.

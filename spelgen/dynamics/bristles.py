@@ -74,8 +74,9 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
 
 
 def turning_points(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the samples (R, n) at which the columns of a path (T, n) begin and turn around, and which of these is the
-    latest, (T, n), at each sample.
+    """Return the samples (R, n) at which the columns of a path (T, n) begin and turn around.
+
+    The second array says which of these is the latest, (T, n), at each sample.
     """
     steps = np.diff(path, axis=0, prepend=path[:1])
     # where a drive stands still it goes on as it went

@@ -16,8 +16,10 @@ from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Dynamics at positions (W, n). mass: M, (W, n, n). force: of (qd, tau, z), what M qdd is, (W, n). friction: of
-    (qd, z), what friction takes, (W, n).
+    """Hold dynamics at positions (W, n).
+
+    mass: M, (W, n, n). force: of (qd, tau, z), what M qdd is, (W, n). friction: of (qd, z), what friction takes,
+    (W, n).
     """
 
     mass: Tensor

@@ -71,8 +71,9 @@ def servo_drives(model: ServoArm) -> ServoDrives:
 
 
 def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
-    """Return the state whose friction makes up, as far as it can, for what the servos' torque is not: at rest, or
-    steady.
+    """Return the state at rest, or of steady motion.
+
+    Its friction makes up, as far as it can, for what the servos' torque is not.
     """
     servo, laws = drives.servo, drives.laws
     torque = servo.kp * beyond(u - q, servo.dead_zone) - servo.kd * qd
@@ -113,10 +114,10 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
 
 
 def replayed(model: ServoArm, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) -> Tensor:
-    """Return positions (W, K, n) after each interval dt (W, K) [s], from q and qd (W, n), under delayed commands
-    (W, K, S, n).
+    """Return positions (W, K, n) after each interval dt (W, K) [s], from q and qd (W, n).
 
-    S: steps in an interval, over which what the bodies weigh and how inert they are is taken once.
+    Commands are delayed ones, (W, K, S, n). S: steps in an interval, over which what the bodies weigh and how inert
+    they are is taken once.
     """
     with torch.no_grad():
         drives, prepared, positions = servo_drives(model), model.prepare(), []

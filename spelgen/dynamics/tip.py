@@ -57,8 +57,10 @@ class TipKinematics:
 def tip_kinematics(
     arm: Any, link: str | None = None, *, joints: Sequence[str] | None = None
 ) -> TipKinematics:
-    """The kinematics of ``link``: by default the tip that the arm was loaded with, else the link after the last joint
-    or the end of the fixed links behind it.
+    """Return the kinematics of ``link``.
+
+    By default it is the tip that the arm was loaded with, else the link after the last joint or the end of the fixed
+    links behind it.
 
     arm: of ``load_arm``, or the path of a URDF, with the names of its ``joints``. Raises ValueError where the joints
     do not lead to the link.

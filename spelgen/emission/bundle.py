@@ -24,8 +24,9 @@ class Definition:
 
 @dataclass(frozen=True)
 class Runtime:
-    """All of the runtime. definitions: by name, in an order in which they can be executed. imports: by the name
-    that they bind.
+    """Hold all of the runtime.
+
+    definitions: by name, in an order in which they can be executed. imports: by the name that they bind.
     """
 
     definitions: dict[str, Definition]

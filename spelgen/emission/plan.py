@@ -152,9 +152,7 @@ def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
 
 
 def _guessed_armature(coordinate: Coordinate) -> float:
-    """A geared drive's own inertia: such that its full effort takes ``rise`` seconds to reach its full
-    speed.
-    """
+    """Return a geared drive's own inertia: its full effort takes ``rise`` seconds to its full speed."""
     effort, speed = coordinate.effort, coordinate.velocity
     if not effort or not speed or effort > TUNING.largest_effort or speed > TUNING.largest_speed:
         return 0.0
@@ -162,8 +160,10 @@ def _guessed_armature(coordinate: Coordinate) -> float:
 
 
 def _friction(coordinate: Coordinate, sizes: Nominal, index: int) -> float:
-    """The size of friction to start from [Nm, N]: a share of the drive's effort where the URDF names a believable
-    one, or of the torques that the nominal arm needs.
+    """Return the size of friction to start from [Nm, N].
+
+    It is a share of the drive's effort where the URDF names a plausible one, or of the torques that the nominal arm
+    needs.
     """
     if coordinate.effort and coordinate.effort <= TUNING.largest_effort:
         return TUNING.friction_of_effort * coordinate.effort

@@ -36,8 +36,9 @@ def assignment(target: str, value: object, indent: int = 0) -> str:
 
 
 def laid_out(start: str, value: object, indent: int = 0) -> str:
-    """``start`` and ``value`` as a formatter lays them out, where that takes three lines at most; else densely, for
-    numbers are read by the row, and marked for the formatter to leave alone.
+    """Return ``start`` and ``value`` as a formatter lays them out, where that takes three lines at most.
+
+    Else they are dense, for numbers are read by the row, and marked for the formatter to leave alone.
     """
     flat = start + _flat(value)
     if indent + len(flat) <= WIDTH or not _items(value) or _alike(value):

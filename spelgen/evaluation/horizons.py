@@ -92,9 +92,7 @@ class Predictions:
 def horizon_lengths(
     logs: JudgedLogs, steps: Sequence[int], seconds: Sequence[float], notes: list[Diagnostic]
 ) -> dict[str, int]:
-    """Return the number of samples of each horizon by name; those longer than every trajectory are left out, and
-    noted.
-    """
+    """Return the number of samples of each horizon by name; those longer than every trajectory are only noted."""
     lengths = {}
     for k in steps:
         lengths["1 step" if k == 1 else f"{k} steps"] = k

@@ -1,5 +1,6 @@
-"""Least squares on a run's own training logs, kept in its folder: what any model of the arm has to beat. Of torques, or
-of an arm under position servos, of MuJoCo's actuators.
+"""Keep in a run's folder what any model of the arm has to beat: least squares on the run's own training logs.
+
+They are least squares of torques or, of an arm under position servos, MuJoCo's actuators.
 """
 
 from __future__ import annotations
@@ -98,8 +99,9 @@ def _has_mujoco() -> bool:
 
 
 def read_followers(run: RunFolder) -> dict[str, CommandFollower]:
-    """Return the actuators of MuJoCo that were fitted to the run's training logs, or are now, by name; none where
-    these logs are gone, or where MuJoCo is not installed.
+    """Return by name the actuators of MuJoCo that were fitted to the run's training logs, or are now.
+
+    There are none where these logs are gone, or where MuJoCo is not installed.
     """
     path = run.baseline
     record = run.read_json(path) if path.exists() else {}

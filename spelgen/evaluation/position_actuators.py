@@ -1,5 +1,7 @@
-"""Fit what most people simulate such an arm with: MuJoCo's position actuators, with armature and frictionloss of each
-joint. Fitted to the logs that a model of position servos was trained on, they are what it has to beat.
+"""Fit MuJoCo's position actuators, with which most people simulate such an arm.
+
+Armature and frictionloss of each joint are fitted too. Fitted to the logs that a model of position servos was trained
+on, they are what it has to beat.
 
 The bodies are the URDF's, and friction is as hard as MuJoCo takes it, as `spelgen export --to mjcf` writes both.
 Windows are rolled out by `mujoco.rollout` and fitted by `mujoco.minimize`, which is what `mujoco.sysid` fits with, and

@@ -34,8 +34,9 @@ MISSING = {
 
 @dataclass(frozen=True)
 class ReplayErrors:
-    """Hold root mean squares over time of one predictor [rad, m]: by trajectory (over joints too), the mean of these,
-    by joint over all trajectories.
+    """Hold root mean squares over time of one predictor [rad, m].
+
+    trajectories: over joints, too. mean: of these. joints: over all trajectories.
     """
 
     trajectories: dict[str, float]

@@ -122,10 +122,10 @@ class Fit:
         return float(np.mean(scores))
 
     def save(self, folder: Path | str, *, force: bool = False) -> Path:
-        """Write the run folder that `spelgen train` writes; return its path. Raises RunError where a run lies, unless
-        forced.
+        """Write the run folder that `spelgen train` writes; return its path.
 
-        `spelgen.keep_baseline(folder, logs)` adds what least squares find, for `evaluate` and `report`.
+        `spelgen.keep_baseline(folder, logs)` adds what least squares find, for `evaluate` and `report`. Raises RunError
+        where a run lies, unless forced.
         """
         if not hasattr(self.model, "source"):
             raise RunError("a model without a module", expected="one of spelgen.build or spelgen.load_module")

@@ -105,13 +105,15 @@ class Objective(Protocol):
         """Do what comes before the first checkpoint of a new fit; return what there is to tell."""
 
     def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
-        """Go on from what the run folder holds. Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError
-        where that is of another model.
+        """Go on from what the run folder holds.
+
+        Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError where that is of another model.
         """
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Fit until an end is reached; call ``save`` where `checkpoint` is worth keeping. KeyboardInterrupt may end it
-        anywhere.
+        """Fit until an end is reached; call ``save`` where `checkpoint` should be kept.
+
+        KeyboardInterrupt may end it anywhere.
         """
 
     def checkpoint(self) -> Content:

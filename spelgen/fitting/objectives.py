@@ -50,8 +50,10 @@ def objective_of(request: FitRequest) -> Objective:
 
 
 def default_objective(model: EmittedModel, rates: Sequence[float]) -> str:
-    """Return what is fitted where nobody says: to an arm under position servos what follows its commands; torque to a
-    model of rigid bodies, where logs are sampled densely enough for accelerations (rates [Hz]); else windows.
+    """Return the objective that is fitted where nobody names one.
+
+    It is "servo" for an arm under position servos, "torque" for a model of rigid bodies where logs are sampled densely
+    enough for accelerations (rates [Hz]), and else "rollout".
     """
     if has_servos(model):
         return "servo"

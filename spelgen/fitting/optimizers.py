@@ -24,16 +24,18 @@ Blocks = Callable[[], Iterable[Any]]  # the same ones whenever it is called
 
 
 class WindowOptimizer(Protocol):
-    """Moves those weights of one model that required a gradient when this was made. stalled: whether there is no way
-    down from here.
+    """Move those weights of one model that required a gradient when this was made.
+
+    stalled: whether there is no way down from here.
     """
 
     @property
     def stalled(self) -> bool: ...
 
     def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
-        """Take ``steps`` steps on ``loss`` with the learning rates learning_rate(0), learning_rate(1) ... Return the
-        mean loss, NaN as soon as one is not finite.
+        """Take ``steps`` steps on ``loss`` and return the mean loss, NaN as soon as one is not finite.
+
+        The learning rates are learning_rate(0), learning_rate(1) ...
         """
         ...
 
@@ -49,8 +51,9 @@ def _moving(model: torch.nn.Module) -> tuple[list[torch.nn.Parameter], list[torc
 
 
 class MiniBatchAdamW:
-    """AdamW on batches in random order; single numbers (constants, viscous friction) learn faster than weights
-    and do not decay.
+    """Step by AdamW on batches in random order.
+
+    Single numbers (constants, viscous friction) learn faster than weights and do not decay.
     """
 
     def __init__(
@@ -190,8 +193,9 @@ def minimise(
     evaluations: int,
     weight_decay: float = 0.0,
 ) -> int:
-    """Move the model's weights down ``loss`` by ``LBFGS`` until that stalls or about so many evaluations are made;
-    return how many were.
+    """Move the model's weights down ``loss`` by ``LBFGS``; return how many evaluations that took.
+
+    It ends where that stalls, or after about so many evaluations.
     """
     return minimise_sum(model, lambda _: loss(), lambda: [None], evaluations, weight_decay)
 

@@ -12,8 +12,9 @@ from spelgen.fitting.run_record import Content
 
 
 class TrainingProgress:
-    """A context that shows a fit on stderr: one line that changes, or one for each stage where there is no terminal;
-    nothing at all when `show` is False.
+    """Show a fit on stderr within a context: one line that changes, or one for each stage where there is no terminal.
+
+    Nothing is shown when `show` is False.
     """
 
     def __init__(self, *, show: bool) -> None:

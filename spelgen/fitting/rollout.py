@@ -94,8 +94,10 @@ def position_difference(
 
 @dataclass(frozen=True, eq=False)
 class LossScales:
-    """One unit of error: for each sample but the first and joint (K-1, n), the root mean square change of q and
-    qd since the window's first sample; for each joint (n,) the standard deviation of tau.
+    """Hold one unit of error of q, qd and tau.
+
+    q, qd: for each sample but the first and joint (K-1, n), the root mean square change since the window's first
+    sample. tau: for each joint (n,) the standard deviation.
     """
 
     q: torch.Tensor
@@ -153,8 +155,7 @@ def rollout_loss(
 
 
 def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> torch.Tensor:
-    """The weak form of the equations: p(t) - p(0) against the impulse of all forces along the measured
-    samples.
+    """Return the error of the weak form: p(t) - p(0) against the impulse of all forces along the measured samples.
 
     Forces between samples are the mean of their values at both ends (trapezium rule): no ODE is solved and no
     acceleration needed. What is missing is told as mean torque, in units of its standard deviation at the
@@ -184,8 +185,7 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
 
 
 def integration_error(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> float:
-    """Return the difference between rollouts with `substeps` and with twice as many, relative to the error of the
-    latter.
+    """Return the difference of rollouts with `substeps` and with twice as many, relative to the error of the latter.
 
     Both are root mean squares in units of `scales`; of the model's error, at least `least_error` is taken.
     """
@@ -201,9 +201,7 @@ def integration_error(model: EmittedModel, windows: Windows, scales: LossScales,
 
 
 def choose_substeps(model: EmittedModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
-    """Return the fewest rk4 steps per sample interval, from `start` on, that make integration a small part of the
-    error.
-    """
+    """Return the fewest rk4 steps per sample interval, from `start` on, with a small error of integration."""
     for substeps in TUNING.substeps:
         if substeps < start:
             continue

@@ -99,8 +99,9 @@ class RunFolder:
             )
 
     def start(self, source: str, urdf: Path | None, *, force: bool) -> None:
-        """Make the folder, write the module's source and copy the robot into it. RunError where a run lies, unless
-        forced. A run it is when config.json is there: that is written last.
+        """Make the folder, write the module's source and copy the robot into it.
+
+        It is a run when config.json is there: that is written last. Raises RunError where a run lies, unless forced.
         """
         self.require_free(force=force)
         robot = self._robot_files(urdf)  # before anything is removed: they may be this very run's copies
@@ -196,8 +197,10 @@ class RunFolder:
         return found
 
     def load_module(self, *, trust: bool = False) -> EmittedModel:
-        """The run's module with the weights that it starts with. Raises ModuleError, and RunError unless it is
-        trusted, ran in this process before, or is what spelgen itself writes for the run's robot.
+        """Return the run's module with the weights that it starts with.
+
+        Raises ModuleError, and RunError unless it is trusted, ran in this process before, or is what spelgen itself
+        writes for the run's robot.
         """
         if not trust and not has_run(read_source(self.module)):
             # looked up when it is needed: what fits knows no symbolic algebra, and this derives the arm anew

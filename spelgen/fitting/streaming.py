@@ -50,8 +50,9 @@ class LargeLogs:
 
 @dataclass(frozen=True, eq=False)
 class LogContents:
-    """Hold what one pass tells. pieces: lengths of the gap-free pieces of each chunk. rates: of chunks that are long
-    enough [Hz].
+    """Hold what one pass finds.
+
+    pieces: lengths of the gap-free pieces of each chunk. rates: of chunks that are long enough [Hz].
     """
 
     chunks: list[Chunk]

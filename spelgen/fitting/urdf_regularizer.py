@@ -24,8 +24,9 @@ TUNING = RegularizerTuning()
 
 @dataclass(frozen=True, eq=False)
 class UrdfRegularizer:
-    """The URDF's variation of M, relative to the model's mean M at the start, and its gravity torque, at
-    points q (S, n).
+    """Hold the URDF's variation of M and its gravity torque at points q (S, n).
+
+    The variation is relative to the model's mean M at the start.
     """
 
     q: torch.Tensor
@@ -49,8 +50,9 @@ class UrdfRegularizer:
 def urdf_regularizer(
     urdf: Path, joints: Sequence[str], model: EmittedModel, windows: Windows
 ) -> UrdfRegularizer:
-    """The regularizer of a URDF around the positions of ``windows``. Raises what Pinocchio raises, and ImportError
-    without it.
+    """Return the regularizer of a URDF around the positions of ``windows``.
+
+    Raises what Pinocchio raises, and ImportError without it.
     """
     dynamics = urdf_dynamics(urdf, joints)
     positions = windows.q.flatten(0, 1)

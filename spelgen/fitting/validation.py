@@ -58,8 +58,9 @@ class Validation:
         return total / self.size
 
     def substeps(self, present: int | None = None) -> int:
-        """Return the integrator's steps per sample interval: those prescribed, or as many as the model now needs;
-        never fewer than the present ones.
+        """Return the integrator's steps per sample interval: those prescribed, or as many as the model now needs.
+
+        They are never fewer than the present ones.
         """
         if self.solver != "rk4":
             return 1

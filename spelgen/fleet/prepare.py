@@ -39,8 +39,10 @@ class Preparation:
 
 @dataclass(frozen=True)
 class PreparedArm:
-    """Hold an arm's logs. key: digest of all that they were made from. data: by split, the paths of training and of
-    test logs, which `mapping` reads.
+    """Hold an arm's logs.
+
+    key: digest of all that they were made from. data: by split, the paths of training and of test logs, which
+    `mapping` reads.
     """
 
     name: str

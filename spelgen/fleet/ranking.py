@@ -39,8 +39,9 @@ def winners(fleet: FleetResults) -> dict[str, int]:
 
 
 def ranking(robot: str, runs: Sequence[RunResult]) -> Listing:
-    """Return one arm's models, the one that predicts best over the longest horizon first, and the baselines among them;
-    medians over seeds and splits.
+    """Return one arm's models and baselines, the one that predicts best over the longest horizon first.
+
+    Figures are medians over seeds and splits.
     """
     presets: dict[str, list[RunResult]] = {}
     for run in runs:

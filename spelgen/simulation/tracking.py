@@ -94,9 +94,7 @@ def track(
 
 
 def tuned_gains(inertia: np.ndarray, bandwidth: float) -> Gains:
-    """Return gains for joints of inertia (n,) [kg m^2; kg] with both poles of the position loop at the bandwidth
-    [Hz].
-    """
+    """Return gains for joints of inertia (n,) [kg m^2; kg]; both poles of the position loop are at the bandwidth."""
     omega = 2 * np.pi * bandwidth
     return Gains(inertia * omega**2, TUNING.integral_gain * inertia * omega**3, 2 * inertia * omega)
 
@@ -109,8 +107,9 @@ def computed_torque(
     lag: np.ndarray,
     omega: float,
 ) -> np.ndarray:
-    """Return the joint torques (n,) of a controller that knows the arm: M (qdd* + 2 omega e' + omega^2 e) + what
-    motion, gravity and friction take (Siciliano et al., Robotics, 2009, 8.5.2).
+    """Return the joint torques (n,) of a controller that knows the arm (Siciliano et al., Robotics, 2009, 8.5.2).
+
+    They are M (qdd* + 2 omega e' + omega^2 e) + what motion, gravity and friction take.
 
     target: q*, qd*, qdd* (n,). seen: positions (n,); lag: e', the error of velocity. Where viscous friction alone makes
     a joint slower than omega, a stiffness of viscous * omega beside it.

@@ -1,5 +1,4 @@
-"""Find the smallest exact form M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, with every f_j on as few joints as
-possible.
+"""Find the smallest exact form M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, with each f_j on as few joints as possible.
 
 U is the span of all changes of M, W the span of M. A read-out is a weighting of M's entries; on the joints
 J only depends exactly that which vanishes on the changes made by every joint outside J. Read-outs are
@@ -37,8 +36,9 @@ def row_of(weights: Weights, n: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Output:
-    """Hold one function f(q) of ``joints`` that is left open: f = sum of ``reads`` x M, and it enters M through
-    ``basis``.
+    """Hold one function f(q) of ``joints`` that is left open.
+
+    f is the sum of ``reads`` x M, and ``basis`` takes it to M.
     """
 
     joints: tuple[int, ...]
@@ -89,8 +89,9 @@ def _constants(
     constant: tuple[np.ndarray, np.ndarray],
     basis: tuple[np.ndarray, np.ndarray],
 ) -> tuple[Constant, ...]:
-    """Return a basis of what the outputs leave of W; entries that are constant themselves are the first choice for a
-    constant.
+    """Return a basis of what the outputs leave of W.
+
+    Entries that are constant themselves are the first choice for a constant.
     """
     # pivots fall on the first columns, so entries that read least become the constants
     order = sorted(range(len(spans.keys)), key=lambda index: (len(spans.entry_joints[index]), -index))

@@ -112,8 +112,9 @@ def pivots(basis: np.ndarray) -> list[int]:
 
 
 def null_space(basis: np.ndarray) -> np.ndarray:
-    """Rows that span {x : basis x = 0} of a ``row_basis``; each is 1 at one free column and elsewhere nonzero at
-    pivots only.
+    """Return rows that span {x : basis x = 0} of a ``row_basis``.
+
+    Each is 1 at one free column and elsewhere nonzero at pivots only.
     """
     width = basis.shape[1]
     bound = pivots(basis)

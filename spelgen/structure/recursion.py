@@ -41,9 +41,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Energies:
-    """The arm's mass matrix as its lower triangle, {(row, column): element}, 0-based, and its potential
-    energy.
-    """
+    """Hold the lower triangle of the arm's mass matrix, {(row, column): element}, 0-based, and its potential energy."""
 
     mass: dict[tuple[int, int], Element]
     potential: Element

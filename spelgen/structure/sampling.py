@@ -1,5 +1,6 @@
-"""Sample mass matrices and potential energies of an arm at random points, in the prime field and in floating point;
-and find the spans that decide the arm's structure.
+"""Sample mass matrices and potential energies of an arm, and find the spans that decide the arm's structure.
+
+Points are random, in the prime field and in floating point.
 
 Both kinds of sample come as a base block and, for every coordinate, a block in which that coordinate alone
 has moved: what changes between the two depends on the coordinate.
@@ -38,8 +39,9 @@ TUNING = StructureTuning()
 
 @dataclass(frozen=True)
 class Samples:
-    """Hold ``mass`` (1 + n, samples, n(n+1)/2) and ``potential`` (1 + n, samples); block 0 is the base, block k
-    has coordinate k moved.
+    """Hold ``mass`` (1 + n, samples, n(n+1)/2) and ``potential`` (1 + n, samples).
+
+    Block 0 is the base, block k has coordinate k moved.
     """
 
     mass: np.ndarray
@@ -205,8 +207,9 @@ def _residue_values(element: Residues | int, shape: tuple[int, ...]) -> np.ndarr
 
 
 class Spans:
-    """Hold row vectors over the n(n+1)/2 entries of M, in the prime field: ``mass`` spans W, ``changes[k]`` spans
-    T_k.
+    """Hold row vectors over the n(n+1)/2 entries of M, in the prime field.
+
+    ``mass`` spans W, ``changes[k]`` spans T_k.
     """
 
     def __init__(self, arm: Arm, assume: Assume):
@@ -247,8 +250,9 @@ class Spans:
 
     @cached_property
     def floats(self) -> Samples:
-        """Twice as many samples in double precision, for the sizes of coefficients; their zeros and ranks
-        come from the field.
+        """Return twice as many samples in double precision, for the sizes of coefficients.
+
+        Their zeros and ranks come from the field.
         """
         return float_samples(self._arm, self._assume, 2 * self._count)
 

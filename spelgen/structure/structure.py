@@ -1,5 +1,6 @@
-"""Arm -> Structure: which entries of M, V and G are zero, constant or vary, with which joints, and the
-smallest exact form of M.
+"""Derive an arm's structure: which entries of M, V and G are zero, constant or vary, and with which joints.
+
+It includes the smallest exact form of M.
 
 M(q) = sum_k c_k A_k + sum_j f_j(q) B_j. Let T_k be the span of the changes M(q) - M(q') when joint k alone
 moves, U the sum of all T_k and W the span of M itself. Then dim U networks outputs f_j are needed, and dim
@@ -37,9 +38,7 @@ class Entry:
 
 @dataclass(frozen=True, repr=False)
 class Structure:
-    """What holds for every value of the inertial parameters (``kinematics``), or for the URDF's
-    (``inertials``).
-    """
+    """Hold what is true for all values of the inertial parameters (``kinematics``), or the URDF's (``inertials``)."""
 
     assume: Assume
     joints: tuple[str, ...]
@@ -88,8 +87,9 @@ def derive(arm: Arm, assume: Assume = "kinematics") -> Structure:
 
 @lru_cache(maxsize=16)
 def base_parameter_count(arm: Arm) -> int:
-    """Rank of the inverse-dynamics regressor: how many combinations of inertial parameters move the arm
-    differently.
+    """Return the rank of the inverse-dynamics regressor.
+
+    So many combinations of inertial parameters move the arm differently.
     """
     points = 7  # enough for all but few arms of up to seven joints
     while True:

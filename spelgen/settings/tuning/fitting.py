@@ -103,8 +103,9 @@ class TorqueTuning:
     regressor_bytes: float = 4e8  # [B] of regressors: 70,000 samples of six joints; of more, every so many
     in_memory: int = 2**18  # samples of logs larger than memory: 140 MB of six joints
     body_step: float = 0.3  # [1] of the way to the border of the possible bodies, at most in a step
-    # about a run that is adapted: nothing is known of a load before
-    prior_of_load: GaussianPrior = field(default_factory=lambda: GaussianPrior(bodies=10.0))
+    # about a run that is adapted: a load is known to a factor of twenty in mass (10 in place of 3 let half a second of
+    # motion err by 27 times the variance of the torque, UR10e)
+    prior_of_load: GaussianPrior = field(default_factory=lambda: GaussianPrior(bodies=3.0))
     # warmth changes the friction of all joints by tens of per cent, of a joint by itself less (Bittencourt and
     # Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012)
     prior_of_friction: GaussianPrior = field(default_factory=lambda: GaussianPrior(**DAY_TO_DAY))
