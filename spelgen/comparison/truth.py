@@ -14,7 +14,8 @@ def true_mass(robot: Path, q: torch.Tensor) -> torch.Tensor:
     from spelgen.dynamics.pinocchio_arm import arm_dynamics
 
     loaded = load_arm(robot)
-    return arm_dynamics(loaded.arm, loaded.settings).mass_matrix(q)
+    mass: torch.Tensor = arm_dynamics(loaded.arm, loaded.settings).mass_matrix(q)
+    return mass
 
 
 def mass_error(learned: torch.Tensor, true: torch.Tensor) -> float:

@@ -8,12 +8,30 @@ K is constant, so it adds no velocity terms; it is a permutation unless joints f
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import wraps
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from spelgen.dynamics.arrays import Array, on_arrays
 from spelgen.dynamics.constraint import Constraint
+
+
+def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
+    """Return a method of states (..., n) that takes batches which go together, and tensors, for which it gives one."""
+
+    @wraps(method)
+    def on_arrays(self: PinocchioDynamics, *states: Any) -> object:
+        first = states[0]
+        if isinstance(first, np.ndarray) and first.ndim == 1:
+            return method(self, *states)
+        result = method(self, *np.broadcast_arrays(*map(np.asarray, states)))
+        if isinstance(first, np.ndarray):
+            return result
+        # what imports this knows no torch
+        return first.new_tensor(result)
+
+    return on_arrays
 
 
 class PinocchioDynamics:
@@ -50,29 +68,58 @@ class PinocchioDynamics:
         """How many coordinates."""
         return int(self.jacobian.shape[1])
 
-    def mass_matrix(self, q: Array) -> Array:
+    @_takes_tensors
+    def mass_matrix(self, q: np.ndarray) -> np.ndarray:
         """M, (..., n, n) [kg m^2, kg m, kg]."""
-        return on_arrays(self._mass, q)
+        upper = np.triu(self._by_joint(pin.crba, self.configuration(q)))
+        joints = upper + np.triu(upper, 1).swapaxes(-1, -2)  # Pinocchio promises the upper triangle only
+        mass: np.ndarray = self.jacobian.T @ joints @ self.jacobian
+        return mass
 
-    def nonlinear_effects(self, q: Array, qd: Array) -> Array:
+    @_takes_tensors
+    def nonlinear_effects(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
         """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
-        return on_arrays(self._effects, q, qd)
+        effects = self._by_joint(pin.nle, self.configuration(q), qd @ self.jacobian.T)
+        result: np.ndarray = effects @ self.jacobian
+        return result
 
-    def gravity(self, q: Array) -> Array:
+    @_takes_tensors
+    def gravity(self, q: np.ndarray) -> np.ndarray:
         """dV/dq, (..., n) [Nm, N]."""
-        return on_arrays(lambda q: self._effects(q, np.zeros_like(q)), q)
+        torque: np.ndarray = self.nonlinear_effects(q, np.zeros_like(q))
+        return torque
 
-    def friction_torque(self, q: Array, qd: Array) -> Array:
+    @_takes_tensors
+    def friction_torque(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
         """What friction takes, (..., n) [Nm, N]."""
-        return on_arrays(lambda _, velocity: self._lost(velocity), q, qd)
+        if self.friction is None:
+            return np.zeros_like(qd)
+        return self.friction(qd)
 
-    def forward_dynamics(self, q: Array, qd: Array, tau: Array) -> Array:
+    @_takes_tensors
+    def forward_dynamics(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
         """qdd, (..., n), under the inputs tau."""
-        return on_arrays(self._forward, q, qd, tau)
+        force = tau if self.inputs is None else tau @ self.inputs.T
+        if self.friction is not None:
+            force = force - self.friction(qd)
+        if self._same:  # a copy, for Pinocchio writes over what it gave
+            return np.array(self._by_joint(pin.aba, self.configuration(q), qd, force))
+        force = force - self.nonlinear_effects(q, qd)
+        qdd: np.ndarray = np.linalg.solve(self.mass_matrix(q), force[..., None])[..., 0]
+        return qdd
 
-    def inverse_dynamics(self, q: Array, qd: Array, qdd: Array) -> Array:
+    @_takes_tensors
+    def inverse_dynamics(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
-        return on_arrays(self._inverse, q, qd, qdd)
+        speeds, rates = qd @ self.jacobian.T, qdd @ self.jacobian.T
+        torque = self._by_joint(pin.rnea, self.configuration(q), speeds, rates) @ self.jacobian
+        if self.friction is not None:
+            torque = torque + self.friction(qd)
+        if self.inputs is None:
+            return np.asarray(torque)
+        passive = np.diag(~self.inputs.any(axis=1))
+        inputs: np.ndarray = np.linalg.solve(self.inputs + passive, torque[..., None])[..., 0]
+        return inputs
 
     def configuration(self, q: np.ndarray) -> np.ndarray:
         """Pinocchio's configuration (..., nq) at q (..., n)."""
@@ -96,40 +143,3 @@ class PinocchioDynamics:
         rows = zip(*(x.reshape(-1, x.shape[-1]) for x in states), strict=True)
         result = np.array([algorithm(self.model, self.data, *row) for row in rows])
         return result.reshape(*batch, *result.shape[1:])
-
-    def _mass(self, q: np.ndarray) -> np.ndarray:
-        upper = np.triu(self._by_joint(pin.crba, self.configuration(q)))
-        joints = upper + np.triu(upper, 1).swapaxes(-1, -2)  # Pinocchio promises the upper triangle only
-        mass: np.ndarray = self.jacobian.T @ joints @ self.jacobian
-        return mass
-
-    def _effects(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-        effects = self._by_joint(pin.nle, self.configuration(q), qd @ self.jacobian.T)
-        result: np.ndarray = effects @ self.jacobian
-        return result
-
-    def _lost(self, qd: np.ndarray) -> np.ndarray:
-        return np.zeros_like(qd) if self.friction is None else self.friction(qd)
-
-    def _forward(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        force = tau if self.inputs is None else tau @ self.inputs.T
-        if self.friction is not None:
-            force = force - self.friction(qd)
-        if self._same:  # a copy, for Pinocchio writes over what it gave
-            return np.array(self._by_joint(pin.aba, self.configuration(q), qd, force))
-        return _solved(self._mass(q), force - self._effects(q, qd))
-
-    def _inverse(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        by_joint = (x @ self.jacobian.T for x in (qd, qdd))
-        force = self._by_joint(pin.rnea, self.configuration(q), *by_joint) @ self.jacobian + self._lost(qd)
-        if self.inputs is None:
-            result: np.ndarray = force
-            return result
-        moved = self.inputs + np.diag(~self.inputs.any(axis=1)).astype(float)
-        return _solved(moved, force)
-
-
-def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """x (..., n) of matrix (..., n, n) x = right (..., n)."""
-    result: np.ndarray = np.linalg.solve(matrix, right[..., None])[..., 0]
-    return result

@@ -30,7 +30,7 @@ class Pose:
 PoseAt = Callable[[Tensor], Pose]
 
 
-def poses(dynamics: Any) -> PoseAt:
+def poses(dynamics: object) -> PoseAt:
     """Return what gives these dynamics at positions; weights must not change meanwhile."""
     if has_momentum(dynamics):
         return partial(_of_weights, dynamics, dynamics.prepare())

@@ -95,8 +95,7 @@ class PortHamiltonian(nn.Module):
         pose = self.at(q, qd, tau)
         force = self.input_force(pose, qd, tau) - self.nonlinear_effects(pose, qd)
         force = force - self.friction_torque(pose, qd, *state)
-        qdd: Tensor = torch.linalg.solve(pose.mass, force.unsqueeze(-1))
-        return qdd.squeeze(-1)
+        return self.velocity(pose, force)  # M^-1 times the force
 
     def inverse_dynamics(self, q: Tensor | Pose, qd: Tensor, qdd: Tensor, *state: Tensor | None) -> Tensor:
         """Return the input tau, (..., n), that gives qdd."""
