@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import torch
 
+from spelgen.arm.arm import Arm
 from spelgen.exporting.describe import array, servos_of
 from spelgen.exporting.description import Servos
 from spelgen.exporting.exported import UNITS, Exported, readme
@@ -60,22 +61,26 @@ def check_mjcf(
 
     Under position servos the actuators are given commands.
     """
-    simulated = _Simulated(text, projection)
-    random = random_inputs(projection.arm.arm.coordinates, states)
+    arm = projection.arm.arm
+    model = mujoco.MjModel.from_xml_string(text.decode())
+    # MuJoCo's friction is not the model's: it is left out of the comparison
+    model.dof_damping[:] = 0.0
+    model.dof_frictionloss[:] = 0.0
+    random = random_inputs(arm.coordinates, states)
     q = torch.from_numpy(random["q"])
     qd = torch.from_numpy(random["qd"])
     controls = torques = random["tau"]
     if servos is not None:
         controls = random["u"]
         torques = _servo_torques(servos, random)
-    masses, biases, accelerations = simulated(random["q"], random["qd"], controls)
+    masses, biases, accelerations = _simulated(model, arm, random["q"], random["qd"], controls)
     mass = projection.bodies.mass_matrix(q)
     bias = projection.bodies.nonlinear_effects(q, qd)
     differences = {
         "mass_matrix": relative(masses, mass.numpy()),
         "bias": relative(biases, bias.numpy()),
     }
-    if not simulated.has_followers:  # MuJoCo's constraint for them is soft
+    if model.nv == len(arm.coordinates):  # MuJoCo's constraint for followers is soft
         force = torch.from_numpy(torques @ inputs.T) - bias
         expected = torch.linalg.solve(mass, force)
         differences["forward_dynamics"] = relative(accelerations, expected.numpy())
@@ -89,44 +94,31 @@ def _servo_torques(servos: Servos, inputs: Values) -> np.ndarray:
     return clipped
 
 
-class _Simulated:
-    """The MJCF in MuJoCo without friction, by the coordinates of the arm."""
-
-    def __init__(self, text: bytes, projection: RigidBodyProjection) -> None:
-        arm = projection.arm.arm
-        model = self._model = mujoco.MjModel.from_xml_string(text.decode())
-        # MuJoCo's friction is not the model's: it is left out of the comparison
-        model.dof_damping[:] = 0.0
-        model.dof_frictionloss[:] = 0.0
-        self.has_followers = model.nv != len(arm.coordinates)
-        self._dofs = [int(model.jnt_dofadr[model.joint(body.name).id]) for body in arm.bodies]
-        self._jacobian = np.zeros((model.nv, len(arm.coordinates)))
-        self._offset = np.zeros(model.nv)
-        for dof, body in zip(self._dofs, arm.bodies, strict=True):
-            self._jacobian[dof, body.coordinate] = float(body.multiplier)
-            self._offset[dof] = body.offset
-        names = [model.actuator(k).name for k in range(model.nu)]
-        self._driven = [k for k, joint in enumerate(arm.coordinates) if joint.name in names]
-        self._actuators = [names.index(arm.coordinates[k].name) for k in self._driven]
-
-    def __call__(
-        self, q: np.ndarray, qd: np.ndarray, controls: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return M, bias and accelerations of states, (states, ...)."""
-        data = mujoco.MjData(self._model)
-        jacobian = self._jacobian
-        full = np.zeros((self._model.nv, self._model.nv))
-        masses: list[np.ndarray] = []
-        biases: list[np.ndarray] = []
-        accelerations: list[np.ndarray] = []
-        for state in range(len(q)):
-            data.qpos[:] = jacobian @ q[state] + self._offset
-            data.qvel[:] = jacobian @ qd[state]
-            data.ctrl[self._actuators] = controls[state, self._driven]
-            mujoco.mj_forward(self._model, data)
-            mujoco.mj_fullM(self._model, data, full)
-            # by the arm's coordinates: followers move with their leaders
-            masses.append(jacobian.T @ full @ jacobian)
-            biases.append(jacobian.T @ data.qfrc_bias)
-            accelerations.append(data.qacc[self._dofs].copy())
-        return np.array(masses), np.array(biases), np.array(accelerations)
+def _simulated(
+    model: mujoco.MjModel, arm: Arm, q: np.ndarray, qd: np.ndarray, controls: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return M, bias and accelerations of states, (states, ...), by the coordinates of the arm."""
+    dofs = [int(model.jnt_dofadr[model.joint(body.name).id]) for body in arm.bodies]
+    # followers move with their leaders
+    jacobian = np.zeros((model.nv, len(arm.coordinates)))
+    offset = np.zeros(model.nv)
+    for dof, body in zip(dofs, arm.bodies, strict=True):
+        jacobian[dof, body.coordinate] = float(body.multiplier)
+        offset[dof] = body.offset
+    columns = {joint.name: k for k, joint in enumerate(arm.coordinates)}
+    driven = [columns[model.actuator(k).name] for k in range(model.nu)]
+    data = mujoco.MjData(model)
+    full = np.zeros((model.nv, model.nv))
+    masses: list[np.ndarray] = []
+    biases: list[np.ndarray] = []
+    accelerations: list[np.ndarray] = []
+    for position, velocity, control in zip(q, qd, controls, strict=True):
+        data.qpos[:] = jacobian @ position + offset
+        data.qvel[:] = jacobian @ velocity
+        data.ctrl[:] = control[driven]
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, full)
+        masses.append(jacobian.T @ full @ jacobian)
+        biases.append(jacobian.T @ data.qfrc_bias)
+        accelerations.append(data.qacc[dofs].copy())
+    return np.array(masses), np.array(biases), np.array(accelerations)

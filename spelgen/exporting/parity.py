@@ -5,19 +5,22 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from spelgen.arm.arm import Coordinate
-from spelgen.dynamics.tip import TipKinematics, tip_kinematics
+from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import RunError
 from spelgen.exporting.entry_points import ENTRY_POINTS, SERVO_TORQUE
 from spelgen.exporting.trained import Trained
 from spelgen.settings.tuning.exporting import TUNING
 from spelgen.structure.nominal import working_range
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
 
 _USUAL_SPEED = {"revolute": 1.0, "prismatic": 0.3}  # rad/s, m/s where the URDF names none
 
@@ -86,11 +89,13 @@ def check_parity(
     count = TUNING.states if states is None else states
     inputs = random_inputs(trained.arm.arm.coordinates, count, trained.memory)
     inputs = {key: value.astype(dtype).astype(np.float64) for key, value in inputs.items()}
-    reference = _Reference(trained)
+    # float32 of a model on another device would be the larger error
+    exact = copy.deepcopy(trained.model).double().cpu().requires_grad_(False)
     differences: dict[str, float] = {}
     for name in names:
         outputs = called(name, inputs)
-        errors = [relative(outputs[key], value) for key, value in reference(name, inputs).items()]
+        expected = _expected(exact, trained, name, inputs)
+        errors = [relative(outputs[key], value) for key, value in expected.items()]
         differences[name] = float(np.max(errors))  # NaN wins
     return Parity(differences, tolerance, count).require()
 
@@ -128,48 +133,34 @@ def relative(values: np.ndarray, expected: np.ndarray) -> float:
         return float(np.abs(values - expected).max() / size)
 
 
-class _Reference:
-    """The torch model in float64, asked by the names of the entry points."""
-
-    def __init__(self, trained: Trained) -> None:
-        # float32 of a model on another device would be the larger error
-        self._model = copy.deepcopy(trained.model).double().cpu().requires_grad_(False)
-        self._trained = trained
-
-    def __call__(self, name: str, inputs: Values) -> Values:
-        """Return an entry point's outputs, (states, ...), by name."""
-        entry = (ENTRY_POINTS | {SERVO_TORQUE.name: SERVO_TORQUE})[name]
-        tensors: list[Tensor] = []
-        for key in entry.inputs:
-            tensor = torch.from_numpy(inputs[key])
-            if key != "z":
-                tensors.append(tensor)
-            elif self._trained.memory:
-                # joint by joint, as the model has it
-                tensors.append(tensor.unflatten(-1, (self._model.n, -1)))
-        outputs = self._outputs(name, tensors, len(entry.outputs))
-        arrays = [output.detach().numpy() for output in outputs]
-        return dict(zip(entry.output_names, arrays, strict=True))
-
-    def _outputs(self, name: str, inputs: list[Tensor], count: int) -> list[Tensor]:
-        if name.endswith("_derivatives"):
-            function = getattr(self._model, name.removesuffix("_derivatives"))
-            return _derivatives(function, inputs, count)
-        if name == "energy":
-            q, qd = inputs
-            kinetic = 0.5 * (self._model.momentum(q, qd) * qd).sum(dim=-1)
-            return [torch.stack([kinetic, self._model.potential_energy(q)], dim=-1)]
-        if name in ("friction_step", "friction_memory"):
-            if not self._trained.memory:
-                return [inputs[0][:, :0]]
-            return [getattr(self._model, _METHODS[name])(*inputs).flatten(-2)]
-        if name in ("tip_pose", "tip_jacobian"):
-            return [getattr(self._tip, name.removeprefix("tip_"))(*inputs)]
-        return [getattr(self._model, _METHODS.get(name, name))(*inputs)]
-
-    @cached_property
-    def _tip(self) -> TipKinematics:
-        return tip_kinematics(self._trained.arm)
+def _expected(model: EmittedModel, trained: Trained, name: str, inputs: Values) -> Values:
+    """Return an entry point's outputs by the model in float64, (states, ...), by name."""
+    entry = (ENTRY_POINTS | {SERVO_TORQUE.name: SERVO_TORQUE})[name]
+    tensors: list[Tensor] = []
+    for key in entry.inputs:
+        tensor = torch.from_numpy(inputs[key])
+        if key != "z":
+            tensors.append(tensor)
+        elif trained.memory:
+            # joint by joint, as the model has it
+            tensors.append(tensor.unflatten(-1, (model.n, -1)))
+    if name.endswith("_derivatives"):
+        function = getattr(model, name.removesuffix("_derivatives"))
+        outputs = _derivatives(function, tensors, len(entry.outputs))
+    elif name == "energy":
+        q, qd = tensors
+        kinetic = 0.5 * (model.momentum(q, qd) * qd).sum(dim=-1)
+        outputs = [torch.stack([kinetic, model.potential_energy(q)], dim=-1)]
+    elif name in ("friction_step", "friction_memory"):
+        outputs = [tensors[0][:, :0]]
+        if trained.memory:
+            outputs = [getattr(model, _METHODS[name])(*tensors).flatten(-2)]
+    elif name in ("tip_pose", "tip_jacobian"):
+        outputs = [getattr(tip_kinematics(trained.arm), name.removeprefix("tip_"))(*tensors)]
+    else:
+        outputs = [getattr(model, _METHODS.get(name, name))(*tensors)]
+    arrays = [output.detach().numpy() for output in outputs]
+    return dict(zip(entry.output_names, arrays, strict=True))
 
 
 def _derivatives(function: Callable[..., Tensor], inputs: list[Tensor], count: int) -> list[Tensor]:
