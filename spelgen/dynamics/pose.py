@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.protocol import has_momentum, has_poses, known_past
+from spelgen.dynamics.protocol import has_momentum, known_past
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 
@@ -34,9 +34,9 @@ def poses(dynamics: object) -> PoseAt:
     """Return what gives these dynamics at positions; weights must not change meanwhile."""
     if has_momentum(dynamics):
         return partial(_of_weights, dynamics, dynamics.prepare())
-    if has_poses(dynamics):
-        return dynamics.pose_at
-    return lambda q: _of_any(dynamics, q)
+    # dynamics by a regressor have their own
+    pose_at: PoseAt = getattr(dynamics, "pose_at", partial(_of_any, dynamics))
+    return pose_at
 
 
 def _of_weights(model: PortHamiltonian, prepared: object, q: Tensor) -> Pose:

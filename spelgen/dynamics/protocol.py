@@ -11,8 +11,6 @@ from spelgen.runtime.port_hamiltonian import PortHamiltonian
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from spelgen.dynamics.pose import Pose
-
 
 class RigidDynamics(Protocol):
     """M(q) qdd + h(q, qd) + friction(q, qd) = G tau of n joints; q, qd, qdd, tau are (..., n).
@@ -41,13 +39,6 @@ class RigidDynamics(Protocol):
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
-
-
-class PosedDynamics(Protocol):
-    """Dynamics that work out once what depends on positions alone."""
-
-    def pose_at(self, q: Tensor) -> Pose:
-        """Return the equations of motion at q, (W, n)."""
 
 
 class ResidualModel(PortHamiltonian):
@@ -93,11 +84,6 @@ def has_servos(model: object) -> bool:
 def has_momentum(dynamics: object) -> TypeGuard[PortHamiltonian]:
     """Return whether momenta can be its state (see ``PortHamiltonian``)."""
     return hasattr(dynamics, "momentum")
-
-
-def has_poses(dynamics: object) -> TypeGuard[PosedDynamics]:
-    """Return whether dynamics work out once what depends on positions alone."""
-    return hasattr(dynamics, "pose_at")
 
 
 def sliding_memory(dynamics: object, qd: Tensor) -> Tensor:
