@@ -90,9 +90,11 @@ def listed(names: Sequence[str]) -> str:
 
 
 def counted(count: int, noun: str) -> str:
-    """Return ``1 joint``, or ``2 joints``."""
+    """Return ``1 joint`` or ``2 joints``, ``1 trajectory`` or ``2 trajectories``."""
     if count == 1:
         return f"1 {noun}"
+    if noun.endswith("y"):
+        return f"{count} {noun[:-1]}ies"
     return f"{count} {noun}s"
 
 

@@ -13,6 +13,7 @@ from spelgen.arm.arm import Arm, make_arm
 from spelgen.certificate.inspection import Inspection
 from spelgen.certificate.verification import Verification
 from spelgen.errors import Diagnostic
+from spelgen.labels import counted
 from spelgen.settings.settings import Settings, load_settings
 from spelgen.spec import Assume, Facts
 from spelgen.structure.base_parameters import BaseParameter, base_parameters
@@ -88,8 +89,8 @@ class LoadedArm:
         return formulas(self.arm, self.structure_for(assume), entry=entry, longest=longest)
 
     def __repr__(self) -> str:
-        n = len(self.arm.coordinates)
-        return f"<LoadedArm {self.arm.name!r}: {n} joint{'s' * (n > 1)} of {self.robot.path.name}>"
+        joints = counted(len(self.arm.coordinates), "joint")
+        return f"<LoadedArm {self.arm.name!r}: {joints} of {self.robot.path.name}>"
 
     def _repr_html_(self) -> str:
         return self.inspect()._repr_html_()

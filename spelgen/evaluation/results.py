@@ -17,6 +17,7 @@ from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.torque import TorqueErrors
 from spelgen.evaluation.traces import Traces
 from spelgen.evaluation.verdict import verdict
+from spelgen.labels import counted
 
 SCHEMA = 9
 
@@ -73,6 +74,4 @@ class Results:
         return "".join([f"<p>{escape(verdict(self).sentence)}</p>", *tables])
 
     def _heading(self) -> str:
-        count = len(self.trajectories)
-        plural = "trajectory" if count == 1 else "trajectories"
-        return f"{self.robot} on {count} test {plural}"
+        return f"{self.robot} on {counted(len(self.trajectories), 'test trajectory')}"

@@ -9,6 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from spelgen.errors import Diagnostic
 from spelgen.fitting.run_record import Content
+from spelgen.labels import counted
 
 
 class TrainingProgress:
@@ -77,8 +78,7 @@ class TrainingProgress:
             self._bar.reset(self._task, description="training", total=epochs, visible=True)
         state = f"validation {record['validation']:.3g}, best {record['best']:.3g}"
         self._bar.update(self._task, completed=record["epoch"], state=state)
-        rate, plural = record["step"] / record["seconds"], "s" * (record["epoch"] != 1)
-        epochs_done = f"{record['epoch']} epoch{plural}"
+        rate, epochs_done = record["step"] / record["seconds"], counted(record["epoch"], "epoch")
         self._said = f"training: {epochs_done}, loss {record['loss']:.3g}, {state}, {rate:.1f} steps/s"
 
     def _end_stage(self) -> None:

@@ -19,6 +19,7 @@ from spelgen.identification.base_parameters import BaseParameters
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.method import LeastSquares
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay
+from spelgen.labels import counted
 from spelgen.listing import WIDTH, Listing
 from spelgen.settings.tuning.identification import IdentificationTuning
 
@@ -163,20 +164,19 @@ class Identification:
 
     def heading(self) -> str:
         """Return what was fitted to what."""
-        count, drives = len(self.trajectories), len(self.base) - self.base.bodies
+        drives = len(self.base) - self.base.bodies
         weighted = _WEIGHTED[self.method.weights]
         return (
             f"{self.arm.name}: {self.base.bodies} base parameters of the bodies and {drives} of friction and drives, "
-            f"from {self.samples} samples of {count} trajector{'y' if count == 1 else 'ies'}, {weighted}."
+            f"from {self.samples} samples of {counted(len(self.trajectories), 'trajectory')}, {weighted}."
         )
 
     def quality(self) -> str:
         """Return how well posed the fit is, and how many parameters are how sure."""
         if self.unseen:
-            directions = f"{self.unseen} direction{'s' * (self.unseen > 1)}"
             conditioned = (
-                f"The logs do not excite {directions} of the base parameters: those values are arbitrary; excite "
-                "the arm more, or train the preset closed-form, which has a prior at the URDF."
+                f"The logs do not excite {counted(self.unseen, 'direction')} of the base parameters: those values are "
+                "arbitrary; excite the arm more, or train the preset closed-form, which has a prior at the URDF."
             )
         else:
             verdict = _conditioned(self.condition)

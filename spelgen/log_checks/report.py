@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 
 from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, SpelgenError
+from spelgen.labels import UNITS, counted
 from spelgen.listing import WIDTH, Listing, number
 from spelgen.log_checks.gravity import GravityFit
 from spelgen.log_checks.statistics import Clock
@@ -14,7 +15,6 @@ from spelgen.logs.trajectory import QUANTITIES, Trajectory
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 TUNING = LogCheckTuning()
-_UNITS = {"revolute": "rad, rad/s, Nm", "prismatic": "m, m/s, N"}
 
 
 @dataclass(frozen=True)
@@ -83,10 +83,10 @@ class LogReport:
         """Return one line: how much there is."""
         files = ""
         if self.files:
-            files = f" in {_counted(self.files, 'file', 'files')}"
+            files = f" in {counted(self.files, 'file')}"
         return (
-            f"{self.robot}: {_counted(len(self.trajectories), 'trajectory', 'trajectories')}{files}, "
-            f"{self.duration:.4g} s, {_counted(self.samples, 'sample', 'samples')}"
+            f"{self.robot}: {counted(len(self.trajectories), 'trajectory')}{files}, "
+            f"{self.duration:.4g} s, {counted(self.samples, 'sample')}"
         )
 
     def listings(self, limit: int | None = None) -> list[Listing]:
@@ -103,8 +103,8 @@ class LogReport:
         return "\n\n".join(paragraphs)
 
     def __repr__(self) -> str:
-        warnings = _counted(len(self.warnings), "warning", "warnings")
-        return f"<LogReport {self.heading()}; {warnings}, {_counted(len(self.errors), 'error', 'errors')}>"
+        warnings = counted(len(self.warnings), "warning")
+        return f"<LogReport {self.heading()}; {warnings}, {counted(len(self.errors), 'error')}>"
 
     def _repr_html_(self) -> str:
         lines: list[tuple[str, ...]] = []
@@ -135,10 +135,10 @@ def _ranges(report: LogReport) -> Listing:
     head = ("joint", "q", "of its range", "qd", "tau")
     rows = []
     for joint in report.joints:
-        q, qd, tau = (_span(joint.low[name], joint.high[name]) for name in QUANTITIES)
+        q, qd, tau = (span(joint.low[name], joint.high[name]) for name in QUANTITIES)
         rows.append((joint.name, q, _percent(joint.range_fraction), qd, tau))
     kinds = {joint.kind for joint in report.joints}
-    units = "; ".join(text for kind, text in _UNITS.items() if kind in kinds)
+    units = "; ".join(f"{x.position}, {x.velocity}, {x.torque}" for kind, x in UNITS.items() if kind in kinds)
     return Listing(f"Ranges [{units}]", head, tuple(rows))
 
 
@@ -173,7 +173,8 @@ def _physics(report: LogReport) -> Listing:
     return Listing("Physics", head, tuple(rows), note)
 
 
-def _span(low: float, high: float) -> str:
+def span(low: float, high: float) -> str:
+    """Return both ends of a range."""
     return f"{number(low)} .. {number(high)}"
 
 
@@ -183,10 +184,6 @@ def _percent(fraction: float | None) -> str:
 
 def _wrapped(finding: Diagnostic) -> str:
     return textwrap.fill(str(finding), WIDTH, initial_indent="  ", subsequent_indent="    ")
-
-
-def _counted(count: int, singular: str, plural: str) -> str:
-    return f"{count} {singular if count == 1 else plural}"
 
 
 def range_fraction(coordinate: Coordinate, low: float, high: float) -> float | None:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 
+from spelgen.labels import UNITS
 from spelgen.listing import Listing, number
-from spelgen.log_checks.report import LogReport, clock_table
-
-_UNITS = {"revolute": "rad", "prismatic": "m"}
+from spelgen.log_checks.report import LogReport, clock_table, span
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class ServoJointReport:
         """Return the joint's row among positions and commands."""
         visited = _format(self.range_fraction, 1, ".0%")
         steps = (number(self.steps["q"]), number(self.steps["u"]))
-        return (self.name, _span(self.q), visited, _span(self.u), number(self.noise), *steps)
+        return (self.name, span(*self.q), visited, span(*self.u), number(self.noise), *steps)
 
     def following(self) -> tuple[str, ...]:
         """Return the joint's row among lags and distances."""
@@ -67,7 +66,7 @@ class ServoLogReport(LogReport):
     def _commands(self) -> Listing:
         head = ("joint", "q", "range", "u", "noise", "q step", "u step")
         kinds = {joint.kind for joint in self.servos}
-        units = "; ".join(unit for kind, unit in _UNITS.items() if kind in kinds)
+        units = "; ".join(unit.position for kind, unit in UNITS.items() if kind in kinds)
         note = (
             "range: how much of the joint's was visited; u: commanded positions; noise: of q, standard deviation of "
             "what changes from sample to sample, from 50 Hz on; step: between the levels of a quantised signal."
@@ -89,7 +88,3 @@ def _format(value: float | None, factor: float, form: str, unit: str = "") -> st
     if value is None:
         return "-"
     return f"{factor * value:{form}}{unit}"
-
-
-def _span(ends: tuple[float, float]) -> str:
-    return f"{number(ends[0])} .. {number(ends[1])}"

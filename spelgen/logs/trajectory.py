@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from spelgen.errors import LogError
+from spelgen.labels import counted
 from spelgen.listing import Listing
 from spelgen.settings.tuning.logs import LogTuning
 
@@ -87,9 +88,9 @@ class Trajectory:
         return float(1.0 / steps[steps <= GAP * np.median(steps)].mean())
 
     def __repr__(self) -> str:
-        joints = self.q.shape[1]
+        joints = counted(self.q.shape[1], "joint")
         summary = f"{len(self)} samples, {self.duration:.4g} s at {self.sample_rate:.4g} Hz"
-        return f"<Trajectory {self.name!r}: {summary}, {joints} joint{'s' * (joints != 1)}>"
+        return f"<Trajectory {self.name!r}: {summary}, {joints}>"
 
     def _repr_html_(self) -> str:
         return trajectory_listing([self]).html()
