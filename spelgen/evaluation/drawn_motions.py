@@ -18,6 +18,7 @@ from spelgen.evaluation.horizons import JudgedLogs
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.torque import friction_past, mean_nmse, predicted_torques
 from spelgen.logs.dynamics_samples import DynamicsSamples
+from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.settings.tuning.evaluation import TraceTuning
@@ -125,7 +126,8 @@ def replayed_motion(log: Trajectory, missed: np.ndarray) -> PredictedMotion:
 def torque_motions(logs: JudgedLogs) -> list[DynamicsSamples]:
     """Return ten seconds from the middle of each log, for logs begin and end at rest, as thin as charts draw them."""
     motions = []
-    for samples in logs.samples or [_steps(piece, logs) for piece in logs.pieces]:
+    slow = [piece for piece in logs.pieces if not shows_accelerations(piece.sample_rate)]
+    for samples in [*logs.samples, *(_steps(piece, logs) for piece in slow)]:
         count = min(len(samples.q), round(TUNING.torque_seconds * samples.rate) + 1)
         start = (len(samples.q) - count) // 2
         motions.append(samples[start : start + count : -(-count // TUNING.samples)])
