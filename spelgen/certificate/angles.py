@@ -32,8 +32,9 @@ def parallel_runs(arm: Arm) -> list[list[int]]:
 
 
 def multiple_angles(powers: Sequence[tuple[Expr, int, int]]) -> list[tuple[Factors, fmpq]]:
-    """Return the product of powers of cosine and sine, given as (angle, power of cos, power of sin), as a sum of
-    multiples of no factor or of one: of a cosine or sine of a sum of the angles.
+    """Return the product of powers of cosine and sine, given as (angle, power of cos, power of sin), as a sum.
+
+    Each term is a multiple of one or of a cosine or sine of a sum of the angles.
     """
     # cos = (e + 1/e) / 2 and sin = (e - 1/e) / 2i with e = exp(iq): coefficients by powers of e, from the highest
     spectra = []

@@ -108,8 +108,10 @@ class Formulas:
 
     @property
     def base_parameters(self) -> dict[Symbol, Expr]:
-        """What each parameter in the expressions is the sum of, by body: m a mass [kg], h = m c a first moment
-        [kg m] and I a tensor [kg m2] about the joint's origin, in a frame whose z is the joint's axis.
+        """Return the sum that each parameter in the expressions stands for, by body.
+
+        m is a mass [kg], h = m c a first moment [kg m] and I a tensor [kg m2] about the joint's origin, in a frame
+        whose z is the joint's axis.
         """
         definitions = {}
         for base in self.base:

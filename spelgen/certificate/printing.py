@@ -31,8 +31,9 @@ class _AsBuilt(Printer):  # type: ignore[misc]  # SymPy has no types
         return str(self.doprint(expression)).replace(_FIXED, " ")
 
     def lines(self, expression: Expr, start: str, width: int, end: str = "") -> list[str]:
-        """Return the expression between ``start`` and ``end``, broken where lines get longer than ``width``: before
-        terms, and inside of those that are longer than a line.
+        """Return the expression between ``start`` and ``end``, broken where lines get longer than ``width``.
+
+        Lines break before terms, and inside of those that are longer than a line.
         """
         indent = " " * (len(start) - len(start.lstrip()) + 4)
         pieces: list[str] = []

@@ -16,8 +16,10 @@ SCRIPTS = ("page.js", "arm.js")
 
 
 def render_page(template: str, **context: object) -> str:
-    """One self-contained page. Its Content-Security-Policy admits the style and the scripts in it by their digests,
-    and nothing else: no file or address can be loaded, and no text that came through can run.
+    """Return one self-contained page.
+
+    Its Content-Security-Policy admits the style and the scripts in it by their digests, and nothing else: no file or
+    address can be loaded, and no text that came through can run.
     """
     style, *scripts = _assets()
     return render(

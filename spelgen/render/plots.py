@@ -190,10 +190,10 @@ def trajectory_panels(
     joints: Sequence[NamedJoint],
     motion: str = "",
 ) -> list[Panel]:
-    """Return by joint position and, where it is known, velocity: measured and predicted, each above what the
-    predictions miss; of servos the commands, too.
+    """Return by joint position and, where it is known, velocity: measured and predicted, of servos the commands too.
 
-    predictions: of one motion, by the names of lines, whose styles stand in `styles`. motion: see `line_chart`.
+    Each is above its errors. predictions: of one motion, by the names of lines, whose styles stand in `styles`. motion:
+    see `line_chart`.
     """
     measured = next(iter(predictions.values()))
     panels = []

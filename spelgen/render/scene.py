@@ -23,8 +23,10 @@ from spelgen.urdf.robot import Joint, Robot
 
 @dataclass(frozen=True, eq=False)
 class SceneLink:
-    """A link, and the joint that carries it: it stands at rotation (3, 3) and position (3,) in its parent's frame and
-    then turns about its axis, or slides along it, by ratio * q[joint] + offset. joint: -1, it is fixed.
+    """Hold a link, and the joint that carries it.
+
+    It stands at rotation (3, 3) and position (3,) in its parent's frame and then turns about its axis, or slides along
+    it, by ratio * q[joint] + offset. joint: -1, it is fixed.
     """
 
     name: str
@@ -95,8 +97,9 @@ def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint,
 
 
 def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
-    """Return the links from the root to the last joint, all that the joints carry, and what is fixed to these links;
-    parents first.
+    """Return the links from the root to the last joint and what the joints carry; parents first.
+
+    What is fixed to these links is among them.
     """
     visible = {robot.joint[name].child for name in joints}
     # from the root on, so that whatever hangs on a carried link is carried, too
