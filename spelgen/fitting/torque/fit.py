@@ -108,11 +108,11 @@ def _with_residuals(
         state = problem.refine(state, samples)
     correlation = problem.correlation
     problem.jacobian.rigid.write(state.x)
-    residuals = select_residuals(model, problem.jacobian.residual_samples(state.x), correlation)
+    residuals = select_residuals(model, *problem.around(state), correlation)
     if not residuals:
         return state, residuals
     for _ in range(TUNING.turns):
         state = problem.refine(state, samples)
         problem.jacobian.rigid.write(state.x)
-        refit_residuals(model, problem.jacobian.residual_samples(state.x), residuals, correlation)
+        refit_residuals(model, *problem.around(state), residuals, correlation)
     return problem.set_samples(state, TorqueJacobian(model, samples)), residuals

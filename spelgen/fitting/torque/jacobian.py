@@ -51,6 +51,20 @@ class ResidualSamples(NamedTuple):
     friction: torch.Tensor
 
 
+class RigidResponse(NamedTuple):
+    """How bodies, drives and friction laws follow a torque on each joint: J (T, C) of the C weights that move it, and
+    what a fit of these weights makes of J^T torque (C, C).
+    """
+
+    slopes: tuple[torch.Tensor, ...]
+    gains: tuple[torch.Tensor, ...]
+
+    def remaining(self, joint: int, torque: torch.Tensor) -> torch.Tensor:
+        """Return what of torques (T, P) on a joint is left when these weights have taken over what they can."""
+        slope = self.slopes[joint]
+        return torque - slope @ (self.gains[joint] @ (slope.mT @ torque))
+
+
 @dataclass(frozen=True, eq=False)
 class _Directions:
     """Directions in which one weight of every joint changes at once, but of joints with a coupling only one.
@@ -78,6 +92,14 @@ class TorqueJacobian:
         self._functional = FunctionalModel(model)
         self._directions = self._by_joint()
         self._blocks = [self._with_regressors(block) for block in samples.blocks(TUNING.block)]
+
+    def start_by_torque(self) -> torch.Tensor:
+        """Return the weights (K,) as they are, with no friction larger than the deviation of its drive's torque."""
+        weights, deviation = self.rigid.named(self.start), self.torque_deviation()
+        largest = (deviation / self.model.friction.nominal).log()
+        for name in self.rigid.of_kind("sizes"):
+            weights[name] = torch.where(deviation > 0, weights[name].minimum(largest), weights[name])
+        return self.rigid.flattened(weights)
 
     def squares(self, x: torch.Tensor) -> torch.Tensor:
         """Return sums of squares (n,) of the missing torque [Nm^2, N^2], as logged where gains are trained."""
@@ -149,6 +171,15 @@ class TorqueJacobian:
                 q, qd, qdd, _, _ = block.measured
                 blocks.append(ResidualSamples(q, qd, qdd, missing, friction))
         return ResidualSamples(*(torch.cat(column) for column in zip(*blocks, strict=True)))
+
+    def response(self, x: torch.Tensor, noise: torch.Tensor, covariance: torch.Tensor) -> RigidResponse:
+        """Return how the weights follow, that have this covariance (K, K) after a fit under this noise (n,)."""
+        blocks: list[list[torch.Tensor]] = [[] for _ in noise]
+        gains = list(noise)
+        for joint, columns, slope, _ in self._slopes(x):
+            blocks[joint].append(slope)
+            gains[joint] = covariance[columns[:, None], columns] / noise[joint] ** 2
+        return RigidResponse(tuple(torch.cat(slopes) for slopes in blocks), tuple(gains))
 
     def torque_deviation(self) -> torch.Tensor:
         """Return standard deviations (n,) of the measured torque, as the joints feel it."""

@@ -20,7 +20,7 @@ import torch
 
 from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
 from spelgen.fitting.levenberg_marquardt import NormalEquations, SolverState, levenberg_marquardt
-from spelgen.fitting.torque.jacobian import TUNING, TorqueJacobian
+from spelgen.fitting.torque.jacobian import TUNING, ResidualSamples, RigidResponse, TorqueJacobian
 from spelgen.fitting.torque.prior import adapted_kinds, covariance, most_probable
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.settings.fits import Adaptation, GaussianPrior
@@ -38,6 +38,8 @@ class TorqueProblem:
 
     def __init__(self, jacobian: TorqueJacobian, prior: GaussianPrior, adapt: Adaptation | None) -> None:
         self.start, self.guess, self.adapt = jacobian.start, prior, adapt
+        if adapt is None:
+            self.start = jacobian.start_by_torque()
         rigid = jacobian.rigid
         self.compensated = rigid.start[rigid.compensation] != 0
         self.covariance = torch.zeros(len(self.start), len(self.start)).double()
@@ -140,6 +142,11 @@ class TorqueProblem:
         if laws.memoryless.any():
             return self.solve(self.set_samples(remembering, self.jacobian), TUNING.rounds)
         return remembering
+
+    def around(self, state: State) -> tuple[ResidualSamples, RigidResponse]:
+        """Return what bodies and laws miss after a fit, and how they would follow what else explained it."""
+        response = self.jacobian.response(state.x, self.noise, self.covariance)
+        return self.jacobian.residual_samples(state.x), response
 
     def _compensate(self, x: torch.Tensor) -> bool:
         """Give a compensation to further joints that want one; return whether there are such.

@@ -1,5 +1,8 @@
 """What stands beside rigid bodies, fitted to the torque that they miss: selected by cross-validation.
 
+Bodies and friction laws were fitted alone, and have taken over what they can of a spring. A torque by position is
+therefore compared as far as they cannot: a partial regression (Frisch and Waugh, Econometrica 1:387, 1933).
+
 A function of one joint is fitted without each tenth of the samples in turn, and without a gap beside it, since errors
 of neighbours are alike. It is selected where the tenths as a whole gain, beyond luck, and where the last half of the
 samples gains by it, too, after a fit of it and of those before it to the first half: one motion often repeats what
@@ -20,7 +23,7 @@ import torch
 
 from spelgen.dynamics.residuals import residual_torque
 from spelgen.fitting.optimizers import minimise
-from spelgen.fitting.torque.jacobian import ResidualSamples
+from spelgen.fitting.torque.jacobian import ResidualSamples, RigidResponse
 from spelgen.runtime.residual_terms import LARGEST
 from spelgen.settings.tuning.fitting import ResidualTuning
 
@@ -46,7 +49,7 @@ class SelectedResidual:
 class _Candidate:
     """A function of one joint: its weights are a row of the model's parameter of that name, in units of ``scale``.
 
-    features: (T, P). force: (n,) how its torque acts on the joints. groups: (P,) which weights have a scale in common.
+    features: (T, P), of torques what bodies and laws cannot take over. force: (n,) how its torque acts on the joints. groups: (P,) which weights have a scale in common.
     friction: (T,) what the function varies, with weights of its logarithm, to which features are the linear answer.
     """
 
@@ -88,14 +91,16 @@ class _Candidate:
         return (missing @ weight) / (self.force @ weight)
 
 
-def select_residuals(model: Any, samples: ResidualSamples, correlation: float) -> list[SelectedResidual]:
+def select_residuals(
+    model: Any, samples: ResidualSamples, rigid: RigidResponse, correlation: float
+) -> list[SelectedResidual]:
     """Give the model all parts that held-out samples gain by; return these. correlation: samples that err alike."""
     first, last = _halves(len(samples.q), correlation)
     if first.stop < last.start - first.stop:  # the gap leaves next to nothing of so few samples
         return []
     noise, missing, selected = _noise(samples.missing), samples.missing, []
     missing_early = samples.missing  # by the same parts, fitted to the first half
-    for candidate in _candidates(model, samples):
+    for candidate in _candidates(model, samples, rigid):
         target, target_early = candidate.target(missing, noise), candidate.target(missing_early, noise)
         gain = _held_out_gain(candidate, target, correlation)
         if gain is None:
@@ -112,12 +117,16 @@ def select_residuals(model: Any, samples: ResidualSamples, correlation: float) -
 
 
 def refit_residuals(
-    model: Any, samples: ResidualSamples, selected: Sequence[SelectedResidual], correlation: float
+    model: Any,
+    samples: ResidualSamples,
+    rigid: RigidResponse,
+    selected: Sequence[SelectedResidual],
+    correlation: float,
 ) -> None:
     """Fit the selected functions of single joints anew, beside what else has changed since."""
     noise, missing, functions = _noise(samples.missing), samples.missing, model.residuals
     chosen = {(residual.name, residual.joint) for residual in selected}
-    for candidate in _candidates(model, samples):
+    for candidate in _candidates(model, samples, rigid):
         if (candidate.parameter, candidate.joint) not in chosen:
             continue
         present = (candidate.features @ candidate.weights(functions)).unsqueeze(-1) * candidate.force
@@ -128,7 +137,7 @@ def refit_residuals(
         missing = missing + present - changed
 
 
-def _candidates(model: Any, samples: ResidualSamples) -> Iterator[_Candidate]:
+def _candidates(model: Any, samples: ResidualSamples, rigid: RigidResponse) -> Iterator[_Candidate]:
     """Yield what could be selected: smooth torques first, then friction that varies, then ripple."""
     functions, motors = model.residuals, model.motors
     with torch.no_grad():
@@ -147,9 +156,9 @@ def _candidates(model: Any, samples: ResidualSamples) -> Iterator[_Candidate]:
             columns = features[:, joint]
             if not columns.any() or scale[joint] <= 0:
                 continue
-            friction = None
-            if parameter == FRICTION:
-                friction = samples.friction[:, joint]
+            friction = samples.friction[:, joint]
+            if parameter != FRICTION:
+                columns, friction = rigid.remaining(joint, columns), None
             yield _Candidate(parameter, joint, float(scale[joint]), columns, force[joint], groups, friction)
 
 
