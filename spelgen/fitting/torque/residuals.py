@@ -4,11 +4,12 @@ Bodies and friction laws were fitted alone, and have taken over what they can of
 therefore compared as far as they cannot: a partial regression (Frisch and Waugh, Econometrica 1:387, 1933).
 
 A function of one joint is fitted without each tenth of the samples in turn, and without a gap beside it, since errors
-of neighbours are alike. It is selected where the tenths as a whole gain, beyond luck, and where the last half of the
-samples gains by it, too, after a fit of it and of those before it to the first half: one motion often repeats what
-another does not. Networks of several joints are judged on the last half alone. Functions are linear in their weights,
-which are found with their scale by maximising the marginal likelihood (MacKay, Neural Computation 4:415, 1992);
-networks are found by L-BFGS from a normal distribution of their weights.
+of neighbours are alike. It can be selected where the tenths gain, beyond luck, and where the last half of the samples
+gains by it, too, after a fit of it and of those before it to the first half: one motion often repeats what another does
+not. The function that gains most comes first. Networks of several joints are judged on the last half alone.
+
+Functions are linear in their weights, which are found with their scale by maximising the marginal likelihood (MacKay,
+Neural Computation 4:415, 1992); networks are found by L-BFGS from a normal distribution of their weights.
 """
 
 from __future__ import annotations
@@ -20,11 +21,12 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 
 from spelgen.dynamics.residuals import residual_torque
 from spelgen.fitting.optimizers import minimise
 from spelgen.fitting.torque.jacobian import ResidualSamples, RigidResponse
-from spelgen.runtime.residual_terms import LARGEST
+from spelgen.runtime.residual_terms import LARGEST, SPLINES
 from spelgen.settings.tuning.fitting import ResidualTuning
 
 TUNING = ResidualTuning()
@@ -47,9 +49,12 @@ class SelectedResidual:
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """A function of one joint: its weights are a row of the model's parameter of that name, in units of ``scale``.
+    """A function of one joint.
 
-    features: (T, P), of torques what bodies and laws cannot take over. force: (n,) how its torque acts on the joints. groups: (P,) which weights have a scale in common.
+    The model's parameter of that name has a row (W,) for it, in units of ``scale``: ``basis``, (W, P), times the
+    weights that are fitted.
+    features: (T, P), of torques what bodies and laws cannot take over. force: (n,) how its torque acts on the joints.
+    groups: (P,) which weights have a scale in common.
     friction: (T,) what the function varies, with weights of its logarithm, to which features are the linear answer.
     """
 
@@ -58,19 +63,22 @@ class _Candidate:
     scale: float
     features: torch.Tensor
     force: torch.Tensor
+    basis: torch.Tensor
     groups: torch.Tensor
     friction: torch.Tensor | None
 
     def weights(self, functions: Any) -> torch.Tensor:
-        """Return the model's (P,)."""
+        """Return weights (P,) that give the model's."""
         if self.friction is not None:
-            result: torch.Tensor = functions.friction_logarithms()[self.joint].detach()
-            return result
-        result = functions.get_parameter(self.parameter)[self.joint].detach() * self.scale
-        return result
+            row = functions.friction_logarithms()[self.joint]
+        else:
+            row = functions.get_parameter(self.parameter)[self.joint] * self.scale
+        # the basis ends with an identity
+        return F.pad(row.detach(), (self.basis.shape[1] - len(row), 0))
 
     def write(self, functions: Any, weights: torch.Tensor) -> None:
         """Make them the model's."""
+        weights = self.basis @ weights
         if self.friction is not None:
             weights = LARGEST * (weights.clamp(-WIDEST, WIDEST) / LARGEST).atanh()
         with torch.no_grad():
@@ -98,20 +106,16 @@ def select_residuals(
     first, last = _halves(len(samples.q), correlation)
     if first.stop < last.start - first.stop:  # the gap leaves next to nothing of so few samples
         return []
-    noise, missing, selected = _noise(samples.missing), samples.missing, []
-    missing_early = samples.missing  # by the same parts, fitted to the first half
-    for candidate in _candidates(model, samples, rigid):
-        target, target_early = candidate.target(missing, noise), candidate.target(missing_early, noise)
-        gain = _held_out_gain(candidate, target, correlation)
-        if gain is None:
-            continue
-        torque_early = candidate.torque(_fit_candidate(candidate, target_early, correlation, first))
-        if (target_early - torque_early)[last].square().sum() >= target_early[last].square().sum():
-            continue
-        weights = _fit_candidate(candidate, target, correlation)
+    noise, selected = _noise(samples.missing), []
+    missing = missing_early = samples.missing  # the latter by the same parts, fitted to the first half
+    candidates = list(_candidates(model, samples, rigid))
+    while best := _best(candidates, missing, missing_early, noise, correlation):
+        candidate, gain, torque_early = best
+        weights = _fit_candidate(candidate, candidate.target(missing, noise), correlation)
         candidate.write(model.residuals, weights)
         missing = missing - candidate.torque(weights).unsqueeze(-1) * candidate.force
         missing_early = missing_early - torque_early.unsqueeze(-1) * candidate.force
+        candidates.remove(candidate)
         selected.append(SelectedResidual(candidate.parameter, candidate.joint, gain))
     return [*selected, *_select_networks(model, samples._replace(missing=missing), correlation)]
 
@@ -137,29 +141,57 @@ def refit_residuals(
         missing = missing + present - changed
 
 
+def _best(
+    candidates: Sequence[_Candidate],
+    missing: torch.Tensor,
+    missing_early: torch.Tensor,
+    noise: torch.Tensor,
+    correlation: float,
+) -> tuple[_Candidate, float, torch.Tensor] | None:
+    """Return the candidate that gains most where it was not seen; None where none gains.
+
+    Beside it are its gain and its torque (T,) after a fit to the first half. missing_early: (T, n) after such fits.
+    """
+    first, last = _halves(len(missing), correlation)
+    best = None
+    for candidate in candidates:
+        target, target_early = candidate.target(missing, noise), candidate.target(missing_early, noise)
+        gain = _held_out_gain(candidate, target, correlation)
+        if gain is None or (best is not None and gain <= best[1]):
+            continue
+        torque_early = candidate.torque(_fit_candidate(candidate, target_early, correlation, first))
+        if (target_early - torque_early)[last].square().sum() < target_early[last].square().sum():
+            best = candidate, gain, torque_early
+    return best
+
+
 def _candidates(model: Any, samples: ResidualSamples, rigid: RigidResponse) -> Iterator[_Candidate]:
-    """Yield what could be selected: smooth torques first, then friction that varies, then ripple."""
+    """Yield what could be selected: smooth torques, friction that varies, and ripple."""
     functions, motors = model.residuals, model.motors
     with torch.no_grad():
         splines, ripple = functions.splines(samples.q), functions.revolute * functions.waves(samples.q)
     joints, unit = torch.eye(len(motors)).to(motors), functions.unit.flatten()
-    common = torch.zeros(splines.shape[-1])
+    one, alike = torch.eye(SPLINES).double(), torch.zeros(SPLINES)
+    # a straight line, and what is not straight: a spring is known where no motion has been
+    line = torch.cat([torch.linspace(-1, 1, SPLINES).double().unsqueeze(-1), one], dim=1)
     pairs = torch.arange(ripple.shape[-1] // 2).repeat(2)
     varied = splines * samples.friction.unsqueeze(-1)
     kinds = (
-        ("raw_torque_splines", splines, unit, joints, common),
-        (FRICTION, varied, torch.ones(len(motors)), motors, common),
-        ("raw_torque_ripple", ripple, unit, joints, pairs),
+        ("raw_torque_splines", splines, unit, joints, line, F.pad(alike + 1, (1, 0))),
+        (FRICTION, varied, torch.ones(len(motors)), motors, one, alike),
+        ("raw_torque_ripple", ripple, unit, joints, torch.eye(len(pairs)).double(), pairs),
     )
-    for parameter, features, scale, force, groups in kinds:
+    for parameter, features, scale, force, basis, groups in kinds:
         for joint in range(len(motors)):
-            columns = features[:, joint]
+            columns = features[:, joint] @ basis
             if not columns.any() or scale[joint] <= 0:
                 continue
             friction = samples.friction[:, joint]
             if parameter != FRICTION:
                 columns, friction = rigid.remaining(joint, columns), None
-            yield _Candidate(parameter, joint, float(scale[joint]), columns, force[joint], groups, friction)
+            yield _Candidate(
+                parameter, joint, float(scale[joint]), columns, force[joint], basis, groups, friction
+            )
 
 
 def _noise(missing: torch.Tensor) -> torch.Tensor:
@@ -216,11 +248,12 @@ def _significant_gain(squares: torch.Tensor, missed: torch.Tensor) -> float | No
     """Return the fraction by which sums of squares of blocks fell; None where luck could do that, or it is next to
     nothing.
     """
-    gains = squares - missed
+    # by the logarithm, else a block of large torques would make all others luck
+    gains = (squares / missed).log()
     error = gains.std() / len(gains) ** 0.5
     if not gains.isfinite().all() or gains.mean() <= TUNING.standard_errors * error:
         return None
-    fraction = float(gains.sum() / squares.sum())
+    fraction = 1 - float(missed.sum() / squares.sum())
     return fraction if fraction > TUNING.least_gain else None
 
 
@@ -236,7 +269,7 @@ def _most_probable(sums: _Sums, groups: torch.Tensor, correlation: float) -> tor
     samples are most probable.
     """
     gram, moment, square, count = sums
-    member = torch.nn.functional.one_hot(groups.long()).double()  # (P, groups)
+    member = F.one_hot(groups.long()).double()  # (P, groups)
     seen = gram.diagonal() > 0
     size, noise = member.sum(dim=0), square / count
     height = (member.mT @ gram.diagonal() / count / size).clamp(min=1e-300)
