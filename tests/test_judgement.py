@@ -32,6 +32,17 @@ from spelgen.logs.windows import Windows
 from spelgen.settings.fits import Rollout, TorqueFit
 
 
+class Alone:
+    """Bodies and friction laws that take over nothing."""
+
+    @staticmethod
+    def remaining(joint, torque):
+        return torque
+
+
+ALONE = Alone()
+
+
 @pytest.fixture
 def hybrid(robots):
     """A model of bodies with functions of joints, and no networks: these take longer."""
@@ -51,7 +62,7 @@ def test_what_the_samples_of_one_stretch_say_is_judged_on_others(hybrid):
     missing = levels.repeat_interleave(200, dim=0) * torch.tensor([[1.0, 0.0]]).double()
     q = torch.stack([torch.linspace(-2, 2, 2000), torch.zeros(2000)], dim=1).double()
     # a function of q explains nearly all of it, and nothing where it was not fitted
-    assert select_residuals(hybrid, samples(missing, q), 1.0) == []
+    assert select_residuals(hybrid, samples(missing, q), ALONE, 1.0) == []
 
 
 def test_neighbours_of_what_is_held_out_are_not_fitted_to(hybrid):
@@ -60,9 +71,9 @@ def test_neighbours_of_what_is_held_out_are_not_fitted_to(hybrid):
     missing = levels.repeat_interleave(200, dim=0)[100:2100] * torch.tensor([[1.0, 0.0]]).double()
     q = torch.stack([torch.linspace(-2, 2, 2000), torch.zeros(2000)], dim=1).double()
     missed = samples(missing, q)
-    spline = next(residual_fit._candidates(hybrid, missed))
+    spline = next(residual_fit._candidates(hybrid, missed, ALONE))
     assert residual_fit._held_out_gain(spline, missing[:, 0], 20.0) is None
-    assert select_residuals(hybrid, missed, 20.0) == []
+    assert select_residuals(hybrid, missed, ALONE, 20.0) == []
 
 
 def test_what_the_first_half_shows_has_to_hold_in_the_last(hybrid):
@@ -72,7 +83,7 @@ def test_what_the_first_half_shows_has_to_hold_in_the_last(hybrid):
     missing = torch.stack([torch.sin(q[:, 0]), torch.zeros_like(t)], dim=1)
     for later, selected in ((0.45, 0), (0.75, 1)):
         missing[2000:] = later * torch.sin(q[2000:])
-        found = select_residuals(hybrid, samples(missing, q), 1.0)
+        found = select_residuals(hybrid, samples(missing, q), ALONE, 1.0)
         assert len(found) == selected
 
 
@@ -82,12 +93,12 @@ def test_a_gain_in_one_of_ten_stretches_is_luck(hybrid):
     everywhere = torch.stack([torch.sin(q[:, 0]), torch.zeros_like(t)], dim=1)
     noise = torch.randn(4000, 2, generator=torch.Generator().manual_seed(0)).double()
     noise[:, 1] = 0.0
-    found = select_residuals(hybrid, samples(everywhere + 0.1 * noise, q), 1.0)
+    found = select_residuals(hybrid, samples(everywhere + 0.1 * noise, q), ALONE, 1.0)
     # what the first part explains is not missing any more: none other is selected for it
     assert [(residual.name, residual.joint) for residual in found] == [("raw_torque_splines", 0)]
     # in one stretch it is so, in the others the torque is nearly nothing: held out it gains in one at most
     once = everywhere * (torch.arange(4000) < 400).unsqueeze(-1)
-    assert select_residuals(hybrid, samples(0.3 * once + noise, q), 1.0) == []
+    assert select_residuals(hybrid, samples(0.3 * once + noise, q), ALONE, 1.0) == []
 
 
 def test_gains_have_to_be_beyond_their_own_scatter():

@@ -23,7 +23,7 @@ from spelgen.fitting.torque import fit as torque_fit
 from spelgen.fitting.torque import jacobian as torque_jacobian
 from spelgen.fitting.torque.body_steps import moved_bodies
 from spelgen.fitting.torque.fit import fit_torque
-from spelgen.fitting.torque.jacobian import ResidualSamples
+from spelgen.fitting.torque.jacobian import ResidualSamples, RigidResponse
 from spelgen.fitting.torque.networks import adapt_networks
 from spelgen.fitting.torque.prior import ADAPTED, adapted_kinds, covariance, most_probable
 from spelgen.fitting.torque.report import torque_notes
@@ -554,6 +554,39 @@ def test_friction_that_is_nearly_nothing_does_not_vary(robots):
     missing = 0.3 * (3 * q).sin() * qd.sign() + noise
     for friction, gain in ((1.0, 0.9), (1e-9, None)):
         model = build(robots / "two_link.urdf", "hybrid")
-        found = select_residuals(model, ResidualSamples(q, qd, 0 * q, missing, friction * qd.sign()), 5.0)
+        samples = ResidualSamples(q, qd, 0 * q, missing, friction * qd.sign())
+        bodies = RigidResponse((torch.zeros(len(q), 0).double(),) * 2, (torch.zeros(0, 0).double(),) * 2)
+        found = select_residuals(model, samples, bodies, 5.0)
         varied = [x.gain for x in found if x.name == FRICTION]
         assert varied == [] if gain is None else min(varied) > gain and len(varied) == 2
+
+
+def test_a_spring_is_found_that_bodies_pass_for(emitted, robots):
+    """In few logs bodies explain much of it, and none of it in others."""
+    true, joint = drawn(emitted["six_dof"][0], seed=3, deviation=0.3), 4
+    stiffness = 2 * recorded(true, 3.0, 0.0).tau[:, joint].std()
+
+    def sprung(seconds, seed):
+        sample = recorded(true, seconds, 0.01, seed)
+        tau = sample.tau.copy()
+        tau[:, joint] += stiffness * sample.q[:, joint]
+        return replace(sample, tau=tau)
+
+    logs, test = [sprung(3.0, seed=0), sprung(3.0, seed=1)], sprung(10.0, seed=9)
+    bodies = build(robots / "six_dof.urdf", "closed-form")
+    fit_torque(bodies, logs)
+    model = build(robots / "six_dof.urdf", "hybrid", width=8)
+    model.residuals.potential = model.residuals.mass = None
+    solution = fit_torque(model, logs)
+    assert {residual.joint for residual in solution.residuals} == {joint}
+    assert nmse(model, test) < 1e-3
+    assert nmse(bodies, test) > 0.05
+
+
+def test_no_friction_is_guessed_that_torques_do_not_have_room_for(emitted, robots):
+    """The efforts of the URDF are placeholders, a million times what the arm ever gives."""
+    true = drawn(emitted["two_link"][0], seed=3, deviation=0.3)
+    model = build(robots / "two_link.urdf", "closed-form")
+    model.friction.nominal *= 1e6
+    fit_torque(model, [recorded(true, 20.0, 0.02)])
+    assert nmse(model, recorded(true, 20.0, 0.0, seed=9)) < 1e-4
