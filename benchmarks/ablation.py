@@ -74,8 +74,19 @@ def remember_always(problem: Any, state: Any) -> Any:
     return problem.solve(problem._first_fit(state.x, state.steps), torque_jacobian.TUNING.rounds)
 
 
+def as_it_is(jacobian: Any) -> Any:
+    """Stand in for `start_by_torque`: friction is guessed by efforts alone."""
+    return jacobian.start
+
+
+def nothing(response: Any, joint: int, torque: Any) -> Any:
+    """Stand in for `remaining`: bodies take over nothing of a torque by position."""
+    return torque
+
+
 def mechanisms() -> list[Mechanism]:
     """All that are switched off."""
+    jacobian = torque_jacobian.TorqueJacobian
     return [
         Mechanism("ends of recordings left out", tuned(dynamics_samples, unsettled=0.0)),
         Mechanism("correlated errors (5 samples)", tuned(torque_jacobian, correlation_length=1.0)),
@@ -86,12 +97,16 @@ def mechanisms() -> list[Mechanism]:
         Mechanism("that of armatures", ((torque_prior, "ADAPTED", ("bodies", "offset")),)),
         Mechanism("memory by evidence", ((torque_problem.TorqueProblem, "select_memory", remember_always),)),
         Mechanism("weak evidence yields to all joints'", tuned(torque_jacobian, memory_evidence=0.0)),
+        Mechanism("no more friction than torque", ((jacobian, "start_by_torque", as_it_is),)),
         Mechanism("friction compensated unseen", tuned(torque_jacobian, compensation_explained=NEVER)),
         Mechanism("every second sample alone", tuned(torque_jacobian, decimation=1)),
         Mechanism("few samples first", tuned(torque_jacobian, subset=2**40)),
         Mechanism("steps in the bodies' parameters", tuned(levenberg_marquardt, kept_promise=-NEVER)),
         Mechanism("turns of bodies and residuals", tuned(torque_jacobian, turns=1)),
         Mechanism("residuals beside rigid bodies", tuned(residual_fit, standard_errors=NEVER)),
+        Mechanism(
+            "what bodies take over of springs", ((torque_jacobian.RigidResponse, "remaining", nothing),)
+        ),
         Mechanism("significance of residuals", tuned(residual_fit, standard_errors=0.0)),
         Mechanism("gaps between blocks", tuned(residual_fit, gap=0.0)),
         Mechanism("least gain of residuals", tuned(residual_fit, least_gain=0.0)),

@@ -186,9 +186,11 @@ def _candidates(model: Any, samples: ResidualSamples, rigid: RigidResponse) -> I
             columns = features[:, joint] @ basis
             if not columns.any() or scale[joint] <= 0:
                 continue
-            friction = samples.friction[:, joint]
-            if parameter != FRICTION:
-                columns, friction = rigid.remaining(joint, columns), None
+            friction = None
+            if parameter == FRICTION:
+                friction = samples.friction[:, joint]
+            else:
+                columns = rigid.remaining(joint, columns)
             yield _Candidate(
                 parameter, joint, float(scale[joint]), columns, force[joint], basis, groups, friction
             )
