@@ -101,6 +101,29 @@ def test_a_gain_in_one_of_ten_stretches_is_luck(hybrid):
     assert select_residuals(hybrid, samples(0.3 * once + noise, q), ALONE, 1.0) == []
 
 
+def test_a_stretch_without_torque_hides_no_gain():
+    """Where a joint rests with no torque at all, a function may err by next to nothing."""
+    squares, missed = torch.full((10,), 100.0), torch.full((10,), 10.0)
+    squares[3], missed[3] = 0.0, 1e-9
+    assert residual_fit._significant_gain(squares, missed) == pytest.approx(0.9)
+
+
+def test_a_network_is_fitted_to_what_functions_of_joints_leave(robots, monkeypatch):
+    """Their torque is no longer in what is missed when networks are fitted, one after the other."""
+    model = build(robots / "two_link.urdf", "hybrid", width=8)
+    torch.nn.init.constant_(model.residuals.raw_torque_splines, 3.0)
+    seen = []
+
+    def fitted(model, network, samples, *_):
+        seen.append(samples.missing)
+        return 0.5
+
+    monkeypatch.setattr(residual_fit, "_fit_network", fitted)
+    q = torch.linspace(-1, 1, 2000).double().unsqueeze(-1).expand(-1, 2)
+    assert len(list(residual_fit._select_networks(model, samples(q.sin(), q), 1.0))) == 2
+    assert torch.equal(*seen)
+
+
 def test_gains_have_to_be_beyond_their_own_scatter():
     squares = torch.ones(10).double()
     steady = torch.full((10,), 0.9).double()

@@ -590,3 +590,15 @@ def test_no_friction_is_guessed_that_torques_do_not_have_room_for(emitted, robot
     model.friction.nominal *= 1e6
     fit_torque(model, [recorded(true, 20.0, 0.02)])
     assert nmse(model, recorded(true, 20.0, 0.0, seed=9)) < 1e-4
+
+
+def test_a_joint_that_stands_still_keeps_its_friction(robots):
+    """A slide held up gives a constant torque, which has no room for friction and says nothing of it."""
+    true, model = (build(robots / "scara.urdf", "closed-form") for _ in range(2))
+    sample = recorded(true, 10.0, 0.0)
+    q, qd, qdd = (column * [1.0, 1.0, 0.0, 1.0] for column in (sample.q, sample.qd, sample.qdd))
+    with torch.no_grad():
+        tau = true.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd))).numpy()
+    tau += 0.01 * np.random.default_rng(0).normal(size=tau.shape)
+    fit_torque(model, [DynamicsSamples("held", q, qd, qdd, tau)])
+    assert nmse(model, recorded(true, 10.0, 0.0, seed=9)) < 1e-3

@@ -51,8 +51,9 @@ def fit_torque(
 ) -> TorqueSolution:
     """Set the weights of a closed-form ``model`` to the most probable ones after ``samples`` (torques as logged).
 
-    The prior is centred on the weights as they are. ``adapt``: these move alone, what stands beside rigid bodies stays
-    as it is, and so does the prior of a load (see ``TorqueFit``).
+    The prior is centred on the weights as they are, but no friction there is larger than its drive's torque. ``adapt``:
+    these move alone, about the weights as they are; what stands beside rigid bodies stays, and so does the prior of a
+    load (see ``TorqueFit``).
     """
     if not isinstance(samples, TorqueSamples):
         samples = TorqueSamples.of(samples, TUNING.decimation)

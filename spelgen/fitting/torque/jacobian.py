@@ -16,11 +16,13 @@ from spelgen.fitting.torque.body_steps import moved_bodies
 from spelgen.fitting.torque.samples import Block, TorqueSamples
 from spelgen.fitting.torque.weights import RigidWeights
 from spelgen.settings.tuning.fitting import TorqueTuning
+from spelgen.settings.tuning.identification import IdentificationTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 TUNING = TorqueTuning()
+MOVING = IdentificationTuning().moving
 LOGARITHMS = ("armature", "sizes", "load_dependence")
 
 
@@ -52,8 +54,9 @@ class ResidualSamples(NamedTuple):
 
 
 class RigidResponse(NamedTuple):
-    """How bodies, drives and friction laws follow a torque on each joint: J (T, C) of the C weights that move it, and
-    what a fit of these weights makes of J^T torque (C, C).
+    """How bodies, drives and friction laws follow a torque on each joint.
+
+    slopes: J (T, C) by the C weights that move its torque. gains: what a fit of these makes of J^T torque (C, C).
     """
 
     slopes: tuple[torch.Tensor, ...]
@@ -95,10 +98,13 @@ class TorqueJacobian:
 
     def start_by_torque(self) -> torch.Tensor:
         """Return the weights (K,) as they are, with no friction larger than the deviation of its drive's torque."""
-        weights, deviation = self.rigid.named(self.start), self.torque_deviation()
+        weights, motors, speed = self.rigid.named(self.start), self.model.motors, self.samples.columns.qd
+        deviation = (self._joint_torque() @ torch.linalg.inv(motors)).std(dim=0)
+        # a drive that stands still, or gives no torque, shows no friction
+        shown = (deviation > 0) & ((speed @ motors.mT).abs().amax(dim=0) > MOVING)
         largest = (deviation / self.model.friction.nominal).log()
         for name in self.rigid.of_kind("sizes"):
-            weights[name] = torch.where(deviation > 0, weights[name].minimum(largest), weights[name])
+            weights[name] = torch.where(shown, weights[name].minimum(largest), weights[name])
         return self.rigid.flattened(weights)
 
     def squares(self, x: torch.Tensor) -> torch.Tensor:
@@ -183,10 +189,14 @@ class TorqueJacobian:
 
     def torque_deviation(self) -> torch.Tensor:
         """Return standard deviations (n,) of the measured torque, as the joints feel it."""
+        return self._joint_torque().std(dim=0)
+
+    def _joint_torque(self) -> torch.Tensor:
+        """Return the measured torque (T, n), as the joints feel it."""
         columns = self.samples.columns
         with torch.no_grad():
-            deviation: torch.Tensor = (columns.tau @ self.model.input_matrix(columns.q[:1])[0].mT).std(dim=0)
-        return deviation
+            torque: torch.Tensor = columns.tau @ self.model.input_matrix(columns.q[:1])[0].mT
+        return torque
 
     def by_velocity(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return of the missing torque the slope by velocity (n,) [Nm s/rad, N s/m], how much of its sum of squares

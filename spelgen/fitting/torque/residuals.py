@@ -250,8 +250,9 @@ def _significant_gain(squares: torch.Tensor, missed: torch.Tensor) -> float | No
     """Return the fraction by which sums of squares of blocks fell; None where luck could do that, or it is next to
     nothing.
     """
-    # by the logarithm, else a block of large torques would make all others luck
-    gains = (squares / missed).log()
+    # by the logarithm, else a block of large torques would make all others luck; one next to nothing counts as nothing
+    negligible = TUNING.least_gain * squares.mean()
+    gains = ((squares + negligible) / (missed + negligible)).log()
     error = gains.std() / len(gains) ** 0.5
     if not gains.isfinite().all() or gains.mean() <= TUNING.standard_errors * error:
         return None
@@ -298,32 +299,32 @@ def _select_networks(model: Any, samples: ResidualSamples, correlation: float) -
     networks = {"residual_potential": list(terms.potential.parameters()) if terms.potential else []}
     networks["residual_mass"] = [terms.raw_constants, *(terms.mass.parameters() if terms.mass else ())]
     for name, weights in networks.items():
-        gain = None
+        gain, present = None, _present_torque(model, subset)
         if weights:
             network = torch.nn.ParameterList(weights)
-            gain = _fit_network(model, network, subset, max(1.0, correlation / step))
+            gain = _fit_network(model, network, subset, present, max(1.0, correlation / step))
         if gain is None:
             continue
-        with torch.no_grad():
-            subset = subset._replace(missing=subset.missing - _network_torque(model, subset))
+        # functions of joints are in both
+        added = _present_torque(model, subset) - present
+        subset = subset._replace(missing=subset.missing - added)
         yield SelectedResidual(name, None, gain)
 
 
 def _fit_network(
-    model: Any, network: torch.nn.Module, samples: ResidualSamples, correlation: float
+    model: Any, network: torch.nn.Module, samples: ResidualSamples, present: torch.Tensor, correlation: float
 ) -> float | None:
-    """Fit one network where that pays on the last half of the samples after a fit to the first, else leave it as it is;
-    return the gain there.
+    """Fit one network where that pays on the last half of the samples after a fit to the first; return the gain there.
+
+    Else it is left as it is. present: (T, n), torque of all residuals before.
     """
     start, noise = copy.deepcopy(network.state_dict()), _noise(samples.missing)
-    with torch.no_grad():
-        present = _network_torque(model, samples)
 
     def fit(rows: slice, evaluations: int) -> None:
         chosen = ResidualSamples(*(column[rows] for column in samples))
 
         def cost() -> torch.Tensor:
-            error = chosen.missing - _network_torque(model, chosen) + present[rows]
+            error = chosen.missing - residual_torque(model, *chosen[:3]) + present[rows]
             return 0.5 * (error / noise).square().sum() / correlation
 
         network.load_state_dict(start)
@@ -333,8 +334,7 @@ def _fit_network(
     # most networks explain nothing, which few evaluations show
     for evaluations in (TUNING.network_first_look, TUNING.network_evaluations):
         fit(first, evaluations)
-        with torch.no_grad():
-            error = samples.missing - _network_torque(model, samples) + present
+        error = samples.missing - _present_torque(model, samples) + present
         squares, missed = [], []
         for block in _blocks(last):
             squares.append((samples.missing[block] / noise).square().sum())
@@ -349,5 +349,7 @@ def _fit_network(
     return gain
 
 
-def _network_torque(model: Any, samples: ResidualSamples) -> torch.Tensor:
-    return residual_torque(model, samples.q, samples.qd, samples.qdd)
+def _present_torque(model: Any, samples: ResidualSamples) -> torch.Tensor:
+    """Return the torque (T, n) of all that stands beside rigid bodies as it is."""
+    with torch.no_grad():
+        return residual_torque(model, samples.q, samples.qd, samples.qdd)
