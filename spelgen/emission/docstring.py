@@ -27,7 +27,7 @@ def class_summary(spec: ModelSpec) -> str:
 def _mass(spec: ModelSpec) -> str:
     """Return what M is made of."""
     if spec.bodies:
-        count = counted(len(spec.bodies), "rigid body").replace("bodys", "bodies")
+        count = counted(len(spec.bodies), "rigid body")
         return f"{count} with trained inertial parameters"
     if spec.design.mass == "dense-3n":
         rows = 3 * len(spec.joints)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from spelgen.baselines.names import MODEL
 from spelgen.evaluation.results import Results
 from spelgen.fitting.objectives import fit_summary
-from spelgen.labels import share, thousandths
+from spelgen.labels import counted, share, thousandths
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.render.charts import Chart
@@ -113,7 +113,7 @@ def _names(trajectories: Sequence[str]) -> str:
     names = ", ".join(trajectories)
     if count > 6:
         names = f"{', '.join(trajectories[:5])} and {count - 5} more"
-    return f"{count} trajector{'ies' if count != 1 else 'y'}: {names}"
+    return f"{counted(count, 'trajectory')}: {names}"
 
 
 def _duration(seconds: float) -> str:
