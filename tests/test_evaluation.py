@@ -359,6 +359,9 @@ def test_torque_errors_by_the_protocol():
     offset = torque_errors(Torques(lambda q, qd, qdd: tau + torch.tensor([1.0, 2.0])), [samples])
     np.testing.assert_allclose(offset.rmse, [1.0, 2.0], rtol=1e-12)
     np.testing.assert_allclose(offset.joint_nmse[0], 1 / samples.tau[:, 0].var(), rtol=1e-12)
+    constant = np.where(samples.tau[:, :1] > 0, 0.1 + 0.2, 0.3)  # with rounding
+    rounded = replace(samples, tau=np.concatenate([samples.tau[:, :1], constant], axis=1))
+    assert torque_errors(Torques(lambda q, qd, qdd: tau), [rounded]).joint_nmse == (0.0, None)
     infinite = torque_errors(Torques(lambda q, qd, qdd: tau / 0), [samples])
     assert infinite.mean_nmse is None
 

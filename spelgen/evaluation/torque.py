@@ -16,9 +16,11 @@ from spelgen.evaluation.plain import finite
 from spelgen.log_checks.statistics import quantisation_step
 from spelgen.logs.dynamics_samples import DynamicsSamples, is_moving
 from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.tuning.identification import IdentificationTuning
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 LEVELS = LogCheckTuning().levels
+NEGLIGIBLE = IdentificationTuning().negligible
 
 
 @dataclass(frozen=True)
@@ -80,10 +82,14 @@ def mean_nmse(residual: np.ndarray, torque: np.ndarray) -> float | None:
 
 def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
     """Return the nMSE of each joint, (T, n) -> (n,): NaN where the torque never varies."""
-    variance = torque.var(axis=0)
+    deviation = torque.std(axis=0)
+    varies = deviation > NEGLIGIBLE * np.abs(torque).max(
+        axis=0, initial=0.0
+    )  # else a constant, with rounding
     # a prediction that is not finite must not pass for a torque that says nothing
     squares = np.nan_to_num(np.square(residual).mean(axis=0), nan=np.inf, posinf=np.inf)
-    nmse: np.ndarray = np.divide(squares, variance, out=np.full_like(variance, np.nan), where=variance > 0)
+    nmse = np.full_like(squares, np.nan)
+    nmse[varies] = squares[varies] / deviation[varies] ** 2
     return nmse
 
 
