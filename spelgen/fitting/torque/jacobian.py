@@ -101,10 +101,10 @@ class TorqueJacobian:
         weights, motors, speed = self.rigid.named(self.start), self.model.motors, self.samples.columns.qd
         deviation = (self._joint_torque() @ torch.linalg.inv(motors)).std(dim=0)
         # a drive that stands still, or gives no torque, shows no friction
-        shown = (deviation > 0) & ((speed @ motors.mT).abs().amax(dim=0) > MOVING)
+        bounded = (deviation > 0) & ((speed @ motors.mT).abs().amax(dim=0) > MOVING)
         largest = (deviation / self.model.friction.nominal).log()
         for name in self.rigid.of_kind("sizes"):
-            weights[name] = torch.where(shown, weights[name].minimum(largest), weights[name])
+            weights[name] = torch.where(bounded, weights[name].minimum(largest), weights[name])
         return self.rigid.flattened(weights)
 
     def squares(self, x: torch.Tensor) -> torch.Tensor:
