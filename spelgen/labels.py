@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -120,7 +119,10 @@ def printable(text: str, allowed: str = "") -> str:
 
 def short_name(name: str) -> str:
     """Return a name from a file as one line of a table shows it: control characters would move the cursor."""
-    return textwrap.shorten(printable(name), LONGEST_NAME, placeholder="...") or '""'
+    line = " ".join(printable(name).split())
+    if len(line) > LONGEST_NAME:
+        return f"{line[: LONGEST_NAME - 3]}..."
+    return line or '""'
 
 
 def thousandths(joint_types: Sequence[str]) -> str:

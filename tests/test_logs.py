@@ -141,6 +141,7 @@ def test_joints_are_read_by_name_in_the_order_asked(tmp_path):
 def test_a_folder_gives_the_part_asked_for(tmp_path):
     for name in ("train", "test"):
         write_logs(tmp_path / f"{name}.parquet", [swing(name)], JOINTS)
+    (tmp_path / "._train.csv").write_bytes(b"of macOS, no log")
     assert [x.name for x in read_logs([tmp_path], JOINTS, role="train")] == ["train"]
     assert [x.name for x in read_logs([tmp_path], JOINTS, role="test")] == ["test"]
     assert [x.name for x in read_logs([tmp_path], JOINTS)] == ["test", "train"]
@@ -354,7 +355,7 @@ def test_gaps_split_and_are_said():
     pieces = split_at_gaps(with_gap())
     assert [len(x.t) for x in pieces] == [120, 80]
     notes = check([with_gap()], JOINTS, ("revolute", "revolute"))
-    assert [(x.code, x.message[:14]) for x in notes] == [("gap", "1 gaps in time")]
+    assert [(x.code, x.message[:14]) for x in notes] == [("gap", "1 gap in time,")]
 
 
 def test_no_window_crosses_a_gap():

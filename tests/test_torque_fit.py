@@ -583,6 +583,22 @@ def test_a_spring_is_found_that_bodies_pass_for(emitted, robots):
     assert nmse(bodies, test) > 0.05
 
 
+def test_a_spring_as_strong_as_gravity_does_not_drive_bodies_away(emitted, robots):
+    """Bodies took on all that they could of it, and positive masses do not follow back as their slopes promise."""
+    true = drawn(emitted["two_link"][0], seed=3, deviation=0.3)
+    stiffness = recorded(true, 5.0, 0.0).tau[:, 0].std()
+
+    def sprung(noise, seed):
+        sample = recorded(true, 10.0, noise, seed)
+        return replace(sample, tau=sample.tau + stiffness * (sample.q[:, :1] + 0.3) * [1, 0])
+
+    model = build(robots / "two_link.urdf", "hybrid", width=8)
+    model.residuals.potential = model.residuals.mass = None
+    solution = fit_torque(model, [sprung(0.01, seed=0), sprung(0.01, seed=1)])
+    assert {residual.joint for residual in solution.residuals} == {0}
+    assert nmse(model, sprung(0.0, seed=9)) < 1e-4
+
+
 def test_no_friction_is_guessed_that_torques_do_not_have_room_for(emitted, robots):
     """The efforts of the URDF are placeholders, a million times what the arm ever gives."""
     true = drawn(emitted["two_link"][0], seed=3, deviation=0.3)

@@ -6,7 +6,7 @@ import pytest
 
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.verdict import verdict
-from spelgen.labels import share
+from spelgen.labels import share, short_name
 
 JOINTS = ["a", "b"]
 
@@ -151,3 +151,11 @@ def test_errors_beyond_the_motion_are_told_as_such():
 
 def test_nothing_to_judge_by_is_said():
     assert verdict(results([], {})).sentence == "No verdict: no horizon and no torque was evaluated."
+
+
+def test_a_long_name_keeps_its_beginning():
+    assert (
+        short_name("a" * 40) == "a" * 33 + "..."
+        and short_name("a  b\n") == "a b\\n"
+        and short_name("") == '""'
+    )

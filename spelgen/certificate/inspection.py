@@ -13,7 +13,7 @@ from spelgen.arm.arm import Arm, Coordinate
 from spelgen.certificate.facts import Fact, facts
 from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.errors import Diagnostic
-from spelgen.labels import LONGEST_NAME, counted, joint_ranges, joints_in_ranges, printable, short_name
+from spelgen.labels import counted, joint_ranges, joints_in_ranges, printable, short_name
 from spelgen.listing import Listing
 from spelgen.structure.structure import Entry, Structure
 
@@ -177,9 +177,10 @@ class Inspection:
 
     def _joint_table(self) -> str:
         lines = ["Joints"]
+        names = [short_name(coordinate.name) for coordinate in self.arm.coordinates]
+        width = max(map(len, names))
         for index, coordinate in enumerate(self.arm.coordinates):
-            name = f"{short_name(coordinate.name):<{LONGEST_NAME}}"
-            line = f"  {index + 1:>2}  {name}  {coordinate.kind:<9}  {reach(coordinate)}"
+            line = f"  {index + 1:>2}  {names[index]:<{width}}  {coordinate.kind:<9}  {reach(coordinate)}"
             if index in self.structure.passive:
                 line += ", passive"
             lines.append(line)

@@ -98,7 +98,7 @@ class LogReport:
         paragraphs = [self.heading(), *map(Listing.text, self.listings(TUNING.shown))]
         if self.findings:
             paragraphs.append("\n".join(["Findings", *map(_wrapped, self.findings)]))
-        else:
+        elif not self.errors:
             paragraphs.append("No findings.")
         return "\n\n".join(paragraphs)
 

@@ -15,7 +15,8 @@ from typing import Generic, Literal, TypeVar
 import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
-from spelgen.logs.rates import is_dense, shows_accelerations
+from spelgen.labels import counted
+from spelgen.logs.rates import SLOWEST, is_dense, shows_accelerations
 from spelgen.logs.recording import is_dropout
 from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
 from spelgen.settings.log_mapping import TIMES
@@ -317,14 +318,17 @@ def clock_diagnostics(trajectory: Trajectory) -> list[Diagnostic]:
     gaps = len(gap_ends(trajectory.t)) - 2
     if gaps:
         longest = np.diff(trajectory.t).max()
-        message = f"{gaps} gaps in time, up to {longest:.3g} s long; no window crosses one"
+        message = f"{counted(gaps, 'gap')} in time, up to {longest:.3g} s long; no window crosses one"
         notes.append(Diagnostic("info", "gap", where, None, message))
     for repair in trajectory.repairs:
         notes.append(Diagnostic("warning", "repaired", where, None, repair))
     rate = trajectory.sample_rate
-    if trajectory.u is None and shows_accelerations(rate) and not is_dense(rate):
+    if trajectory.u is None and not is_dense(rate):
+        use = f"too slow for fits to torques, which need {SLOWEST:g} Hz"
+        if shows_accelerations(rate):
+            use = "interpolated for fits to torques"
         message = (
-            f"{rate:.3g} Hz: interpolated for fits to torques; motion faster than {rate / 2:.3g} Hz, delays below "
+            f"{rate:.3g} Hz: {use}; motion faster than {rate / 2:.3g} Hz, delays below "
             f"{1e3 / rate:.0f} ms and friction where a joint reverses are not visible at this rate"
         )
         notes.append(Diagnostic("warning", "low-rate", where, None, message))

@@ -41,7 +41,9 @@ def _logs_at(path: Path, role: str | None) -> list[Path]:
 
 
 def _folder_logs(folder: Path, role: str | None) -> list[Path]:
-    logs = sorted(path for path in folder.iterdir() if format_of(path) is not None)
+    # hidden files are not recordings: macOS puts "._log.csv" beside log.csv on other file systems
+    visible = (path for path in folder.iterdir() if not path.name.startswith("."))
+    logs = sorted(path for path in visible if format_of(path) is not None)
     if not logs:
         raise LogError("a folder without logs", file=folder, expected=describe_formats())
     has_roles = any(path.stem in ("train", "test") for path in logs)

@@ -112,8 +112,13 @@ def _with_residuals(
     residuals = select_residuals(model, *problem.around(state), correlation)
     if not residuals:
         return state, residuals
+    follow = True
     for _ in range(TUNING.turns):
+        missed = problem.noise.log().sum()
         state = problem.refine(state, samples)
         problem.jacobian.rigid.write(state.x)
-        refit_residuals(model, *problem.around(state), residuals, correlation)
+        missing, rigid = problem.around(state)
+        # masses are positive: bodies that do not follow as their slopes promise would drive functions ever further
+        follow = follow and bool(problem.noise.log().sum() <= missed)
+        refit_residuals(model, missing, rigid if follow else None, residuals, correlation)
     return problem.set_samples(state, TorqueJacobian(model, samples)), residuals

@@ -24,7 +24,7 @@ TUNING = TorqueReportTuning()
 
 EFFECTS = {
     "raw_torque_splines": "a torque by position (spring, cable)",
-    "raw_torque_ripple": "ripple",
+    "raw_torque_ripple": "a torque that repeats with the turn (ripple, cogging)",
     "raw_friction_splines": "friction that varies with position",
     "residual_potential": "a network in V",
     "residual_mass": "networks in M",

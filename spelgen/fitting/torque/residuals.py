@@ -53,7 +53,8 @@ class _Candidate:
 
     The model's parameter of that name has a row (W,) for it, in units of ``scale``: ``basis``, (W, P), times the
     weights that are fitted.
-    features: (T, P), of torques what bodies and laws cannot take over. force: (n,) how its torque acts on the joints.
+    features: (T, P); in a selection, of torques what bodies and laws cannot take over.
+    force: (n,) how its torque acts on the joints.
     groups: (P,) which weights have a scale in common.
     friction: (T,) what the function varies, with weights of its logarithm, to which features are the linear answer.
     """
@@ -123,11 +124,14 @@ def select_residuals(
 def refit_residuals(
     model: Any,
     samples: ResidualSamples,
-    rigid: RigidResponse,
+    rigid: RigidResponse | None,
     selected: Sequence[SelectedResidual],
     correlation: float,
 ) -> None:
-    """Fit the selected functions of single joints anew, beside what else has changed since."""
+    """Fit the selected functions of single joints anew, beside what else has changed since.
+
+    To all that is missed where ``rigid`` is None, else as far as bodies and laws cannot follow.
+    """
     noise, missing, functions = _noise(samples.missing), samples.missing, model.residuals
     chosen = {(residual.name, residual.joint) for residual in selected}
     for candidate in _candidates(model, samples, rigid):
@@ -165,8 +169,11 @@ def _best(
     return best
 
 
-def _candidates(model: Any, samples: ResidualSamples, rigid: RigidResponse) -> Iterator[_Candidate]:
-    """Yield what could be selected: smooth torques, friction that varies, and ripple."""
+def _candidates(model: Any, samples: ResidualSamples, rigid: RigidResponse | None) -> Iterator[_Candidate]:
+    """Yield what could be selected: smooth torques, friction that varies, and ripple.
+
+    Torques by position are those that ``rigid`` leaves, where it is given.
+    """
     functions, motors = model.residuals, model.motors
     with torch.no_grad():
         splines, ripple = functions.splines(samples.q), functions.revolute * functions.waves(samples.q)
@@ -189,7 +196,7 @@ def _candidates(model: Any, samples: ResidualSamples, rigid: RigidResponse) -> I
             friction = None
             if parameter == FRICTION:
                 friction = samples.friction[:, joint]
-            else:
+            elif rigid is not None:
                 columns = rigid.remaining(joint, columns)
             yield _Candidate(
                 parameter, joint, float(scale[joint]), columns, force[joint], basis, groups, friction
