@@ -358,6 +358,7 @@ def test_negated_torques_of_an_arm_without_gravity_are_refused(robots, rate):
     refused = check_logs([replace(right, tau=-right.tau)], flat)
     assert ("too slow for fits to torques" in refused.text()) == (rate < 24)
     assert "No findings" not in refused.text()
+    assert check_logs([right[:1]], flat).errors == ()  # no rate at all
     (error,) = refused.errors
     assert "act against acceleration" in str(error) and "--accept torque-sense" in str(error)
 

@@ -323,7 +323,7 @@ def clock_diagnostics(trajectory: Trajectory) -> list[Diagnostic]:
     for repair in trajectory.repairs:
         notes.append(Diagnostic("warning", "repaired", where, None, repair))
     rate = trajectory.sample_rate
-    if trajectory.u is None and not is_dense(rate):
+    if trajectory.u is None and rate > 0 and not is_dense(rate):
         use = f"too slow for fits to torques, which need {SLOWEST:g} Hz"
         if shows_accelerations(rate):
             use = "interpolated for fits to torques"
