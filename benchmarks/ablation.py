@@ -43,6 +43,8 @@ SIMULATED = (
     replace(
         truth.PANDA, number=1_000_002, arm="random", friction="stribeck", urdf_error=np.inf, seconds=20.0
     ),
+    replace(truth.PANDA, number=1_000_003, springs=True, seconds=10.0),
+    replace(truth.PANDA, number=1_000_004, arm="niryo_ned3pro", friction="load"),  # a wrist without load
 )
 
 
@@ -145,7 +147,8 @@ def fit_and_judge(urdf: Path, training: Any, tests: Any) -> Callable[[], dict[st
 def simulated_cases(folder: Path) -> Iterator[tuple[str, Callable[[], dict[str, float]]]]:
     """Fits to arms whose truth is known."""
     for case in SIMULATED:
-        yield f"{case.arm}, {case.friction}", lambda case=case: fit_truth(case, folder)
+        springs = ", springs" * case.springs
+        yield f"{case.arm}, {case.friction}{springs}", lambda case=case: fit_truth(case, folder)
 
 
 def fit_truth(case: truth.Case, folder: Path) -> dict[str, float]:
