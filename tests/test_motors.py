@@ -19,6 +19,8 @@ from spelgen.fitting.fit import fit
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.identification import torque_delay
+from spelgen.identification.drive_hints import Coupling
 from spelgen.identification.identify import identify, least_squares
 from spelgen.identification.method import LeastSquares
 from spelgen.loaded_arm import load_arm
@@ -265,6 +267,22 @@ def test_no_delay_is_searched_beside_a_coupling_that_no_file_names(uncoupled):
     assert (
         identify(uncoupled, log, preprocessing=Preprocessing(torque_delay=0.002)).torque_delay.delay == 0.002
     )
+
+
+def test_a_coupling_that_goes_with_the_delay_is_a_delay(uncoupled, monkeypatch):
+    """Number 160 of `benchmarks/truth.py`: 5 ms of an arm without friction passed for a coupling."""
+    coupling, looked_at = Coupling(5, 4, 1.0, "joints"), []
+
+    def only_at_first(problem):
+        looked_at.append(problem.rows[..., -1])
+        return (coupling, 0.5) if len(looked_at) == 1 else None
+
+    monkeypatch.setattr(torque_delay, "find_coupling", only_at_first)
+    found = identify(uncoupled, recorded(uncoupled, "joints", 0.0, late=0.005)).torque_delay
+    assert found.coupling is None
+    assert found.delay == pytest.approx(0.005, abs=0.0005)
+    logged, moved_by_delay = looked_at
+    assert np.abs(moved_by_delay - logged).max() > 0.01 * np.abs(logged).max()
 
 
 def test_logs_of_plain_drives_suggest_nothing(uncoupled):

@@ -111,6 +111,11 @@ class DriveProblem:
         products[joints] = block_products(rows, products.shape[1])
         return replace(self, products=products)
 
+    def of_torques(self, tau: np.ndarray) -> DriveProblem:
+        """Return the same with other torques (S, n)."""
+        rows = np.concatenate([self.rows[..., :-1], tau[..., None]], axis=2)
+        return replace(self, rows=rows, products=block_products(rows, self.products.shape[1]))
+
     def in_one_block(self, stride: int) -> DriveProblem:
         """Return the same on one of so many samples, in a single block: it judges by what it was fitted to."""
         rows = self.rows[::stride]

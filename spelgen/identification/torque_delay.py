@@ -93,14 +93,27 @@ def delay_of(
     drives: Drives,
     chain: BodyChain,
 ) -> TorqueDelay:
+    """Return the delay that these samples show, or a coupling of motors instead.
+
+    problem: of these samples, which shows couplings; None: they are too few.
+    """
+    late = _likely_delay(samples, kinds, drives, chain)
+    coupling = None if problem is None else find_coupling(problem)
+    if problem is None or coupling is None:
+        return late
+    # torques that are late pass for a coupling, too, and no longer once they are moved
+    if late.delay and find_coupling(problem.of_torques(samples.torques @ _spline(late.delay))) is None:
+        return late
+    return TorqueDelay(coupling=coupling)
+
+
+def _likely_delay(
+    samples: DriveSamples, kinds: Sequence[str], drives: Drives, chain: BodyChain
+) -> TorqueDelay:
     """Return the delay that least squares with and without friction's memory both show, where both fit.
 
-    The value is that of the form of friction that leaves less of the torque. problem: of these samples, which shows
-    couplings; None: they are too few.
+    The value is that of the form of friction that leaves less of the torque.
     """
-    coupling = None if problem is None else find_coupling(problem)
-    if coupling is not None:
-        return TorqueDelay(coupling=coupling)
     q, qd, qdd, z, direction, tau = samples
     if tau.std(axis=0).max() <= TUNING.negligible * np.abs(tau).max():  # a constant, with rounding
         return NO_DELAY
