@@ -83,12 +83,11 @@ def mean_nmse(residual: np.ndarray, torque: np.ndarray) -> float | None:
 def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
     """Return the nMSE of each joint, (T, n) -> (n,): NaN where the torque never varies."""
     deviation = torque.std(axis=0)
-    varies = deviation > NEGLIGIBLE * np.abs(torque).max(
-        axis=0, initial=0.0
-    )  # else a constant, with rounding
+    largest = np.abs(torque).max(axis=0, initial=0.0)
+    varies = deviation > NEGLIGIBLE * largest  # else a constant, with rounding
     # a prediction that is not finite must not pass for a torque that says nothing
     squares = np.nan_to_num(np.square(residual).mean(axis=0), nan=np.inf, posinf=np.inf)
-    nmse = np.full_like(squares, np.nan)
+    nmse: np.ndarray = np.full_like(squares, np.nan)
     nmse[varies] = squares[varies] / deviation[varies] ** 2
     return nmse
 
