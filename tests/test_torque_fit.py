@@ -26,7 +26,7 @@ from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import ResidualSamples, RigidResponse
 from spelgen.fitting.torque.networks import adapt_networks
 from spelgen.fitting.torque.prior import ADAPTED, adapted_kinds, covariance, most_probable
-from spelgen.fitting.torque.report import torque_notes
+from spelgen.fitting.torque.report import terms_in_use, torque_notes
 from spelgen.fitting.torque.residuals import FRICTION, select_residuals
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.weights import RIGID, RigidWeights
@@ -618,3 +618,13 @@ def test_a_joint_that_stands_still_keeps_its_friction(robots):
     tau += 0.01 * np.random.default_rng(0).normal(size=tau.shape)
     fit_torque(model, [DynamicsSamples("held", q, qd, qdd, tau)])
     assert nmse(model, recorded(true, 10.0, 0.0, seed=9)) < 1e-3
+
+
+def test_a_model_says_what_stands_beside_its_bodies(robots):
+    assert terms_in_use(build(robots / "rpr.urdf", "closed-form")) == []
+    model = build(robots / "rpr.urdf", "hybrid", width=8)
+    assert terms_in_use(model) == []
+    with torch.no_grad():
+        model.residuals.raw_torque_splines[1, 3] = 1.0
+        model.residuals.raw_constants += 0.1
+    assert terms_in_use(model) == ["a torque by position (spring, cable) at joint2", "networks in M"]

@@ -45,7 +45,7 @@ def summary(spec: ModelSpec) -> str:
     mass = _mass(spec)
     text = mass[0].upper() + mass[1:]
     if _has_residuals(spec):
-        text += f";\nresidual networks: {_functions(spec)} in M"
+        text += f";\nresidual networks, zero unless a fit selects them: {_functions(spec)} in M"
     text += ".\n"
     if spec.potential:
         text += f"The potential energy depends on {joints_in_ranges(spec.potential)}.\n"

@@ -151,7 +151,7 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
     traces = Traces({}) if run.results is None else run.results.traces
     arm, cells, training, tables = None, None, None, []
     if config:
-        training = training_facts(config, run.metrics, run.identified)
+        training = training_facts(config, run.metrics, run.identified, run.model)
     if run.results is not None:
         tables = result_tables(run.results)
     if run.arm is not None:

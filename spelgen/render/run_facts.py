@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from spelgen.baselines.names import MODEL
 from spelgen.evaluation.results import Results
 from spelgen.fitting.objectives import fit_summary
+from spelgen.fitting.torque.report import terms_in_use
 from spelgen.labels import counted, share, thousandths
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
@@ -72,8 +73,10 @@ def _errors(results: Results) -> list[Number]:
     return figures
 
 
-def training_facts(config: Record, metrics: Sequence[Record], identified: Record | None) -> Training:
-    """Return how the run was trained, from its config.json and metrics.jsonl."""
+def training_facts(
+    config: Record, metrics: Sequence[Record], identified: Record | None, model: EmittedModel | None
+) -> Training:
+    """Return how the run was trained, from its config.json, metrics.jsonl and the model that came of it."""
     preprocessing, options = Preprocessing(**config["preprocessing"]), config["config"]
     facts = {
         "objective": config["objective"],
@@ -85,6 +88,8 @@ def training_facts(config: Record, metrics: Sequence[Record], identified: Record
     if identified and "samples" in identified:
         count = f"{identified['samples']:,}"
         facts["dense samples"] = f"{count} that move, from which least squares is fitted as well"
+    if model is not None and hasattr(model, "residuals"):
+        facts["beside rigid bodies"] = "; ".join(terms_in_use(model)) or "nothing that logs ask for"
     chart = None
     # fits to torques have no epochs
     if metrics:

@@ -1,7 +1,7 @@
 r"""Port-Hamiltonian model of an arm with 3 joints, written by `spelgen build`.
 
 3 rigid bodies with trained inertial parameters;
-residual networks: 3 learned functions of q and 2 constants in M.
+residual networks, zero unless a fit selects them: 3 learned functions of q and 2 constants in M.
 The potential energy depends on joint 3.
 Sizes and starting values are the URDF's inertials.
 

@@ -1,7 +1,7 @@
 r"""Port-Hamiltonian model of an arm with 2 joints, written by `spelgen build`.
 
 2 rigid bodies with trained inertial parameters;
-residual networks: 1 learned function of q and 2 constants in M.
+residual networks, zero unless a fit selects them: 1 learned function of q and 2 constants in M.
 The potential energy depends on joints 1,2.
 Sizes and starting values are the URDF's inertials.
 

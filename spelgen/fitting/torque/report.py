@@ -10,6 +10,7 @@ import torch
 from torch.autograd.functional import jacobian
 
 from spelgen.dynamics.protocol import has_residuals
+from spelgen.dynamics.residuals import idle_residuals
 from spelgen.errors import Diagnostic
 from spelgen.fitting.functional_model import FunctionalModel
 from spelgen.fitting.torque.fit import TorqueSolution
@@ -85,6 +86,25 @@ def _selected(solution: TorqueSolution, names: np.ndarray) -> str:
         "residual terms selected by cross-validation, with the decrease of the mean squared torque residual: "
         + ", ".join(parts)
     )
+
+
+def terms_in_use(model: EmittedModel) -> list[str]:
+    """Return what stands beside the rigid bodies of a model, by effect and joint."""
+    names = model.joint_names
+    if not has_residuals(model):
+        return []
+    idle, terms = idle_residuals(model), []
+    networks: set[str] = set()
+    for name, weights in model.residuals.named_parameters():
+        if f"residuals.{name}" in idle:
+            continue
+        if name in EFFECTS:
+            rows = weights.any(dim=1).tolist()
+            joints = [joint for joint, used in zip(names, rows, strict=True) if used]
+            terms.append(f"{EFFECTS[name]} at {', '.join(joints)}")
+        else:
+            networks.add("residual_potential" if name.startswith("potential.") else "residual_mass")
+    return terms + [EFFECTS[name] for name in sorted(networks)]
 
 
 def _inertia(model: EmittedModel, q: torch.Tensor, covariance: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
