@@ -89,7 +89,7 @@ def training_facts(
         count = f"{identified['samples']:,}"
         facts["dense samples"] = f"{count} that move, from which least squares is fitted as well"
     if model is not None and hasattr(model, "residuals"):
-        facts["beside rigid bodies"] = "; ".join(terms_in_use(model)) or "nothing that logs ask for"
+        facts["beside rigid bodies"] = "; ".join(terms_in_use(model)) or "nothing selected"
     chart = None
     # fits to torques have no epochs
     if metrics:

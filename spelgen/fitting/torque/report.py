@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import compress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -93,18 +94,21 @@ def terms_in_use(model: EmittedModel) -> list[str]:
     names = model.joint_names
     if not has_residuals(model):
         return []
-    idle, terms = idle_residuals(model), []
-    networks: set[str] = set()
+    idle = idle_residuals(model)
+    terms: list[str] = []
     for name, weights in model.residuals.named_parameters():
         if f"residuals.{name}" in idle:
             continue
         if name in EFFECTS:
-            rows = weights.any(dim=1).tolist()
-            joints = [joint for joint, used in zip(names, rows, strict=True) if used]
-            terms.append(f"{EFFECTS[name]} at {', '.join(joints)}")
+            joints = compress(names, weights.any(dim=1).tolist())
+            term = f"{EFFECTS[name]} at {', '.join(joints)}"
+        elif name.startswith("potential."):
+            term = EFFECTS["residual_potential"]
         else:
-            networks.add("residual_potential" if name.startswith("potential.") else "residual_mass")
-    return terms + [EFFECTS[name] for name in sorted(networks)]
+            term = EFFECTS["residual_mass"]
+        if term not in terms:
+            terms.append(term)
+    return terms
 
 
 def _inertia(model: EmittedModel, q: torch.Tensor, covariance: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
