@@ -43,7 +43,7 @@ SIMULATED = (
     replace(
         truth.PANDA, number=1_000_002, arm="random", friction="stribeck", urdf_error=np.inf, seconds=20.0
     ),
-    replace(truth.PANDA, number=1_000_003, springs=True, seconds=10.0),
+    replace(truth.PANDA, number=118, arm="realman_rm_75", springs=True, seconds=10.0),
     replace(truth.PANDA, number=1_000_004, arm="niryo_ned3pro", friction="load"),  # a wrist without load
 )
 
