@@ -214,7 +214,7 @@ def test_what_could_not_be_done_is_said(run):
         "errors on training data are not test errors",
         "horizon-too-long": "no prediction over 5 s: the longest trajectory has 24 steps",
         "low-rate": "20 Hz: too slow for fits to torques, which need 24 Hz; motion faster than 10 Hz, delays below "
-        "50 ms and friction where a joint reverses are not visible at this rate",
+        "50 ms and friction where a joint reverses are not visible at this rate (and in 3 more trajectories)",
         "no-urdf-baseline": "no comparison with the URDF: no arm is known",
     }
 

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from spelgen.building import build
-from spelgen.errors import LogError, SpelgenErrors
+from spelgen.errors import Diagnostic, LogError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
-from spelgen.logs.checks import check
+from spelgen.logs.checks import check, once
 from spelgen.logs.chunks import scan
 from spelgen.logs.filtering import low_pass, prepare, resample
 from spelgen.logs.rates import automatic_cutoff, automatic_decimation, shows_accelerations
@@ -498,3 +498,11 @@ def test_a_models_logs_have_the_urdfs_names(tmp_path):
     path = write_logs(tmp_path / "log.csv", [log], arm)
     for owner in (arm, model):
         assert np.array_equal(read_logs(path, owner)[0].tau, log.tau)
+
+
+def test_what_is_said_of_many_recordings_is_said_once():
+    slow, other = (Diagnostic("warning", "low-rate", f"trajectory {k}", None, "slow") for k in "ab")
+    gap = Diagnostic("info", "gap", "trajectory a", None, "1 gap in time")
+    first, second = once([slow, gap, other])
+    assert (first.where, first.message) == ("trajectory a", "slow (and in 1 more trajectory)")
+    assert second == gap

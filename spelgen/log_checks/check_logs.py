@@ -28,7 +28,7 @@ from spelgen.log_checks.gravity import (
 from spelgen.log_checks.report import TUNING, JointReport, LogReport, range_fraction
 from spelgen.log_checks.robot_checks import CHECKS, JointEvidence
 from spelgen.log_checks.statistics import Statistics, joint_statistics, statistics
-from spelgen.logs.checks import Finding, Findings, clock_diagnostics, findings, run_checks, summarised
+from spelgen.logs.checks import Finding, Findings, clock_diagnostics, findings, once, run_checks, summarised
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
@@ -81,6 +81,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
         raise LogError("no trajectory", expected="at least one")
     # what files declare by themselves holds where all of them do
     accepted = set(mapping.accept) | set.intersection(*declared_codes)
+    notes = once(notes)
     summary = summarised(odd, joints, len(measured))
     motion = joined(samples)
     reports = []

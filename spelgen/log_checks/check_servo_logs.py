@@ -20,6 +20,7 @@ from spelgen.logs.checks import (
     clock_diagnostics,
     findings,
     is_factor,
+    once,
     run_checks,
     summarised,
 )
@@ -47,6 +48,7 @@ def check_servo_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> ServoLogRepo
         require_commands(log)
         odd += findings(log, joints, kinds)
         notes += clock_diagnostics(log)
+    notes = once(notes)
     summary = summarised(odd, joints, len(logs))
     following = measure_following(logs, _saturation(arm))
     measured = list(map(statistics, logs))

@@ -7,7 +7,7 @@ so that logs need not lie in memory together. `log_checks` has the checks that t
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Generic, Literal, TypeVar
@@ -308,7 +308,21 @@ def check(
         count += 1
     summary = summarised(results, joints, count)
     collect(summary.errors)
-    return [*notes, *summary.notes]
+    return [*once(notes), *summary.notes]
+
+
+def once(notes: Sequence[Diagnostic]) -> list[Diagnostic]:
+    """Return each message of trajectories once, with how many others it is about."""
+    groups: dict[tuple[str, str], list[Diagnostic]] = {}
+    for note in notes:
+        groups.setdefault((note.code, note.message), []).append(note)
+    merged = []
+    for first, *others in groups.values():
+        if others:
+            more = counted(len(others), "more trajectory")
+            first = replace(first, message=f"{first.message} (and in {more})")
+        merged.append(first)
+    return merged
 
 
 def clock_diagnostics(trajectory: Trajectory) -> list[Diagnostic]:
