@@ -34,7 +34,7 @@ from spelgen.building import build
 from spelgen.dynamics.bristles import bristle_reach, reach_of
 from spelgen.dynamics.regressor import regressor
 from spelgen.errors import LogError
-from spelgen.evaluation.state_errors import end_errors
+from spelgen.evaluation.horizons import end_errors
 from spelgen.evaluation.torque import mean_nmse, predicted_torques
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.torque.fit import fit_torque

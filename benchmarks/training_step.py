@@ -106,12 +106,12 @@ def networks_alone(model: EmittedModel, data: Data) -> None:
     total = torch.zeros((), dtype=torch.float64)
     for _ in range(4 * (SAMPLES - 1)):
         features = network_inputs(model, q).requires_grad_()
-        layers = prepared.mass
+        layers = prepared["mass"]
         total = total + dynamics.mass.network(features, layers)[0].sum()
-        total = total + dynamics.potential(features, prepared.potential)[0].sum()
-        total = total + dynamics.friction(features, qd, prepared.friction, qd.unsqueeze(-1)).sum()
+        total = total + dynamics.potential(features, prepared["potential"])[0].sum()
+        total = total + dynamics.friction(features, qd, prepared["friction"], qd.unsqueeze(-1)).sum()
         if hasattr(dynamics, "input_network"):
-            total = total + dynamics.input_network(features, prepared.input)[0].sum()
+            total = total + dynamics.input_network(features, prepared["input"])[0].sum()
     total.backward()
 
 
@@ -155,7 +155,7 @@ def sizes(model: EmittedModel) -> str:
         len(given.biases[-1]) if given else 0,
         len(potential.biases[-1]),
     )
-    return f"{' '.join(f'{count:4}' for count in outputs)} {mass.weights[0].shape[1]:7}"
+    return f"{' '.join(f'{count:4}' for count in outputs)} {int(mass.mask0.flatten(1).any(dim=0).sum()):7}"
 
 
 def median(times: list[float]) -> float:

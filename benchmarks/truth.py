@@ -148,8 +148,8 @@ class Truth:
 def _maxwell_slip(q: np.ndarray, coulomb: np.ndarray) -> np.ndarray:
     """Return friction of six elements in parallel that stick up to their own reach and then slip.
 
-    The generalised Maxwell-slip model (Al-Bender et al., IEEE TAC 50:1883, 2005), which is not the law of the
-    fitted models: their bristles slide gradually.
+    The generalised Maxwell-slip model (Al-Bender et al., IEEE TAC 50:1883, 2005), with other reaches than those
+    of the fitted models.
     """
     reaches = np.geomspace(2e-4, 3e-2, 6)
     z = np.zeros((len(reaches), q.shape[1]))

@@ -17,8 +17,14 @@ PRESET_NAMES: tuple[str, ...] = get_args(Preset)
 
 Net = Literal["mlp", "kan"]
 
-BRISTLE_REACH = {"revolute": (1e-4, 1e-3, 1e-2, 1e-1), "prismatic": (1e-5, 1e-4, 1e-3, 1e-2)}
+BRISTLE_REACH = {
+    "revolute": (1e-4, 4e-4, 1.6e-3, 6.4e-3, 2.5e-2, 1e-1),
+    "prismatic": (1e-5, 4e-5, 1.6e-4, 6.4e-4, 2.5e-3, 1e-2),
+}
 """How far friction's memory reaches, by kind of joint [rad, m]: what gears do before they slide spans such decades."""
+SERVO_STRIBECK_ROUNDING = 0.2
+"""Of the Stribeck velocity, for joints that servos hold at rest: their friction falls from rest on, or they creep."""
+
 
 PRESETS = Path(__file__).parent / "presets"
 

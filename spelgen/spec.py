@@ -25,7 +25,7 @@ Kind = Literal["zero", "constant", "varying"]
 Entries = tuple[tuple[int, int, float], ...]
 """A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""
 
-MODULE_FORMAT = 6
+MODULE_FORMAT = 7
 """Of emitted modules: it changes when a module, or weights of one, written before cannot be used any more."""
 LARGEST_MODULE = 2**22  # bytes: the largest that `build` writes has a tenth
 _MOST_WEIGHTS = 2**24  # of the hidden layers of one network: 134 MB in double precision
@@ -85,7 +85,6 @@ class JointSpec:
     mass_sensitivity: float
     potential_sensitivity: float
     """How much M, or V, changes with this joint, relative to the joint it changes with most."""
-    actuated: bool
 
 
 Triple = tuple[float, float, float]
@@ -161,7 +160,7 @@ class ModelSpec:
     bodies: tuple[BodySpec, ...] = ()
     """Of a closed-form model."""
     inputs: tuple[tuple[int, int, float, bool], ...] = ()
-    """(row, column, value, trained) of G; none where each torque acts on its own actuated joint as it is."""
+    """(row, column, value, trained) of G; none where every joint's own torque acts on it as it is."""
     motor_speeds: tuple[tuple[float, ...], ...] = ()
     """By joint velocities, where motors move several joints."""
     servos: tuple[ServoSpec, ...] = ()

@@ -139,7 +139,8 @@ class ExactFunctions(nn.Module):
     ):
         super().__init__()
         self.mean, self.scale, self.n = mean, scale, len(encoding.center)
-        self.center, self.reach = encoding.center, encoding.reach
+        self.encoding = encoding
+        self.reach = torch.where(encoding.slope > 0, 1 / encoding.slope, 0.0)
         self.values = [_compiled(f) for f in functions]
         self.slopes = [
             [_compiled(f.derivative(3 * k + letter)) for k in range(self.n) for letter in range(3)]
@@ -153,15 +154,15 @@ class ExactFunctions(nn.Module):
         self, encoded: torch.Tensor, layers: tuple[torch.Tensor, torch.Tensor]
     ) -> tuple[torch.Tensor, torch.Tensor]:
         output_map, offset = layers
-        cos, sin, *rest = encoded.split(self.n, dim=-1)
-        q = rest[0] * self.reach + self.center if rest else torch.zeros_like(cos)
-        variables = torch.stack([cos, sin, q], dim=-1).flatten(-2)  # (..., 3 n): c1, s1, q1, c2, ...
+        first, second = encoded.split(self.n, dim=-1)
+        q = first * self.reach + self.encoding.center
+        variables = torch.stack([first, second, q], dim=-1).flatten(-2)  # (..., 3 n): c1, s1, q1, c2, ...
         y = torch.stack([_evaluated(f, variables) for f in self.values], dim=-1)
         slopes = torch.stack(
             [torch.stack([_evaluated(d, variables) for d in row], dim=-1) for row in self.slopes], dim=-2
         )
         by_c, by_s, by_q = slopes.unflatten(-1, (self.n, 3)).unbind(dim=-1)
-        jacobian = torch.cat([by_c, by_s, by_q * self.reach] if rest else [by_c, by_s], dim=-1)
+        jacobian = torch.cat([by_c * self.encoding.revolute + by_q * self.reach, by_s], dim=-1)
         y = (y - self.mean) / self.scale
         return y @ output_map.mT + offset, output_map @ (jacobian / self.scale.unsqueeze(-1))
 

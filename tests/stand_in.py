@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 FACTS = """{
-  "format": 6,
+  "format": 7,
   "robot": "stand_in",
   "urdf": "stand_in.urdf",
   "urdf_sha256": "none",

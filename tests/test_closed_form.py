@@ -178,7 +178,9 @@ def test_friction_at_a_standstill_has_its_slope(emitted):
     away = torch.full_like(q, 1e-3)
     torque = model.friction(away, model.gravity(q), constants)
     dry = constants.coulomb + constants.load_dependence * torch.hypot(model.gravity(q), constants.least_load)
-    dry = dry + constants.stribeck / (1 + (away / constants.stribeck_velocity) ** 2 / 16) ** 16
+    relative = away / constants.stribeck_velocity
+    rounding = constants.stribeck_rounding
+    dry = dry + constants.stribeck / (1 + (1 + rounding) * relative**2 / (relative + rounding) / 8) ** 8
     saturating = constants.saturation * away / (away**2 + constants.saturation_velocity**2).sqrt()
     dry = dry * away / (away**2 + constants.coulomb_smoothing_velocity**2).sqrt()
     near(torque, constants.viscous * away + saturating + dry)

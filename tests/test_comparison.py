@@ -17,9 +17,9 @@ from spelgen.baselines.predictor import Predictor
 from spelgen.comparison import metrics, runs
 from spelgen.comparison.formatting import comparison_tables
 from spelgen.comparison.known_urdf import with_wrong_inertials
+from spelgen.comparison.metrics import mass_error, true_mass
 from spelgen.comparison.runs import predict_example, run_study, time_steps
 from spelgen.comparison.study import VARIANTS, ablation_variants, prepare_study
-from spelgen.comparison.truth import mass_error, true_mass
 from spelgen.design import load_design
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
@@ -138,7 +138,7 @@ def test_every_run_is_noted_and_measured(study, notes):
         assert result.invariants.least_eigenvalue > 0
     assert results["hybrid"].sizes.outputs == (1, 2, 0, 1)
     assert results["phnode"].sizes.outputs == (21, 21, 6, 1)  # as in the paper
-    assert results["phnode"].sizes.inputs == 18
+    assert results["phnode"].sizes.inputs == 4
 
 
 def test_losses_are_of_the_logs_that_they_are_named_after(study):

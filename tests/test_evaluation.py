@@ -283,7 +283,7 @@ def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
 
     arm = load_arm(cart)
     model, dynamics = build(arm, preset="closed-form"), urdf_dynamics(cart, ["slide", "swing"])
-    logs = motions(dynamics, count=2, samples=200, rate=100.0)
+    logs = motions(dynamics, count=2, samples=130, rate=100.0)
     result = evaluate(
         model, logs, arm=arm, baselines={"truth": dynamics}, preprocessing=Preprocessing(cutoff=0.0)
     )

@@ -110,9 +110,9 @@ def test_splines_at_their_ends_and_beyond(tmp_path):
     q = torch.cat([knots, torch.tensor([[50.0, -50.0], [1e6, -1e6]], dtype=torch.float64)]).contiguous()
     inputs = {key: 0 * q.numpy() + 0.3 for key in ("qd", "qdd")} | {
         "q": q.numpy(),
-        "z": np.zeros((len(q), 8)),
+        "z": np.zeros((len(q), 12)),
     }
-    expected = model.inverse_dynamics(q, 0 * q + 0.3, 0 * q + 0.3, torch.zeros(len(q), 2, 4)).numpy()
+    expected = model.inverse_dynamics(q, 0 * q + 0.3, 0 * q + 0.3, torch.zeros(len(q), 2, 6)).numpy()
     still = model.gravity(q).numpy()
     for called in (c_library(described, tmp_path), called_by_state(casadi_functions(described))):
         np.testing.assert_allclose(called("inverse_dynamics", inputs)["tau"], expected, rtol=1e-9, atol=1e-9)

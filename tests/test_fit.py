@@ -9,6 +9,7 @@ from emitted import random_model
 
 import spelgen
 from spelgen.errors import LogError, RunError
+from spelgen.fitting.adaptive import SOLVER
 from spelgen.fitting.adaptive import TUNING as ADAPTIVE
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.rollout import loss_scales, roll_out, rollout_loss
@@ -195,8 +196,11 @@ def test_a_fit_tells_what_it_is():
 @pytest.mark.parametrize(
     "samples, preset", [(4, "spel"), (4, "closed-form"), (ADAPTIVE.adjoint_samples + 2, "phnode")]
 )
-def test_both_solvers_agree(tmp_path, samples, preset):
+def test_both_solvers_agree(tmp_path, samples, preset, monkeypatch):
     """In what they predict and in its gradient, which over long horizons comes from the adjoint equation."""
+    # where bristles begin to slide steps of 1e-7 have gradients of 1e-3
+    monkeypatch.setitem(SOLVER, "rtol", 1e-9)
+    monkeypatch.setitem(SOLVER, "atol", 1e-11)
     model = random_model("two_link", tmp_path, seed=0, preset=preset)
     torch.manual_seed(0)
     q, qd, tau = torch.rand(3, 5, samples, model.n, dtype=torch.float64)

@@ -144,6 +144,6 @@ def require_answer(path: Path) -> bool:
             assert line.startswith((str(path), "and ")), line
             assert line.isprintable(), line
         return False
-    assert found.text(80)
+    assert found.text()
     assert len(found.structure.joints) == len(found.arm.coordinates)
     return True

@@ -172,13 +172,15 @@ def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
 @pytest.mark.parametrize("part", ["mass.network", "potential", "input_network"])
 @pytest.mark.parametrize("net", ["mlp", "kan"])
 def test_networks_read_rotation_matrices(net, part, tmp_path):
-    """Layer by layer as the papers write them, on the 9 numbers of R and the 3 of r."""
+    """Layer by layer as the papers write them, on what varies of the 9 numbers of R and the 3 of r."""
     owner = random_model("rpr", tmp_path, seed=5, preset="phnode", net=net)
     model, encoding = owner.get_submodule(part), owner.encoding
     q = states(3)[0]
     parts = to_group(owner.joint_types, q)
-    parts[1] = (parts[1] - encoding.center[1] * torch.tensor([0, 0, 1.0], dtype=q.dtype)) / encoding.reach[1]
-    layer = torch.cat([part.reshape(len(q), -1) for part in parts], dim=-1)
+    slide = (parts[1][:, 2] - encoding.center[1]) * encoding.slope[1]
+    turns = (parts[0], parts[2])
+    cosines, sines = (torch.stack([x[:, k, 0] for x in turns], dim=-1) for k in (0, 1))
+    layer = torch.stack([cosines[:, 0], slide, cosines[:, 1], sines[:, 0], 0 * slide, sines[:, 1]], dim=-1)
     count = len(model.weights)
     for index, (weight, level) in enumerate(zip(model.weights, model.biases, strict=True)):
         weight = weight * getattr(model, f"mask{index}")
@@ -223,7 +225,7 @@ def test_phnode_is_its_three_axis_model_held_by_bearings(net, tmp_path):
 
     def inverse_mass(at: torch.Tensor) -> torch.Tensor:
         pose = model.at(at)
-        return model.mass.inverse(pose.encoded, pose.prepared.mass)
+        return model.mass.inverse(pose.encoded, pose.prepared["mass"])
 
     inverse = inverse_mass(q).detach()
     assert torch.linalg.eigvalsh(inverse)[:, 0].min() > 0

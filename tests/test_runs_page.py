@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 from spelgen.cli.main import app
 from spelgen.errors import RunError
-from spelgen.evaluation.csv_file import HEAD, csv_text
 from spelgen.evaluation.results import Results
+from spelgen.evaluation.tables import CSV_HEAD, csv_text
 from spelgen.identification.identify import identify
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.trajectory import Trajectory
@@ -31,10 +31,8 @@ def test_runs_stand_side_by_side_and_the_better_one_is_named(run, tmp_path):  # 
     changed["torque"]["model"]["mean_nmse"] = 0.02
     (better / "evaluation.json").write_text(json.dumps(changed))
     text = " ".join(" ".join(Page(render_runs([run, better])).text).split())
-    assert (
-        "better has the smallest rollout error over 1 s (0.00615 of the motion) and run has the smallest torque error"
-        in text
-    )
+    assert "run has the smallest nMSE of torques (1 % of variance)" in text
+    assert "better has the smallest rollout error after 1 s (0.615 % of motion)" in text
     result = CliRunner().invoke(app, ["report", str(run), str(better), "-o", str(tmp_path / "both.html")])
     assert result.exit_code == 0 and (tmp_path / "both.html").exists()
 
@@ -50,7 +48,7 @@ def test_runs_of_servos_are_compared_by_what_they_replay(run, tmp_path):  # noqa
         changed = EVALUATION | {"horizons": [], "torque": {}, "replays": [replay]}
         (folder / "evaluation.json").write_text(json.dumps(changed))
     text = " ".join(" ".join(Page(render_runs([run, better])).text).split())
-    assert "better has the smallest error with commands replayed, whole log (6 mrad" in text
+    assert "better has the smallest position error, commands replayed, whole log (6 mrad" in text
     assert "b 8 6 mean of all 8 6" in text and " a 8" not in text
 
 
@@ -62,7 +60,7 @@ def test_a_run_without_evaluation_cannot_be_set_beside_others(run):  # noqa: F81
 
 def test_the_table_holds_every_figure_once_with_its_unit():
     head, *rows = csv.reader(io.StringIO(csv_text(Results.from_dict(EVALUATION))))
-    assert tuple(head) == HEAD
+    assert tuple(head) == CSV_HEAD
     found = {tuple(row[:-1]): row[-1] for row in rows}
     assert len(found) == len(rows)
     assert found["Position error after 1 s", "joint2 [m]", "model"] == "0.02"

@@ -17,13 +17,13 @@ from servo_arm import COM, GRAVITY, MASS, STRIBECK_VELOCITY, Servos, servo_logs,
 from typer.testing import CliRunner
 
 import spelgen
+from spelgen.baselines import mujoco_actuators
+from spelgen.baselines.mujoco_actuators import kept_actuators
 from spelgen.baselines.names import DELAYED_COMMAND, LINEAR_SERVOS, POSITION_ACTUATORS
 from spelgen.cli.main import app
 from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import LogError, OptionError, RunError, SettingsError
-from spelgen.evaluation import keep
-from spelgen.evaluation.keep import read_followers
 from spelgen.files import write_json
 from spelgen.fitting.dataset import digest
 from spelgen.fitting.levenberg_marquardt import NormalEquations
@@ -92,7 +92,7 @@ def test_actuators_of_mujoco_are_what_it_has_to_beat(fitted, logs, monkeypatch):
     mujoco = pytest.importorskip("mujoco")
     run = RunFolder(fitted.folder)
     spelgen.keep_baseline(run.path, logs[:1])
-    (found,) = read_followers(run).values()
+    (found,) = kept_actuators(run).values()
     simulated = mujoco.MjModel.from_xml_string(found.mjcf)
     assert simulated.actuator_gainprm[:, 0] == pytest.approx(TRUTH.kp, rel=0.05)
     assert -simulated.actuator_biasprm[:, 2] == pytest.approx(TRUTH.kd, rel=0.05)
@@ -109,7 +109,7 @@ def test_actuators_of_mujoco_are_what_it_has_to_beat(fitted, logs, monkeypatch):
     notes = " ".join(x.message for x in results.diagnostics if x.code == "baseline")
     assert "by mujoco.minimize, the least squares of mujoco.sysid" in notes
     monkeypatch.setitem(sys.modules, "mujoco", None)  # as if it were not installed
-    assert read_followers(run) == {}
+    assert kept_actuators(run) == {}
     alone = spelgen.evaluate(run.path, logs[4][:40])
     assert "no-position-actuators" in {x.code for x in alone.diagnostics}
 
@@ -118,21 +118,21 @@ def test_actuators_of_mujoco_are_fitted_to_files_when_they_are_needed(
     fitted, logs, arm, tmp_path, monkeypatch
 ):
     pytest.importorskip("mujoco")
-    monkeypatch.setattr(keep, "_fit_position_actuators", lambda run, logs: {"fitted to": len(logs)})
+    monkeypatch.setattr(mujoco_actuators, "fitted_actuators", lambda run, logs: {"fitted to": len(logs)})
     run = RunFolder(tmp_path / "run")
     shutil.copytree(fitted.folder, run.path)
     path = spelgen.write_logs(tmp_path / "logs.parquet", logs[:4], arm)
     read = spelgen.read_logs(path, arm, {"input": "position"})  # where no zero is negative
     write_json(run.config, run.read_config() | {"data_digest": digest(read)})
     spelgen.keep_baseline(run.path, [path])
-    assert read_followers(run) == {}
+    assert kept_actuators(run) == {}
     assert run.read_json(run.baseline)["fitted to"] == 4
     spelgen.keep_baseline(run.path, [path])
     spelgen.write_logs(path, logs[:3], arm)
-    assert read_followers(run) == {}
+    assert kept_actuators(run) == {}
     assert "fitted to" not in run.read_json(run.baseline)  # other logs than the model was fitted to
     path.unlink()
-    assert read_followers(run) == {}
+    assert kept_actuators(run) == {}
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ def test_actuators_from_elsewhere_are_what_was_written_or_an_error(mjcf, joints,
     with pytest.raises(
         RunError, match=r"least_squares\.json: got actuators of MuJoCo that cannot be used"
     ) as told:
-        read_followers(RunFolder(tmp_path))
+        kept_actuators(RunFolder(tmp_path))
     assert said in f"{told.value} {type(told.value).__name__}"
 
 
@@ -185,7 +185,14 @@ def test_joints_get_the_laws_that_they_have(fitted):
         laws = fitted.model.friction.prepare()
     assert laws.stribeck[0] < 0.15 * TRUTH.coulomb[0]
     assert float(laws.stribeck[1]) == pytest.approx(TRUTH.stribeck[1], rel=0.3)
-    assert float(laws.stribeck_velocity[1]) == pytest.approx(STRIBECK_VELOCITY, rel=0.1)
+    # its velocity is that of another form: the curves are compared, by kp
+    speeds = torch.tensor([0.05, 0.1, 0.2, 0.4]).double()
+    with torch.no_grad():
+        dry = fitted.model.friction.dry(speeds[:, None].expand(-1, 2), torch.zeros(4, 2).double(), laws)
+    falling = TRUTH.coulomb[1] + TRUTH.stribeck[1] * torch.exp(-((speeds / STRIBECK_VELOCITY) ** 2))
+    torch.testing.assert_close(
+        dry[:, 1] / fitted.model.kp[1].detach(), falling / TRUTH.kp[1], rtol=0.06, atol=0
+    )
 
 
 def test_intervals_count_errors_that_are_alike_once():
@@ -255,7 +262,8 @@ def test_what_is_told_covers_the_truth(fitted):
             ("static_error", TRUTH.coulomb[k] / TRUTH.kp[k] + TRUTH.dead_zone[k]),
         ):
             assert joint[what]["determined"]
-            assert joint[what]["value"] == pytest.approx(truth, rel=0.03), what
+            # friction of the simulated elbow falls as a Gaussian, that of the model from rest on
+            assert joint[what]["value"] == pytest.approx(truth, rel=0.03 if k == 0 else 0.04), what
             assert joint[what]["low"] < truth < joint[what]["high"], what
     # the elbow's small weight does not tell dry friction from a dead zone
     assert told[0]["dry"]["determined"] and "dry/kp of elbow" in servo_text(fitted.record["servo"])
@@ -346,7 +354,7 @@ def test_a_missing_column_is_named(tmp_path, logs, arm, quantity):
 def test_what_does_not_belong_together_is_told(arm, logs, robots):
     with pytest.raises(SettingsError, match="preset with bristle friction"):
         spelgen.build(arm, "spel")
-    with pytest.raises(OptionError, match="this arm has position servos"):
+    with pytest.raises(OptionError, match="input: torque' in their settings, this has 'position'"):
         spelgen.fit(spelgen.build(arm, "closed-form"), logs, spelgen.TorqueFit())
     with pytest.raises(LogError, match="commanded positions and no torques"):
         spelgen.identify(arm, logs)

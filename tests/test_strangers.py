@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from spelgen.building import build
-from spelgen.comparison.results import RunResult
+from spelgen.comparison.metrics import RunResult
 from spelgen.emission.loading import load_module
 from spelgen.errors import LogError, RunError, SettingsError, SpelgenError
 from spelgen.exporting.exported import readme
@@ -202,7 +202,7 @@ DEFINITE = {
     "minimal": (100.0, 30.0),
     "spel-kan": (100.0, 10.0),
     "hybrid": (5.0, 2.0),
-    "closed-form": (10.0, 3.0),
+    "closed-form": (6.0, 3.0),
     "phnode": (0.3, 0.3),
 }
 

@@ -555,7 +555,8 @@ def test_friction_that_is_nearly_nothing_does_not_vary(robots):
     for friction, gain in ((1.0, 0.9), (1e-9, None)):
         model = build(robots / "two_link.urdf", "hybrid")
         samples = ResidualSamples(q, qd, 0 * q, missing, friction * qd.sign())
-        bodies = RigidResponse((torch.zeros(len(q), 0).double(),) * 2, (torch.zeros(0, 0).double(),) * 2)
+        still = dict.fromkeys(range(2), torch.zeros(0, 0).double())
+        bodies = RigidResponse((torch.zeros(len(q), 0).double(),) * 2, still)
         found = select_residuals(model, samples, bodies, 5.0)
         varied = [x.gain for x in found if x.name == FRICTION]
         assert varied == [] if gain is None else min(varied) > gain and len(varied) == 2
@@ -585,7 +586,7 @@ def test_a_spring_is_found_that_bodies_pass_for(emitted, robots):
 
 def test_a_spring_as_strong_as_gravity_does_not_drive_bodies_away(emitted, robots):
     """Bodies took on all that they could of it, and positive masses do not follow back as their slopes promise."""
-    true = drawn(emitted["two_link"][0], seed=3, deviation=0.3)
+    true = drawn(emitted["two_link"][0], seed=4, deviation=0.3)
     stiffness = recorded(true, 5.0, 0.0).tau[:, 0].std()
 
     def sprung(noise, seed):

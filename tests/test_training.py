@@ -32,6 +32,7 @@ from spelgen.fitting.rollout import (
     loss_scales,
     momentum_loss,
     position_difference,
+    probed,
     roll_out,
     rollout_loss,
 )
@@ -197,11 +198,8 @@ def test_stiff_friction_gets_more_substeps():
     model.damping += 5.0  # decays within a few milliseconds, samples are 50 ms apart
     stiff = choose_substeps(model, windows, scales)
     assert gentle < stiff
-    assert (
-        integration_error(model, windows, scales, stiff)
-        < 0.03
-        <= integration_error(model, windows, scales, 1)
-    )
+    once, twice, fine, finer = (probed(model, windows, scales, k) for k in (1, 2, stiff, 2 * stiff))
+    assert integration_error(fine, finer) < 0.03 <= integration_error(once, twice)
 
 
 def test_training_finds_the_true_parameters(logs, tmp_path):

@@ -17,7 +17,7 @@ from spelgen.identification.identification import identified_dynamics
 from spelgen.identification.identify import identify_by
 from spelgen.identification.method import LeastSquares
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.trajectory import Trajectory, require_torques
 
 FRICTION = {
     LEAST_SQUARES: ("parameters", FrictionModel()),
@@ -29,12 +29,12 @@ FRICTION = {
 class IdentifiedArm(Baseline):
     """Take an arm for what least squares makes of the training logs."""
 
-    def fit(
-        self, run: RunFolder, logs: Sequence[Trajectory], preprocessing: Preprocessing
-    ) -> dict[str, object]:
-        """Return the parameters with what is known of them; {} where logs are too sparse for accelerations."""
+    def fit(self, run: RunFolder, logs: Sequence[Trajectory], files: Sequence[str]) -> dict[str, object]:
+        """Return the parameters with what is known of them; {} where logs show no torques or no accelerations."""
+        preprocessing = Preprocessing(**run.read_config()["preprocessing"])
         methods = [LeastSquares(friction=friction) for _, friction in FRICTION.values()]
         try:
+            require_torques(logs)
             found = identify_by(run_arm(run), logs, methods, preprocessing)
         except (LogError, np.linalg.LinAlgError):
             return {}

@@ -1,10 +1,17 @@
-"""The arm of a run folder."""
+"""The arm and the logs of a run folder."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
 from spelgen.errors import RunError
 from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.streaming import LargeLogs
+from spelgen.fitting.train import open_logs
 from spelgen.loaded_arm import LoadedArm, arm_of_module
+from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.spec import read_facts
 
 
@@ -13,3 +20,8 @@ def run_arm(run: RunFolder) -> LoadedArm:
     if not run.urdf.exists():
         raise RunError("no robot.urdf", file=run.path, do="train with --robot")
     return arm_of_module(read_facts(run.module), run.urdf)
+
+
+def run_logs(run: RunFolder, paths: Iterable[Path | str]) -> Sequence[Trajectory] | LargeLogs:
+    """Return log files read as those that the run was trained on. Raises LogError."""
+    return open_logs(run.load_module(), paths, LogMapping(**run.read_config()["mapping"]))

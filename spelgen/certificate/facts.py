@@ -6,7 +6,7 @@ A reason is given only where the arm's exact geometry proves it (``reasons``).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from fractions import Fraction
 
 from spelgen.arm.arm import Arm
@@ -30,10 +30,6 @@ class Fact:
     statement: str
     means: str
     reason: Reason
-
-    def to_dict(self) -> dict[str, Reason]:
-        """Return the three fields as a JSON object."""
-        return asdict(self)
 
     def __str__(self) -> str:
         if self.reason:

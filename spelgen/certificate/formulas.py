@@ -181,7 +181,11 @@ def formulas(
     # of one entry, parameters that it does not contain would only puzzle a reader
     base = writer.base
     if entry is not None:
-        base = _named_in(rows, base)
+        names: set[str] = set()
+        for row in rows:
+            if row.expression is not None:
+                names.update(symbol.name for symbol in row.expression.free_symbols)
+        base = tuple(parameter for parameter in base if parameter.name in names)
     return Formulas(arm, structure.assume, base, tuple(rows))
 
 
@@ -193,15 +197,6 @@ def _place(n: int, entry: Entry) -> Place:
         expected = f"a row and a column from 1 to {n}, or V"
         raise SpelgenError(f"the entry {entry[0]},{entry[1]} of M", expected=expected)
     return row - 1, column - 1
-
-
-def _named_in(rows: Sequence[Formula], base: Sequence[BaseParameter]) -> tuple[BaseParameter, ...]:
-    """Return the base parameters that stand in the expressions of ``rows``."""
-    names: set[str] = set()
-    for row in rows:
-        if row.expression is not None:
-            names.update(symbol.name for symbol in row.expression.free_symbols)
-    return tuple(parameter for parameter in base if parameter.name in names)
 
 
 class _Writer:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import product
 from typing import TYPE_CHECKING, Literal
 
@@ -14,7 +14,7 @@ from spelgen.certificate.facts import Fact, facts
 from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.errors import Diagnostic
 from spelgen.labels import counted, joint_ranges, joints_in_ranges, printable, short_name
-from spelgen.listing import Listing
+from spelgen.listing import WIDTH, Listing
 from spelgen.structure.structure import Entry, Structure
 
 if TYPE_CHECKING:  # SymPy is read in only for formulas
@@ -22,6 +22,8 @@ if TYPE_CHECKING:  # SymPy is read in only for formulas
     from spelgen.certificate.formulas import Formulas
 
 SCHEMA = 1
+LETTERS = {"zero": "0", "constant": "C"}
+"""Of entries of M that no joint moves."""
 POSITION = "the springs of position servos: tau = clip(kp (u - q) - kd qd), which store 1/2 kp (q - u)^2"
 
 
@@ -70,17 +72,17 @@ class Inspection:
             },
             "input_matrix": self._input_matrix(),
             "base_parameters": structure.base_parameter_count,
-            "facts": list(map(Fact.to_dict, self.facts)),
+            "facts": list(map(asdict, self.facts)),
             "diagnostics": list(map(Diagnostic.to_dict, self.diagnostics)),
         }
 
-    def text(self, width: int = 80) -> str:
-        """Return a report for a terminal ``width`` columns wide."""
-        paragraphs = [self._heading(), self._joint_table(), self._matrix(), self._needs(width)]
+    def text(self) -> str:
+        """Return a report for a terminal."""
+        paragraphs = [self._heading(), self._joint_table(), self._matrix(), self._needs()]
         if self.facts:
-            paragraphs.append(_indented("In words", map(str, self.facts), width))
+            paragraphs.append(_indented("In words", map(str, self.facts)))
         if self.diagnostics:
-            paragraphs.append(_indented("Remarks", map(_remark, self.diagnostics), width))
+            paragraphs.append(_indented("Remarks", map(_remark, self.diagnostics)))
         return "\n\n".join(paragraphs)
 
     def __repr__(self) -> str:
@@ -187,7 +189,11 @@ class Inspection:
         return "\n".join(lines)
 
     def _cells(self) -> dict[tuple[int, int], str]:
-        return {(entry.row, entry.column): _cell(entry) for entry in self.structure.entries}
+        cells = {}
+        for entry in self.structure.entries:
+            letter = LETTERS.get(entry.kind)
+            cells[entry.row, entry.column] = joint_ranges(entry.joints) if letter is None else letter
+        return cells
 
     def _matrix(self) -> str:
         """Return the lower triangle of M with each entry's joints."""
@@ -218,10 +224,10 @@ class Inspection:
             "base": f"{structure.base_parameter_count} base inertial parameters",
         }
 
-    def _needs(self, width: int) -> str:
+    def _needs(self) -> str:
         lines = ["The model needs"]
         for name, need in self.needs().items():
-            lines += textwrap.wrap(need, width, initial_indent=f"  {name:<5} ", subsequent_indent=" " * 8)
+            lines += textwrap.wrap(need, WIDTH, initial_indent=f"  {name:<5} ", subsequent_indent=" " * 8)
         return "\n".join(lines)
 
 
@@ -244,10 +250,10 @@ def _triangle(cells: dict[tuple[int, int], str], n: int) -> list[str]:
     return list(map(str.rstrip, lines))
 
 
-def _indented(title: str, paragraphs: Iterable[str], width: int) -> str:
+def _indented(title: str, paragraphs: Iterable[str]) -> str:
     lines = [title]
     for paragraph in paragraphs:
-        lines += textwrap.wrap(paragraph, width, initial_indent="  ", subsequent_indent="    ")
+        lines += textwrap.wrap(paragraph, WIDTH, initial_indent="  ", subsequent_indent="    ")
     return "\n".join(lines)
 
 
@@ -268,11 +274,3 @@ def reach(coordinate: Coordinate) -> str:
     if coordinate.kind == "revolute":
         unit = "rad"
     return f"{coordinate.lower:g} .. {coordinate.upper:g} {unit}"
-
-
-def _cell(entry: Entry) -> str:
-    if entry.kind == "varying":
-        return joint_ranges(entry.joints)
-    if entry.kind == "constant":
-        return "C"
-    return "0"

@@ -12,9 +12,8 @@ from fractions import Fraction
 import numpy as np
 import pinocchio as pin
 
-from spelgen.arm.arm import Arm, Body
+from spelgen.arm.arm import Arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
-from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.settings.settings import Settings
 from spelgen.structure.pseudo_inertia import parameters_of
 
@@ -52,12 +51,11 @@ def draw(arm: Arm, count: int, rng: np.random.Generator, *, random_inertials: bo
         if random_inertials:
             dynamics = arm_dynamics(with_random_inertias(arm, rng), Settings())
         base, moved = _positions(arm, rng), _positions(arm, rng)
-        for block in range(1 + n):
-            q = base.copy()
-            if block > 0:
-                q[block - 1] = moved[block - 1]
-            mass[block, sample] = dynamics.mass_matrix(q)
-            potential[block, sample] = _potential_energy(dynamics, q)
+        q = np.where(np.eye(1 + n, n, -1) == 1, moved, base)  # (1 + n, n)
+        mass[:, sample] = dynamics.mass_matrix(q)
+        for block, configuration in enumerate(dynamics.configuration(q)):
+            energy = pin.computePotentialEnergy(dynamics.model, dynamics.data, configuration)
+            potential[block, sample] = energy
     # entries mix kilograms and kilogram square metres: each is judged in its own unit
     diagonal = np.abs(np.diagonal(mass, axis1=2, axis2=3)).mean(axis=(0, 1))
     scale = np.sqrt(np.outer(diagonal, diagonal))[rows, columns]
@@ -89,20 +87,13 @@ def _positions(arm: Arm, rng: np.random.Generator) -> np.ndarray:
     return rng.uniform(-reach, reach)
 
 
-def _potential_energy(dynamics: PinocchioDynamics, q: np.ndarray) -> float:
-    energy = pin.computePotentialEnergy(dynamics.model, dynamics.data, dynamics.configuration(q))
-    return float(energy)
-
-
 def with_random_inertias(arm: Arm, rng: np.random.Generator) -> Arm:
     """Return the arm with the inertia of a possible rigid body, drawn anew, on every joint."""
     translations = np.array([body.translation for body in arm.bodies], dtype=float)
     size = float(np.linalg.norm(translations, axis=1).mean()) or 1.0
-    return replace(arm, bodies=tuple(_random_body(body, size, rng) for body in arm.bodies))
-
-
-def _random_body(body: Body, size: float, rng: np.random.Generator) -> Body:
     # any positive definite pseudo-inertia is that of a possible body; lengths are of the arm's size
-    factor = rng.normal(size=(4, 4)) * np.array([[size], [size], [size], [1.0]])
-    inertia = parameters_of(factor @ factor.T)
-    return replace(body, inertia=tuple(map(Fraction, inertia.tolist())))
+    factors = rng.normal(size=(len(arm.bodies), 4, 4)) * np.array([[size], [size], [size], [1.0]])
+    bodies = []
+    for body, inertia in zip(arm.bodies, parameters_of(factors @ factors.mT).tolist(), strict=True):
+        bodies.append(replace(body, inertia=tuple(map(Fraction, inertia))))
+    return replace(arm, bodies=tuple(bodies))

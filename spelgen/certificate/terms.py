@@ -109,24 +109,21 @@ def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
     total: Terms = {}
     constant = (((), fmpq(1)),)
     for unit, members in sorted(groups.items(), key=lambda group: group[0] != constant):  # constants first
-        total |= _group(dict(unit), members)
+        number = fmpq(1)
+        factors, _ = unit[0]
+        if len(unit) > 1:
+            first = abs(next(iter(members.values())))
+            number, bracket = bracketed(times(dict(unit), first))
+            factors = (expression(bracket),)
+            members = times(members, 1 / first)
+        if len(members) > 1 and factors:
+            size, parameters = bracketed(members)
+            total[expression(parameters), *factors] = number * size
+            continue
+        for symbol, value in members.items():
+            total[*symbol, *factors] = number * value
     # a common factor before the sum: 2*(a + b) is shorter than 2*a + 2*b
     size = abs(bracketed(total)[0])
     if size == 1:
         return expression(total)
     return expression({(expression(times(total, 1 / size)),): size})
-
-
-def _group(unit: Terms, members: Terms) -> Terms:
-    """Return the terms of parameters times multiples of one function, given with 1 as its first coefficient."""
-    number = fmpq(1)
-    factors = next(iter(unit))
-    if len(unit) > 1:
-        first = abs(next(iter(members.values())))
-        number, bracket = bracketed(times(unit, first))
-        factors = (expression(bracket),)
-        members = times(members, 1 / first)
-    if len(members) > 1 and factors:
-        size, parameters = bracketed(members)
-        return {(expression(parameters), *factors): number * size}
-    return {(*symbol, *factors): number * value for symbol, value in members.items()}

@@ -7,6 +7,7 @@ angles, so it is compared with the arm as the file has it; how far rounding move
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
@@ -15,7 +16,7 @@ import pinocchio as pin
 from lxml import etree
 
 from spelgen.arm.arm import Arm, make_arm
-from spelgen.certificate.verification import Check, size_text
+from spelgen.certificate.verification import Check, Verdict, size_text
 from spelgen.dynamics.constraint import mimic_constraint
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
@@ -40,7 +41,7 @@ class _Reading:
     loads: np.ndarray
 
 
-def urdf_cross_check(robot: Robot, arm: Arm, *, samples: int = 6, seed: int = 0) -> tuple[Check, ...]:
+def urdf_cross_check(robot: Robot, arm: Arm, seed: int) -> tuple[Check, ...]:
     """Compare ``arm`` with Pinocchio's reading of the same bytes at random configurations."""
     try:
         dynamics = _pinocchio_dynamics(robot, arm)
@@ -48,7 +49,7 @@ def urdf_cross_check(robot: Robot, arm: Arm, *, samples: int = 6, seed: int = 0)
         text = " ".join(str(problem).split())[:120]
         result = f"Pinocchio cannot read it ({type(problem).__name__}: {text})"
         return (Check("reading of the file", "the moving bodies", result, "undecided"),)
-    q = np.random.default_rng(seed).uniform(-1.0, 1.0, (samples, len(arm.coordinates)))
+    q = np.random.default_rng(seed).uniform(-1.0, 1.0, (6, len(arm.coordinates)))
     gravity = tuple(map(float, arm.gravity))
     as_written = make_arm(robot, joints=arm.joint_names, angle_tolerance=0.0, gravity=gravity)
     theirs = _reading(dynamics, arm, q)
@@ -56,12 +57,10 @@ def urdf_cross_check(robot: Robot, arm: Arm, *, samples: int = 6, seed: int = 0)
     ours = _reading(_arm_dynamics(arm), arm, q)
     is_rounded = any(remark.code.startswith("snapped-") for remark in arm.diagnostics)
     allowed = TUNING.frame_rounding * len(robot.joints)
-    checks = [_check("axes of the joints", theirs.axes, written.axes, ours.axes, allowed, is_rounded)]
+    checks = {"axes of the joints": [theirs.axes, written.axes, ours.axes]}
     if any(body.inertia is not None for body in arm.bodies):
-        checks.append(
-            _check("masses and inertias", theirs.loads, written.loads, ours.loads, allowed, is_rounded)
-        )
-    return tuple(checks)
+        checks["masses and inertias"] = [theirs.loads, written.loads, ours.loads]
+    return tuple(_check(what, readings, allowed, is_rounded) for what, readings in checks.items())
 
 
 def _pinocchio_dynamics(robot: Robot, arm: Arm) -> PinocchioDynamics:
@@ -106,17 +105,16 @@ def _reading(dynamics: PinocchioDynamics, arm: Arm, q: np.ndarray) -> _Reading:
     return _Reading(np.array(axes), np.array(loads))
 
 
-def _check(
-    what: str, theirs: np.ndarray, written: np.ndarray, ours: np.ndarray, allowed: float, is_rounded: bool
-) -> Check:
+def _check(what: str, readings: Sequence[np.ndarray], allowed: float, is_rounded: bool) -> Check:
     """Return a check of one quantity, whose numbers are compared with the largest of its kind at each joint."""
+    theirs, written, ours = readings
     scale = np.abs(written).max(axis=0) + np.abs(written).max() * 1e-3
     apart = float((np.abs(theirs - written) / scale).max())
     moved = float((np.abs(ours - written) / scale).max())
-    derived = "as Pinocchio reads them"
+    verdict: Verdict = "agrees"
+    if apart > allowed or (moved > allowed and not is_rounded):
+        verdict = "differs"
     result = f"at most {size_text(apart)} of their size apart"
     if is_rounded:
         result += f"; the reported roundings move them by {size_text(moved)}"
-    if apart > allowed or (moved > allowed and not is_rounded):
-        return Check(f"{what} in the file", derived, result, "differs")
-    return Check(f"{what} in the file", derived, result, "agrees")
+    return Check(f"{what} in the file", "as Pinocchio reads them", result, verdict)

@@ -6,7 +6,7 @@ import textwrap
 from dataclasses import asdict, dataclass
 from typing import Literal
 
-from spelgen.listing import Listing
+from spelgen.listing import WIDTH, Listing
 
 Verdict = Literal["agrees", "differs", "undecided"]
 _MARKS = {"agrees": "ok", "differs": "DIFFERS", "undecided": "open"}
@@ -23,10 +23,6 @@ class Check:
     derived: str
     found: str
     verdict: Verdict
-
-    def to_dict(self) -> dict[str, str]:
-        """Return the four fields as a JSON object."""
-        return asdict(self)
 
     def __str__(self) -> str:
         return f"{self.fact}: {self.derived}; {self.found}"
@@ -66,16 +62,16 @@ class Verification:
             "means": self.means,
             "samples": self.samples,
             "seed": self.seed,
-            "checks": list(map(Check.to_dict, self.checks)),
+            "checks": list(map(asdict, self.checks)),
         }
 
-    def text(self, width: int = 80) -> str:
-        """Return a paragraph for a terminal ``width`` columns wide: one line or more for every check."""
-        lines = textwrap.wrap(f"Verified by {self.means}", width)
+    def text(self) -> str:
+        """Return a paragraph for a terminal: one line or more for every check."""
+        lines = textwrap.wrap(f"Verified by {self.means}", WIDTH)
         for check in self.checks:
             mark = f"  {_MARKS[check.verdict]:<7} "
             lines += textwrap.wrap(
-                str(check), width, initial_indent=mark, subsequent_indent=" " * 12, break_on_hyphens=False
+                str(check), WIDTH, initial_indent=mark, subsequent_indent=" " * 12, break_on_hyphens=False
             )
         return "\n".join(lines)
 

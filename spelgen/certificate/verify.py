@@ -89,10 +89,10 @@ class _Case:
         )
 
 
-def verify(robot: Robot, arm: Arm, structure: Structure, *, samples: int = 0, seed: int = 0) -> Verification:
+def verify(robot: Robot, arm: Arm, structure: Structure, *, seed: int = 0) -> Verification:
     """Check the structure of ``arm``, and the arm against the file of ``robot``, at random configurations.
 
-    ``samples`` is how many; never fewer than show the ranks. Raises SpelgenError without Pinocchio.
+    There are as many of these as show the ranks. Raises SpelgenError without Pinocchio.
     """
     try:
         from spelgen.certificate import numeric_samples
@@ -102,7 +102,7 @@ def verify(robot: Robot, arm: Arm, structure: Structure, *, samples: int = 0, se
         problem = "the numerical proof needs the package pinocchio, which is not installed"
         raise SpelgenError(problem, do="pip install 'spelgen[simulate]'") from None
     # a rank r shows in r samples; the spare ones would show a larger rank
-    count = max(samples, len(structure.entries) + _SPARE)
+    count = len(structure.entries) + _SPARE
     rng = np.random.default_rng(seed)
     # a structure for any inertial values is tested with inertials that no URDF has
     free = structure.assume == "kinematics"
@@ -116,7 +116,7 @@ def verify(robot: Robot, arm: Arm, structure: Structure, *, samples: int = 0, se
         *_ranks(case),
         _potential(case),
         case.rank_check("base parameters", regressor, structure.base_parameter_count),
-        *urdf_cross_check(robot, arm, seed=seed),
+        *urdf_cross_check(robot, arm, seed),
     )
     inertials = "the URDF's inertial values"
     if free:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -13,36 +12,10 @@ from spelgen.baselines.names import MODEL
 from spelgen.cli import options
 from spelgen.cli.console import deliver, note, progress_bar, say
 from spelgen.cli.options import Data, Filter, Mapping, MoreData, Output, Run, Trust
-
-if TYPE_CHECKING:
-    from spelgen.evaluation.results import Results
+from spelgen.evaluation.tables import LIMITS, csv_text, figures
 
 Format = Literal["text", "json", "csv"]
 MISSED = 3  # exit code: usage errors are 2
-
-
-def _torque_nmse(results: Results) -> float | None:
-    summary = results.torque.get(MODEL)
-    return None if summary is None else summary.mean_nmse
-
-
-def _worst_joint_nmse(results: Results) -> float | None:
-    summary = results.torque.get(MODEL)
-    # a joint whose torque never changes has no nMSE
-    known = [] if summary is None else [value for value in summary.joint_nmse if value is not None]
-    return max(known, default=None)
-
-
-def _rollout_rms(results: Results) -> float | None:
-    return results.horizons[-1].errors[MODEL].mean_relative_rms if results.horizons else None
-
-
-FIGURES: dict[str, Callable[[Results], float | None]] = {
-    "torque.nmse": _torque_nmse,
-    "joint.nmse": _worst_joint_nmse,
-    "rollout.rms": _rollout_rms,
-}
-"""The model's torque nMSE, that of its worst joint, and the relative error after the longest rollout."""
 
 
 def evaluate(
@@ -57,7 +30,7 @@ def evaluate(
         list[str] | None,
         typer.Option(
             metavar="FIGURE=MAX",
-            help=f"Exit with {MISSED} if a figure is larger: {', '.join(FIGURES)}; once for each.",
+            help=f"Exit with {MISSED} if a figure is larger: {', '.join(LIMITS)}; once for each.",
         ),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Torque errors alone, without rollouts.")] = False,
@@ -95,18 +68,21 @@ def evaluate(
         note(diagnostic)
     chosen = options.choose_format(format, output, Format)
     if chosen == "csv":
-        from spelgen.evaluation.csv_file import csv_text
-
         deliver(csv_text(results), output)
     elif chosen == "json":
         deliver(json.dumps(record) + "\n", output)
     else:
         deliver(results.text() + "\n", output)
     # after the result, so that a script that failed still has the figures
-    missed = [line for name, largest in limits if (line := _missed(results, name, largest))]
-    for line in missed:
-        note(line)
-    if missed:
+    exceeded = False
+    values = {figure.name: figure.values[MODEL] for figure in figures(results)}
+    for name, largest in limits:
+        value = values.get(name)
+        if value is None or value > largest:
+            exceeded = True
+            shown = "not known" if value is None else f"{value:.4g}"
+            note(f"limit exceeded: {name} is {shown}, expected at most {largest:g}")
+    if exceeded:
         raise typer.Exit(MISSED)
 
 
@@ -114,22 +90,13 @@ def _limit(text: str) -> tuple[str, float]:
     """Return `torque.nmse=0.01` as a name and a number. A usage error for anything else."""
     name, _, largest = text.partition("=")
     try:
-        if name in FIGURES:
+        if name in LIMITS:
             return name, float(largest)
     except ValueError:
         pass
     raise typer.BadParameter(
-        f"{text!r} is not FIGURE=MAX with one of {', '.join(FIGURES)}", param_hint="'--limit'"
+        f"{text!r} is not FIGURE=MAX with one of {', '.join(LIMITS)}", param_hint="'--limit'"
     )
-
-
-def _missed(results: Results, name: str, largest: float) -> str | None:
-    """Return how a figure exceeds its limit; None where it does not. A figure that is not known does."""
-    value = FIGURES[name](results)
-    if value is not None and value <= largest:
-        return None
-    shown = "not known" if value is None else f"{value:.4g}"
-    return f"limit exceeded: {name} is {shown}, expected at most {largest:g}"
 
 
 def report(
@@ -138,11 +105,9 @@ def report(
     ],
     output: Annotated[
         Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="FILE",
-            help="HTML file, or .json for the data. Default: report.html in the run folder, runs.html for several.",
+        options.output_option(
+            "FILE",
+            "HTML file, or .json for the data. Default: report.html in the run folder, runs.html for several.",
         ),
     ] = None,
     robot: Annotated[

@@ -73,7 +73,14 @@ def _text(
 
         return page(inspection, closed, proof, urdf)
     if format == "json":
-        return _json(inspection, closed, proof)
+        data = inspection.to_dict()
+        if closed:
+            from spelgen.certificate.formula_text import to_dict
+
+            data["formulas"] = to_dict(closed)
+        if proof:
+            data["verification"] = proof.to_dict()
+        return json.dumps(data, indent=2) + "\n"
     if closed is None:
         result = inspection.text()
     else:
@@ -83,17 +90,6 @@ def _text(
     if proof:
         result += f"\n\n{proof.text()}"
     return result + "\n"
-
-
-def _json(inspection: Inspection, closed: Formulas | None, proof: Verification | None) -> str:
-    data = inspection.to_dict()
-    if closed:
-        from spelgen.certificate.formula_text import to_dict
-
-        data["formulas"] = to_dict(closed)
-    if proof:
-        data["verification"] = proof.to_dict()
-    return json.dumps(data, indent=2) + "\n"
 
 
 def _formula_file(format: str, closed: Formulas, proof: Verification | None) -> str:

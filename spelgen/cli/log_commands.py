@@ -1,4 +1,4 @@
-"""Commands about logs: `excite`, which motion to log, and `logs`, what was logged."""
+"""Commands about logs: `excite`, which motion to log, `simulate`, logs of a simulation, and `logs`, what was logged."""
 
 from __future__ import annotations
 
@@ -20,9 +20,7 @@ if TYPE_CHECKING:
 
 def excite(
     robot: Robot,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FILE.csv", help="Output file of the motion.")
-    ],
+    output: Annotated[Path, options.output_option("FILE.csv", "Output file of the motion.")],
     joints: Joints = None,
     tip: Tip = None,
     angle_tolerance: AngleTolerance = 2e-3,
@@ -66,6 +64,36 @@ def excite(
         )
     path = write_text(output, motion.csv())
     answer(format, {"wrote": str(path)} | motion.to_dict(), motion.text(), f"wrote {path}")
+
+
+def simulate(
+    robot: Robot,
+    output: Annotated[Path, options.output_option("LOGS", "Folder for train and test logs.")],
+    joints: Joints = None,
+    tip: Tip = None,
+    angle_tolerance: AngleTolerance = 2e-3,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Random seed; default: that of the robot's settings.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Simulate training and test logs with Pinocchio."""
+    from spelgen.loaded_arm import load_arm
+    from spelgen.logs.read import write_logs
+    from spelgen.simulation.simulate import simulate as simulate_arm
+
+    arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
+    paths = {role: output / f"{role}.parquet" for role in ("train", "test")}
+    for path in paths.values():
+        options.require_free(path, force=force)
+    with progress_bar("simulating") as progress:
+        logs = simulate_arm(arm, seed=seed, progress=progress)
+    # logs are written in SI units under the URDF names: no mapping is needed to read them
+    names = arm.arm.joint_names
+    for path, trajectories in zip(paths.values(), (logs.train, logs.test), strict=True):
+        if trajectories:
+            write_logs(path, trajectories, names)
+            say(f"wrote {path}: {len(trajectories)} trajectories, {sum(map(len, trajectories))} samples")
 
 
 def logs(

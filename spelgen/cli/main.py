@@ -13,15 +13,12 @@ from typing import Annotated
 import typer
 
 from spelgen.cli import (
-    compare_command,
     evaluate_command,
-    export_command,
-    fleet_command,
     identify_command,
     inspect_command,
     log_commands,
     model_commands,
-    simulate_command,
+    study_commands,
     train_command,
 )
 from spelgen.cli.command import Command, Group
@@ -41,16 +38,16 @@ for command in (
     inspect_command.inspect,
     model_commands.init,
     model_commands.build,
-    simulate_command.simulate,
+    log_commands.simulate,
     identify_command.identify,
     log_commands.excite,
     log_commands.logs,
     train_command.train,
     evaluate_command.evaluate,
     evaluate_command.report,
-    export_command.export,
-    compare_command.compare,
-    fleet_command.fleet,
+    model_commands.export,
+    study_commands.compare,
+    study_commands.fleet,
     model_commands.check,
 ):
     app.command(cls=Command, context_settings=CONTEXT)(handle_errors(command))

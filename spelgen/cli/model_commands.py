@@ -1,4 +1,4 @@
-"""Commands about the model itself: `init`, `build`, `check`."""
+"""Commands about the model itself: `init`, `build`, `check`, `export`."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ from spelgen.cli.options import (
     RobotOption,
     TextOrJson,
     Tip,
+    Trust,
 )
 from spelgen.design import PRESET_NAMES, Net
+from spelgen.exporting.exported import Format
 from spelgen.files import write_text
 from spelgen.spec import parse_facts
 
@@ -32,9 +34,7 @@ def init(
     tip: Tip = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "-o", "--output", metavar="FILE.yaml", help="Output file; default: ROBOT.yaml beside the URDF."
-        ),
+        options.output_option("FILE.yaml", "Output file; default: ROBOT.yaml beside the URDF."),
     ] = None,
     force: Force = False,
 ) -> None:
@@ -68,12 +68,7 @@ def build(
     depth: Annotated[int, typer.Option(min=1, max=16, help="Number of hidden layers.")] = 2,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="MODULE.py",
-            help="Output file; default: <robot>_spel.py in this folder.",
-        ),
+        options.output_option("MODULE.py", "Output file; default: <robot>_spel.py in this folder."),
     ] = None,
     force: Force = False,
     format: TextOrJson = "text",
@@ -113,3 +108,42 @@ def check(module: Module, robot: RobotOption = None) -> None:
         raise typer.Exit(FAILED)
     proof = f"{len(result.proof.checks)} facts proved by {result.proof.means}"
     say(f"{module} is up to date with {result.urdf}; {proof}")
+
+
+def export(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A folder that `spelgen train` wrote.")],
+    output: Annotated[Path, options.output_option("FILE|FOLDER", "Output file or folder.")],
+    to: Annotated[
+        Format | None, typer.Option(help="Export format. Default: by the extension of the output.")
+    ] = None,
+    entry: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="A function to export, for c, casadi, onnx and torch; repeatable. Default: all but derivatives.",
+        ),
+    ] = None,
+    force: Force = False,
+    trust: Trust = False,
+    format: TextOrJson = "text",
+) -> None:
+    """Export a trained model to other tools. Each export is compared with the model before it is written.
+
+    urdf: the rigid bodies; for models with networks in M, the nearest rigid bodies. mjcf: rigid bodies, drives and
+    friction for MuJoCo. c: a C99 header and source without dependencies. ros2: a colcon package around these. casadi,
+    onnx, torch: a file for each function.
+    """
+    from spelgen.exporting.export import export as export_run
+    from spelgen.exporting.exported import format_by_extension, require_fitting
+    from spelgen.fitting.fitted import load_run
+
+    if to is None:
+        to = format_by_extension(output)
+    # names and free places are checked before the model is loaded, which takes seconds
+    require_fitting(to, output)
+    options.require_free(output, force=force)
+    result = export_run(load_run(run, trust=trust), to, entries=entry or ())
+    # all or nothing: a failed parity check above has left no file
+    files = [str(path) for path in result.write(output, force=force)]
+    lines = [f"wrote {path}" for path in files]
+    answer(format, {"files": files, "summary": result.summary}, *lines, *result.summary)

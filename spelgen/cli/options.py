@@ -101,9 +101,6 @@ Trust = Annotated[
     bool,
     typer.Option("--trust", help="Execute the module of the run folder even if spelgen did not write it."),
 ]
-Output = Annotated[
-    Path | None, typer.Option("-o", "--output", metavar="FILE", help="Write the result to a file.")
-]
 Address = Annotated[
     str | None,
     typer.Option(
@@ -112,6 +109,15 @@ Address = Annotated[
 ]
 Strict = Annotated[bool, typer.Option("--strict", help="Exit with 1 if there is any warning.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite existing output.")]
+
+
+def output_option(metavar: str, text: str) -> OptionInfo:
+    """Return the option `-o` of a command."""
+    option: OptionInfo = typer.Option("-o", "--output", metavar=metavar, help=text)
+    return option
+
+
+Output = Annotated[Path | None, output_option("FILE", "Write the result to a file.")]
 
 
 def result_format() -> OptionInfo:
@@ -159,24 +165,6 @@ def logs(data: list[Path] | None, extra_logs: list[Path] | None) -> list[Path]:
     if not data:
         raise typer.BadParameter("name at least one file or folder", param_hint="'--data'")
     return [*data, *(extra_logs or [])]
-
-
-def mapping(file: Path | None, urdf: Path | None, joints: Sequence[str]) -> LogMapping | None:
-    """Return what a mapping file says, else the settings beside the URDF; None without either.
-
-    The file may speak of all joints of the URDF, or of `joints` where there is none.
-    """
-    from spelgen.settings.settings import load_mapping, load_settings
-    from spelgen.urdf.read import read_urdf
-
-    has_urdf = urdf is not None and urdf.is_file()
-    if file is not None:
-        if urdf is not None and has_urdf:
-            joints = [joint.name for joint in read_urdf(urdf).joints]
-        return load_mapping(file, joints)
-    if urdf is not None and has_urdf:
-        return load_settings(urdf).logs
-    return None
 
 
 def accepting(mapping: LogMapping, codes: Sequence[str] | None) -> LogMapping:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,15 +22,13 @@ from spelgen.cli.train_settings import (
     read_assignments,
     resumed_run,
 )
-from spelgen.errors import Diagnostic, ModuleError, OptionError
+from spelgen.errors import ModuleError, OptionError
 from spelgen.labels import counted
 from spelgen.settings.fits import Objective, Rollout, WindowConfig
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.spec import read_facts
 
 if TYPE_CHECKING:
     from spelgen.fitting.fitted import Fit
-    from spelgen.logs.trajectory import Trajectory
 
 
 TrainModule = Annotated[
@@ -41,9 +39,7 @@ TrainModule = Annotated[
         show_default=False,
     ),
 ]
-NewRun = Annotated[
-    Path | None, typer.Option("-o", "--output", metavar="RUN", help="Run folder; default: runs/<module>.")
-]
+NewRun = Annotated[Path | None, options.output_option("RUN", "Run folder; default: runs/<module>.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Resume the run in the run folder.")]
 Source = Annotated[
     Path | None,
@@ -105,24 +101,22 @@ def train(
     else:
         urdf = robot or _unchanged_urdf(module)
         start = new_run(module, urdf, request)
-    log_mapping = options.mapping(mapping, urdf, read_facts(start.module).joints) or start.mapping
-    if accept:
-        log_mapping = options.accepting(log_mapping or LogMapping(), accept)
+    from spelgen.loaded_arm import arm_of_module
+    from spelgen.log_checks.check_logs import require_sound_logs
+    from spelgen.logs.arm_mapping import log_source
+
+    facts = read_facts(start.module)
+    # the mapping may speak of all joints of a URDF, and logs are checked beside the arm
+    arm = None if urdf is None else arm_of_module(facts, urdf)
+    log_mapping = options.accepting(log_source(arm or facts.joints, mapping or start.mapping).mapping, accept)
     # where a fit runs is no part of what is fitted, and not recorded with it
     machine = Machine.model_validate({name: values[name] for name in Machine.model_fields if name in values})
     # torch is imported where it is needed: --help and mistakes are answered at once
     from spelgen.fitting.fit import RunOptions
     from spelgen.fitting.train import train as train_files
 
-    run_options = RunOptions(
-        device=machine.device,
-        threads=machine.threads,
-        resume=resume,
-        force=force,
-        progress=machine.progress,
-        mapping=log_mapping,
-        began=start_time,
-    )
+    where = machine.model_dump()
+    run_options = RunOptions(**where, resume=resume, force=force, mapping=log_mapping, began=start_time)
     try:
         fit = train_files(
             start.module,
@@ -135,11 +129,14 @@ def train(
             validation=start.validation,
             seed=start.seed,
             trust=trust,
-            require=_log_check(urdf, start.module, log_mapping),
+            require=lambda logs: [] if arm is None else require_sound_logs(logs, arm, log_mapping),
             options=run_options,
         )
     except OptionError as error:
-        raise UsageError(f"{_spelled(error.option)}: {error.got}") from error
+        option = f"--set {error.option}"
+        if error.option in ("objective", TIME_LIMIT):
+            option = f"--{error.option.replace('_', '-')}"
+        raise UsageError(f"{option}: {error.got}") from error
     _tell(fit, folder, paths, format, resume=resume)
 
 
@@ -202,31 +199,11 @@ def _warm_start(request: Request) -> Request:
     return Request(objective, values, warm_start=True)
 
 
-def _spelled(option: str) -> str:
-    """Return an option of a fit as the command line has it."""
-    if option in ("objective", TIME_LIMIT):
-        return f"--{option.replace('_', '-')}"
-    return f"--set {option}"
-
-
 def _default_folder(module: Path, resume: bool) -> Path:
     # `train RUN --resume` names the folder where a module stands otherwise
     if resume and module.is_dir():
         return module
     return Path("runs") / module.stem
-
-
-def _log_check(
-    urdf: Path | None, module: Path, mapping: LogMapping | None
-) -> Callable[[Sequence[Trajectory]], list[Diagnostic]] | None:
-    """Return what checks logs beside the arm, as `spelgen logs` does; None: the arm is not known."""
-    if urdf is None:
-        return None
-    from spelgen.loaded_arm import arm_of_module
-    from spelgen.log_checks.check_logs import require_sound_logs
-
-    arm = arm_of_module(read_facts(module), urdf)
-    return lambda logs: require_sound_logs(logs, arm, mapping)
 
 
 def _module_of_run(source: Path, robot: Path | None) -> tuple[Path, Path | None]:

@@ -109,15 +109,14 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
         fields = texts.setdefault(name, {})
         if isinstance(fields, dict):
             fields[field] = text
-    return {name: _checked(name, text) for name, text in texts.items()}
-
-
-def _checked(name: str, text: object) -> object:
-    try:
-        return getattr(KEYS[name].model_validate({name: text}), name)
-    except ValidationError as error:
-        wrong = explain(error.errors(include_url=False)[0], None, KEYS[name])
-        raise UsageError(f"--set {wrong}") from error
+    values = {}
+    for name, given in texts.items():
+        try:
+            values[name] = getattr(KEYS[name].model_validate({name: given}), name)
+        except ValidationError as error:
+            wrong = explain(error.errors(include_url=False)[0], None, KEYS[name])
+            raise UsageError(f"--set {wrong}") from error
+    return values
 
 
 def new_run(module: Path, urdf: Path | None, request: Request) -> Start:

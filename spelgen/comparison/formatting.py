@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
-from spelgen.comparison.results import RunResult
-from spelgen.evaluation.tables import Numbers, Row, Table, known, table
+from spelgen.comparison.metrics import RunResult
+from spelgen.evaluation.tables import Row, Table, table
 from spelgen.listing import number
 from spelgen.settings.comparison import PublishedFigures
 
@@ -35,12 +36,6 @@ PUBLISHED = {
     "position": "position",
 }
 """By label, fields of `PublishedFigures`."""
-INVARIANTS: dict[str, tuple[Quantity, Callable[[list[float]], float]]] = {
-    "least eigenvalue of M / mean": (lambda run: run.invariants.least_eigenvalue, min),
-    "rise of energy, no input": (lambda run: run.invariants.energy_rise, max),
-    "energy drift, no friction": (lambda run: run.invariants.energy_drift, max),
-}
-"""By label, what is measured, and which of several is the worst."""
 
 
 def comparison_tables(
@@ -48,13 +43,24 @@ def comparison_tables(
 ) -> list[Table]:
     """Return the tables of a comparison: sizes and speed, losses, those of each seed, invariants."""
     runs: dict[str, list[RunResult]] = {}
+    losses: dict[str, dict[str, float | None]] = {}
+    for result in sorted(results, key=lambda result: result.seed):
+        losses.setdefault(f"seed {result.seed}", {})[result.variant] = result.prediction.loss
     for result in results:
         runs.setdefault(result.variant, []).append(result)
+    invariants = (
+        Row("least eigenvalue of M / mean", _summary(runs, lambda x: x.invariants.least_eigenvalue, min)),
+        Row("rise of energy, no input", _summary(runs, lambda x: x.invariants.energy_rise, max)),
+        Row("energy drift, no friction", _summary(runs, lambda x: x.invariants.energy_drift, max)),
+    )
     return [
         _sizes(runs, step_seconds, published),
         _losses(runs, published),
-        _by_seed(runs),
-        _invariants(runs),
+        table("Prediction loss over 1 s of every run", list(losses), losses.values()),
+        Table(
+            "Invariants, worst over seeds; a negative rise is a fall",
+            tuple(replace(row, ranked=False) for row in invariants),
+        ),
     ]
 
 
@@ -77,10 +83,15 @@ def _sizes(runs: Runs, step_seconds: Mapping[str, float], published: Published) 
 def _losses(runs: Runs, published: Published) -> Table:
     rows = []
     for label, quantity in LOSSES.items():
-        medians = {name: _median(of_seeds, quantity) for name, of_seeds in runs.items()}
+        medians = _summary(runs, quantity, statistics.median)
         rows.append(Row(label, medians))
+        baseline = medians.get(BASELINE)
         if BASELINE in runs and label in RATIOS:
-            rows.append(Row(f"{BASELINE}'s {RATIOS[label]} / this", _ratios(medians), ranked=False))
+            ratios: dict[str, float | None] = dict.fromkeys(medians)
+            for name, median in medians.items():
+                if baseline is not None and median:
+                    ratios[name] = baseline / median
+            rows.append(Row(f"{BASELINE}'s {RATIOS[label]} / this", ratios, ranked=False))
     for label, field in PUBLISHED.items():
         rows += _published(runs, published, label, field)
     title = (
@@ -90,45 +101,20 @@ def _losses(runs: Runs, published: Published) -> Table:
     return Table(title, tuple(rows))
 
 
-def _by_seed(runs: Runs) -> Table:
-    losses: dict[int, dict[str, float | None]] = {}
+def _summary(
+    runs: Runs, quantity: Quantity, combined: Callable[[list[float]], float]
+) -> dict[str, float | None]:
+    """Return by variant one number of all seeds; a run that is not finite counts as infinitely bad."""
+    summaries: dict[str, float | None] = {}
     for name, of_seeds in runs.items():
+        values = []
         for run in of_seeds:
-            losses.setdefault(run.seed, {})[name] = run.prediction.loss
-    labels = [f"seed {seed}" for seed in sorted(losses)]
-    return table("Prediction loss over 1 s of every run", labels, [losses[seed] for seed in sorted(losses)])
-
-
-def _invariants(runs: Runs) -> Table:
-    rows = []
-    for label, (quantity, worst) in INVARIANTS.items():
-        worst_values: dict[str, float | None] = {}
-        for name, of_seeds in runs.items():
-            values = known(map(quantity, of_seeds))
-            worst_values[name] = worst(values) if len(values) == len(of_seeds) else None
-        rows.append(Row(label, worst_values, ranked=False))
-    return Table("Invariants, worst over seeds; a negative rise is a fall", tuple(rows))
-
-
-def _ratios(medians: Numbers) -> Numbers:
-    """Return how many times worse than each variant the baseline predicts."""
-    baseline = medians[BASELINE]
-    ratios: dict[str, float | None] = dict.fromkeys(medians)
-    for name, median in medians.items():
-        if baseline is not None and median:
-            ratios[name] = baseline / median
-    return ratios
-
-
-def _median(runs: Sequence[RunResult], quantity: Quantity) -> float | None:
-    """Return that over seeds; a run that is not finite counts as infinitely bad."""
-    values = []
-    for run in runs:
-        value = quantity(run)
-        # infinite and not left out: a variant that blows up in one seed of two is no better than the other seed
-        values.append(math.inf if value is None else value)
-    middle = statistics.median(values)
-    return middle if math.isfinite(middle) else None
+            value = quantity(run)
+            # infinite and not left out: a variant that blows up in one seed of two is no better than the other seed
+            values.append(math.inf if value is None else value)
+        summary = combined(values)
+        summaries[name] = summary if math.isfinite(summary) else None
+    return summaries
 
 
 def _published(

@@ -31,11 +31,12 @@ def with_wrong_inertials(robot: Path, error: float) -> bytes:
         by_mass, by_inertia = np.exp(error * rng.normal(size=2))
         moved = error * rng.normal(size=3)
         mass, tensor = inertial.find("mass"), inertial.find("inertia")
-        if mass is None or tensor is None or float(mass.get("value", "0")) <= TUNING.massless:
+        kilograms = 0.0 if mass is None else float(mass.get("value", "0"))
+        if mass is None or tensor is None or kilograms <= TUNING.massless:
             continue
         trace = sum(float(tensor.get(name, "0")) for name in ("ixx", "iyy", "izz"))
-        size = np.sqrt(max(trace, 0.0) / 2 / float(mass.get("value", "0")))  # about that of the body
-        mass.set("value", repr(float(by_mass * float(mass.get("value", "0")))))
+        size = np.sqrt(max(trace, 0.0) / 2 / kilograms)  # about that of the body
+        mass.set("value", repr(float(by_mass * kilograms)))
         for name, value in tensor.attrib.items():
             tensor.set(name, repr(float(by_mass * by_inertia * float(value))))
         origin = inertial.find("origin")

@@ -1,18 +1,23 @@
-"""What is measured of one trained model: losses as the paper has them, sizes, speed."""
+"""What is measured of one trained model: losses as the paper has them, sizes, speed, and how far M is off."""
 
 from __future__ import annotations
 
-import statistics
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from pydantic import TypeAdapter, ValidationError
 
 from spelgen.dynamics.protocol import has_residuals
-from spelgen.evaluation.plain import finite
-from spelgen.fitting.rollout import LossScales, position_difference, roll_out, rollout_loss
+from spelgen.errors import RunError
+from spelgen.evaluation.drawn_motions import PredictedMotion
+from spelgen.evaluation.invariants import Invariants
+from spelgen.evaluation.plain import finite, record
+from spelgen.files import read_json, write_json
+from spelgen.fitting.rollout import position_difference, roll_out
+from spelgen.loaded_arm import load_arm
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.settings.tuning.comparison import ComparisonTuning
@@ -45,6 +50,46 @@ class Sizes:
     parameters: int
 
 
+@dataclass(frozen=True)
+class LearnedMass:
+    """error: of M, see `mass_error`. along: M (T, n, n) at the measured positions of the example."""
+
+    error: float
+    along: list[list[list[float]]]
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """The measurements of a trained variant.
+
+    seconds: of training. train, test: errors over windows as long as those of training; prediction: over 1 s of tests.
+    """
+
+    variant: str
+    seed: int
+    seconds: float
+    substeps: int
+    sizes: Sizes
+    train: Prediction
+    test: Prediction
+    prediction: Prediction
+    invariants: Invariants
+    mass: LearnedMass
+    example: PredictedMotion | None
+
+    def save(self, path: Path) -> None:
+        """Write it as JSON."""
+        write_json(path, record(self))
+
+    @classmethod
+    def read(cls, path: Path) -> RunResult:
+        """Read what `save` wrote. Raises RunError."""
+        try:
+            return TypeAdapter(cls).validate_python(read_json(path, RunError))
+        except ValidationError as error:
+            raise RunError("other values than a result has", file=path, do="remove it") from error
+
+
 def thinned(pieces: Sequence[Trajectory], samples: int, decimation: int) -> Windows:
     """At most about so many windows, evenly spread, a multiple of ``decimation`` samples apart."""
     starts = sum(max(0, len(x) - (samples - 1) * decimation) for x in pieces)
@@ -71,12 +116,18 @@ def sizes(model: EmittedModel) -> Sizes:
     )  # fmt: skip
     outputs = []
     for network in networks:
-        outputs.append(0 if network is None else len(network.biases[-1]))
+        outputs.append(0 if network is None else _outputs(network))
     if _network(model, "friction") is None:
         outputs[1] = model.n  # a function of each joint's own
-    inputs = 0 if mass is None else int(mass.weights[0].shape[1])
+    inputs = 0 if mass is None else int(mass.mask0.flatten(1).any(dim=0).sum())
     parameters = sum(parameter.numel() for parameter in model.parameters())
     return Sizes((outputs[0], outputs[1], outputs[2], outputs[3]), inputs, parameters)
+
+
+def _outputs(network: Any) -> int:
+    """Return how many outputs depend on q: V that is constant has one that reads no joint."""
+    last = network.get_buffer(f"mask{len(network.biases) - 1}")
+    return int(last.flatten(1).any(dim=1).sum())
 
 
 def _network(model: Any, name: str) -> Any:
@@ -85,13 +136,21 @@ def _network(model: Any, name: str) -> Any:
     return owner if hasattr(owner, "biases") else getattr(owner, "network", None)
 
 
-def step_seconds(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> float:
-    """Return the median time of a training step on these windows, without the update of the weights [s]."""
-    times = []
-    # the median: other programs run beside
-    for _ in range(TUNING.timed_steps):
-        start = time.perf_counter()
-        model.zero_grad()
-        torch.autograd.backward(rollout_loss(model, windows, scales, substeps))
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
+def true_mass(robot: Path, q: torch.Tensor) -> torch.Tensor:
+    """Return M (T, n, n) [kg m^2, kg m, kg] of a URDF and its sidecar, by Pinocchio, at q (T, n); rotors included."""
+    from spelgen.dynamics.pinocchio_arm import arm_dynamics
+
+    loaded = load_arm(robot)
+    mass: torch.Tensor = arm_dynamics(loaded.arm, loaded.settings).mass_matrix(q)
+    return mass
+
+
+def mass_error(learned: torch.Tensor, true: torch.Tensor) -> float:
+    """Return how far M is off (T, n, n), without unit: root mean square of the entries of L^-1 (learned - true) L^-T.
+
+    L L^T is the mean true M: so every entry counts in the units of its own joints.
+    """
+    factor = torch.linalg.cholesky(true.mean(dim=0))
+    half = torch.linalg.solve_triangular(factor, learned - true, upper=False)
+    relative = torch.linalg.solve_triangular(factor, half.mT, upper=False)
+    return float(relative.square().mean().sqrt())

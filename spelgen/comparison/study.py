@@ -17,7 +17,7 @@ from typing import cast
 import yaml
 
 from spelgen.comparison.known_urdf import with_wrong_inertials, without_inertials
-from spelgen.comparison.results import RunResult
+from spelgen.comparison.metrics import RunResult
 from spelgen.design import Design, Net, Preset, load_design
 from spelgen.errors import RunError, SettingsError
 from spelgen.files import read_json, write_json, write_text
@@ -25,7 +25,6 @@ from spelgen.fitting.window.problem import TUNING
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import write_logs
-from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.fits import Rollout, fit_config
@@ -170,7 +169,14 @@ def prepare_study(
         high=tuple(high for _, high in ranges),
     )
     description = _description(study, loaded)
-    if not force and _is_same_study(folder, description):
+    path = folder / "study.json"
+    if path.exists() and not force:
+        if read_json(path, RunError) != json.loads(json.dumps(description)):
+            raise RunError(
+                "a comparison with other settings",
+                file=path,
+                do="--force begins anew, -o names another folder",
+            )
         for variant in study.variants:  # the folder may come from elsewhere
             require_own_module(study.module(variant), study.urdf)
         return study
@@ -179,7 +185,7 @@ def prepare_study(
             old.unlink()
     _write_logs(study, loaded, progress)
     _write_modules(study, loaded)
-    write_json(folder / "study.json", description)
+    write_json(path, description)
     return study
 
 
@@ -224,32 +230,14 @@ def _description(study: Study, loaded: LoadedArm) -> dict[str, object]:
     }
 
 
-def _is_same_study(folder: Path, description: dict[str, object]) -> bool:
-    """Return whether the folder holds this very comparison. Raises RunError where it holds another."""
-    path = folder / "study.json"
-    if not path.exists():
-        return False
-    if read_json(path, RunError) != json.loads(json.dumps(description)):
-        raise RunError(
-            "a comparison with other settings", file=path, do="--force begins anew, -o names another folder"
-        )
-    return True
-
-
 def _write_logs(study: Study, loaded: LoadedArm, progress: Callable[[int, int], None] | None) -> None:
     from spelgen.simulation.simulate import simulate
 
     result = simulate(loaded, progress=progress)
     names = loaded.arm.joint_names
-    training = [_beginning(trajectory, study.settings.first) for trajectory in result.train]
+    training = result.train
+    if study.settings.first is not None:  # the seconds that are trained on
+        training = tuple(x[: int((x.t - x.t[0] < study.settings.first - 1e-9).sum())] for x in training)
     study.logs.mkdir(parents=True, exist_ok=True)
     write_logs(study.logs / "train.parquet", training, names)
     write_logs(study.logs / "test.parquet", result.test, names)
-
-
-def _beginning(trajectory: Trajectory, seconds: float | None) -> Trajectory:
-    """Return the samples before so many seconds."""
-    if seconds is None:
-        return trajectory
-    elapsed = trajectory.t - trajectory.t[0]
-    return trajectory[: int((elapsed < seconds - 1e-9).sum())]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol, TypeGuard
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeGuard
 
 import torch
 
@@ -76,9 +76,9 @@ def has_friction_state(model: object) -> TypeGuard[FrictionState]:
     return getattr(model, "elements", 0) > 0
 
 
-def has_servos(model: object) -> bool:
-    """Return whether position servos stand between a model's inputs, which are commands, and its joints."""
-    return hasattr(model, "servo")
+def input_of(model: object) -> Literal["torque", "position"]:
+    """Return what a model's inputs are: torques, or commands of position servos."""
+    return "position" if hasattr(model, "servo") else "torque"
 
 
 def has_momentum(dynamics: object) -> TypeGuard[PortHamiltonian]:

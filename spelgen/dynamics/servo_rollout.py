@@ -1,10 +1,10 @@
 """Roll out arms that position servos hold under their commands.
 
-Springs and dry friction are stiff, so both are taken implicitly, linearised at the start of a step (a Rosenbrock
-method, Hairer and Wanner, Solving ODEs II, IV.7, with the weights of the theta method): a few steps between samples are
+Springs and dry friction are stiff, so both are taken implicitly, springs linearised at the start of a step (Rosenbrock;
+Hairer and Wanner, Solving ODEs II, IV.7, with the weights of the theta method): a few steps between samples are
 stable for any gain. Theta is such that motion which fades does so as fast as it would, to third order (Liniger and
 Willoughby, SIAM J. Numerical Analysis 7:47, 1970): 1/2 for what is slow, which adds no damping of its own, and towards
-1 for what is too fast for a step. Friction's memory follows the displacement exactly.
+1 for what is too fast for a step. Friction's bristles follow the displacement exactly, also where they begin to slide.
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from spelgen.runtime.bristles import bristle_slope, moved_bristles
+from spelgen.runtime.bristles import moved_bristles
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
+from spelgen.runtime.port_hamiltonian import applied
 from spelgen.runtime.position_servo import ServoConstants, beyond
 
+COUPLED_PASSES = 2  # by which joints that move one another agree on which bristles slide
 ServoArm = Any  # an emitted model with servos: emission comes after this room
 
 
@@ -86,31 +88,53 @@ def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) 
 def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: Tensor) -> ServoState:
     """Return the state one step ``h`` (..., 1) [s] later, under the delayed command u (..., n)."""
     (q, qd, z), servo, laws = state, drives.servo, drives.laws
-    dry = laws.dry(qd, load.gravity, drives.friction)
-    stiffness = dry * (drives.steepness * bristle_slope(z, qd, drives.reach)).sum(dim=0)
+    strength = laws.dry(qd, load.gravity, drives.friction) * drives.steepness
     spring = servo.kp * beyond(u - q, servo.dead_zone)
     torque = spring - servo.kd * qd
     free = (torque.abs() < servo.limit).to(q)  # 0 where the servo is saturated: it neither stiffens nor damps
     servo_stiffness = free * servo.kp * (spring != 0)
     torque = torch.where(free > 0, spring, servo.limit * torque.sign())
-    force = torque - drives.offset - load.bias - dry * (drives.steepness * z).sum(dim=0)
+    force = torque - drives.offset - load.bias - (strength * z).sum(dim=0)
     damping = free * servo.kd + laws.viscosity(qd, drives.friction)
-    inertia = load.inertia
-    if load.coupled:
-        inertia = inertia.diagonal(dim1=-2, dim2=-1)
+    inertia = load.inertia.diagonal(dim1=-2, dim2=-1) if load.coupled else load.inertia
+    stiffness = (strength * (qd.sign() * z < drives.reach)).sum(dim=0)
     decay = h * (damping + h * (servo_stiffness / 2 + stiffness)) / inertia
     theta = (3 + decay) / (6 + decay)
     # at theta of the step; bristles at its end: they are the stiffest
-    damping = theta * h * (damping + h * (theta * servo_stiffness + stiffness))
-    impulse = theta * h * force
+    impulse, bristle_stiffness = theta * h * force, theta * h * h * strength
+    damping = theta * h * (damping + h * theta * servo_stiffness)
+    # bristles by the velocity of the step, which is the unknown
+    bent, reach = z / h, drives.reach / h
+    velocity = slipped(inertia * qd + impulse, inertia + damping, bristle_stiffness, bent, reach)
     if load.coupled:
-        momentum = (load.inertia @ qd.unsqueeze(-1)).squeeze(-1)
-        velocity = torch.linalg.solve(load.inertia + torch.diag_embed(damping), momentum + impulse)
-    else:
-        velocity = (load.inertia * qd + impulse) / (load.inertia + damping)
+        momentum = applied(load.inertia, qd) + impulse
+        # how far bristles give way depends on what other joints do
+        for _ in range(COUPLED_PASSES):
+            rise = (bristle_stiffness * (moved_bristles(bent, velocity, reach) - bent)).sum(dim=0)
+            secant = rise / torch.where(velocity == 0, 1.0, velocity)
+            effective = load.inertia + torch.diag_embed(damping + secant)
+            velocity = torch.linalg.solve(effective, momentum.unsqueeze(-1)).squeeze(-1)
+            others = applied(load.inertia, velocity) - inertia * velocity
+            velocity = slipped(momentum - others, inertia + damping, bristle_stiffness, bent, reach)
     displacement = h * velocity
     qd = qd + (velocity - qd) / theta
     return ServoState(q + displacement, qd, moved_bristles(z, displacement, drives.reach))
+
+
+def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Tensor) -> Tensor:
+    """Return the displacement x, (..., n), at which slope x and the bristles' rise balance a push, (..., n).
+
+    The rise is the sum of strength (z(x) - z). strength, z, reach: (K, ..., n), the shortest reach first. Bristles that
+    are bent one way slide in that order, so x is the largest zero of K + 1 straight lines: in the k-th, k slide.
+    """
+    way, remaining = push.sign(), push.abs()
+    stiffness = slope + strength.sum(dim=0)
+    displacement = remaining / stiffness
+    for spring, bent, longest in zip(strength, z, reach, strict=True):
+        remaining = remaining - spring * (longest - way * bent)
+        stiffness = stiffness - spring
+        displacement = torch.maximum(displacement, remaining / stiffness)
+    return way * displacement
 
 
 def replayed(model: ServoArm, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) -> Tensor:

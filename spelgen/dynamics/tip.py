@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import pytorch_kinematics as pk
 import torch
 from lxml import etree
 
@@ -24,6 +23,8 @@ class TipKinematics:
     """
 
     def __init__(self, robot: Robot, joints: Sequence[str], link: str) -> None:
+        import pytorch_kinematics as pk  # takes long to import, with matplotlib
+
         self.link = link
         chain = pk.build_serial_chain_from_urdf(_way(robot, link), link)
         self._chain = chain.to(dtype=torch.float64)

@@ -6,7 +6,6 @@ as code.
 
 from __future__ import annotations
 
-from spelgen.design import BRISTLE_REACH
 from spelgen.emission import docstring, tailored
 from spelgen.emission.bundle import bundle
 from spelgen.spec import ModelSpec, facts_json
@@ -31,7 +30,6 @@ def emit(spec: ModelSpec) -> str:
         attributes=tailored.attributes(spec),
         class_summary=docstring.class_summary(spec),
         bases=tailored.bases(spec),
-        elements=len(BRISTLE_REACH["revolute"]) if spec.design.memory == "bristles" else 0,
         servo=tailored.servo(spec),
         values=_values(spec),
     )

@@ -54,7 +54,7 @@ def plan_model(
         if servos:
             servo_specs.append(_servo(coordinate, drive))
     inputs = []
-    if not actuation.direct:
+    if design.input == "derived" and not (actuation.direct and len(actuation.entries) == len(joints)):
         for entry in actuation.entries:
             inputs.append((entry.row, entry.column, entry.value, entry.kind == "gain"))
     bodies: tuple[BodySpec, ...] = ()
@@ -138,7 +138,6 @@ def _joint(
         gear=drive.gear,
         mass_sensitivity=sizes.mass_sensitivities[index],
         potential_sensitivity=sizes.potential_sensitivities[index],
-        actuated=not coordinate.passive,
     )
 
 

@@ -10,7 +10,7 @@ from textwrap import fill, indent
 
 import numpy as np
 
-from spelgen.design import BRISTLE_REACH
+from spelgen.design import BRISTLE_REACH, SERVO_STRIBECK_ROUNDING
 from spelgen.emission.source import WIDTH, Call, Code, assignment, call, laid_out
 from spelgen.emission.unit_joints import hidden_units
 from spelgen.labels import entry_name, joint_ranges
@@ -21,6 +21,7 @@ _FRICTION_AXES = {"dense-n": 1, "dense-3n": 3}
 _UNPACKED = 10  # names on a line
 _GENERATOR = Code("torch.Generator().manual_seed(seed)")
 _INDENT = 4
+_DEPTH = 2  # hidden layers of a network that names no number of them
 
 
 class _Body:
@@ -65,7 +66,6 @@ def kinds(spec: ModelSpec) -> dict[str, str]:
     friction = "JointFriction" if spec.design.dissipation == "per-joint" else "DenseFriction"
     return network | {
         "Pose": "NetworkPose",
-        "Prepared": "NetworkPrepared",
         "Mass": mass,
         "Friction": friction,
     }
@@ -84,7 +84,7 @@ def parts(spec: ModelSpec) -> tuple[str, str]:
 
 
 def servo(spec: ModelSpec) -> str:
-    """Return the statement that puts position servos before the model's joints; empty without them."""
+    """Return the statements that put position servos before the model's joints; empty without them."""
     if not spec.servos:
         return ""
     limits: list[object] = []
@@ -92,7 +92,11 @@ def servo(spec: ModelSpec) -> str:
         limits.append(Code('float("inf")') if joint.limit is None else joint.limit)
     gains = _columns(spec.servos, "kp", "kd")
     known = _columns(spec.servos, "known")
-    return assignment("self.servo", call("PositionServo", **gains, limit=tuple(limits), **known), 2 * _INDENT)
+    servos = assignment(
+        "self.servo", call("PositionServo", **gains, limit=tuple(limits), **known), 2 * _INDENT
+    )
+    rounding = f"self.friction.stribeck_rounding.fill_({SERVO_STRIBECK_ROUNDING})"
+    return f"{servos}\n{' ' * 2 * _INDENT}{rounding}"
 
 
 def mass_entries(spec: ModelSpec) -> str:
@@ -210,7 +214,6 @@ def _joints(spec: ModelSpec) -> Call:
         revolute=_revolute(spec.joints),
         **_columns(spec.joints, "center", "reach", "speed", "friction"),
         **armature,
-        **_columns(spec.joints, "actuated"),
     )
 
 
@@ -271,26 +274,9 @@ def _residuals(body: _Body, spec: ModelSpec) -> None:
     body.give("ResidualTerms", body.let("residuals", residuals))
 
 
-def _grouped(start: str, rows: Sequence[tuple[int, ...]]) -> Code:
-    """The tuple of these rows, of which those that are alike stand together; ``start`` precedes it."""
-    terms = []
-    for row, alike in groupby(rows):
-        count = len([*alike])
-        term = f"({row!r},)"
-        if count > 1:
-            term += f" * {count}"
-        terms.append(term)
-    text = " + ".join(terms)
-    if _INDENT + len(start + text) <= WIDTH:
-        return Code(text)
-    inner = " " * (_INDENT + 4)
-    lines = [inner + terms[0]]
-    for term in terms[1:]:
-        if len(lines[-1]) + len(term) + 3 > WIDTH:
-            lines.append(f"{inner}+ {term}")
-        else:
-            lines[-1] += f" + {term}"
-    return Code("\n".join(["(", *lines, " " * _INDENT + ")  # fmt: skip"]))
+def _groups(outputs: Sequence[tuple[int, ...]]) -> tuple[tuple[tuple[int, ...], int], ...]:
+    """Return which joints so many outputs in a row read."""
+    return tuple((joints, len([*alike])) for joints, alike in groupby(outputs))
 
 
 def _networks(body: _Body, spec: ModelSpec) -> None:
@@ -301,12 +287,15 @@ def _networks(body: _Body, spec: ModelSpec) -> None:
         body.give("Network", _potential(body, spec))
         body.give("float", spec.potential_scale)
     else:
-        body.give("None", None)
+        # one output that reads no joint
+        inputs = ((1.0,) * len(spec.joints),) * 2
+        network = call("Network", Code("generator"), inputs, hidden=(), outputs=(((), 1),), depth=0)
+        body.give("Network", body.let("potential", network))
         body.give("float", 1.0)
     body.give("Friction", _friction(body, spec))
     if spec.design.input == "dense-3n":
         n = len(spec.joints)
-        body.give("Network", _network(body, spec, "input", (_all(spec),) * (3 * n), _all(spec), (1.0,) * n))
+        body.give("Network", _network(body, spec, (_all(spec),) * (3 * n), (1.0,) * n))
 
 
 def _all(spec: ModelSpec) -> tuple[int, ...]:
@@ -318,7 +307,7 @@ def _mass(body: _Body, spec: ModelSpec) -> Code:
         rows = 3 * len(spec.joints)
         outputs = (_all(spec),) * (rows * (rows + 1) // 2)
         sensitivity = _columns(spec.joints, "mass_sensitivity")["mass_sensitivity"]
-        network = _network(body, spec, "mass", outputs, _all(spec), sensitivity)
+        network = _network(body, spec, outputs, sensitivity)
         return body.let("mass", call("Mass", Code("joints"), mean=mean_mass(spec), network=network))
     constants = tuple(map(attrgetter("start", "scale"), spec.constants))
     if not spec.outputs:
@@ -329,7 +318,7 @@ def _mass(body: _Body, spec: ModelSpec) -> Code:
         Code("mass_entries"),
         functions=tuple(map(attrgetter("mean", "scale"), spec.outputs)),
         constants=constants,
-        network=_mass_network(body, spec),
+        net=_mass_network(body, spec),
         margin=spec.margin,
     )
     return body.let("mass", mass)
@@ -341,56 +330,51 @@ def _mass_network(body: _Body, spec: ModelSpec) -> Code:
     if spec.design.net == "kan":
         fewest = TUNING.least_kan_units
     outputs = tuple(map(attrgetter("joints"), spec.outputs))
-    read = tuple(sorted(set().union(*outputs)))
-    if spec.design.encoding == "lie-group":
-        read = _all(spec)
     sensitivity = _columns(spec.joints, "mass_sensitivity")["mass_sensitivity"]
-    return _network(body, spec, "mass", outputs, read, sensitivity, fewest=fewest)
+    return _network(body, spec, outputs, sensitivity, fewest=fewest)
 
 
 def _potential(body: _Body, spec: ModelSpec) -> Code:
     sensitivity = _columns(spec.joints, "potential_sensitivity")["potential_sensitivity"]
     width = max(TUNING.least_units, round(TUNING.potential_fraction * units(spec)))
     outputs = (spec.potential,)
-    return _network(
-        body, spec, "potential", outputs, spec.potential, sensitivity, width=width, name="potential"
-    )
+    return _network(body, spec, outputs, sensitivity, width=width, name="potential")
 
 
 def _network(
     body: _Body,
     spec: ModelSpec,
-    quantity: str,
     outputs: tuple[tuple[int, ...], ...],
-    read: tuple[int, ...],
     sensitivity: object,
     *,
-    axes: int = 0,
+    velocities: tuple[tuple[float, ...], ...] = (),
+    depth: int | None = None,
     width: int | None = None,
     fewest: int = 1,
     name: str = "network",
 ) -> Code:
-    """Add a network of ``outputs`` for a quantity; ``read``: the joints that it reads."""
-    inputs = call("joint_input", Code("joints"), read, sensitivity)
-    if spec.design.encoding == "lie-group":
-        inputs = call("lie_group_input", Code("joints"), sensitivity)
-    if axes:
-        inputs = call("with_velocities", inputs, Code("joints"), axes)
-    hidden = hidden_units(outputs, width or units(spec), fewest)
-    for layer, rows in ((f"{quantity}_outputs", outputs), (f"{quantity}_hidden", hidden)):
-        body.let(layer, _grouped(f"{layer} = ", rows))
-    layers = f"{quantity}_hidden, " * spec.options.depth + f"{quantity}_outputs"
-    return body.let(name, call("Network", inputs, Code(f"({layers})"), Code("generator")))
+    """Add a network of ``outputs``, each by the joints that it reads."""
+    layers: dict[str, object] = {"hidden": hidden_units(outputs, width or units(spec), fewest)}
+    layers["outputs"] = _groups(outputs)
+    if (depth or spec.options.depth) != _DEPTH:
+        layers["depth"] = depth or spec.options.depth
+    inputs = (sensitivity, sensitivity, *velocities)
+    return body.let(name, call("Network", Code("generator"), inputs, **layers))
 
 
 def _friction(body: _Body, spec: ModelSpec) -> Code:
+    n = len(spec.joints)
+    sensitivity = (TUNING.position_sensitivity,) * n
     if spec.design.dissipation == "per-joint":
-        return body.let("friction", call("Friction", Code("joints"), Code("generator")))
-    n, axes = len(spec.joints), _FRICTION_AXES[spec.design.dissipation]
+        own = tuple((joint,) for joint in range(n))
+        width = TUNING.friction_units * n
+        velocities = (tuple(float(f"{1 / joint.speed:.4g}") for joint in spec.joints), (1.0,) * n)
+        network = _network(body, spec, own, sensitivity, velocities=velocities, width=width, depth=1)
+        return body.let("friction", call("Friction", Code("joints"), network))
+    axes = _FRICTION_AXES[spec.design.dissipation]
     rows = axes * n
     outputs = (_all(spec),) * (rows * (rows + 1) // 2)
-    sensitivity = (TUNING.position_sensitivity,) * n
-    network = _network(body, spec, "friction", outputs, _all(spec), sensitivity, axes=axes)
+    network = _network(body, spec, outputs, sensitivity, velocities=((1.0,) * n,))
     return body.let("friction", call("Friction", Code("joints"), network, axes=axes))
 
 

@@ -10,8 +10,8 @@ import numpy as np
 
 def hidden_units(
     outputs: Sequence[tuple[int, ...]], width: int, fewest: int = 1
-) -> tuple[tuple[int, ...], ...]:
-    """Return the joints that each unit of a hidden layer may read, for outputs that read these joints.
+) -> tuple[tuple[tuple[int, ...], int], ...]:
+    """Return how many units of a hidden layer may read which joints, for outputs that read these joints.
 
     A hidden layer has ``width`` units, shared out in proportion to how many outputs read the same joints, ``fewest`` or
     more for each such group.
@@ -26,7 +26,4 @@ def hidden_units(
         units[gains.argmax()] -= 1
     while units.sum() < width:
         units[(ideal - units).argmax()] += 1
-    layer: list[tuple[int, ...]] = []
-    for joints, number in zip(groups, units.tolist(), strict=True):
-        layer += [joints] * number
-    return tuple(layer)
+    return tuple(zip(groups, units.tolist(), strict=True))

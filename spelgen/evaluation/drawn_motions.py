@@ -170,6 +170,17 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
         predicted[name] = _at_joints(inputs, predicted_torques(predictor, samples))
     measured = _at_joints(inputs, samples.tau)
     t = np.arange(len(samples.q)) / samples.rate
+    # an offset of the torque is with the friction
+    stored = parts["inertia"] + parts["Coriolis"] + parts["gravity"]
+    works = {
+        "work of the drives": measured,
+        "stored": stored,
+        "friction": predicted[MODEL] - stored,
+        "not explained": measured - predicted[MODEL],
+    }
+    energy = {}
+    for name, torque in works.items():
+        energy[name] = cumulative_trapezoid((torque * samples.qd).sum(axis=-1), t, initial=0)
     return TorqueTrace(
         trajectory=samples.name,
         error=mean_nmse(predicted[MODEL] - measured, measured),
@@ -179,7 +190,7 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
         measured=measured,
         predicted=predicted,
         parts=parts,
-        energy=_energy(t, samples.qd, measured, predicted[MODEL], parts),
+        energy=energy,
     )
 
 
@@ -187,27 +198,3 @@ def _at_joints(inputs: np.ndarray, torques: np.ndarray) -> np.ndarray:
     """Return the joints' torques of the motors'."""
     by_joint: np.ndarray = (inputs @ torques[..., None])[..., 0]
     return by_joint
-
-
-def _energy(
-    t: np.ndarray,
-    qd: np.ndarray,
-    measured: np.ndarray,
-    predicted: np.ndarray,
-    parts: Mapping[str, np.ndarray],
-) -> dict[str, np.ndarray]:
-    """Return where the drives' work went since the start, (T,) [J]: stored, lost to friction, not explained.
-
-    Powers are of the model's torques on the measured motion; an offset of the torque is with the friction.
-    """
-    stored = parts["inertia"] + parts["Coriolis"] + parts["gravity"]
-    torques = {
-        "work of the drives": measured,
-        "stored": stored,
-        "friction": predicted - stored,
-        "not explained": measured - predicted,
-    }
-    work = {}
-    for name, torque in torques.items():
-        work[name] = cumulative_trapezoid((torque * qd).sum(axis=-1), t, initial=0)
-    return work

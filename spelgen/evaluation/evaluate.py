@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spelgen.baselines.baseline import JudgedArm
+from spelgen.baselines.baseline import CommandFollower, JudgedArm
 from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.baselines.registry import BASELINES
 from spelgen.baselines.solver import accurate_solver
-from spelgen.dynamics.protocol import has_servos
+from spelgen.dynamics.protocol import input_of
+from spelgen.dynamics.residuals import without_idle_residuals
+from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import Diagnostic, LogError
-from spelgen.evaluation.horizons import Horizon, JudgedLogs, Predictions, horizon_lengths, predict
+from spelgen.evaluation.horizons import (
+    Horizon,
+    JudgedLogs,
+    Predictions,
+    TipPosition,
+    horizon_lengths,
+    predict,
+)
 from spelgen.evaluation.replay import replays
 from spelgen.evaluation.results import Results
-from spelgen.evaluation.state_errors import TipPosition
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import TorqueErrors, coarse_torques, torque_errors
 from spelgen.evaluation.traces import Traces, motion_traces, replay_traces
@@ -25,7 +33,7 @@ from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import SHORTEST, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
-from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
+from spelgen.logs.trajectory import Trajectory, require_commands, require_joints, require_torques
 from spelgen.settings.tuning.evaluation import EvaluationTuning
 
 if TYPE_CHECKING:
@@ -73,27 +81,27 @@ def evaluate(
             f"names also used in training: {', '.join(seen)}; errors on training data are not test errors"
         )
         notes.append(Diagnostic("warning", "tested-on-training-data", "logs", None, message))
-    if has_servos(judged.model):
-        if baselines:
-            raise LogError(
-                "baselines that take torques", expected="none: the model is one of position servos"
-            )
-        return _evaluate_servos(judged, logs, notes)
-    return _evaluate_torques(judged, logs, notes, baselines or {}, preprocessing, (steps, seconds), progress)
+    conditions = _Conditions(baselines or {}, preprocessing, steps, seconds, progress)
+    return JUDGES[input_of(judged.model)](judged, logs, notes, conditions)
 
 
-def _evaluate_torques(
-    judged: Subject,
-    logs: Sequence[Trajectory],
-    notes: list[Diagnostic],
-    more_dynamics: Mapping[str, RigidDynamics],
-    preprocessing: Preprocessing | None,
-    ahead: tuple[Sequence[int], Sequence[float]],
-    progress: Progress | None,
+@dataclass(frozen=True)
+class _Conditions:
+    """Hold under which conditions logs are judged, see `evaluate`."""
+
+    baselines: Mapping[str, RigidDynamics]
+    preprocessing: Preprocessing | None
+    steps: Sequence[int]
+    seconds: Sequence[float]
+    progress: Progress | None
+
+
+def _judge_torques(
+    judged: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic], conditions: _Conditions
 ) -> Results:
+    """Judge torques, and the motion that they predict."""
     require_torques(logs)
-    model, types = judged.model, judged.model.joint_types
-    used = judged.preprocessing
+    used, preprocessing, progress = judged.preprocessing, conditions.preprocessing, conditions.progress
     if preprocessing is not None or used is None:
         preprocessing = preprocessing or Preprocessing()
         if used is not None and preprocessing.torque_delay is None:  # of the logger, whatever the filter
@@ -102,14 +110,16 @@ def _evaluate_torques(
     all_samples = dynamics_samples(logs, pauses=True, preprocessing=used, reach=judged.reach)
     samples = [sample for sample in all_samples if len(sample.q)]
     # a rollout takes a start and a sample after it
-    tests = JudgedLogs(used.pieces(logs, shortest=2), samples, used, judged.reach, types)
-    lengths = horizon_lengths(tests, *ahead, notes)
+    tests = JudgedLogs(used.pieces(logs, shortest=2), samples, used, judged.reach, judged.model.joint_types)
+    lengths = horizon_lengths(tests, conditions.steps, conditions.seconds, notes)
     probe = tests.windows(judged.window - 1, TUNING.probed_model_windows)
+    # residual terms that were not selected add nothing but time
+    model = without_idle_residuals(judged.model)
     solver = accurate_solver(model, probe)
     predictors = [Predictor(MODEL, solver, model)]
     for baseline in BASELINES:
         predictors += baseline.predictors(JudgedArm(judged.joints, judged.urdf, judged.run, probe, notes))
-    for name, dynamics in more_dynamics.items():
+    for name, dynamics in conditions.baselines.items():
         predictors.append(of_dynamics(name, dynamics, probe))
     tip = _tip(judged, notes)
     horizons: list[Horizon] = []
@@ -158,23 +168,28 @@ def _results(
     )
 
 
-def _evaluate_servos(judged: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic]) -> Results:
-    """Judge an arm under position servos by replaying its commands."""
-    if any(trajectory.u is None for trajectory in logs):
-        raise LogError(
-            "logs without commanded positions",
-            element=logs[0].name,
-            expected="u: the model is one of position servos",
-        )
-    errors, missed = replays(judged.model, logs, judged.command_followers, notes)
+def _judge_commands(
+    judged: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic], conditions: _Conditions
+) -> Results:
+    """Judge the positions that follow commands, which are replayed."""
+    if conditions.baselines:
+        raise LogError("baselines that take torques", expected="none: the model is one of position servos")
+    followers: dict[str, CommandFollower] = {}
+    for trajectory in logs:
+        require_commands(trajectory)
+    for baseline in BASELINES:
+        followers |= baseline.followers(judged.fit, notes)
+    errors, missed = replays(judged.model, logs, followers, notes)
     return replace(_results(judged, logs, replay_traces(missed), notes), replays=errors)
+
+
+JUDGES = {"torque": _judge_torques, "position": _judge_commands}
+"""By the inputs of a model, how it is judged."""
 
 
 def _tip(judged: Subject, notes: list[Diagnostic]) -> TipPosition | None:
     if judged.urdf is None:
         return None
-    from spelgen.dynamics.tip import tip_kinematics  # slow to import
-
     try:
         return tip_kinematics(judged.urdf, judged.tip, joints=judged.joints).position
     except Exception as error:  # pytorch-kinematics raises many kinds; the evaluation stands without

@@ -42,13 +42,12 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
     tau = windows.tau[:, :past]
     z = memory_along(dynamics, q, qd, windows.z)
     cache = dynamics.prepare()
-    p = dynamics.momentum(dynamics.at(q, prepared=cache), qd)
-    # the input jumps at samples: each interval has its own at both ends
-    _, at_start = dynamics.port_hamiltonian_rhs(
-        q[:, :-1], p[:, :-1], tau, cache, *known_past(dynamics, z[:, :-1])
-    )
-    _, at_end = dynamics.port_hamiltonian_rhs(q[:, 1:], p[:, 1:], tau, cache, *known_past(dynamics, z[:, 1:]))
-    lacking = p.diff(dim=1) / dt - (at_start + at_end) / 2  # d of each interval, (W, past, n)
+    pose = dynamics.at(q, prepared=cache)
+    p = dynamics.momentum(pose, qd)
+    # the input jumps at samples: that of the interval after each sample, and that of the interval before
+    inputs = torch.stack([torch.cat([tau, tau[:, -1:]], dim=1), torch.cat([tau[:, :1], tau], dim=1)])
+    _, (at_start, at_end) = dynamics.port_hamiltonian_rhs(pose, p, inputs, cache, *known_past(dynamics, z))
+    lacking = p.diff(dim=1) / dt - (at_start[:, :-1] + at_end[:, 1:]) / 2  # d of each interval, (W, past, n)
     gain = 1 - torch.exp(-dt / TUNING.observer_time_constant)
     r = torch.zeros_like(lacking[:, 0])
     response = torch.zeros_like(gain[:, 0])  # of the filter to d = 1

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from spelgen.baselines.baseline import CommandFollower
-from spelgen.baselines.names import LINEAR_SERVOS, MODEL, POSITION_ACTUATORS
+from spelgen.baselines.names import MODEL
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import Diagnostic
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
@@ -22,14 +22,6 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 TUNING = EvaluationTuning()
-MISSING = {
-    LINEAR_SERVOS: ("no-linear-servos", "no linear servos to compare with: they are fitted by `train`"),
-    POSITION_ACTUATORS: (
-        "no-position-actuators",
-        "no actuators of MuJoCo to compare with: they are fitted where MuJoCo is installed, to the training logs "
-        "as long as these stay where they are",
-    ),
-}
 
 
 @dataclass(frozen=True)
@@ -88,20 +80,20 @@ def replays(
 ) -> tuple[tuple[Replay, ...], list[Missed]]:
     """Replay whole logs, and windows of a second one after another, by the model and the baselines.
 
-    Returns these, and what the model misses of whole logs. Notes say what the baselines are, or that there are none.
+    Returns these, and what the model misses of whole logs. Notes say what the baselines are.
     """
     pieces: list[Trajectory] = []
     for log in logs:
         pieces += [piece for piece in split_at_gaps(log) if len(piece) > 2]
     windows: list[LogRows] = []
+    first_qd: list[np.ndarray] = []
     for piece in pieces:
-        length = round(TUNING.replay_window * piece.sample_rate) + 1
-        starts = range(0, len(piece) - length + 1, length - 1)
-        windows += [(piece, slice(start, start + length)) for start in starts]
-    for name, (code, message) in MISSING.items():
-        if name in baselines:
-            code, message = "baseline", f"{name}: {baselines[name].about}"
-        notes.append(Diagnostic("info", code, "logs", None, message))
+        length, qd = round(TUNING.replay_window * piece.sample_rate) + 1, velocities(piece)
+        for start in range(0, len(piece) - length + 1, length - 1):
+            windows.append((piece, slice(start, start + length)))
+            first_qd.append(qd[start])
+    for name, baseline in baselines.items():
+        notes.append(Diagnostic("info", "baseline", "logs", None, f"{name}: {baseline.about}"))
     predictors = {MODEL: ServoModel(model), **baselines}
     # logs begin before the arm moves; within them windows begin in motion
     logs_from_rest: list[LogRows] = [(piece, slice(0, len(piece))) for piece in pieces]
@@ -109,9 +101,8 @@ def replays(
     whole, missed = _replay("whole log", predictors, logs_from_rest, rest)
     results = [whole]
     if windows:
-        smooth_velocities = {id(piece): velocities(piece) for piece in pieces}
-        qd = np.stack([smooth_velocities[id(log)][rows.start] for log, rows in windows])
-        results.append(_replay(f"windows of {TUNING.replay_window:g} s", predictors, windows, qd)[0])
+        name = f"windows of {TUNING.replay_window:g} s"
+        results.append(_replay(name, predictors, windows, np.stack(first_qd))[0])
     return tuple(results), list(zip(pieces, missed, strict=True))
 
 
@@ -125,22 +116,14 @@ def _replay(
         errors[predictor] = []
         for (log, rows), predicted in zip(parts, follower.positions(parts, q, qd), strict=True):
             errors[predictor].append(predicted - log.q[rows][1:])
-    summaries = {predictor: _summary(parts, missed) for predictor, missed in errors.items()}
+    summaries = {}
+    for predictor, missed in errors.items():
+        # a log with gaps is several pieces of one name
+        by_name: dict[str, list[np.ndarray]] = {}
+        for (log, _), error in zip(parts, missed, strict=True):
+            by_name.setdefault(log.name, []).append(np.square(error))
+        trajectories = {log: float(np.sqrt(np.concatenate(x).mean())) for log, x in by_name.items()}
+        joints = np.sqrt(np.square(np.concatenate(missed)).mean(axis=0))
+        mean = float(np.mean(list(trajectories.values())))
+        summaries[predictor] = ReplayErrors(trajectories, mean, tuple(joints.tolist()))
     return Replay(name, summaries), errors[MODEL]
-
-
-def _summary(parts: Sequence[LogRows], errors: Sequence[np.ndarray]) -> ReplayErrors:
-    # a log with gaps is several pieces of one name
-    by_name: dict[str, list[np.ndarray]] = {}
-    for (log, _), error in zip(parts, errors, strict=True):
-        by_name.setdefault(log.name, []).append(error)
-    trajectories = {}
-    for name, pieces in by_name.items():
-        trajectories[name] = float(_rms(np.concatenate(pieces), None))
-    joints = _rms(np.concatenate(errors), 0)
-    return ReplayErrors(trajectories, float(np.mean(list(trajectories.values()))), tuple(joints.tolist()))
-
-
-def _rms(x: np.ndarray, axis: int | None) -> np.ndarray:
-    result: np.ndarray = np.sqrt(np.square(x).mean(axis=axis))
-    return result

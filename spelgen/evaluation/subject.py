@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 
-from spelgen.baselines.baseline import CommandFollower
-from spelgen.baselines.names import DELAYED_COMMAND, LINEAR_SERVOS
 from spelgen.dynamics.bristles import NO_BRISTLES, BristleReach, bristle_reach, reach_of
-from spelgen.evaluation.keep import read_followers
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.servo.linear_servos import DelayedCommand, LinearServos
 from spelgen.logs.arm_mapping import GivenMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
@@ -41,8 +37,7 @@ class Subject:
 
     urdf: its robot's, where known; tip: the link there, None for the last. preprocessing, window: those of its fit.
     reach: (n, K) of the bristles that friction remembers with, its own or the usual ones.
-    trained_on: names of the trajectories that it has seen. run: the folder, where there is one.
-    command_followers: fitted to them, what a model of position servos is compared with, by name.
+    fit: what found it, where that is known.
     """
 
     model: EmittedModel
@@ -53,9 +48,21 @@ class Subject:
     preprocessing: Preprocessing | None = None
     window: int = TUNING.model_window
     reach: BristleReach = NO_BRISTLES
-    trained_on: frozenset[str] = frozenset()
-    run: RunFolder | None = None
-    command_followers: Mapping[str, CommandFollower] = field(default_factory=dict)
+    fit: Fit | None = None
+
+    @property
+    def trained_on(self) -> frozenset[str]:
+        """Names of the trajectories that it has seen."""
+        if self.fit is None:
+            return frozenset()
+        return frozenset([*self.fit.record["training"], *self.fit.record["validation"]])
+
+    @property
+    def run(self) -> RunFolder | None:
+        """The folder of its fit, where there is one."""
+        if self.fit is None or self.fit.folder is None:
+            return None
+        return RunFolder(self.fit.folder)
 
     @property
     def parameters(self) -> int:
@@ -78,19 +85,8 @@ def subject(judged: EmittedModel | Fit | Path | str, arm: LoadedArm | Path | str
         _of_model(judged.model, urdf or judged.urdf),
         preprocessing=judged.preprocessing,
         window=getattr(judged.config, "window", TUNING.model_window),
-        trained_on=frozenset([*judged.record["training"], *judged.record["validation"]]),
-        run=None if judged.folder is None else RunFolder(judged.folder),
-        command_followers=_command_followers(judged),
+        fit=judged,
     )
-
-
-def _command_followers(fit: Fit) -> dict[str, CommandFollower]:
-    """Return the baselines that a fit of position servos leaves in its record and its folder."""
-    if "servo" not in fit.record:
-        return {}
-    followers = {} if fit.folder is None else read_followers(RunFolder(fit.folder))
-    servos = LinearServos.from_dict(fit.record["servo"]["linear"])
-    return {**followers, LINEAR_SERVOS: servos, DELAYED_COMMAND: DelayedCommand(servos.late)}
 
 
 def _of_model(model: EmittedModel, urdf: Path | str | None) -> Subject:

@@ -39,6 +39,11 @@ class TorqueErrors:
     joint_nmse: tuple[float | None, ...] = ()
     nmse_with_pauses: float | None = None
 
+    @property
+    def worst_nmse(self) -> float | None:
+        """Return the largest of joint_nmse, which a mean hides."""
+        return max((nmse for nmse in self.joint_nmse if nmse is not None), default=None)
+
 
 def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueErrors:
     """Return the errors of an inverse dynamics on these samples, of which those of pauses count apart."""

@@ -26,10 +26,9 @@ from spelgen.evaluation.drawn_motions import (
     torque_trace,
     typical_and_worst,
 )
-from spelgen.evaluation.horizons import JudgedLogs, Predictions
+from spelgen.evaluation.horizons import JudgedLogs, Predictions, TipPosition
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.replay import Missed
-from spelgen.evaluation.state_errors import TipPosition
 from spelgen.fitting.rollout import AT_REST, loss_scales, position_difference
 from spelgen.logs.coverage import coverage
 from spelgen.logs.trajectory import Trajectory

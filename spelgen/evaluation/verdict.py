@@ -17,13 +17,20 @@ from spelgen.listing import number
 from spelgen.settings.tuning.evaluation import EvaluationTuning
 
 if TYPE_CHECKING:
+    from spelgen.evaluation.horizons import StateErrors
     from spelgen.evaluation.results import Results
-    from spelgen.evaluation.state_errors import StateErrors
 
 TUNING = EvaluationTuning()
 SEEN = "tested-on-training-data"
 STANDSTILL = "near standstill"
 EXCITE = "(as spelgen excite proposes)"
+TORQUE_USES: tuple[tuple[float, Sequence[str], Sequence[str]], ...] = (
+    (TUNING.explained_for_contacts, ["feed-forward control", "contact detection"], []),
+    (TUNING.explained_for_feed_forward, ["feed-forward control"], ["contact detection"]),
+    (TUNING.explained_for_gravity, ["gravity compensation"], ["feed-forward control"]),
+    (-math.inf, [], ["control"]),
+)
+"""By the least part of a torque's variance that is explained: what the model is good enough for, and what not."""
 Limits = Sequence[tuple[float, float] | None]
 """Lowest and highest position of each joint; None: it has no limits."""
 
@@ -103,16 +110,11 @@ def _judge_torques(results: Results, uses: _Uses) -> None:
     worst = _worst_torque(results)
     unexplained = torque.mean_nmse if worst is None else worst[1]
     explained = 1 - unexplained  # coefficient of determination
-    if explained >= TUNING.explained_for_contacts:
-        uses.good += ["feed-forward control", "contact detection"]
-    elif explained >= TUNING.explained_for_feed_forward:
-        uses.good.append("feed-forward control")
-        uses.bad.append("contact detection")
-    elif explained >= TUNING.explained_for_gravity:
-        uses.good.append("gravity compensation")
-        uses.bad.append("feed-forward control")
-    else:
-        uses.bad.append("control")
+    for least, good, bad in TORQUE_USES:
+        if explained >= least:
+            uses.good += good
+            uses.bad += bad
+            break
     proof = f"explains {_explained(torque.mean_nmse)} of the variance of the torques"
     if worst is not None and _explained(worst[1]) != _explained(torque.mean_nmse):
         proof += f" ({_explained(worst[1])} at {worst[0]})"
@@ -199,16 +201,15 @@ def _constant_velocity(results: Results) -> str:
 def _better_baselines(results: Results) -> str:
     """Say which other baselines are better, at what."""
     better: dict[str, list[str]] = {}
-    for horizon in results.horizons:
-        errors = {name: _relative(x) for name, x in horizon.errors.items()}
-        errors.pop(CONSTANT_VELOCITY, None)
-        best = min(errors, key=errors.__getitem__)
-        if errors[best] < min(errors[MODEL], errors.get(observed(MODEL), math.inf)):
-            better.setdefault(best, []).append(f"after {horizon.name}")
-    torque = {name: x.mean_nmse for name, x in results.torque.items() if x.mean_nmse is not None}
-    best = min(torque, key=torque.__getitem__, default=MODEL)
-    if MODEL in torque and best != MODEL:
-        better.setdefault(best, []).append("in torque")
+    errors = {
+        f"after {x.name}": {name: _relative(e) for name, e in x.errors.items()} for x in results.horizons
+    }
+    errors["in torque"] = {name: x.mean_nmse for name, x in results.torque.items() if x.mean_nmse is not None}
+    for occasion, by_predictor in errors.items():
+        by_predictor.pop(CONSTANT_VELOCITY, None)
+        best = min(by_predictor, key=by_predictor.__getitem__, default=MODEL)
+        if MODEL in by_predictor and best not in (MODEL, observed(MODEL)):
+            better.setdefault(best, []).append(occasion)
     if not better:
         return ""
     drives = [results.horizons[-1].errors.get(URDF_WITH_DRIVES)] if results.horizons else []

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import casadi as ca
 
-# friction's memory is double in any case: tanh, expm1, fabs and copysign have no form for float
+# friction's memory is double in any case: tanh has no form for float
 _FORMS = {
     ca.OP_NEG: "-{0}",
     ca.OP_SQ: "{0} * {0}",
@@ -16,9 +16,8 @@ _FORMS = {
     ca.OP_COS: "COS({0})",
     ca.OP_TANH: "tanh({0})",
     ca.OP_EXP: "EXP({0})",
-    ca.OP_EXPM1: "expm1({0})",
-    ca.OP_FABS: "fabs({0})",
-    ca.OP_COPYSIGN: "copysign({0}, {1})",
+    ca.OP_FABS: "MAX({0}, -{0})",
+    ca.OP_SIGN: "({0} > 0) - ({0} < 0)",
     ca.OP_ADD: "{0} + {1}",
     ca.OP_SUB: "{0} - {1}",
     ca.OP_MUL: "{0} * {1}",

@@ -17,7 +17,7 @@ from spelgen.dynamics.protocol import (
     has_friction_state,
     has_residuals,
     has_rigid_bodies,
-    has_servos,
+    input_of,
 )
 from spelgen.errors import RunError
 from spelgen.exporting.description import (
@@ -96,7 +96,7 @@ def array(value: Tensor) -> np.ndarray:
 
 def servos_of(model: EmittedModel) -> Servos | None:
     """Return the position servos of a model, None where it has none."""
-    if not has_servos(model):
+    if input_of(model) == "torque":
         return None
     kp, kd, limit, dead_zone = map(array, model.servo.prepare())
     return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
@@ -153,10 +153,11 @@ def _network(
     for weight, bias in layers:
         weights.append(array(weight))
         biases.append(array(bias))
-    if encoding.columns == 3:
-        # positions come as (q - center) / reach
-        slopes = weights[0][:, 2 * len(encoding.center) :]
-        slopes /= array(encoding.reach)
+    if encoding.slope.any():
+        # cos q, sin q and q in place of cos q or (q - center) slope, and sin q or zero
+        first, second = np.hsplit(weights[0], 2)
+        slopes, revolute = first * array(encoding.slope), array(encoding.revolute)
+        weights[0] = np.hstack([first * revolute, second * revolute, slopes])
         biases[0] -= slopes @ array(encoding.center)
     if functions is not None:
         # outputs that are always zero would be units of the last hidden layer

@@ -31,6 +31,7 @@ class FrictionLaw:
     coulomb: np.ndarray
     stribeck: np.ndarray
     stribeck_velocity: np.ndarray
+    stribeck_rounding: np.ndarray
     coulomb_smoothing_velocity: np.ndarray
     load_dependence: np.ndarray
     least_load: np.ndarray

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import math
-from itertools import pairwise
-
 import casadi as ca
 import numpy as np
 
 from spelgen.exporting.description import Bristles, FrictionLaw
-
-_NEGLIGIBLE = 1e-30  # of a bristle's way to its end; its power of ten is still a normal number
 
 
 def law_torque(law: FrictionLaw, qd: ca.SX, gravity: ca.SX, direction: ca.SX) -> ca.SX:
@@ -20,8 +15,10 @@ def law_torque(law: FrictionLaw, qd: ca.SX, gravity: ca.SX, direction: ca.SX) ->
     """
     load = ca.sqrt(gravity**2 + law.least_load**2)
     dry = law.coulomb + law.load_dependence * load
-    slow = 1 / (1 + (qd / (4 * law.stribeck_velocity)) ** 2)
-    for _ in range(4):  # to the power of 16
+    speed = ca.fabs(qd) / law.stribeck_velocity
+    rounding = law.stribeck_rounding
+    slow = 1 / (1 + (1 + rounding) / 8 * speed**2 / (speed + rounding))
+    for _ in range(3):  # to the power of 8
         slow = slow * slow
     dry += law.stribeck * slow
     torque: ca.SX = law.viscous * qd + law.saturation * turned(qd, law.saturation_velocity) + dry * direction
@@ -50,24 +47,9 @@ def sliding_bristles(bristles: Bristles, law: FrictionLaw, qd: ca.SX) -> ca.SX:
 
 
 def bristle_step(bristles: Bristles, z: ca.SX, dq: ca.SX) -> ca.SX:
-    """Return z after a displacement dq: the solution of z' = qd - |qd| z / reach along it."""
-    decays = []
-    for joint, reach in enumerate(bristles.reach):
-        moved = ca.fabs(dq[joint])
-        decay = ca.expm1(-moved / reach[-1])
-        by_element, remaining = [decay], 1 + decay
-        for longer, shorter in pairwise(reach[::-1]):
-            ratio = round(longer / shorter)
-            if math.isclose(longer, ratio * shorter, rel_tol=1e-12):
-                # one exponential a joint: powers of it take a fraction of its time, but not among subnormal numbers
-                remaining = ca.fmax(remaining, _NEGLIGIBLE) ** ratio
-            else:
-                remaining = ca.exp(-moved / shorter)
-            by_element.insert(0, remaining - 1)
-        decays += by_element
-    # no branch; which sign a zero has is no matter, for nothing is added then
-    end = ca.copysign(1, _by_element(bristles, dq)) * bristles.reach.ravel()
-    z_next: ca.SX = z + (z - end) * ca.vertcat(*decays)
+    """Return z after a displacement dq one way: bristles bend up to their reach."""
+    reach = bristles.reach.ravel()
+    z_next: ca.SX = ca.fmin(ca.fmax(z + _by_element(bristles, dq), -reach), reach)
     return z_next
 
 

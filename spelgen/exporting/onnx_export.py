@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import onnx
@@ -14,6 +14,7 @@ import onnxruntime
 import onnxscript
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from spelgen.dynamics.prepared import PreparedModel
 from spelgen.exporting.entry_points import chosen
@@ -44,9 +45,9 @@ def export_onnx(trained: Trained) -> Exported:
 
 def onnx_model(model: PreparedModel, name: str) -> bytes:
     """Return the serialised ONNX model of an entry point."""
-    program = export_program(model, name, flat_memory=True)
+    with _without_warnings(), _WrittenOut():
+        program = export_program(model, name, flat_memory=True)
     with _without_warnings():
-        program = program.run_decompositions(_DECOMPOSITIONS)
         exported = torch.onnx.export(
             program,
             dynamo=True,
@@ -101,21 +102,22 @@ def _softplus(x: Tensor, beta: float = 1.0, threshold: float = 20.0) -> Tensor:
     return torch.where(x > threshold, x, smooth)
 
 
-def _cholesky_ex(matrix: Tensor, *, upper: bool = False, check_errors: bool = False) -> tuple[Tensor, Tensor]:
-    """Return L with L L^T the matrix, and 1 where it is not positive definite, else 0.
+class _Definiteness(NamedTuple):
+    """Hold 1 where a matrix is not positive definite, else 0: of a Cholesky factor networks of M use this alone."""
 
-    Networks of M ask for the latter alone, and ONNX leaves L out.
-    """
+    info: Tensor
+
+
+def _cholesky_ex(matrix: Tensor) -> _Definiteness:
+    """Return what the pivots of a Cholesky factor say, without the factor."""
     rows = matrix
-    columns: list[Tensor] = []
     info = torch.zeros(matrix.shape[:-2], dtype=torch.int32)
     for k in range(matrix.shape[-1]):
         pivot = rows[..., k : k + 1, k : k + 1]
         # a pivot that is NaN counts as not positive
         info = torch.where(pivot[..., 0, 0] > 0, info, 1)
-        columns.append(rows[..., k : k + 1] / pivot.sqrt())
         rows = rows - rows[..., k : k + 1] * rows[..., k : k + 1, :] / pivot
-    return torch.cat(columns, dim=-1), info
+    return _Definiteness(info)
 
 
 def _scalar_tensor(
@@ -131,13 +133,26 @@ def _scalar_tensor(
     return cast("onnxscript.ir.Value", constant)
 
 
-# ONNX has no operators for these
-_DECOMPOSITIONS = {
-    torch.ops.aten.linalg_solve.default: _solve,
-    torch.ops.aten.linalg_solve_triangular.default: _solve_triangular,
-    torch.ops.aten.softplus.default: _softplus,
-    torch.ops.aten.linalg_cholesky_ex.default: _cholesky_ex,
+_WRITTEN_OUT: dict[object, Callable[..., object]] = {
+    torch.linalg.solve: _solve,
+    torch.linalg.solve_triangular: _solve_triangular,
+    torch.nn.functional.softplus: _softplus,
+    torch.linalg.cholesky_ex: _cholesky_ex,
 }
+
+
+class _WrittenOut(TorchFunctionMode):
+    """Write out, while a program is traced, the functions that ONNX has no operators for."""
+
+    def __torch_function__(
+        self,
+        func: Callable[..., object],
+        types: object,
+        args: tuple[object, ...] = (),
+        kwargs: dict[str, object] | None = None,
+    ) -> object:
+        """Call a function, or what stands for it."""
+        return _WRITTEN_OUT.get(func, func)(*args, **(kwargs or {}))
 
 
 @contextmanager

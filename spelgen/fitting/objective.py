@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, Protocol
 
 from spelgen.errors import Diagnostic
-from spelgen.fitting.run_record import Content
+from spelgen.fitting.run_record import Content, ReadContent
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.listing import Listing
 from spelgen.logs.preprocessing import Preprocessing
@@ -88,8 +88,15 @@ class Objective(Protocol):
     """
 
     name: ClassVar[str]
-    follows_commands: ClassVar[bool]
-    """Whether it is for arms under position servos, whose logs have commands, or for logs of torques."""
+    input: ClassVar[Literal["torque", "position"]]
+    """What the inputs are of the models that it is for, and what their logs have."""
+
+    @staticmethod
+    def summary(record: ReadContent) -> FitSummary | None:
+        """Return what a fit determined beside a model; None where that is nothing, or it is not over.
+
+        record: contents of config.json.
+        """
 
     def __init__(self, request: FitRequest) -> None:
         """Begin with a model that this objective is for, and a config of its own."""

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from spelgen.dynamics.protocol import has_rigid_bodies, has_servos
+from spelgen.dynamics.protocol import has_rigid_bodies, input_of
 from spelgen.errors import OptionError
 from spelgen.fitting.objective import FitRequest, FitSummary, Objective
 from spelgen.fitting.run_record import ReadContent
 from spelgen.fitting.servo.objective import ServoObjective
-from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.torque.objective import TorqueObjective
 from spelgen.fitting.window.objectives import MomentumObjective, RolloutObjective
 from spelgen.logs.rates import shows_accelerations
@@ -27,36 +26,33 @@ OBJECTIVES: dict[str, type[Objective]] = {
 }
 
 
-SUMMARIES: dict[str, Callable[[ReadContent], FitSummary | None]] = {ServoObjective.name: servo_summary}
-"""What an objective says of a run's config.json, where it determines more than a model."""
-
-
 def fit_summary(record: ReadContent) -> FitSummary | None:
-    """Return what a fit determined, None where its objective has nothing to say, or is not over."""
-    summary = SUMMARIES.get(record.get("objective", ""))
-    return None if summary is None else summary(record)
+    """Return what a fit determined beside a model, if anything; record: contents of config.json, {} without."""
+    objective = OBJECTIVES.get(record.get("objective", ""))
+    return None if objective is None else objective.summary(record)
 
 
 def objective_of(request: FitRequest) -> Objective:
     """Return the objective of a request. Raises OptionError where it is not for this model."""
     name = request.config.objective
     objective = OBJECTIVES[name]
-    if has_servos(request.model) and not objective.follows_commands:
-        message = f"{name} belongs to logs of torques, this arm has position servos"
+    under = input_of(request.model)
+    if objective.input != under:
+        message = (
+            f"{name} belongs to arms with 'input: {objective.input}' in their settings, this has '{under}'"
+        )
         raise OptionError("objective", message)
-    if objective.follows_commands and not has_servos(request.model):
-        raise OptionError("objective", f"{name} belongs to arms with 'input: position' in their settings")
     return objective(request)
 
 
 def default_objective(model: EmittedModel, rates: Sequence[float]) -> str:
     """Return the objective that is fitted where nobody names one.
 
-    It is "servo" for an arm under position servos, "torque" for a model of rigid bodies where logs are sampled densely
-    enough for accelerations (rates [Hz]), and else "rollout".
+    It is that of position servos for an arm under these, "torque" for a model of rigid bodies where logs are sampled
+    densely enough for accelerations (rates [Hz]), and else "rollout".
     """
-    if has_servos(model):
-        return "servo"
+    if input_of(model) == ServoObjective.input:
+        return ServoObjective.name
     if has_rigid_bodies(model) and any(map(shows_accelerations, rates)):
         return "torque"
     return "rollout"

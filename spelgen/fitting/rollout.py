@@ -184,27 +184,31 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     return result
 
 
-def integration_error(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> float:
-    """Return the difference of rollouts with `substeps` and with twice as many, relative to the error of the latter.
+def probed(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
+    """Return `rollout_errors` without gradients, NaN where numbers blow up."""
+    try:
+        with torch.no_grad():
+            return rollout_errors(model, windows, scales, substeps)
+    except torch.linalg.LinAlgError:
+        return torch.tensor(math.nan)
+
+
+def integration_error(coarse: torch.Tensor, fine: torch.Tensor) -> float:
+    """Return the difference of scaled errors of a rollout and of one with twice as many steps, relative to the latter.
 
     Both are root mean squares in units of `scales`; of the model's error, at least `least_error` is taken.
     """
-    try:
-        with torch.no_grad():
-            fine = rollout_errors(model, windows, scales, 2 * substeps)
-            difference = rollout_errors(model, windows, scales, substeps) - fine
-    except torch.linalg.LinAlgError:  # numbers blew up
-        return math.inf
     model_error = max(fine.square().mean().sqrt().item(), TUNING.least_error)
-    error = difference.square().mean().sqrt().item() / model_error
+    error = (coarse - fine).square().mean().sqrt().item() / model_error
     return error if math.isfinite(error) else math.inf
 
 
 def choose_substeps(model: EmittedModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
     """Return the fewest rk4 steps per sample interval, from `start` on, with a small error of integration."""
-    for substeps in TUNING.substeps:
-        if substeps < start:
-            continue
-        if integration_error(model, windows, scales, substeps) < TUNING.fraction:
-            return substeps
-    return max(start, TUNING.substeps[-1])
+    substeps, coarse = start, probed(model, windows, scales, start)
+    while substeps < TUNING.most_substeps:
+        fine = probed(model, windows, scales, 2 * substeps)
+        if integration_error(coarse, fine) < TUNING.fraction:
+            break
+        substeps, coarse = 2 * substeps, fine
+    return substeps

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.errors import Diagnostic, RunError
 from spelgen.fitting.dataset import TrainingData, WindowChoice, prepare_data
-from spelgen.fitting.objective import FitRequest, PreparedLogs
-from spelgen.fitting.run_record import Content
+from spelgen.fitting.objective import FitRequest, FitSummary, PreparedLogs
+from spelgen.fitting.run_record import Content, ReadContent
 from spelgen.fitting.streaming import LargeLogs, prepare_streamed
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
 from spelgen.settings.fits import FitConfig
@@ -22,11 +22,16 @@ class TorqueLogObjective:
     history, results: none, where an objective has no more to keep.
     """
 
-    follows_commands: ClassVar[bool] = False
+    input: ClassVar[Literal["torque", "position"]] = "torque"
 
     def __init__(self, request: FitRequest) -> None:
         self.request, self.model = request, request.model
         self.history: list[Content] = []
+
+    @staticmethod
+    def summary(record: ReadContent) -> FitSummary | None:
+        """Return nothing: a fit to torques determines no more than a model."""
+        return None
 
     def results(self) -> dict[str, object]:
         """Return nothing more: history and notes tell how it went."""

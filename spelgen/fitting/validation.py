@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from spelgen.fitting.dataset import TrainingData
-from spelgen.fitting.rollout import TUNING as INTEGRATION
-from spelgen.fitting.rollout import choose_substeps, integration_error, rollout_loss
+from spelgen.fitting.rollout import choose_substeps, rollout_loss
 from spelgen.fitting.run_record import Content
 from spelgen.settings.fits import DEFAULTS, Solver
 from spelgen.settings.tuning.fitting import ValidationTuning
@@ -66,11 +65,7 @@ class Validation:
             return 1
         if self.prescribed is not None:
             return self.prescribed
-        if present is None:
-            return choose_substeps(self.model, self.probe, self.scales)
-        if integration_error(self.model, self.probe, self.scales, present) <= INTEGRATION.fraction:
-            return present
-        return choose_substeps(self.model, self.probe, self.scales, start=2 * present)
+        return choose_substeps(self.model, self.probe, self.scales, start=present or 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 import torch
 from scipy.optimize import minimize_scalar
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.body_regressor import regressor_of
@@ -227,5 +227,5 @@ def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: in
     ratios = np.log(logged / mended)  # by factors: a block that is hard to tell counts as any other
     standard_error = ratios.std(ddof=1) / np.sqrt(len(ratios))
     # of hundreds of couplings one is always better by chance (Bonferroni's bound)
-    needed = float(student.isf(TUNING.chance / candidates, len(ratios) - 1))
+    needed = -float(stdtrit(len(ratios) - 1, TUNING.chance / candidates))
     return bool(ratios.mean() > needed * standard_error)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.body_regressor import regressor_of
@@ -125,7 +125,7 @@ def _likely_delay(
     for dry in (z / reach_of(kinds).values, direction[..., None]):
         friction = FRICTION.columns(qd, qdd, dry, drives.speeds)
         estimates.append(_estimate(np.concatenate([bodies, friction], axis=2), tau))
-    quantile = student.isf(HINTS.delay_chance / 2, HINTS.blocks - 1)
+    quantile = -stdtrit(HINTS.blocks - 1, HINTS.delay_chance / 2)
     # a lag of friction passes for one of torques with memory, not without: its errors are alike to both sides
     memory, direct = estimates
     likely = [direct]

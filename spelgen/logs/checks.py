@@ -318,11 +318,15 @@ def once(notes: Sequence[Diagnostic]) -> list[Diagnostic]:
         groups.setdefault((note.code, note.message), []).append(note)
     merged = []
     for first, *others in groups.values():
-        if others:
-            more = counted(len(others), "more trajectory")
-            first = replace(first, message=f"{first.message} (and in {more})")
-        merged.append(first)
+        merged.append(replace(first, message=_with_others(first.message, len(others))))
     return merged
+
+
+def _with_others(message: str, others: int) -> str:
+    """Return a message that is about so many other trajectories, too."""
+    if not others:
+        return message
+    return f"{message} (and in {counted(others, 'more trajectory')})"
 
 
 def clock_diagnostics(trajectory: Trajectory) -> list[Diagnostic]:
@@ -378,9 +382,7 @@ def summarised(results: Sequence[Finding], joints: Sequence[str], trajectories: 
             # a joint that rests in one motion and moves in another is no oddity
             if not alike or (odd.everywhere and len(alike) < trajectories):
                 continue
-            message = alike[0].message
-            if len(alike) > 1:
-                message += f" (and in {len(alike) - 1} more trajectories)"
+            message = _with_others(alike[0].message, len(alike) - 1)
             summary.add(odd, message, f"trajectory {alike[0].trajectory}, joint {joint!r}", alike[0].file)
     return summary
 

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
-from spelgen.arm.arm import Arm, Coordinate
+from spelgen.arm.arm import Arm
 from spelgen.baselines.names import MODEL
 from spelgen.certificate.facts import facts
 from spelgen.certificate.formulas import formulas
+from spelgen.certificate.inspection import LETTERS
 from spelgen.certificate.printing import Text
 from spelgen.evaluation.plain import Curve, record
 from spelgen.evaluation.traces import Traces
@@ -21,9 +22,9 @@ from spelgen.render.page import json_data
 from spelgen.render.plots import Record
 from spelgen.render.scene import scene
 from spelgen.settings.tuning.render import TUNING
+from spelgen.structure.nominal import working_range
 from spelgen.structure.structure import Structure
 
-LETTERS = {"zero": "0", "constant": "C"}
 KINDS = {"zero": "is always zero", "constant": "is constant"}
 IDENTIFIED = ("never", "in combination", "alone")
 ENTRY = re.compile(r"M\d+(?:,\d+)?")
@@ -147,24 +148,12 @@ def _sweep(arm: Arm) -> Motion:
     t = np.linspace(0, 12, 121)
     q = np.zeros((len(t), len(arm.coordinates)))
     for k, coordinate in enumerate(arm.coordinates):
-        low, high = _range(coordinate)
-        q[:, k] = (low + high) / 2 + 0.4 * (high - low) * np.sin(2 * np.pi * t / 12 * (1 + k % 3) + k)
+        low, high = working_range(coordinate)
+        # limits of a hundred turns, as some URDFs have them, would show a blur
+        swing = min(0.4 * (high - low), 1.2 if coordinate.kind == "revolute" else 0.3)
+        q[:, k] = (low + high) / 2 + swing * np.sin(2 * np.pi * t / 12 * (1 + k % 3) + k)
     label = "a motion through the joints' ranges"
     return Motion("sweep", label, t.round(3), q.round(4))
-
-
-def _range(coordinate: Coordinate) -> tuple[float, float]:
-    """Return the range that is shown: that of the URDF, or a usual one where it has none or a very wide one."""
-    # limits of a hundred turns, as some URDFs have them, would show a blur
-    usual = 1.2 if coordinate.kind == "revolute" else 0.3
-    low, high = -usual, usual
-    if not coordinate.continuous and coordinate.lower is not None:
-        low = max(coordinate.lower, -2 * usual)
-    if not coordinate.continuous and coordinate.upper is not None:
-        high = min(coordinate.upper, 2 * usual)
-    if low < high:
-        return low, high
-    return coordinate.lower or 0.0, coordinate.upper or 0.0
 
 
 def _unseen(arm: Arm, identified: Record) -> list[float] | None:

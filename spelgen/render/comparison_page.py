@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from spelgen.comparison.results import RunResult
+from spelgen.comparison.metrics import RunResult, true_mass
 from spelgen.comparison.study import Study
-from spelgen.comparison.truth import true_mass
 from spelgen.evaluation.drawn_motions import PredictedMotion
+from spelgen.evaluation.plain import array
 from spelgen.evaluation.tables import Table
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.labels import named_joints
 from spelgen.render.charts import Chart, Line, line_chart
 from spelgen.render.page import render_page
-from spelgen.render.plots import Panel, mass_panels, numbers, trajectory_panels
+from spelgen.render.plots import Panel, mass_panels, trajectory_panels
 from spelgen.spec import read_facts
 
 STYLES = ("c1", "c2", "c3", "gravity", "c4", "c5", "c6")
@@ -68,7 +68,7 @@ def _losses(study: Study, styles: Mapping[str, str]) -> Chart:
     for variant in study.variants:
         records = RunFolder(study.run(variant, 0)).read_metrics()
         if variant.name in styles and records:
-            steps, losses = numbers([(record["step"], record["best"]) for record in records]).T
+            steps, losses = array([(record["step"], record["best"]) for record in records]).T
             lines.append(Line(variant.name, steps, losses, styles[variant.name]))
     title = "Best validation loss by step"
     return line_chart(lines, title, "training step", "loss", log=True, width=560, height=250)
@@ -87,7 +87,7 @@ def _mass_panels(
     masses = {"true": true_mass(study.source, torch.from_numpy(along.q)).numpy()}
     for result in results:
         if result.variant in examples:
-            masses[result.variant] = numbers(result.mass.along)
+            masses[result.variant] = array(result.mass.along)
     rows, columns = np.tril_indices(len(joint_types))
     entries = {name: mass[:, rows, columns].T for name, mass in masses.items()}
     return mass_panels(along.t, entries, {"true": "truth", **styles}, joint_types, width=400)

@@ -6,17 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from spelgen.baselines.names import LEAST_SQUARES, MODEL
-from spelgen.evaluation.drawn_motions import PredictedMotion
 from spelgen.evaluation.traces import Traces
-from spelgen.evaluation.verdict import Limits
 from spelgen.labels import named_joints, thousandths
 from spelgen.listing import number
 from spelgen.render.charts import Chart
 from spelgen.render.plots import (
     STYLES,
     Panel,
-    Record,
-    coverage_panels,
     eigenvalue_chart,
     energy_chart,
     friction_panels,
@@ -60,7 +56,13 @@ def curves(traces: Traces, facts: Facts) -> Curves:
     for trace in traces.torques[:1]:
         drawn.energy = energy_chart(trace)
     for example in traces.trajectories:
-        title = _prediction_title(example, facts)
+        title = f"{example.which.capitalize()} prediction: {example.trajectory}, "
+        if example.start is None:
+            title = f"{example.which.capitalize()} log replayed: {example.trajectory}, "
+            distance = None if example.error is None else 1000 * example.error
+            title += f"{number(distance)} {thousandths(facts.joint_types)} off"
+        else:
+            title += f"{example.start:.3g} s into it, relative error {number(example.error)}"
         motion = f"prediction {example.which}"
         drawn.trajectories[title] = trajectory_panels(
             {"predicted": example}, {"predicted": "predicted"}, joints, motion
@@ -72,20 +74,3 @@ def curves(traces: Traces, facts: Facts) -> Curves:
     if traces.friction is not None:
         drawn.friction = friction_panels(traces.friction, traces.torques, joints)
     return drawn
-
-
-def _prediction_title(example: PredictedMotion, facts: Facts) -> str:
-    kind, name, error = example.which.capitalize(), example.trajectory, example.error
-    if example.start is None:
-        distance = None if error is None else 1000 * error
-        return f"{kind} log replayed: {name}, {number(distance)} {thousandths(facts.joint_types)} off"
-    return f"{kind} prediction: {name}, {example.start:.3g} s into it, relative error {number(error)}"
-
-
-def coverage(traces: Traces, identified: Record | None, facts: Facts, limits: Limits) -> list[Panel]:
-    """Return histograms of positions and velocities of training and test logs."""
-    logs = {"training": (identified or {}).get("coverage"), "test": traces.coverage}
-    recorded = {name: covered for name, covered in logs.items() if covered}
-    if not recorded:
-        return []
-    return coverage_panels(recorded, named_joints(facts.joints, facts.joint_types), limits)

@@ -8,12 +8,11 @@ import numpy as np
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor, urdf_parameters
-from spelgen.labels import UNITS, NamedJoint
+from spelgen.labels import named_joints
 from spelgen.log_checks.report import LogReport
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
-from spelgen.render.charts import Line
 from spelgen.render.page import render_page
-from spelgen.render.plots import Panel, Row, stack
+from spelgen.render.plots import JointRow, Panel, stacks
 from spelgen.settings.tuning.render import TUNING
 
 
@@ -38,26 +37,23 @@ def charts(log: Trajectory, arm: Arm, inputs: np.ndarray) -> list[Panel]:
     # gaps are kept: no line is drawn over one by a slope across it
     pieces = [piece[:: -(-len(log.t) // TUNING.points)] for piece in split_at_gaps(log)]
     t, q = _joined(pieces, "t"), _joined(pieces, "q")
-    quantities = {"position": [("logged", q, "truth")]}
+    position, columns = [("logged", q, "truth")], []
     if log.u is not None:
-        quantities["position"].append(("commanded", _joined(pieces, "u"), "predicted"))
+        position.append(("commanded", _joined(pieces, "u"), "predicted"))
     else:
         slope = np.concatenate(list(map(_slope, pieces)))
-        quantities["velocity"] = [("logged", _joined(pieces, "qd"), "truth"), ("dq/dt", slope, "predicted")]
-        quantities["torque"] = [("logged", _joined(pieces, "tau") @ inputs.T, "truth")]
+        columns = [("velocity", [("logged", _joined(pieces, "qd"), "truth"), ("dq/dt", slope, "predicted")])]
+        torque = [("logged", _joined(pieces, "tau") @ inputs.T, "truth")]
         if any(body.inertia for body in arm.bodies):
             rest = np.zeros_like(q)
             gravity = regressor(arm, q, rest, rest) @ urdf_parameters(arm)  # (T, n)
-            quantities["torque"].append(("gravity of the URDF", gravity, "predicted"))
-    panels = []
-    joints = [NamedJoint(joint.name, UNITS[joint.kind]) for joint in arm.coordinates]
-    for k, joint in enumerate(joints):
-        rows = []
-        for quantity, columns in quantities.items():
-            lines = [Line(label, t, values[:, k], style) for label, values, style in columns]
-            rows.append(Row(lines, f"{quantity} of {joint.name}", joint.axis(quantity)))
-        panels.append(stack(joint.name, rows))
-    return panels
+            torque.append(("gravity of the URDF", gravity, "predicted"))
+        columns.append(("torque", torque))
+    rows = [
+        JointRow(quantity, quantity, quantity, lines)
+        for quantity, lines in [("position", position), *columns]
+    ]
+    return stacks(t, rows, named_joints(arm.joint_names, arm.joint_types))
 
 
 def _joined(pieces: Sequence[Trajectory], column: str) -> np.ndarray:

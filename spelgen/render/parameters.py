@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from spelgen.dynamics.protocol import has_rigid_bodies, has_servos
+from spelgen.dynamics.parameters import parameters_of_kind
+from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
 from spelgen.exporting.urdf_file import about_center
@@ -74,8 +75,15 @@ def base_table(model: EmittedModel | None, arm: LoadedArm, identified: Record) -
     base = base_parameters(arm.arm, friction, arm.actuation.drives().speeds)
     nominal = np.zeros(base.combination.shape[1])
     nominal[: 10 * len(arm.arm.bodies)] = urdf_parameters(arm.arm)
+    learned = None
+    bodies = None if model is None else body_parameters(model)
+    if model is not None and bodies is not None:
+        # ten a body, then those of drives, of which a model has the armature in common with least squares
+        parameters = np.zeros_like(nominal)
+        parameters[: bodies.size] = bodies.ravel()
+        parameters[bodies.size : bodies.size + model.n] = model.armature.detach().numpy()
+        learned = base.combination @ parameters
     nominal = base.combination @ nominal
-    learned = _learned(model, base.combination)
     sure: list[tuple[str, ...]] = []
     unsure: list[tuple[str, ...]] = []
     head: list[str] = []
@@ -113,21 +121,6 @@ def base_table(model: EmittedModel | None, arm: LoadedArm, identified: Record) -
         folded=tuple(unsure),
         folded_title=f"{len(unsure)} more, not significantly different from zero",
     )
-
-
-def _learned(model: EmittedModel | None, combination: np.ndarray) -> np.ndarray | None:
-    """Return base parameters of a model of rigid bodies; those of friction follow other laws, and stay zero."""
-    if model is None:
-        return None
-    bodies = body_parameters(model)
-    if bodies is None:
-        return None
-    # ten a body, then those of drives, of which a model has the armature in common with least squares
-    parameters = np.zeros(combination.shape[1])
-    parameters[: bodies.size] = bodies.ravel()
-    parameters[bodies.size : bodies.size + model.n] = model.armature.detach().numpy()
-    learned: np.ndarray = combination @ parameters
-    return learned
 
 
 def _body_table(values: np.ndarray, arm: LoadedArm | None) -> Listing:
@@ -169,6 +162,7 @@ def _joint_table(model: EmittedModel, arm: LoadedArm | None) -> Listing | None:
     if not hasattr(model, "armature"):
         return None
     rigid = has_rigid_bodies(model)
+    damped = parameters_of_kind(model, "damping")
     friction = None
     note = ""
     if arm is not None and rigid:
@@ -181,8 +175,8 @@ def _joint_table(model: EmittedModel, arm: LoadedArm | None) -> Listing | None:
         cells = {"joint": f"joint {k + 1}", "armature": f"{model.armature[k]:.3g} {units.inertia}"}
         if friction is not None:
             viscous, forward, backward, _ = friction[:, k]
-            # kd of a servo contains its joint's viscous friction
-            if not has_servos(model):
+            # the damping of a drive's control contains its joint's viscous friction
+            if not damped:
                 cells["viscous"] = f"{viscous:.3g} {slope}"
             cells["Coulomb, qd > 0"] = f"{forward:.3g} {units.torque}"
             cells["Coulomb, qd < 0"] = f"{backward:.3g} {units.torque}"
@@ -202,7 +196,12 @@ def _constant_table(untrained: Any, trained: Any) -> Listing:
     """Return the constants of M that a model has learned, in the units of the first entries that they are in."""
     rows = []
     values = zip(untrained.mass.constants().tolist(), trained.mass.constants().tolist(), strict=True)
-    for basis, (start, learned) in zip(_constant_basis(trained.mass), values, strict=True):
+    # what each constant adds to M, (constants, n, n)
+    count = len(trained.mass.raw_constants)
+    functions = torch.zeros(len(getattr(trained.mass, "function_mean", ())), count, dtype=torch.float64)
+    units = torch.eye(count, dtype=torch.float64)
+    combinations = trained.mass.entries(functions.unbind(), units.unbind())
+    for basis, (start, learned) in zip(combinations, values, strict=True):
         row, column = basis.tril().nonzero()[0].tolist()
         unit = inertia_unit(trained.joint_types[row], trained.joint_types[column])
         rows.append((_entry_sum(basis), f"{start:.4g}", f"{learned:.4g}", unit))
@@ -212,15 +211,6 @@ def _constant_table(untrained: Any, trained: Any) -> Listing:
         tuple(rows),
         "An entry of M is the sum of its constants and learned functions.",
     )
-
-
-def _constant_basis(mass: Any) -> torch.Tensor:
-    """Return what each constant adds to M, (constants, n, n)."""
-    count = len(mass.raw_constants)
-    functions = torch.zeros(len(getattr(mass, "function_mean", ())), count, dtype=torch.float64)
-    units = torch.eye(count, dtype=torch.float64)
-    basis: torch.Tensor = mass.entries(functions.unbind(), units.unbind())
-    return basis
 
 
 def _entry_sum(basis: torch.Tensor) -> str:

@@ -20,7 +20,8 @@ from spelgen.baselines.names import (
     observed,
 )
 from spelgen.evaluation.drawn_motions import PredictedMotion, TorqueTrace
-from spelgen.evaluation.traces import FrictionTrace, Growth, MassTrace, Quantiles
+from spelgen.evaluation.plain import array
+from spelgen.evaluation.traces import FrictionTrace, Growth, MassTrace, Quantiles, Traces
 from spelgen.evaluation.verdict import Limits
 from spelgen.labels import UNITS, NamedJoint, entry_name
 from spelgen.render.charts import MARGINS, Band, Chart, Dots, Line, Mark, Values, line_chart
@@ -57,25 +58,39 @@ class Panel:
     charts: tuple[Chart, ...]
 
 
-@dataclass(frozen=True)
-class Row:
-    """A chart of a stack over one time; height: without the numbers of its time [pixels]."""
+@dataclass(frozen=True, eq=False)
+class JointRow:
+    """A chart of each joint; unit: the quantity whose unit the axis has. columns: label, values (T, n) and style.
 
-    lines: Sequence[Line]
+    height: without the numbers of the time [pixels].
+    """
+
     title: str
-    label: str
+    axis: str
+    unit: str
+    columns: Sequence[tuple[str, np.ndarray, str]]
     height: int = 130
 
 
-def stack(name: str, rows: Sequence[Row], motion: str = "") -> Panel:
-    """Return charts above one another; the numbers of the time stand below the last one alone."""
-    charts = []
-    for number, row in enumerate(rows, start=1):
-        time, height = "", row.height
-        if number == len(rows):
-            time, height = "t [s]", row.height + MARGINS.bottom - MARGINS.bare
-        charts.append(line_chart(row.lines, row.title, time, row.label, motion=motion, height=height))
-    return Panel(name, tuple(charts))
+def stacks(
+    t: Values, rows: Sequence[JointRow], joints: Sequence[NamedJoint], motion: str = ""
+) -> list[Panel]:
+    """Return by joint charts above one another; the numbers of the time stand below the last one alone.
+
+    motion: see `line_chart`.
+    """
+    panels = []
+    for k, joint in enumerate(joints):
+        charts = []
+        for number, row in enumerate(rows, start=1):
+            time, height = "", row.height
+            if number == len(rows):
+                time, height = "t [s]", row.height + MARGINS.bottom - MARGINS.bare
+            lines = [Line(label, t, values[:, k], style) for label, values, style in row.columns]
+            title, axis = f"{row.title} of {joint.name}", f"{row.axis} [{getattr(joint.units, row.unit)}]"
+            charts.append(line_chart(lines, title, time, axis, motion=motion, height=height))
+        panels.append(Panel(joint.name, tuple(charts)))
+    return panels
 
 
 def inertia_unit(a: str, b: str) -> str:
@@ -85,15 +100,10 @@ def inertia_unit(a: str, b: str) -> str:
     return "kg m"
 
 
-def numbers(values: object) -> np.ndarray:
-    """Return nested lists, None where not finite, as an array."""
-    return np.array(values, dtype=float)
-
-
 def loss_chart(metrics: Sequence[Record], best_epoch: int) -> Chart:
     """Return training and validation loss by epoch, with the epoch of the model that was kept."""
     columns = [(record["epoch"], record["loss"], record["validation"]) for record in metrics]
-    epochs, training, validation = numbers(columns).T
+    epochs, training, validation = array(columns).T
     lines = [
         Line("training loss", epochs, training, "train"),
         Line("validation loss", epochs, validation, "model"),
@@ -144,44 +154,26 @@ def _error_limits(errors: Mapping[str, Quantiles]) -> tuple[float, float] | None
     # pages of several runs have no baselines, and so nothing to cut off
     if MODEL not in errors:
         return None
-    model_errors = _positive([errors[MODEL].low, errors[MODEL].high])
-    medians = _positive([error.median for error in errors.values()])
+    model_errors = np.concatenate([errors[MODEL].low, errors[MODEL].high])
+    medians = np.concatenate([error.median for error in errors.values()])
+    model_errors, medians = model_errors[model_errors > 0], medians[medians > 0]
     if not model_errors.size or not medians.size:
         return None
     high = max(model_errors.max(), medians[medians < TUNING.outlier * model_errors.max()].max(initial=0.0))
     return float(min(model_errors.min(), medians.min())) / 1.3, 1.3 * float(high)
 
 
-def _positive(columns: Sequence[np.ndarray]) -> np.ndarray:
-    values = np.concatenate(columns)
-    positive: np.ndarray = values[values > 0]
-    return positive
-
-
 def torque_panels(trace: TorqueTrace, joints: Sequence[NamedJoint]) -> list[Panel]:
     """Return by joint measured and predicted torque, the residual, and the components of the prediction."""
     measured, predicted = trace.measured, trace.predicted[MODEL]
-    residual = measured - predicted
-    panels = []
-    for k, joint in enumerate(joints):
-        unit = joint.units.torque
-        torques = [
-            Line("measured", trace.t, measured[:, k], "truth"),
-            Line("predicted", trace.t, predicted[:, k], "predicted"),
-        ]
-        components = [Line(name, trace.t, part[:, k], name.lower()) for name, part in trace.parts.items()]
-        rows = [
-            Row(torques, f"Torque of {joint.name}", f"torque [{unit}]", 160),
-            Row(
-                [Line("residual", trace.t, residual[:, k], "model")],
-                f"Residual of {joint.name}",
-                f"residual [{unit}]",
-                100,
-            ),
-            Row(components, f"Components of the torque of {joint.name}", f"components [{unit}]", 162),
-        ]
-        panels.append(stack(joint.name, rows, f"torque {trace.which}"))
-    return panels
+    both = [("measured", measured, "truth"), ("predicted", predicted, "predicted")]
+    components = [(name, part, name.lower()) for name, part in trace.parts.items()]
+    rows = [
+        JointRow("Torque", "torque", "torque", both, 160),
+        JointRow("Residual", "residual", "torque", [("residual", measured - predicted, "model")], 100),
+        JointRow("Components of the torque", "components", "torque", components, 162),
+    ]
+    return stacks(trace.t, rows, joints, f"torque {trace.which}")
 
 
 def trajectory_panels(
@@ -192,30 +184,24 @@ def trajectory_panels(
 ) -> list[Panel]:
     """Return by joint position and, where it is known, velocity: measured and predicted, of servos the commands too.
 
-    Each is above its errors. predictions: of one motion, by the names of lines, whose styles stand in `styles`. motion:
-    see `line_chart`.
+    Each is above its errors. predictions: of one motion, by the names of lines, whose styles stand in `styles`.
     """
     measured = next(iter(predictions.values()))
-    panels = []
-    for k, joint in enumerate(joints):
-        rows = []
-        for key, quantity in QUANTITIES.items():
-            values = getattr(measured, key)
-            if values is None:
-                continue
-            lines = [Line("measured", measured.t, values[:, k], "truth")]
-            if measured.u is not None:
-                lines.insert(0, Line("commanded", measured.t, measured.u[:, k], "hold"))
-            errors = []
-            for name, prediction in predictions.items():
-                predicted = getattr(prediction, f"predicted_{key}")[:, k]
-                lines.append(Line(name, measured.t, predicted, styles[name]))
-                errors.append(Line(name, measured.t, predicted - values[:, k], styles[name]))
-            title, axis = f"{quantity} of {joint.name}", joint.axis(quantity)
-            rows.append(Row(lines, title, axis))
-            rows.append(Row(errors, f"Error of the {title}", axis.replace(quantity, "error"), 100))
-        panels.append(stack(joint.name, rows, motion))
-    return panels
+    rows = []
+    for key, quantity in QUANTITIES.items():
+        values = getattr(measured, key)
+        if values is None:
+            continue
+        lines, errors = [("measured", values, "truth")], []
+        if measured.u is not None:
+            lines.insert(0, ("commanded", measured.u, "hold"))
+        for name, prediction in predictions.items():
+            predicted = getattr(prediction, f"predicted_{key}")
+            lines.append((name, predicted, styles[name]))
+            errors.append((name, predicted - values, styles[name]))
+        rows.append(JointRow(quantity, quantity, quantity, lines))
+        rows.append(JointRow(f"Error of the {quantity}", "error", quantity, errors, 100))
+    return stacks(measured.t, rows, joints, motion)
 
 
 def mass_panels(
@@ -301,9 +287,13 @@ def _friction_limits(measured: np.ndarray, curve: np.ndarray) -> tuple[float, fl
 
 
 def coverage_panels(
-    by_logs: Mapping[str, Record], joints: Sequence[NamedJoint], limits: Limits
+    traces: Traces, identified: Record | None, joints: Sequence[NamedJoint], limits: Limits
 ) -> list[Panel]:
-    """Return by joint how often positions and velocities occur in the logs named; the joint's limits are marked."""
+    """Return by joint how often training and test logs have positions and velocities; the joint's limits are marked."""
+    logs: dict[str, Record | None] = {"training": (identified or {}).get("coverage"), "test": traces.coverage}
+    by_logs = {name: covered for name, covered in logs.items() if covered}
+    if not by_logs:
+        return []
     panels = []
     for k, joint in enumerate(joints):
         charts = []
@@ -332,7 +322,7 @@ def coverage_panels(
 
 def _histogram(name: str, histogram: Record) -> Band:
     """Return the outline of a histogram's bars; heights sum to one."""
-    counts = numbers(histogram["counts"])
+    counts = array(histogram["counts"])
     # each bar as two points, so that the outline has steps
     edges = np.linspace(histogram["low"], histogram["high"], len(counts) + 1)
     heights = np.repeat(counts / max(counts.sum(), 1.0), 2)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,14 +19,14 @@ from spelgen.evaluation.verdict import Limits, Verdict, verdict
 from spelgen.files import write_json, write_text
 from spelgen.fitting.objectives import fit_summary
 from spelgen.fitting.run_folder import RunFolder, trained_model
-from spelgen.labels import UNITS
+from spelgen.labels import UNITS, named_joints
 from spelgen.listing import Listing
 from spelgen.loaded_arm import LoadedArm
 from spelgen.render.arm_section import arm_section, matrix
-from spelgen.render.curves import coverage, curves
+from spelgen.render.curves import curves
 from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, parameter_tables
-from spelgen.render.plots import Record
+from spelgen.render.plots import Record, coverage_panels
 from spelgen.render.reproduction import commands, files
 from spelgen.render.run_facts import head_numbers, training_facts
 from spelgen.spec import Facts, read_facts
@@ -38,18 +38,49 @@ SCHEMA = 1
 """Of the page as data."""
 
 
-@dataclass(frozen=True)
 class Run:
-    """What a run folder holds; None for what it lacks. arm: None also where its URDF can no longer be read."""
+    """Read what a run folder holds, each file when it is first needed; None stands for what the folder lacks."""
 
-    folder: RunFolder
-    facts: Facts
-    config: Record | None
-    metrics: Sequence[Record]
-    results: Results | None
-    identified: Record | None
-    arm: LoadedArm | None
-    model: EmittedModel | None
+    def __init__(self, folder: Path | str) -> None:
+        self.folder = RunFolder(Path(folder))
+
+    @cached_property
+    def facts(self) -> Facts:
+        """Return the facts of the run's module."""
+        return read_facts(self.folder.module)
+
+    @cached_property
+    def config(self) -> Record | None:
+        """Return how the run was trained."""
+        return self.folder.read_config() if self.folder.config.is_file() else None
+
+    @cached_property
+    def results(self) -> Results | None:
+        """Return the evaluation."""
+        record = self.record(self.folder.evaluation)
+        return None if record is None else Results.from_dict(record)
+
+    @cached_property
+    def identified(self) -> Record | None:
+        """Return what least squares found."""
+        return self.record(self.folder.baseline)
+
+    @cached_property
+    def arm(self) -> LoadedArm | None:
+        """Return the arm; None also where its URDF is one that this version refuses: the page stands without."""
+        try:
+            return run_arm(self.folder)
+        except SpelgenError:
+            return None
+
+    @cached_property
+    def model(self) -> EmittedModel | None:
+        """Return the trained model."""
+        return trained_model(self.folder) if self.folder.weights.is_file() else None
+
+    def record(self, path: Path) -> Record | None:
+        """Return what a file of JSON holds."""
+        return self.folder.read_json(path) if path.is_file() else None
 
     @property
     def limits(self) -> Limits:
@@ -89,7 +120,7 @@ def write_report(
 
 def report_data(folder: Path | str) -> Record:
     """Return all that the page shows, for programs: the verdict, the evaluation, least squares, the parameters."""
-    run = _read(RunFolder(Path(folder)))
+    run = Run(folder)
     data: dict[str, object] = {"schema": SCHEMA, "verdict": None, "bodies": None}
     if run.verdict is not None:
         data["verdict"] = asdict(run.verdict)
@@ -98,80 +129,59 @@ def report_data(folder: Path | str) -> Record:
         if bodies is not None:
             data["bodies"] = bodies.tolist()
     data["tables"] = list(map(asdict, run.parameters))
-    evaluation = _json(run.folder, run.folder.evaluation)
-    return data | {"evaluation": evaluation, "least_squares": run.identified}
+    return data | {"evaluation": run.record(run.folder.evaluation), "least_squares": run.identified}
 
 
 def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
     """Return the page about a run as HTML; the same folder gives the same text. robot: see ``write_report``."""
-    run = RunFolder(Path(folder))
-    if not run.module.is_file():
+    run = Run(folder)
+    if not run.folder.module.is_file():
         raise RunError(
-            "no run", file=run.path, expected="a folder with module.py", do="make one with `spelgen train`"
+            "no run",
+            file=run.folder.path,
+            expected="a folder with module.py",
+            do="make one with `spelgen train`",
         )
     # files of a run folder may come from anywhere and hold anything
     try:
-        return _rendered(_read(run), robot)
+        return _rendered(run, robot)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, TemplateError) as error:
         raise RunError(
             f"files without the data of a report ({type(error).__name__}: {error})",
-            file=run.path,
+            file=run.folder.path,
             do="run `spelgen evaluate` again",
         ) from error
 
 
-def _read(folder: RunFolder) -> Run:
-    # the page stands without a URDF: a run may have none, or one that this version refuses
-    try:
-        arm = run_arm(folder)
-    except SpelgenError:
-        arm = None
-    evaluation = _json(folder, folder.evaluation)
-    return Run(
-        folder,
-        read_facts(folder.module),
-        config=folder.read_config() if folder.config.is_file() else None,
-        metrics=folder.read_metrics(),
-        results=None if evaluation is None else Results.from_dict(evaluation),
-        identified=_json(folder, folder.baseline),
-        arm=arm,
-        model=trained_model(folder) if folder.weights.is_file() else None,
-    )
-
-
-def _json(folder: RunFolder, path: Path) -> Record | None:
-    if not path.is_file():
-        return None
-    record: Record = folder.read_json(path)
-    return record
-
-
 def _rendered(run: Run, robot: Path | str | None) -> str:
-    facts, config = run.facts, run.config or {}
+    facts, config, metrics = run.facts, run.config or {}, run.folder.read_metrics()
     traces = Traces({}) if run.results is None else run.results.traces
     arm, cells, training, tables = None, None, None, []
+    joints = named_joints(facts.joints, facts.joint_types)
     if config:
-        training = training_facts(config, run.metrics, run.identified, run.model)
+        training = training_facts(config, metrics, run.identified, run.model)
     if run.results is not None:
         tables = result_tables(run.results)
     if run.arm is not None:
         arm = arm_section(run.arm.arm, Path(robot or run.arm.robot.path), traces, run.identified)
         cells = matrix(run.arm.arm, run.arm.structure_for(facts.options.assume))
+    # the sentences about the model
+    docstring = ast.get_docstring(ast.parse(run.folder.module.read_bytes())) or ""
     return render_page(
         "report.html.jinja",
         facts=facts,
-        about=_about(run.folder.module),
+        about=" ".join(docstring.split("\n\n")[1].split()),
         cells=cells,
         arm=arm,
         units=UNITS,
-        numbers=head_numbers(run.model, config, run.metrics, run.results),
+        numbers=head_numbers(run.model, config, metrics, run.results),
         verdict=run.verdict,
         config=run.config,
         training=training,
         evaluation=run.results,
         tables=tables,
         curves=curves(traces, facts),
-        coverage=coverage(traces, run.identified, facts, run.limits),
+        coverage=coverage_panels(traces, run.identified, joints, run.limits),
         trained=run.model is not None,
         under_servos=config.get("mapping", {}).get("input") == "position",
         summary=fit_summary(config),
@@ -179,9 +189,3 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         files=files(run.folder.path),
         commands=commands(run.folder, facts, run.config),
     )
-
-
-def _about(module: Path) -> str:
-    """Return the sentences about the model in the docstring of its module."""
-    docstring = ast.get_docstring(ast.parse(module.read_bytes())) or ""
-    return " ".join(docstring.split("\n\n")[1].split())

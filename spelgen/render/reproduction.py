@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import shlex
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 from rich.filesize import decimal
@@ -20,17 +20,8 @@ from spelgen.spec import Facts, Options
 HASHED = 1_000_000_000  # bytes of the largest file whose digest is computed, in some seconds
 
 
-@dataclass(frozen=True)
-class File:
-    """A file of the run folder."""
-
-    name: str
-    size: str
-    sha256: str
-
-
-def files(folder: Path) -> list[File]:
-    """Return every file of the folder but pages and what is being written."""
+def files(folder: Path) -> list[tuple[str, str, str]]:
+    """Return name, size and SHA-256 of every file of the folder but pages and what is being written."""
     entries = []
     for path in sorted(folder.iterdir()):
         # pages are made from the folder and so are no part of what is reproduced
@@ -39,7 +30,7 @@ def files(folder: Path) -> list[File]:
             if size <= HASHED:
                 with path.open("rb") as content:
                     digest = hashlib.file_digest(content, "sha256").hexdigest()
-            entries.append(File(path.name, decimal(size), digest))
+            entries.append((path.name, decimal(size), digest))
     return entries
 
 

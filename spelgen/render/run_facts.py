@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 from spelgen.baselines.names import MODEL
 from spelgen.evaluation.results import Results
+from spelgen.evaluation.tables import figures
 from spelgen.fitting.objectives import fit_summary
 from spelgen.fitting.torque.report import terms_in_use
-from spelgen.labels import counted, share, thousandths
+from spelgen.labels import counted
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.render.charts import Chart
@@ -41,36 +42,22 @@ def head_numbers(
     model: EmittedModel | None, config: Record, metrics: Sequence[Record], results: Results | None
 ) -> list[Number]:
     """Return the figures a reader wants first, as far as the run has come; records are empty where there are none."""
-    figures = _errors(results) if results is not None else []
+    numbers = []
+    if results is not None:
+        for figure in figures(results):
+            value = figure.values[MODEL]
+            if value is not None:
+                numbers.append(Number(figure.text(value), figure.label))
     summary = fit_summary(config)
     if summary is not None:
-        figures.append(Number(*summary.headline))
+        numbers.append(Number(*summary.headline))
     elif model is not None:
         count = sum(parameter.numel() for parameter in model.parameters())
-        figures.append(Number(f"{count:,}", "trained parameters"))
+        numbers.append(Number(f"{count:,}", "trained parameters"))
     if metrics:
         label = f"of training, {metrics[-1]['step']:,} steps"
-        figures.append(Number(_duration(metrics[-1]["seconds"]), label))
-    return figures
-
-
-def _errors(results: Results) -> list[Number]:
-    figures = []
-    torque = results.torque.get(MODEL)
-    if torque is not None and torque.mean_nmse is not None:
-        figures.append(Number(share(torque.mean_nmse), "torque error relative to its variance (nMSE)"))
-    # the longest horizon is the hardest, and what a simulation needs
-    for horizon in results.horizons[-1:]:
-        error = horizon.errors[MODEL]
-        if error.mean_relative_rms is not None:
-            value = share(error.mean_relative_rms, "motion")
-            figures.append(Number(value, f"rollout error after {horizon.name}"))
-        if error.tip_mm is not None:
-            figures.append(Number(f"{number(error.tip_mm)} mm", f"tip error after {horizon.name}"))
-    for replay in results.replays:
-        value = f"{number(1000 * replay.errors[MODEL].mean)} {thousandths(results.joint_types)}"
-        figures.append(Number(value, f"position error, commands replayed, {replay.name}"))
-    return figures
+        numbers.append(Number(_duration(metrics[-1]["seconds"]), label))
+    return numbers
 
 
 def training_facts(

@@ -119,11 +119,16 @@ def _visual_meshes(urdf: Path, links: Sequence[str]) -> dict[str, Any]:
 
 
 def _read_meshes(files: Mapping[str, Path]) -> dict[str, Trimesh]:
-    """Return the meshes in these files. Raises CalledProcessError where one is no mesh, or too large for a page."""
+    """Return the meshes in these files.
+
+    Raises OSError where one is missing, and CalledProcessError where one is no mesh, or too large for a page.
+    """
     import trimesh
 
     if not files:
         return {}
+    for path in files.values():
+        path.stat()  # a process takes longer to start than to find that a file is missing
     command = [sys.executable, "-P", "-m", mesh_child.__name__, *map(str, files.values())]
     # a file may say that it is a thousand times as large as it is, or name one that never ends
     run = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=60, check=True)

@@ -11,12 +11,12 @@ from torch import Tensor, nn
 class Bristles(nn.Module):
     """K elements a joint, elastic up to their reach, sliding beyond; z is (..., n, K) [rad, m].
 
-    z' = qd - |qd| z / reach, whatever the speed: in displacement it is linear, and needs no small
-    steps (Dahl, A Solid Friction Model, 1968; several elements as in Lampaert, Al-Bender and
-    Swevers, A Generalized Maxwell-Slip Friction Model, 2003).
+    z' = qd, and zero where |z| is the reach and would grow (Maxwell-slip elements: Lampaert, Al-Bender
+    and Swevers, A Generalized Maxwell-Slip Friction Model, 2003). What turns around within the reach
+    closes its loop, so a joint that stiction stops does not creep where its load oscillates.
     """
 
-    reach: Tensor  # (n, K)
+    reach: Tensor  # (n, K), a joint's shortest first
 
     def __init__(self, reach: Sequence[Sequence[float]]) -> None:
         super().__init__()
@@ -24,20 +24,14 @@ class Bristles(nn.Module):
 
     def rate(self, qd: Tensor, z: Tensor) -> Tensor:
         """z', (..., n, K)."""
-        return qd.unsqueeze(-1) * bristle_slope(z, qd.unsqueeze(-1), self.reach)
+        qd = qd.unsqueeze(-1)
+        return qd * (qd.sign() * z < self.reach)
 
     def moved(self, z: Tensor, displacement: Tensor) -> Tensor:
         """z after joints went one way by (..., n), exactly."""
         return moved_bristles(z, displacement.unsqueeze(-1), self.reach)
 
 
-def bristle_slope(z: Tensor, qd: Tensor, reach: Tensor) -> Tensor:
-    """dz/dq, from 0 to 2, of joints that go the way of qd; shapes as z, or broadcast to it."""
-    return 1 - qd.sign() * z / reach
-
-
 def moved_bristles(z: Tensor, displacement: Tensor, reach: Tensor) -> Tensor:
     """z after joints went one way by a displacement, exactly; shapes as z, or broadcast to it."""
-    end = displacement.sign() * reach
-    # to all digits of small displacements
-    return z + (z - end) * (-displacement.abs() / reach).expm1()
+    return (z + displacement).clamp(-reach, reach)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.parts import Entries, Pairs
+from spelgen.runtime.parts import Layout, Pairs
 
 
 class ConstantMass(nn.Module):
@@ -21,7 +21,7 @@ class ConstantMass(nn.Module):
         ("raw_armature", "armature", "kg m^2, kg"),
     )
 
-    def __init__(self, joints: Joints, entries: Entries, constants: Pairs) -> None:
+    def __init__(self, joints: Joints, entries: Layout, constants: Pairs) -> None:
         super().__init__()
         self.entries = entries
         self.constant_scale = nn.Buffer(vector(unit for _, unit in constants))

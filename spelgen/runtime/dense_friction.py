@@ -20,11 +20,10 @@ class DenseFriction(nn.Module):
     def __init__(self, joints: Joints, network: Network, axes: int) -> None:
         super().__init__()
         self.speed, self.nominal = nn.Buffer(vector(joints.speed)), nn.Buffer(vector(joints.friction))
-        rows = axes * joints.n
+        rows = axes * len(joints.speed)
         row, column = torch.tril_indices(rows, rows)
         # spreads the numbers of a lower triangle, row by row, over a matrix: (rows, rows, numbers)
-        spread = torch.zeros(rows, rows, len(row), dtype=torch.float64)
-        spread[row, column, torch.arange(len(row))] = 1.0
+        spread = torch.eye(rows * rows).double()[:, rows * row + column].reshape(rows, rows, -1)
         self.entries = nn.Buffer(spread[axes - 1 :: axes])
         self.start = nn.Buffer(FACTOR_START * torch.eye(rows).double()[axes - 1 :: axes])
         self.network = network

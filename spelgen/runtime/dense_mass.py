@@ -29,7 +29,7 @@ def nominal_factor(joints: Joints, mean: Sequence[Sequence[float]]) -> Tensor:
     ``mean`` is the lower triangle of the nominal mean of M without armature. z of each joint
     moves; about its other axes a joint is taken to be as heavy as about z.
     """
-    n = joints.n
+    n = len(joints.speed)
     mass = torch.zeros(n, n, dtype=torch.float64)
     row, column = torch.tril_indices(n, n)
     mass[row, column] = mass[column, row] = vector(x for entries in mean for x in entries)
@@ -51,7 +51,7 @@ class DenseMass(nn.Module):
 
     def __init__(self, joints: Joints, mean: Sequence[Sequence[float]], network: Network) -> None:
         super().__init__()
-        self.size = 3 * joints.n
+        self.size = 3 * len(joints.speed)
         factor = nominal_factor(joints, mean)
         self.nominal = nn.Buffer(factor)
         self.moving = nn.Buffer(torch.linalg.inv(factor)[:, 2::3])

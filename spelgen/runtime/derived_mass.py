@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.parts import Entries, Intermediates, Layers, Network, Pairs
+from spelgen.runtime.parts import Intermediates, Layers, Layout, Network, Pairs
 
 
 class DerivedMass(nn.Module):
@@ -28,16 +28,10 @@ class DerivedMass(nn.Module):
     )
 
     def __init__(
-        self,
-        joints: Joints,
-        entries: Entries,
-        functions: Pairs,
-        constants: Pairs,
-        network: Network,
-        margin: float,
+        self, joints: Joints, entries: Layout, functions: Pairs, constants: Pairs, net: Network, margin: float
     ) -> None:
         super().__init__()
-        self.entries, self.network = entries, network
+        self.entries, self.network = entries, net
         self.constant_scale = nn.Buffer(vector(unit for _, unit in constants))
         self.function_mean = nn.Buffer(vector(mean for mean, _ in functions))
         self.function_scale = nn.Buffer(vector(scale for _, scale in functions))

@@ -14,6 +14,9 @@ from spelgen.runtime.joints import Joints, vector
 # where the constants start, relative to a joint's usual friction and speed
 STRIBECK = 0.3  # dry friction that only slow motion has
 STRIBECK_VELOCITY = 0.03  # where that has faded
+STRIBECK_ROUNDING = (
+    10.0  # by that velocity: above 1 the fall is nearly a Gaussian, far below it begins at rest
+)
 SMOOTHING_VELOCITY = 0.006  # over which dry friction turns around
 # the same of joints whose friction has no memory though others' has: a wider turn looks like memory
 SHARP_VELOCITY = 0.001
@@ -33,6 +36,7 @@ class FrictionConstants(NamedTuple):
     coulomb: Tensor  # [Nm, N]
     stribeck: Tensor  # [Nm, N]
     stribeck_velocity: Tensor  # [rad/s, m/s]
+    stribeck_rounding: Tensor  # by that velocity
     coulomb_smoothing_velocity: Tensor  # [rad/s, m/s]
     load_dependence: Tensor  # dry friction by gravity torque
     least_load: Tensor  # [Nm, N]
@@ -44,13 +48,15 @@ class FrictionLaws(nn.Module):
     """Friction which resists whatever the weights are: they are logarithms.
 
     viscous qd + saturation turned(qd, saturation_velocity)
-    + (coulomb + stribeck / (1 + (qd / stribeck_velocity)^2 / 16)^16 + load_dependence load) direction,
-    with the load sqrt(gravity torque^2 + least_load^2) and turned(x, width) = x / sqrt(x^2 + width^2).
+    + (coulomb + stribeck / (1 + (1 + r) v^2 / (v + r) / 8)^8 + load_dependence load) direction, with
+    v = |qd| / stribeck_velocity, r the rounding, load = sqrt(gravity torque^2 + least_load^2) and
+    turned(x, width) = x / sqrt(x^2 + width^2).
 
     The direction, from -1 to 1, is that of the bristles, sum of fraction z / reach; at joints without
     memory, or where nothing is known of the way here, turned(qd, coulomb_smoothing_velocity).
     No law has an exponential: a control loop has them in a third of the time. The Stribeck effect is the
-    Gaussian of Armstrong-Helouvry (Control of Machines with Friction, 1991) to 1 %.
+    nearly the Gaussian of Armstrong-Helouvry (Control of Machines with Friction, 1991) where r is large, and
+    the exponential of Bo and Pavelescu (Wear 82:277, 1982), without its corner at rest, where it is small.
     """
 
     kinds = (
@@ -68,6 +74,7 @@ class FrictionLaws(nn.Module):
     nominal: Tensor
     speed: Tensor
     memoryless: Tensor
+    stribeck_rounding: Tensor
     raw_coulomb_smoothing_velocity: nn.Parameter | None
     raw_bristle_fractions: nn.Parameter | None
 
@@ -75,10 +82,11 @@ class FrictionLaws(nn.Module):
         super().__init__()
         self.register_buffer("nominal", vector(joints.friction))
         self.register_buffer("speed", vector(joints.speed))
-        self.bristles = Bristles(reach or [[]] * joints.n)
-        start = torch.zeros(joints.n, dtype=torch.float64)
+        self.bristles = Bristles(reach or [[]] * len(joints.speed))
+        start = torch.zeros(len(joints.speed), dtype=torch.float64)
         # no parameter: a fit to torques compares both forms
         self.register_buffer("memoryless", torch.full_like(start, 0.0 if reach else 1.0))
+        self.register_buffer("stribeck_rounding", torch.full_like(start, STRIBECK_ROUNDING))
         self.raw_viscous = nn.Parameter(start.clone())
         self.raw_saturation = nn.Parameter(start.clone())
         self.raw_saturation_velocity = nn.Parameter(start.clone())
@@ -108,6 +116,7 @@ class FrictionLaws(nn.Module):
             coulomb=size * self.raw_coulomb.exp(),
             stribeck=STRIBECK * size * self.raw_stribeck.exp(),
             stribeck_velocity=STRIBECK_VELOCITY * speed * self.raw_stribeck_velocity.exp(),
+            stribeck_rounding=self.stribeck_rounding,
             coulomb_smoothing_velocity=self.sharp_velocity
             if smoothing is None
             else SMOOTHING_VELOCITY * speed * smoothing.exp(),
@@ -169,8 +178,10 @@ class FrictionLaws(nn.Module):
     @staticmethod
     def dry(qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
         """The size of dry friction, (..., n) [Nm, N]."""
-        fall = 1 / (1 + (qd / c.stribeck_velocity).square() / 16)
-        slow = fall.square().square().square().square()  # a power of 16 takes twice the time
+        speed = qd.abs() / c.stribeck_velocity
+        rounding = c.stribeck_rounding
+        slow = 1 / (1 + (1 + rounding) / 8 * speed.square() / (speed + rounding))
+        slow = slow.square().square().square()  # a power of 8 takes twice the time
         load = (gravity.square() + c.least_load**2).sqrt()
         return c.coulomb + c.stribeck * slow + c.load_dependence * load
 

@@ -18,12 +18,6 @@ class Joints(NamedTuple):
     speed: tuple[float, ...]  # usual velocity
     friction: tuple[float, ...]  # usual size of the friction torque
     armature: tuple[float, ...]  # nominal rotor inertia times gear squared [kg m^2, kg]
-    actuated: tuple[bool, ...]
-
-    @property
-    def n(self) -> int:
-        """The number of joints."""
-        return len(self.revolute)
 
 
 def vector(values: Iterable[float]) -> Tensor:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.encoding import NetworkInput, joint_mask
-from spelgen.runtime.parts import Intermediates, Layers, Units
+from spelgen.runtime.masked_mlp import joint_masks
+from spelgen.runtime.parts import Intermediates, Layers, Rows, Units
 
 GRID = 4  # bumps on an edge
 SPACING = 2 / (GRID - 1)
@@ -24,44 +23,35 @@ class Bumps(NamedTuple):
 
 
 class MaskedKAN(nn.Module):
-    """A Kolmogorov-Arnold network.
+    """A Kolmogorov-Arnold network of ``depth`` hidden layers; units have no path to a joint they must
+    not depend on. It reads a row of numbers for all joints, then the next; ``sensitivity`` scales each.
 
     Each edge from an input to a unit has a learned function of its own: a sum of Gaussian bumps on
     a grid over [-1, 1] (Li, arXiv 2405.06721, in place of the splines of Liu et al., arXiv
     2404.19756). It starts nearly straight, with a random slope: few samples do not smooth what
-    starts wavy. tanh keeps what a layer hands on within the grid. ``layers`` names, unit by unit,
-    the joints that each layer's units may read; edges between others are masked, so that a unit
-    has no path to a joint it must not depend on.
+    starts wavy. tanh keeps what a layer hands on within the grid.
     """
 
-    def __init__(self, inputs: NetworkInput, layers: Sequence[Units], generator: torch.Generator) -> None:
+    def __init__(
+        self, generator: torch.Generator, sensitivity: Rows, hidden: Units, outputs: Units, depth: int = 2
+    ) -> None:
         super().__init__()
         grid = torch.linspace(-1, 1, GRID, dtype=torch.float64)
         self.grid = nn.Buffer(grid / SPACING)
-        bumps = torch.eye(GRID, dtype=torch.float64)
-        # the bumps of -x are those of x in reverse
-        forth, back = inputs.matrix.clamp(min=0), (-inputs.matrix).clamp(min=0)
-        self.matrix = nn.Buffer(torch.kron(forth, bumps) + torch.kron(back, bumps.flip(0)))
-        still = 1 - inputs.matrix.abs().sum(dim=1, keepdim=True)
-        self.offset = nn.Buffer((still * self._bumps(inputs.offset).height).flatten())
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
-        below: Units = [(joint,) for joint in inputs.joints]
-        for index, units in enumerate(layers):
-            mask = joint_mask(units, below).unsqueeze(-1)
-            slope = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
-            self.weights.append(nn.Parameter(slope * grid / mask.sum(dim=1, keepdim=True).sqrt()))
-            self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
-            mask = mask * inputs.sensitivity.unsqueeze(-1) if index == 0 else mask
-            self.register_buffer(f"mask{index}", mask)
-            below = units
+        for index, mask in enumerate(joint_masks(sensitivity, [hidden] * depth + [outputs])):
+            edges = mask.unsqueeze(-1)
+            slope = torch.randn(edges.shape, dtype=torch.float64, generator=generator)
+            readable = (edges != 0).double().sum(dim=1, keepdim=True)
+            self.weights.append(nn.Parameter(slope * grid / readable.sqrt()))
+            self.biases.append(nn.Parameter(torch.zeros(len(mask), dtype=torch.float64)))
+            self.register_buffer(f"mask{index}", edges)
         nn.init.zeros_(self.weights[-1])  # so that nothing is learned yet
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
-        """Return the weights for the encoding as it is, and for offset + output_map y in place of y."""
+        """Return the masked weights, for offset + output_map y in place of y."""
         weights = [(w * self.get_buffer(f"mask{i}")).flatten(1) for i, w in enumerate(self.weights)]
         biases = list(self.biases)
-        biases[0] = biases[0] + weights[0] @ self.offset
-        weights[0] = weights[0] @ self.matrix
         weights[-1], biases[-1] = output_map @ weights[-1], offset + output_map @ biases[-1]
         return tuple(zip(weights, biases, strict=True))
 

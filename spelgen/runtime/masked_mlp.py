@@ -2,43 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.encoding import NetworkInput, joint_mask
-from spelgen.runtime.parts import Intermediates, Layers, Units
+from spelgen.runtime.joints import vector
+from spelgen.runtime.parts import Intermediates, Layers, Rows, Units
+
+
+def joint_masks(sensitivity: Rows, layers: Sequence[Units]) -> Iterator[Tensor]:
+    """Yield what scales each layer's weights, (units, units below): 0 where one below reads more joints."""
+    below = [{joint} for row in sensitivity for joint in range(len(row))]
+    scale = torch.cat([vector(row) for row in sensitivity])
+    for groups in layers:
+        units = [set(joints) for joints, count in groups for _ in range(count)]
+        yield scale * torch.stack([vector(lower <= unit for lower in below) for unit in units])
+        below, scale = units, torch.ones(len(units), dtype=torch.float64)
 
 
 class MaskedMLP(nn.Module):
-    """A tanh network.
+    """A tanh network of ``depth`` hidden layers; units have no path to a joint they must not depend on.
 
-    ``layers`` names, unit by unit, the joints that each layer's units may read; weights between
-    others are masked, so that a unit has no path to a joint it must not depend on.
+    It reads a row of numbers for all joints, then the next row; ``sensitivity`` scales each of them.
     """
 
-    def __init__(self, inputs: NetworkInput, layers: Sequence[Units], generator: torch.Generator) -> None:
+    def __init__(
+        self, generator: torch.Generator, sensitivity: Rows, hidden: Units, outputs: Units, depth: int = 2
+    ) -> None:
         super().__init__()
-        self.matrix, self.offset = nn.Buffer(inputs.matrix), nn.Buffer(inputs.offset)
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
-        below: Units = [(joint,) for joint in inputs.joints]
-        for index, units in enumerate(layers):
-            mask = joint_mask(units, below)
+        for index, mask in enumerate(joint_masks(sensitivity, [hidden] * depth + [outputs])):
             weight = torch.randn(mask.shape, dtype=torch.float64, generator=generator)
-            self.weights.append(nn.Parameter(weight / mask.sum(dim=1, keepdim=True).sqrt()))
-            self.biases.append(nn.Parameter(torch.zeros(len(units), dtype=torch.float64)))
-            self.register_buffer(f"mask{index}", mask * inputs.sensitivity if index == 0 else mask)
-            below = units
+            readable = (mask != 0).double().sum(dim=1, keepdim=True)
+            self.weights.append(nn.Parameter(weight / readable.sqrt()))
+            self.biases.append(nn.Parameter(torch.zeros(len(mask), dtype=torch.float64)))
+            self.register_buffer(f"mask{index}", mask)
         nn.init.zeros_(self.weights[-1])  # so that nothing is learned yet
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
-        """Return the weights for the encoding as it is, and for offset + output_map y in place of y."""
+        """Return the masked weights, for offset + output_map y in place of y."""
         weights = [weight * self.get_buffer(f"mask{index}") for index, weight in enumerate(self.weights)]
         biases = list(self.biases)
-        biases[0] = biases[0] + weights[0] @ self.offset
-        weights[0] = weights[0] @ self.matrix
         weights[-1], biases[-1] = output_map @ weights[-1], offset + output_map @ biases[-1]
         return tuple(zip(weights, biases, strict=True))
 

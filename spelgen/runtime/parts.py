@@ -10,12 +10,12 @@ from torch import Tensor
 Row = tuple[float, float, float]
 Rows = Sequence[Sequence[float]]
 Pairs = Sequence[tuple[float, float]]
-Entries = Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]  # a matrix by functions and constants
-Units = Sequence[tuple[int, ...]]  # of a layer: the joints that each may read
+Layout = Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]  # a matrix by functions and constants
+Units = Sequence[tuple[tuple[int, ...], int]]  # of a layer: which joints so many units may read
 Layers = tuple[tuple[Tensor, Tensor], ...]  # a network's weights and biases, ready for many states
 Intermediates = Any  # what a part's derivatives need of the work done for its values
-# an emitted module has the type of its own dynamics under each of these names
 Prepared = Any  # all that depends on the weights alone
+# an emitted module has the type of its own dynamics under this name
 Pose = Any  # all that depends on q alone
 
 

@@ -7,7 +7,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.parts import Pose, Prepared
 
 
@@ -23,8 +22,7 @@ class PortHamiltonian(nn.Module):
 
     The port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014).
     q, qd, qdd, tau and p are (..., n), with any leading dimensions; rad and Nm, m and N if prismatic. In
-    place of q methods take a pose, too: all that depends on q, M as ``mass``, which ``at`` works out once
-    for several of them. ``prepared`` is what ``prepare`` gave: all that depends on the weights alone.
+    place of q methods take a pose, too: all that depends on q, which ``at`` works out once for several.
     """
 
     n: int
@@ -32,30 +30,22 @@ class PortHamiltonian(nn.Module):
     prepare: Callable[..., Prepared]
     configuration: Callable[[Tensor, Prepared], Pose]
     potential_energy: Callable[[Tensor | Pose], Tensor]  # V, (...) [J]
-    gravity: Callable[[Tensor | Pose], Tensor]  # dV/dq
     lagrangian_gradient: Callable[[Tensor | Pose, Tensor], Tensor]  # d/dq of 1/2 qd^T M qd - V
     nonlinear_effects: Callable[[Tensor | Pose, Tensor], Tensor]  # Coriolis, centrifugal, gravity torque
     friction_torque: Callable[..., Tensor]  # D(q, qd) qd
-
-    def __init__(self, joints: Joints) -> None:
-        super().__init__()
-        # 1 where a joint is driven, 0 where it is passive
-        self.actuated = nn.Buffer(vector(float(x) for x in joints.actuated))
 
     def at(self, q: Tensor | Pose, *others: Tensor, prepared: Prepared | None = None) -> Pose:
         """Return the pose at q. Raises TypeError or ValueError for vectors not as q and the weights."""
         if isinstance(q, tuple):
             return q  # a pose already: what stands beside it is not checked
-        expected = self.actuated.dtype
+        dtype = self.get_buffer("friction.nominal").dtype
         for x in (q, *others):
             kind = x.dtype if isinstance(x, Tensor) else type(x).__name__
-            if kind != expected:
-                advice = f"pass torch.as_tensor(x, dtype={expected})"
-                raise TypeError(f"got {kind}, expected a tensor of {expected} like the weights; {advice}")
+            if kind != dtype:
+                raise TypeError(f"got {kind}, expected a {dtype} tensor: torch.as_tensor(x, dtype={dtype})")
             if x.shape != (*q.shape[:-1], self.n):
                 shapes = " and ".join(str(tuple(each.shape)) for each in (q, *others))
-                advice = "pass states side by side, the joints last"
-                raise ValueError(f"got shapes {shapes}, expected (..., {self.n}) of all alike; {advice}")
+                raise ValueError(f"got shapes {shapes}, expected (..., {self.n}) of all alike, joints last")
         return self.configuration(q, self.prepare() if prepared is None else prepared)
 
     def mass_matrix(self, q: Tensor | Pose) -> Tensor:
@@ -63,16 +53,21 @@ class PortHamiltonian(nn.Module):
         mass: Tensor = self.at(q).mass
         return mass
 
+    def gravity(self, q: Tensor | Pose) -> Tensor:
+        """Return dV/dq, (..., n) [Nm, N]."""
+        pose = self.at(q)
+        return -self.lagrangian_gradient(pose, torch.zeros_like(pose.mass[..., 0]))
+
     def input_matrix(self, q: Tensor) -> Tensor:
-        """Return G(q), (..., n, n): an input is the torque of its own joint, none of a passive one."""
-        return torch.diag(self.actuated).expand(*q.shape, -1)
+        """Return G(q), (..., n, n): an input is the torque of its own joint."""
+        return torch.eye(self.n).to(q).expand(*q.shape, -1)
 
     def input_force(self, pose: Pose, qd: Tensor, tau: Tensor) -> Tensor:
         """Return G tau, (..., n) [Nm, N]."""
-        return self.actuated * tau
+        return tau
 
     def input_torque(self, pose: Pose, qd: Tensor, force: Tensor) -> Tensor:
-        """Return the tau, (..., n), that makes this force; a passive joint shows the torque it lacks."""
+        """Return the tau, (..., n), that makes this force."""
         return force
 
     def momentum(self, q: Tensor | Pose, qd: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from spelgen.runtime.encoding import JointEncoding
 from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.parts import Entries, Intermediates, Layers, Network
+from spelgen.runtime.parts import Intermediates, Layers, Layout, Network
 from spelgen.runtime.port_hamiltonian import applied
 
 SPLINES = 34  # over the range of a joint
@@ -69,7 +69,7 @@ class ResidualTerms(nn.Module):
         self,
         joints: Joints,
         gear: Sequence[float],
-        entries: Entries,
+        entries: Layout,
         functions: int,
         constants: int,
         network: Network | None,
@@ -77,7 +77,8 @@ class ResidualTerms(nn.Module):
         scale: float,
     ) -> None:
         super().__init__()
-        n, zeros = joints.n, torch.zeros(joints.n, SPLINES, dtype=torch.float64)
+        n = len(joints.speed)
+        zeros = torch.zeros(n, SPLINES, dtype=torch.float64)
         self.encoding = JointEncoding(joints)
         spacing = 2 * vector(joints.reach).unsqueeze(-1) / (SPLINES - 3)
         knots = torch.arange(SPLINES).double() - (SPLINES - 1) / 2

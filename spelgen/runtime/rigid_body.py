@@ -128,10 +128,10 @@ class InertialParameters(nn.Module):
 
     def forward(self) -> Tensor:
         """Return, by body, (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
-        root = self.factors @ body_factor((self.raw @ self.triangle).reshape(-1, 4, 4))
+        root = self.factors @ body_factor(torch.unflatten(self.raw @ self.triangle, -1, (4, 4)))
         pseudo = root @ root.mT
-        second = pseudo[:, :3, :3]
+        second = pseudo[..., :3, :3]
         trace = second.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
-        inertia = trace[:, None, None] * torch.eye(3).to(pseudo) - second
+        inertia = trace[..., None, None] * torch.eye(3).to(pseudo) - second
         row, column = torch.triu_indices(3, 3)
-        return torch.cat([pseudo[:, 3, 3:], pseudo[:, 3, :3], inertia[:, row, column]], dim=-1)
+        return torch.cat([pseudo[..., 3, 3:], pseudo[..., 3, :3], inertia[..., row, column]], dim=-1)

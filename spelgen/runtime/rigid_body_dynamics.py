@@ -52,17 +52,19 @@ class RigidBodyDynamics(PortHamiltonian):
     def __init__(
         self, joints: Joints, bodies: Bodies, gravity: Row, reach: Rows = (), motors: Rows = ()
     ) -> None:
-        super().__init__(joints)
-        zeros = torch.zeros(joints.n, dtype=torch.float64)
+        super().__init__()
+        # 1 where the measured torque moves a joint, (n,)
+        self.actuated = nn.Buffer(self.input_matrix(vector([0.0] * self.n)).any(dim=0).double())
+        n, zeros = len(joints.speed), torch.zeros(len(joints.speed), dtype=torch.float64)
         self.elements = len(reach[0]) if reach else 0
-        self.chain = BodyChain(joints.n, bodies, gravity)
+        self.chain = BodyChain(n, bodies, gravity)
         self.basis = nn.Buffer(spatial_inertia(torch.eye(10).double()))
         self.bodies, self.friction = InertialParameters(bodies), FrictionLaws(joints, reach)
         self.nominal_armature = nn.Buffer(vector(joints.armature))
         self.raw_armature = nn.Parameter(zeros.clone())  # its logarithm
         # C, (n, n), and its inverse; each drive moves its own joint alone where it is not given
         rows = [vector(row) for row in motors]
-        self.motors = nn.Buffer(torch.stack(rows) if rows else torch.eye(joints.n).double())
+        self.motors = nn.Buffer(torch.stack(rows) if rows else torch.eye(n).double())
         self.loads = nn.Buffer(torch.linalg.inv(self.motors))
         # of the measured torque, in units of the joints' usual friction
         self.raw_offset = nn.Parameter(zeros.clone())
@@ -123,12 +125,9 @@ class RigidBodyDynamics(PortHamiltonian):
         return pose.gravity
 
     def lagrangian_gradient(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
-        """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n).
-
-        The kinetic part: the momentum of all that a joint carries, by what its displacement adds to
-        their twist.
-        """
+        """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
         pose: Motion = self.at(q, qd)
+        # the momentum of all that a joint carries, by what its displacement adds to their twist
         momenta = self.chain.at_base(pose.chain, applied(pose.momenta.mT, qd))
         return self.chain.by_joints(self.chain.turning(pose.chain, qd)[1], momenta) - pose.gravity
 

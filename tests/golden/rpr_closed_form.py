@@ -26,9 +26,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 6, "robot": "rpr", "urdf": "rpr.urdf",
+FACTS = r"""{"format": 7, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "5749d27750f265dce1c8451f5ac6960b7c391ed7748debfd74c6fb89b677b012",
+ "spec_sha256": "fd9844abd9d2c3ac7c9888bcacbdd0f8d4d105f63b86e2ca3ef52f16fb43a600",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
   "net": null, "preset": "closed-form", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
@@ -42,7 +42,6 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows]:
     joints = Joints(
         revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
         speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
-        actuated=(True, True, True),
     )  # fmt: skip
     bodies = Bodies(
         parent=(-1, 0, 1), joint=(0, 1, 2), revolute=(True, False, True), ratio=(1.0, 1.0, 1.0),
@@ -61,19 +60,16 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows]:
     )  # fmt: skip
     return (
         joints, bodies, (0.0, 0.0, -9.81),
-        ((0.0001, 0.001, 0.01, 0.1), (1e-05, 0.0001, 0.001, 0.01), (0.0001, 0.001, 0.01, 0.1)), (),
+        (
+            (0.0001, 0.0004, 0.0016, 0.0064, 0.025, 0.1), (1e-05, 4e-05, 0.00016, 0.00064, 0.0025, 0.01),
+            (0.0001, 0.0004, 0.0016, 0.0064, 0.025, 0.1),
+        ),
+        (),
     )  # fmt: skip
 
 
-# ---- this arm's model ----
-
-
 class Model(RigidBodyDynamics):
-    """The arm's dynamics: 3 rigid bodies with trained inertial parameters.
-
-    For all weights M is positive definite, D positive semi-definite.
-    z, (..., n, 4), friction's memory, is how far its bristles are bent [rad, m]; None: they slide as qd goes.
-    """
+    """The arm's dynamics: 3 rigid bodies with trained inertial parameters."""
 
     n = 3
     joint_names = ("joint1", "joint2", "joint3")

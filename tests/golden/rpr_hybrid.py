@@ -21,16 +21,16 @@ Joints, in the order of q, qd and tau:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 6, "robot": "rpr", "urdf": "rpr.urdf",
+FACTS = r"""{"format": 7, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "765da56814f8b95376bd87633bc5dfaec8f5161fa9db5448b6d7d871c48b3080",
+ "spec_sha256": "420b54556321f503f4c5eabb13f403d60e6723206638c7ceba9548528c905488",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
   "net": "mlp", "preset": "hybrid", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
@@ -52,7 +52,6 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualTerm
     joints = Joints(
         revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
         speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
-        actuated=(True, True, True),
     )  # fmt: skip
     bodies = Bodies(
         parent=(-1, 0, 1), joint=(0, 1, 2), revolute=(True, False, True), ratio=(1.0, 1.0, 1.0),
@@ -70,36 +69,29 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualTerm
         ),
     )  # fmt: skip
     generator = torch.Generator().manual_seed(seed)
-    mass_outputs = ((2,),) + ((1, 2),) * 2
-    mass_hidden = ((2,),) * 21 + ((1, 2),) * 43
     network = Network(
-        joint_input(joints, (1, 2), (0.02, 1.0, 0.518)), (mass_hidden, mass_hidden, mass_outputs), generator
-    )
-    potential_outputs = ((2,),)
-    potential_hidden = ((2,),) * 32
-    potential = Network(
-        joint_input(joints, (2,), (0.02, 0.02, 1.0)), (potential_hidden, potential_hidden, potential_outputs),
-        generator,
+        generator, ((0.02, 1.0, 0.518), (0.02, 1.0, 0.518)), hidden=(((2,), 21), ((1, 2), 43)),
+        outputs=(((2,), 1), ((1, 2), 2)),
     )  # fmt: skip
+    potential = Network(
+        generator, ((0.02, 0.02, 1.0), (0.02, 0.02, 1.0)), hidden=(((2,), 32),), outputs=(((2,), 1),)
+    )
     residuals = ResidualTerms(
         joints, (1.0, 1.0, 1.0), mass_entries, functions=3, constants=2, network=network, potential=potential,
         scale=0.703291,
     )  # fmt: skip
     return (
         joints, bodies, (0.0, 0.0, -9.81),
-        ((0.0001, 0.001, 0.01, 0.1), (1e-05, 0.0001, 0.001, 0.01), (0.0001, 0.001, 0.01, 0.1)), (), residuals,
+        (
+            (0.0001, 0.0004, 0.0016, 0.0064, 0.025, 0.1), (1e-05, 4e-05, 0.00016, 0.00064, 0.0025, 0.01),
+            (0.0001, 0.0004, 0.0016, 0.0064, 0.025, 0.1),
+        ),
+        (), residuals,
     )  # fmt: skip
 
 
-# ---- this arm's model ----
-
-
 class Model(ResidualDynamics):
-    """The arm's dynamics: 3 rigid bodies with trained inertial parameters, and residual networks.
-
-    For all weights M is positive definite, D positive semi-definite.
-    z, (..., n, 4), friction's memory, is how far its bristles are bent [rad, m]; None: they slide as qd goes.
-    """
+    """The arm's dynamics: 3 rigid bodies with trained inertial parameters, and residual networks."""
 
     n = 3
     joint_names = ("joint1", "joint2", "joint3")

@@ -19,16 +19,16 @@ Joints, in the order of q, qd and tau:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 6, "robot": "rpr", "urdf": "rpr.urdf",
+FACTS = r"""{"format": 7, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "78e16dc7ad67f88500d19ab13a555f327d630ef495be053e71cb4ca2d0ce6f84",
+ "spec_sha256": "146b09931965e3ae2d9a3d682f864a1c6805907d909fc9580bc067c5ccdf832a",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
   "net": "mlp", "preset": "minimal", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
@@ -50,37 +50,30 @@ def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction]:
     joints = Joints(
         revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
         speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
-        actuated=(True, True, True),
     )  # fmt: skip
     generator = torch.Generator().manual_seed(seed)
-    mass_outputs = ((2,),) + ((1, 2),) * 2
-    mass_hidden = ((2,),) * 21 + ((1, 2),) * 43
     network = Network(
-        joint_input(joints, (1, 2), (0.02, 1.0, 0.518)), (mass_hidden, mass_hidden, mass_outputs), generator
-    )
+        generator, ((0.02, 1.0, 0.518), (0.02, 1.0, 0.518)), hidden=(((2,), 21), ((1, 2), 43)),
+        outputs=(((2,), 1), ((1, 2), 2)),
+    )  # fmt: skip
     mass = Mass(
         joints, mass_entries,
         functions=((-0.00167665, 1.36528), (-0.00154309, 0.0595527), (139.887, 12.6351)),
-        constants=((0.0101411, 0.0101411), (5.33, 5.33)), network=network, margin=0.08,
+        constants=((0.0101411, 0.0101411), (5.33, 5.33)), net=network, margin=0.08,
     )  # fmt: skip
-    potential_outputs = ((2,),)
-    potential_hidden = ((2,),) * 32
     potential = Network(
-        joint_input(joints, (2,), (0.02, 0.02, 1.0)), (potential_hidden, potential_hidden, potential_outputs),
-        generator,
+        generator, ((0.02, 0.02, 1.0), (0.02, 0.02, 1.0)), hidden=(((2,), 32),), outputs=(((2,), 1),)
+    )
+    network = Network(
+        generator, ((0.1, 0.1, 0.1), (0.1, 0.1, 0.1), (0.3333, 1.0, 0.1667), (1.0, 1.0, 1.0)),
+        hidden=(((0,), 8), ((1,), 8), ((2,), 8)), outputs=(((0,), 1), ((1,), 1), ((2,), 1)), depth=1,
     )  # fmt: skip
-    friction = Friction(joints, generator)
+    friction = Friction(joints, network)
     return (joints, mass, potential, 0.703291, friction)
 
 
-# ---- this arm's model ----
-
-
 class Model(NetworkDynamics):
-    """The arm's dynamics: 3 learned functions of q and 2 constants make the mass matrix.
-
-    For all weights M is positive definite, D positive semi-definite.
-    """
+    """The arm's dynamics: 3 learned functions of q and 2 constants make the mass matrix."""
 
     n = 3
     joint_names = ("joint1", "joint2", "joint3")

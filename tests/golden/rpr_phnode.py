@@ -20,16 +20,16 @@ Joints, in the order of q, qd and tau:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 6, "robot": "rpr", "urdf": "rpr.urdf",
+FACTS = r"""{"format": 7, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "d6dad934a75884d2aac3b6ac8d416f824749ba5567be3358835a594118798460",
+ "spec_sha256": "a3178383c59411fcd1be26f55c056099de06bfe3983bfdf4c079e77e030c84ce",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
   "net": "mlp", "preset": "phnode", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
@@ -43,46 +43,32 @@ def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction, Netwo
     joints = Joints(
         revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
         speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
-        actuated=(True, True, True),
     )  # fmt: skip
     generator = torch.Generator().manual_seed(seed)
-    mass_outputs = ((0, 1, 2),) * 45
-    mass_hidden = ((0, 1, 2),) * 64
     network = Network(
-        lie_group_input(joints, (0.02, 1.0, 0.518)), (mass_hidden, mass_hidden, mass_outputs), generator
-    )
+        generator, ((0.02, 1.0, 0.518), (0.02, 1.0, 0.518)), hidden=(((0, 1, 2), 64),),
+        outputs=(((0, 1, 2), 45),),
+    )  # fmt: skip
     mass = Mass(
         joints, mean=((139.887,), (-0.00167665, 5.33), (-0.00154309, 0.0, 0.0101411)), network=network
     )
-    potential_outputs = ((0, 1, 2),)
-    potential_hidden = ((0, 1, 2),) * 32
     potential = Network(
-        lie_group_input(joints, (0.02, 0.02, 1.0)), (potential_hidden, potential_hidden, potential_outputs),
-        generator,
+        generator, ((0.02, 0.02, 1.0), (0.02, 0.02, 1.0)), hidden=(((0, 1, 2), 32),),
+        outputs=(((0, 1, 2), 1),),
     )  # fmt: skip
-    friction_outputs = ((0, 1, 2),) * 45
-    friction_hidden = ((0, 1, 2),) * 64
     network = Network(
-        with_velocities(lie_group_input(joints, (0.1, 0.1, 0.1)), joints, 3),
-        (friction_hidden, friction_hidden, friction_outputs), generator,
+        generator, ((0.1, 0.1, 0.1), (0.1, 0.1, 0.1), (1.0, 1.0, 1.0)), hidden=(((0, 1, 2), 64),),
+        outputs=(((0, 1, 2), 45),),
     )  # fmt: skip
     friction = Friction(joints, network, axes=3)
-    input_outputs = ((0, 1, 2),) * 9
-    input_hidden = ((0, 1, 2),) * 64
     network = Network(
-        lie_group_input(joints, (1.0, 1.0, 1.0)), (input_hidden, input_hidden, input_outputs), generator
+        generator, ((1.0, 1.0, 1.0), (1.0, 1.0, 1.0)), hidden=(((0, 1, 2), 64),), outputs=(((0, 1, 2), 9),)
     )
     return (joints, mass, potential, 0.703291, friction, network)
 
 
-# ---- this arm's model ----
-
-
 class Model(DenseInput):
-    """The arm's dynamics: 45 learned functions of q make M^-1 over all axes.
-
-    For all weights M is positive definite, D positive semi-definite.
-    """
+    """The arm's dynamics: 45 learned functions of q make M^-1 over all axes."""
 
     n = 3
     joint_names = ("joint1", "joint2", "joint3")

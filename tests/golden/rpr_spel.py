@@ -19,16 +19,16 @@ Joints, in the order of q, qd and tau:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 6, "robot": "rpr", "urdf": "rpr.urdf",
+FACTS = r"""{"format": 7, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "e2b2672a0a0a3b1db747c3df581d770cde90de47558dd2a7f6cba3fa4a39f7c1",
+ "spec_sha256": "83c253b456d357e1db84159b27c7c5cd54cc9ec0e5074273f980395919fbe118",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
   "net": "mlp", "preset": "spel", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
@@ -50,43 +50,31 @@ def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction]:
     joints = Joints(
         revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
         speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
-        actuated=(True, True, True),
     )  # fmt: skip
     generator = torch.Generator().manual_seed(seed)
-    mass_outputs = ((0, 1, 2),) * 3
-    mass_hidden = ((0, 1, 2),) * 64
     network = Network(
-        lie_group_input(joints, (0.02, 1.0, 0.518)), (mass_hidden, mass_hidden, mass_outputs), generator
-    )
+        generator, ((0.02, 1.0, 0.518), (0.02, 1.0, 0.518)), hidden=(((0, 1, 2), 64),),
+        outputs=(((0, 1, 2), 3),),
+    )  # fmt: skip
     mass = Mass(
         joints, mass_entries,
         functions=((-0.00167665, 1.36528), (-0.00154309, 0.0595527), (139.887, 12.6351)),
-        constants=((0.0101411, 0.0101411), (5.33, 5.33)), network=network, margin=0.08,
+        constants=((0.0101411, 0.0101411), (5.33, 5.33)), net=network, margin=0.08,
     )  # fmt: skip
-    potential_outputs = ((0, 1, 2),)
-    potential_hidden = ((0, 1, 2),) * 32
     potential = Network(
-        lie_group_input(joints, (0.02, 0.02, 1.0)), (potential_hidden, potential_hidden, potential_outputs),
-        generator,
+        generator, ((0.02, 0.02, 1.0), (0.02, 0.02, 1.0)), hidden=(((0, 1, 2), 32),),
+        outputs=(((0, 1, 2), 1),),
     )  # fmt: skip
-    friction_outputs = ((0, 1, 2),) * 6
-    friction_hidden = ((0, 1, 2),) * 64
     network = Network(
-        with_velocities(lie_group_input(joints, (0.1, 0.1, 0.1)), joints, 1),
-        (friction_hidden, friction_hidden, friction_outputs), generator,
+        generator, ((0.1, 0.1, 0.1), (0.1, 0.1, 0.1), (1.0, 1.0, 1.0)), hidden=(((0, 1, 2), 64),),
+        outputs=(((0, 1, 2), 6),),
     )  # fmt: skip
     friction = Friction(joints, network, axes=1)
     return (joints, mass, potential, 0.703291, friction)
 
 
-# ---- this arm's model ----
-
-
 class Model(NetworkDynamics):
-    """The arm's dynamics: 3 learned functions of q and 2 constants make the mass matrix.
-
-    For all weights M is positive definite, D positive semi-definite.
-    """
+    """The arm's dynamics: 3 learned functions of q and 2 constants make the mass matrix."""
 
     n = 3
     joint_names = ("joint1", "joint2", "joint3")

@@ -19,16 +19,16 @@ Joints, in the order of q, qd and tau:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 6, "robot": "two_link", "urdf": "two_link.urdf",
+FACTS = r"""{"format": 7, "robot": "two_link", "urdf": "two_link.urdf",
  "urdf_sha256": "d5393c842e189b72219c5ce02e115de571a94cd406b48898ea64b5431a395232",
- "spec_sha256": "cf4c44ab15d7ac790beed5add4bf06756e7ac55956487a16b62ea4abe6154142",
+ "spec_sha256": "b39c214c5a314cd296914f6b9abedc38fa3070faab5ca6443958c25eee3b218d",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
   "net": "mlp", "preset": "hybrid", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "revolute"}}"""
@@ -50,7 +50,7 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualTerm
     """Return what this arm's `Model` is made of, with random weights of this seed."""
     joints = Joints(
         revolute=(True, True), center=(0.0, 0.0), reach=(3.14159, 3.14159), speed=(10.0, 10.0),
-        friction=(1.0, 1.0), armature=(0.1, 0.1), actuated=(True, True),
+        friction=(1.0, 1.0), armature=(0.1, 0.1),
     )  # fmt: skip
     bodies = Bodies(
         parent=(-1, 0), joint=(0, 1), revolute=(True, True), ratio=(1.0, 1.0), offset=(0.0, 0.0),
@@ -65,36 +65,23 @@ def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows, ResidualTerm
         ),
     )  # fmt: skip
     generator = torch.Generator().manual_seed(seed)
-    mass_outputs = ((1,),)
-    mass_hidden = ((1,),) * 64
-    network = Network(
-        joint_input(joints, (1,), (0.02, 1.0)), (mass_hidden, mass_hidden, mass_outputs), generator
-    )
-    potential_outputs = ((0, 1),)
-    potential_hidden = ((0, 1),) * 32
+    network = Network(generator, ((0.02, 1.0), (0.02, 1.0)), hidden=(((1,), 64),), outputs=(((1,), 1),))
     potential = Network(
-        joint_input(joints, (0, 1), (1.0, 0.307)), (potential_hidden, potential_hidden, potential_outputs),
-        generator,
-    )  # fmt: skip
+        generator, ((1.0, 0.307), (1.0, 0.307)), hidden=(((0, 1), 32),), outputs=(((0, 1), 1),)
+    )
     residuals = ResidualTerms(
         joints, (1.0, 1.0), mass_entries, functions=1, constants=2, network=network, potential=potential,
         scale=10.8194,
     )  # fmt: skip
     return (
-        joints, bodies, (0.0, -9.81, 0.0), ((0.0001, 0.001, 0.01, 0.1), (0.0001, 0.001, 0.01, 0.1)), (),
+        joints, bodies, (0.0, -9.81, 0.0),
+        ((0.0001, 0.0004, 0.0016, 0.0064, 0.025, 0.1), (0.0001, 0.0004, 0.0016, 0.0064, 0.025, 0.1)), (),
         residuals,
     )  # fmt: skip
 
 
-# ---- this arm's model ----
-
-
 class Model(ResidualDynamics):
-    """The arm's dynamics: 2 rigid bodies with trained inertial parameters, and residual networks.
-
-    For all weights M is positive definite, D positive semi-definite.
-    z, (..., n, 4), friction's memory, is how far its bristles are bent [rad, m]; None: they slide as qd goes.
-    """
+    """The arm's dynamics: 2 rigid bodies with trained inertial parameters, and residual networks."""
 
     n = 2
     joint_names = ("joint1", "joint2")

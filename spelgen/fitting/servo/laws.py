@@ -24,10 +24,11 @@ TUNING, SOLVER = ServoLawTuning(), ServoSolverTuning()
 
 def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
     """Return parameters with the dead zones that the joints turn out to have, which are fitted from then on."""
-    costs = problem.joint_costs(x, problem.residuals(x))
-    minimum, joint_costs = _joint_minima(problem, divided(problem, x, TUNING.dead_zone_fraction))
-    better = joint_costs + TUNING.significance**2 / 2 < costs  # never where a rollout left all bounds
-    joints, active = torch.where(better, minimum.joints, x.joints), x.active.clone()
+    problem.weigh(problem.residuals(x))
+    plain, plain_costs = _joint_minima(problem, x)
+    zoned, zoned_costs = _joint_minima(problem, divided(problem, x, TUNING.dead_zone_fraction))
+    better = zoned_costs + TUNING.significance**2 / 2 < plain_costs  # never where a rollout left all bounds
+    joints, active = torch.where(better, zoned.joints, plain.joints), x.active.clone()
     active[problem.rows.row(DEAD_ZONE)] = better
     return without_faint(problem, replace(x, joints=joints, active=active))
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -20,13 +20,13 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import digest
 from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
 from spelgen.fitting.levenberg_marquardt import SolverState, levenberg_marquardt
-from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
-from spelgen.fitting.run_record import Content
+from spelgen.fitting.objective import FitRequest, FitSummary, PreparedLogs, Status
+from spelgen.fitting.run_record import Content, ReadContent
 from spelgen.fitting.servo.laws import select_dead_zones, without_faint
 from spelgen.fitting.servo.linear_servos import fit_linear_servos
 from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
-from spelgen.fitting.servo.report import servo_record, solution
+from spelgen.fitting.servo.report import servo_record, servo_summary, solution
 from spelgen.fitting.servo.start import start_servos
 from spelgen.fitting.servo.windows import servo_windows
 from spelgen.fitting.streaming import LargeLogs
@@ -51,7 +51,7 @@ class ServoObjective:
     """
 
     name: ClassVar[str] = "servo"
-    follows_commands: ClassVar[bool] = True
+    input: ClassVar[Literal["torque", "position"]] = "position"
 
     def __init__(self, request: FitRequest) -> None:
         self.request = request
@@ -140,6 +140,11 @@ class ServoObjective:
         linear = fit_linear_servos(self._windows.thinned(TUNING.sparse_windows)).to_dict()
         self._results["servo"] = record | {"linear": linear}
         self._take_checkpoint(float(np.sqrt(np.square(record["rms"]).mean())))
+
+    @staticmethod
+    def summary(record: ReadContent) -> FitSummary | None:
+        """See `Objective`."""
+        return servo_summary(record)
 
     def checkpoint(self) -> Content:
         """Return that of the last round's beginning, or of the end."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -28,7 +28,7 @@ LOGARITHMS = ("armature", "sizes", "load_dependence")
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Samples (T, n) with the drives' speeds, and the regressors (T, n, 10 B) of torque and of the gravity torque that
+    """Samples (T, n) with the drives' motion, and the regressors (T, n, 10 B) of torque and of the gravity torque that
     the drives bear. residual: (T, n) torque of what stands beside rigid bodies. factor: (T, n) on friction.
     direction: (T, n) of dry friction without memory; None: as the speed has it.
     """
@@ -37,6 +37,7 @@ class _Samples:
     z: torch.Tensor | None
     direction: torch.Tensor | None
     speed: torch.Tensor
+    acceleration: torch.Tensor
     regressor: torch.Tensor
     load_regressor: torch.Tensor
     residual: torch.Tensor
@@ -53,32 +54,28 @@ class ResidualSamples(NamedTuple):
     friction: torch.Tensor
 
 
+class Slope(NamedTuple):
+    """How a joint's torque follows the columns (C,) of weights that move it: J (T, C); and what is missing (T,)."""
+
+    joint: int
+    columns: torch.Tensor
+    slope: torch.Tensor
+    missing: torch.Tensor
+
+
 class RigidResponse(NamedTuple):
     """How bodies, drives and friction laws follow a torque on each joint.
 
-    slopes: J (T, C) by the C weights that move its torque. gains: what a fit of these makes of J^T torque (C, C).
+    slopes: J (T, C), see `TorqueJacobian.slopes`. gains: what a fit of these makes of J^T torque (C, C).
     """
 
     slopes: tuple[torch.Tensor, ...]
-    gains: tuple[torch.Tensor, ...]
+    gains: dict[int, torch.Tensor]
 
     def remaining(self, joint: int, torque: torch.Tensor) -> torch.Tensor:
         """Return what of torques (T, P) on a joint is left when these weights have taken over what they can."""
         slope = self.slopes[joint]
         return torque - slope @ (self.gains[joint] @ (slope.mT @ torque))
-
-
-@dataclass(frozen=True, eq=False)
-class _Directions:
-    """Directions in which one weight of every joint changes at once, but of joints with a coupling only one.
-
-    by_name: of each name changes (D, *shape) of its weights. of_weight: (K,) the direction of each weight, -1 of
-    those of bodies. moves: (K, n) whose torques each weight moves.
-    """
-
-    by_name: dict[str, torch.Tensor]
-    of_weight: torch.Tensor
-    moves: torch.Tensor
 
 
 class TorqueJacobian:
@@ -93,7 +90,13 @@ class TorqueJacobian:
         self.rigid = RigidWeights(model)
         self.start = self.rigid.flattened(self.rigid.start)
         self._functional = FunctionalModel(model)
-        self._directions = self._by_joint()
+        of_bodies = {
+            name: torch.full_like(x, name == self.rigid.bodies) for name, x in self.rigid.start.items()
+        }
+        self._of_bodies = self.rigid.flattened(of_bodies) > 0
+        self._drives = self.model.motors != 0  # (n, n): whether a drive moves a joint
+        self._moves = self._moved_joints()
+        self._colours = _colours(self._drives.double().mT @ self._drives.double() > 0)
         self._blocks = [self._with_regressors(block) for block in samples.blocks(TUNING.block)]
 
     def start_by_torque(self) -> torch.Tensor:
@@ -113,7 +116,7 @@ class TorqueJacobian:
         total = torch.zeros(self.samples.joints).double()
         with torch.no_grad():
             for block in self._blocks:
-                total += self._logged(weights, block).square().sum(dim=0)
+                total += (self._missing(weights, block)[0] * self._per_gain(weights)).square().sum(dim=0)
         return total
 
     def per_gain(self, x: torch.Tensor) -> torch.Tensor:
@@ -124,56 +127,65 @@ class TorqueJacobian:
         ones = torch.ones(self.samples.joints).double()
         for name in self.rigid.of_kind("gains"):  # logarithms of gains between logged and joint torques
             change = weights[name] - self.rigid.start[name]
-            return ones.index_put((self.model.gain_rows,), (-change).exp())
+            return ones.expand(*change.shape[:-1], -1).index_copy(-1, self.model.gain_rows, (-change).exp())
         return ones
 
     def normal_equations(self, x: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return J^T J (K, K) and J^T r (K,) of the missing torque r, in units of ``noise`` (n,)."""
-        curvature, descent = torch.zeros(len(x), len(x)).double(), torch.zeros(len(x)).double()
-        for joint, columns, slope, missing in self._slopes(x):
-            slope = slope / noise[joint]
-            curvature[columns[:, None], columns] += slope.mT @ slope
-            descent[columns] += slope.mT @ (missing / noise[joint])
-        return curvature, descent
+        curvature, descent = _normal_equations(self.slopes(x), noise, len(x))
+        along = self._along(x)
+        return along.mT @ curvature @ along, along.mT @ descent
 
     def least_squares(
-        self, x: torch.Tensor, noise: torch.Tensor, free: torch.Tensor
+        self, slopes: Sequence[Slope], noise: torch.Tensor, free: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return sums of squares (n,) that least squares by the free weights (K,) leave, and how many weights each
-        torque determines (n,); torques are taken as linear about x (K,).
+        torque determines (n,); torques are linear, with these `slopes`.
         """
-        curvature, descent = self.normal_equations(x, noise)
+        curvature, descent = _normal_equations(slopes, noise, len(free))
         inverse = torch.zeros_like(curvature)
         inverse[free[:, None] & free] = _pseudo_inverse(curvature[free][:, free]).flatten()
         step = inverse @ descent
-        squares, weights = torch.zeros(2, self.samples.joints).double()
-        for joint, columns, slope, missing in self._slopes(x):
+        squares, weights = torch.zeros(2, len(noise)).double()
+        for joint, columns, slope, missing in slopes:
             squares[joint] += (missing - slope @ step[columns]).square().sum()
             weights[joint] += ((slope @ inverse[columns[:, None], columns]) * slope).sum() / noise[joint] ** 2
         return squares, weights
 
-    def _slopes(self, x: torch.Tensor) -> Iterator[tuple[int, torch.Tensor, torch.Tensor, torch.Tensor]]:
-        """Yield block by block each joint, the weights (C,) that move its torque, J (T, C) and what is missing (T,)."""
-        weights, by_body = self.rigid.named(x), self._directions.of_weight < 0
+    def slopes(self, x: torch.Tensor) -> Iterator[Slope]:
+        """Yield J of each joint, block by block: by the bodies' parameters in place of their weights, see `_along`."""
+        weights, per_gain = self.rigid.named(x), self.per_gain(x)
+        of_bodies, of_joints = self._of_bodies.nonzero()[:, 0], (~self._of_bodies).nonzero()[:, 0]
         for block in self._blocks:
-            missing, changes = self._joint_slope(weights, block)
-            bodies = self._body_slope(weights, block)
-            for joint in range(self.samples.joints):
+            missing, by_weights, by_load = self._joint_slope(weights, block)
+            for joint, colour in enumerate(self._colours):
                 # of the weights of joints, few move this one's torque: the others' columns are zero
-                own = self._directions.moves[:, joint]
-                slope = torch.cat(
-                    [bodies[:, joint], changes[self._directions.of_weight[own], :, joint].mT], 1
-                )
-                columns = torch.cat([by_body.nonzero()[:, 0], own.nonzero()[:, 0]])
-                yield joint, columns, slope, missing[:, joint]
+                moving, drives = self._moves[:, joint], self._drives[:, joint]
+                loads = by_load[colour][:, drives].unsqueeze(-1) * block.load_regressor[:, drives]
+                bodies = per_gain[joint] * block.regressor[:, joint] + loads.sum(dim=1)
+                slope = torch.cat([bodies, by_weights[colour][:, moving]], dim=1)
+                yield Slope(joint, torch.cat([of_bodies, of_joints[moving]]), slope, missing[:, joint])
+
+    def _along(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the derivative (K, K) of what torques are linear in by the weights: each body's are its own."""
+        weights = self.rigid.named(x)
+        # ten times the weights: one for the derivative of each parameter
+        bodies = weights[self.rigid.bodies].expand(10, -1, -1).detach().requires_grad_()
+        with torch.enable_grad():
+            parameters = self._inertial_parameters({**weights, self.rigid.bodies: bodies})
+        (slopes,) = gradient(parameters.diagonal(dim1=0, dim2=2).sum(), bodies)
+        along = torch.eye(len(x)).double()
+        along[self._of_bodies[:, None] & self._of_bodies] = torch.block_diag(
+            *slopes.transpose(0, 1)
+        ).flatten()
+        return along
 
     def residual_samples(self, x: torch.Tensor) -> ResidualSamples:
         """Return what these weights leave of the torque, of all samples."""
         weights, blocks = self.rigid.named(x), []
         with torch.no_grad():
             for block in self._blocks:
-                friction = block.factor * self._friction(weights, block, self._load(weights, block))
-                missing = self._missing(weights, block)
+                missing, friction = self._missing(weights, block)
                 q, qd, qdd, _, _ = block.measured
                 blocks.append(ResidualSamples(q, qd, qdd, missing, friction))
         return ResidualSamples(*(torch.cat(column) for column in zip(*blocks, strict=True)))
@@ -181,11 +193,13 @@ class TorqueJacobian:
     def response(self, x: torch.Tensor, noise: torch.Tensor, covariance: torch.Tensor) -> RigidResponse:
         """Return how the weights follow, that have this covariance (K, K) after a fit under this noise (n,)."""
         blocks: list[list[torch.Tensor]] = [[] for _ in noise]
-        gains = list(noise)
-        for joint, columns, slope, _ in self._slopes(x):
+        gains: dict[int, torch.Tensor] = {}
+        along = self._along(x)
+        covariance = along @ covariance @ along.mT
+        for joint, columns, slope, _ in self.slopes(x):
             blocks[joint].append(slope)
             gains[joint] = covariance[columns[:, None], columns] / noise[joint] ** 2
-        return RigidResponse(tuple(torch.cat(slopes) for slopes in blocks), tuple(gains))
+        return RigidResponse(tuple(map(torch.cat, blocks)), gains)
 
     def torque_deviation(self) -> torch.Tensor:
         """Return standard deviations (n,) of the measured torque, as the joints feel it."""
@@ -206,7 +220,7 @@ class TorqueJacobian:
         sums = torch.zeros(3, self.samples.joints).double()
         with torch.no_grad():
             for block in self._blocks:
-                tau, qd = self._missing(weights, block), block.measured.qd
+                tau, qd = self._missing(weights, block)[0], block.measured.qd
                 sums += torch.stack([tau * qd, qd * qd, tau * tau]).sum(dim=1)
         products, speeds, squares = sums
         slope = products / speeds.clamp(min=1e-300)
@@ -240,118 +254,87 @@ class TorqueJacobian:
                 z=z[..., :elements] if columns else None,
                 direction=z[..., elements] if columns > elements else None,
                 speed=qd @ model.motors.mT,
+                acceleration=qdd @ model.motors.mT,
                 regressor=regressor_of(model.chain, q, qd, qdd),
                 load_regressor=torch.einsum("jm,tjk->tmk", model.loads, gravity_regressor),
                 residual=residual_torque(model, q, qd, qdd),
                 factor=friction_factor(model, q),
             )
 
-    def _by_joint(self) -> _Directions:
-        """Return the directions of all weights but those of bodies."""
-        moves = self.model.motors != 0
-        coupled = moves.double() @ moves.double().mT > 0
-        colour = torch.tensor(_colours(coupled))
-        colours = int(colour.max()) + 1
-        by_name, of_weight, moved, count = {}, [], [], 0
-        numbers = [
-            weight[0].numel() for name, weight in self.rigid.start.items() if name != self.rigid.bodies
-        ]
-        total = colours * sum(numbers)
+    def _moved_joints(self) -> torch.Tensor:
+        """Return which joints' torques each weight moves (K', n), of all weights but those of bodies."""
+        moves = []
         for name, weight in self.rigid.start.items():
             if name == self.rigid.bodies:
-                of_weight.append(torch.full((weight.numel(),), -1))
-                moved.append(torch.zeros(weight.numel(), self.samples.joints, dtype=torch.bool))
                 continue
-            size = weight[0].numel()
-            row = torch.arange(len(weight)).repeat_interleave(size)
-            column = torch.arange(size).repeat(len(weight))
-            joint = row
+            rows = self._drives
             if self.rigid.kinds[name] == "gains":
-                joint = self.model.gain_rows[row]
-            direction = count + colours * column + colour[joint]
-            changes = torch.zeros(total, len(weight), size).double()
-            changes[direction, row, column] = 1.0
-            by_name[name] = changes.reshape(total, *weight.shape)
-            of_weight.append(direction)
-            moved.append(moves[joint])
-            count += colours * size
-        return _Directions(by_name, torch.cat(of_weight), torch.cat(moved))
+                rows = rows[self.model.gain_rows]
+            moves.append(rows.repeat_interleave(weight[0].numel(), dim=0))
+        return torch.cat(moves)
 
     def _inertial_parameters(self, weights: Weights) -> torch.Tensor:
         """Return the ten parameters of all bodies (B, 10)."""
         parameters: torch.Tensor = self._functional.under(weights, lambda model: model.inertial_parameters)
         return parameters
 
-    def _load(self, weights: Weights, samples: _Samples) -> torch.Tensor:
-        """Return the gravity torque that the drives bear (T, n)."""
-        return samples.load_regressor @ self._inertial_parameters(weights).flatten()
+    def _missing(
+        self, weights: Weights, samples: _Samples, load: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the torque that the model does not explain, and that of friction at the drives, (T, n).
 
-    def _friction(self, weights: Weights, samples: _Samples, load: torch.Tensor) -> torch.Tensor:
-        """Return friction's torque at the drives (T, n), as its laws alone have it."""
-        constants = self._functional.under(weights, lambda model: model.friction.prepare())
-        friction: torch.Tensor = self.model.friction(
-            samples.speed, load, constants, samples.z, samples.direction
-        )
-        return friction
+        load: gravity torque that the drives bear (T, n); None: that of the weights.
+        """
+        _, qd, _, tau, _ = samples.measured
 
-    def _missing(self, weights: Weights, samples: _Samples) -> torch.Tensor:
-        """Return the torque that the model does not explain (T, n)."""
-        _, qd, qdd, tau, _ = samples.measured
-
-        def missing(model: Any) -> torch.Tensor:
-            prepared, parameters = model.prepare(), model.inertial_parameters.flatten()
-            load = samples.load_regressor @ parameters
-            friction = model.friction(samples.speed, load, prepared.friction, samples.z, samples.direction)
+        def torques(model: Any) -> tuple[torch.Tensor, torch.Tensor]:
+            constants, parameters = model.friction.prepare(), model.inertial_parameters.flatten()
+            borne = samples.load_regressor @ parameters if load is None else load
+            friction = model.friction(samples.speed, borne, constants, samples.z, samples.direction)
             friction = samples.factor * friction
-            force = model.input_force(None, qd, tau)
-            inertial = samples.regressor @ parameters + qdd @ prepared.armature
-            difference: torch.Tensor = force - inertial - samples.residual - friction @ model.motors
-            return difference
+            of_drives = friction + model.armature * samples.acceleration
+            force = model.input_force(None, qd, tau) - samples.residual
+            return force - samples.regressor @ parameters - of_drives @ model.motors, friction
 
-        torque: torch.Tensor = self._functional.under(weights, missing)
-        return torque
+        missing, friction = self._functional.under(weights, torques)
+        return missing, friction
 
-    def _logged(self, weights: Weights, samples: _Samples) -> torch.Tensor:
-        """Return the missing torque in the units of what was logged (T, n)."""
-        return self._missing(weights, samples) * self._per_gain(weights)
+    def _joint_slope(
+        self, weights: Weights, samples: _Samples
+    ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
+        """Return the missing torque as logged (T, n), and minus its derivatives, for each colour of joints the sum of
+        theirs: (T, K) by the K weights that are not of bodies, and (T, n) by the load on each drive.
 
-    def _joint_slope(self, weights: Weights, samples: _Samples) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the missing torque as logged (T, n), and minus its changes (D, T, n) along `_Directions`.
-
-        J d is the derivative of J^T v, which is linear in v, by v. That takes reverse passes alone: forward ones go
-        through constants too, as zeros whose shapes torch works out in Python, at several times the cost.
+        With weights of their own all samples have their slopes in one reverse pass: a weight moves a joint of a colour.
+        The gradients are those of sums: of several outputs they would load torch's symbolic shapes, half a second.
         """
-        leaves = {name: weights[name].clone().requires_grad_() for name in self._directions.by_name}
+        repeated = {}
+        for name, weight in weights.items():
+            if name != self.rigid.bodies:
+                repeated[name] = weight.expand(len(samples.speed), *weight.shape).detach().requires_grad_()
+        parameters = self._inertial_parameters(weights).flatten()
+        load = (samples.load_regressor @ parameters).detach().requires_grad_()
         with torch.enable_grad():
-            missing = self._logged({**weights, **leaves}, samples)
-            v = torch.zeros_like(missing, requires_grad=True)
-            products = gradient(missing, list(leaves.values()), v, create_graph=True, materialize_grads=True)
-        directions = list(self._directions.by_name.values())
-        (changes,) = gradient(products, v, directions, is_grads_batched=True, materialize_grads=True)
-        return missing.detach(), -changes
+            by_sample = {**weights, **repeated}
+            missing = self._missing(by_sample, samples, load)[0] * self._per_gain(by_sample)
+        by_weights, by_load, colours = [], [], torch.tensor(self._colours)
+        for colour in range(max(self._colours) + 1):
+            total = -missing[:, colours == colour].sum()
+            slopes = gradient(total, [load, *repeated.values()], retain_graph=True, materialize_grads=True)
+            by_load.append(slopes[0])
+            by_weights.append(torch.cat([slope.flatten(1) for slope in slopes[1:]], dim=1))
+        return missing.detach(), by_weights, by_load
 
-    def _body_slope(self, weights: Weights, samples: _Samples) -> torch.Tensor:
-        """Return minus the derivative (T, n, 10 B) by the bodies' weights: through the torque, and through the load
-        that friction grows with.
-        """
-        load = self._load(weights, samples).detach().requires_grad_()
-        with torch.enable_grad():
-            friction = self._friction(weights, samples, load)
-        (by_load,) = gradient(friction.sum(), load, materialize_grads=True)  # each drive's by its own load
-        at_drives = (samples.factor * by_load).unsqueeze(-1) * samples.load_regressor
-        loaded = samples.regressor + torch.einsum("mj,tmk->tjk", self.model.motors, at_drives)
-        result: torch.Tensor = (loaded @ self._parameter_slope(weights)) * self._per_gain(weights)[:, None]
-        return result.detach()
 
-    def _parameter_slope(self, weights: Weights) -> torch.Tensor:
-        """Return the derivative of the bodies' parameters by their weights (10 B, 10 B): each body's are its own."""
-        bodies = weights[self.rigid.bodies].clone().requires_grad_()
-        with torch.enable_grad():
-            parameters = self._inertial_parameters({**weights, self.rigid.bodies: bodies})
-        each = torch.eye(10).double().unsqueeze(1).expand(-1, len(bodies), -1)
-        (slopes,) = gradient(parameters, bodies, each, is_grads_batched=True, materialize_grads=True)
-        result: torch.Tensor = torch.block_diag(*slopes.transpose(0, 1))
-        return result
+def _normal_equations(
+    slopes: Iterable[Slope], noise: torch.Tensor, count: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return J^T J (K, K) and J^T r (K,) of so many weights, in units of noise (n,)."""
+    curvature, descent = torch.zeros(count, count).double(), torch.zeros(count).double()
+    for joint, columns, slope, missing in slopes:
+        curvature[columns[:, None], columns] += slope.mT @ slope / noise[joint] ** 2
+        descent[columns] += slope.mT @ missing / noise[joint] ** 2
+    return curvature, descent
 
 
 def _colours(coupled: torch.Tensor) -> list[int]:

@@ -78,8 +78,9 @@ class TorqueProblem:
     def _set_least_squares_noise(self, x: torch.Tensor) -> None:
         """Take for noise what least squares miss, which no prior holds; of torques that are linear about x (K,)."""
         self.noise = self.correlation**0.5 * self.range
+        slopes = list(self.jacobian.slopes(x))
         for _ in range(TUNING.last_rounds):
-            squares, weights = self.jacobian.least_squares(x, self.noise, self.free)
+            squares, weights = self.jacobian.least_squares(slopes, self.noise, self.free)
             # each weight takes an independent sample, of which one is left at least
             independent = self.count / self.correlation
             self.set_noise(squares * independent / (independent - weights).clamp(min=1.0))

@@ -15,7 +15,7 @@ Neural Computation 4:415, 1992); networks are found by L-BFGS from a normal dist
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -51,8 +51,8 @@ class SelectedResidual:
 class _Candidate:
     """A function of one joint.
 
-    The model's parameter of that name has a row (W,) for it, in units of ``scale``: ``basis``, (W, P), times the
-    weights that are fitted.
+    The model's parameter of that name has a row (W,) for it, in units of ``scale``. Weights are those of ``lines``,
+    (W, L), which are sums over the row, and then the row's own: P = L + W.
     features: (T, P); in a selection, of torques what bodies and laws cannot take over.
     force: (n,) how its torque acts on the joints.
     groups: (P,) which weights have a scale in common.
@@ -64,7 +64,7 @@ class _Candidate:
     scale: float
     features: torch.Tensor
     force: torch.Tensor
-    basis: torch.Tensor
+    lines: torch.Tensor
     groups: torch.Tensor
     friction: torch.Tensor | None
 
@@ -74,12 +74,12 @@ class _Candidate:
             row = functions.friction_logarithms()[self.joint]
         else:
             row = functions.get_parameter(self.parameter)[self.joint] * self.scale
-        # the basis ends with an identity
-        return F.pad(row.detach(), (self.basis.shape[1] - len(row), 0))
+        return F.pad(row.detach(), (self.lines.shape[1], 0))
 
     def write(self, functions: Any, weights: torch.Tensor) -> None:
         """Make them the model's."""
-        weights = self.basis @ weights
+        count = self.lines.shape[1]
+        weights = self.lines @ weights[:count] + weights[count:]
         if self.friction is not None:
             weights = LARGEST * (weights.clamp(-WIDEST, WIDEST) / LARGEST).atanh()
         with torch.no_grad():
@@ -134,9 +134,7 @@ def refit_residuals(
     """
     noise, missing, functions = _noise(samples.missing), samples.missing, model.residuals
     chosen = {(residual.name, residual.joint) for residual in selected}
-    for candidate in _candidates(model, samples, rigid):
-        if (candidate.parameter, candidate.joint) not in chosen:
-            continue
+    for candidate in _candidates(model, samples, rigid, chosen):
         present = (candidate.features @ candidate.weights(functions)).unsqueeze(-1) * candidate.force
         target = candidate.target(missing + present, noise)
         weights = _fit_candidate(candidate, target, correlation)
@@ -169,37 +167,44 @@ def _best(
     return best
 
 
-def _candidates(model: Any, samples: ResidualSamples, rigid: RigidResponse | None) -> Iterator[_Candidate]:
+def _candidates(
+    model: Any,
+    samples: ResidualSamples,
+    rigid: RigidResponse | None,
+    chosen: Collection[tuple[str, int | None]] | None = None,
+) -> Iterator[_Candidate]:
     """Yield what could be selected: smooth torques, friction that varies, and ripple.
 
-    Torques by position are those that ``rigid`` leaves, where it is given.
+    Torques by position are those that ``rigid`` leaves, where it is given. chosen: parameters and joints; None: all.
     """
     functions, motors = model.residuals, model.motors
     with torch.no_grad():
         splines, ripple = functions.splines(samples.q), functions.revolute * functions.waves(samples.q)
     joints, unit = torch.eye(len(motors)).to(motors), functions.unit.flatten()
-    one, alike = torch.eye(SPLINES).double(), torch.zeros(SPLINES)
+    alike, pairs = torch.zeros(SPLINES), torch.arange(ripple.shape[-1] // 2).repeat(2)
     # a straight line, and what is not straight: a spring is known where no motion has been
-    line = torch.cat([torch.linspace(-1, 1, SPLINES).double().unsqueeze(-1), one], dim=1)
-    pairs = torch.arange(ripple.shape[-1] // 2).repeat(2)
+    line = torch.linspace(-1, 1, SPLINES).double().unsqueeze(-1)
     varied = splines * samples.friction.unsqueeze(-1)
     kinds = (
         ("raw_torque_splines", splines, unit, joints, line, F.pad(alike + 1, (1, 0))),
-        (FRICTION, varied, torch.ones(len(motors)), motors, one, alike),
-        ("raw_torque_ripple", ripple, unit, joints, torch.eye(len(pairs)).double(), pairs),
+        (FRICTION, varied, torch.ones(len(motors)), motors, line[:, :0], alike),
+        ("raw_torque_ripple", ripple, unit, joints, torch.zeros(len(pairs), 0).double(), pairs),
     )
-    for parameter, features, scale, force, basis, groups in kinds:
+    for parameter, features, scale, force, lines, groups in kinds:
         for joint in range(len(motors)):
-            columns = features[:, joint] @ basis
+            if chosen is not None and (parameter, joint) not in chosen:
+                continue
+            columns = features[:, joint]
             if not columns.any() or scale[joint] <= 0:
                 continue
+            columns = torch.cat([columns @ lines, columns], dim=1)
             friction = None
             if parameter == FRICTION:
                 friction = samples.friction[:, joint]
             elif rigid is not None:
                 columns = rigid.remaining(joint, columns)
             yield _Candidate(
-                parameter, joint, float(scale[joint]), columns, force[joint], basis, groups, friction
+                parameter, joint, float(scale[joint]), columns, force[joint], lines, groups, friction
             )
 
 

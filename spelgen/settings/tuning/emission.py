@@ -22,6 +22,7 @@ class ModelTuning:
     servo_lag: float = 0.05  # [s] kd by kp, to start from
     least_armature: float = 0.01  # [1] of an entry of M, where nothing is known of the drive
     position_sensitivity: float = 0.1  # [1] of friction's networks, relative to velocity
+    friction_units: int = 8  # [1] hidden units of the network of one joint's friction
     least_units: int = 4  # [1] hidden units of the outputs that read the same joints
     least_kan_units: int = 2  # [1] the same of Kolmogorov-Arnold networks
     kan_fraction: float = 0.25  # [1] of the width: each of their edges has a grid of numbers

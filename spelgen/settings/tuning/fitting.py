@@ -151,7 +151,7 @@ class TorqueReportTuning:
 class IntegrationTuning:
     """Steps of the integrator in rollouts (`fitting.rollout`)."""
 
-    substeps: tuple[int, ...] = (1, 2, 4, 8, 16, 32)  # of rk4 between samples, that are tried
+    most_substeps: int = 32  # of rk4 between samples
     fraction: float = 0.03  # [1] of the model's own error, that the integrator may add
     least_error: float = 1e-2  # [1] in units of the loss's scales: no model is expected to be better
 

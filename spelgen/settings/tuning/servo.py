@@ -79,9 +79,11 @@ class ServoSolverTuning:
 class ServoLawTuning:
     """Decide which joints get a dead zone or friction that falls with velocity."""
 
-    dead_zone_fraction: float = 0.4  # [1] of the static error, that a dead zone makes up to begin with
+    dead_zone_fraction: float = 0.25  # [1] of the static error, that a dead zone makes up to begin with
     steps: int = 6  # of joints by themselves
-    significance: float = 3.0  # [1] standard deviations that a law has to be worth
+    significance: float = (
+        4.0  # [1] standard deviations that a law has to gain: other forms of friction gain 3
+    )
     least_dead_zone: float = 1e-3  # [rad, m] smaller ones are none: a step of a 12-bit encoder is 1.5e-3
 
 
