@@ -21,7 +21,7 @@ from spelgen.runtime.joints import Joints
 
 JOINTS = Joints(
     revolute=(True, False), center=(0.0, 0.0), reach=(3.0, 1.0), speed=(2.0, 0.5), friction=(1.5, 4.0),
-    armature=(0.0, 0.0), actuated=(True, True),
+    armature=(0.0, 0.0),
 )  # fmt: skip
 REACH = [[3e-4, 3e-3, 3e-2], [3e-5, 3e-4, 3e-3]]
 
@@ -53,7 +53,8 @@ def test_a_step_of_any_length_is_exact_along_one_way():
     parts = z
     for part in torch.rand(50, 1).double().softmax(dim=0):
         parts = bristles.moved(parts, part * way)
-    torch.testing.assert_close(parts, bristles.moved(z, way), rtol=1e-12, atol=1e-18)
+    # Fifty sums of a way of 20 mrad round by some 1e-17, and an element may end at zero.
+    torch.testing.assert_close(parts, bristles.moved(z, way), rtol=1e-12, atol=1e-15)
 
 
 def test_load_dependent_friction_is_smooth_at_right_angles():
@@ -106,7 +107,7 @@ def test_energy_of_an_arm_left_to_itself_never_rises(tmp_path):
         q, qd = torch.tensor([[0.3, 0.1, -0.4]]).double(), torch.tensor([[1.0, 0.2, -1.5]]).double()
         steps = torch.full((1, 2000), 5e-4).double()
         still = Windows(
-            steps, q[:, None], qd[:, None], torch.zeros(1, 2000, 3).double(), torch.zeros(1, 3, 4).double()
+            steps, q[:, None], qd[:, None], torch.zeros(1, 2000, 3).double(), torch.zeros(1, 3, 6).double()
         )
         q, qd = (
             torch.cat([x[:, None], y], dim=1)[0] for x, y in zip((q, qd), roll_out(model, still), strict=True)
@@ -151,14 +152,14 @@ def test_least_squares_finds_the_strengths_of_bristles():
     qd, qdd = np.gradient(q, 0.002, axis=0), np.gradient(np.gradient(q, 0.002, axis=0), 0.002, axis=0)
     reach = reach_of(["revolute", "revolute"])
     z = bristles_along(q, reach)
-    strengths = rng.uniform(0.2, 1.0, (2, 4))
+    strengths = rng.uniform(0.2, 1.0, (2, 6))
     model = LeastSquares(friction=FrictionModel(memory=True))
     tau = (strengths * z / reach.values).sum(axis=-1)
     found = least_squares(arm, [DynamicsSamples("x", q, qd, qdd, tau, z)], model)
     names = [name for name in found.base.names if name.startswith("bristle")]
-    assert len(names) == 8
+    assert len(names) == 12
     values = dict(zip(found.base.names, found.values, strict=True))
-    for k in range(4):
+    for k in range(6):
         for joint in range(2):
             assert values[f"bristle {k + 1}, joint {joint + 1}"] == pytest.approx(
                 strengths[joint, k], abs=1e-6
