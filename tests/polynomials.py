@@ -16,8 +16,7 @@ from flint import Ordering, fmpq, fmpq_mpoly, fmpq_mpoly_ctx
 
 from spelgen.arm.arm import Arm
 from spelgen.structure.basis import Weights
-from spelgen.structure.recursion import PARAMETERS, energies
-from spelgen.structure.sampling import Position, motions
+from spelgen.structure.recursion import PARAMETERS, Position, energies
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ def polynomials(arm: Arm, *, inertials: bool = False) -> Polynomials:
         ]
     else:
         parameters = [variables[3 * n + 10 * body :][:10] for body in range(bodies)]
-    result = energies(arm, motions(arm, positions, _rational), parameters, _rational)
+    result = energies(arm, positions, parameters, _rational)
     mass = {key: _reduced(value * one, n) for key, value in result.mass.items()}
     return Polynomials(tuple(names), mass, _reduced(result.potential * one, n))
 

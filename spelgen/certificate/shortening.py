@@ -17,7 +17,7 @@ from spelgen.arm.arm import Arm
 from spelgen.certificate.axes import Axes, is_plain
 from spelgen.certificate.terms import Factors, Terms, collected, coordinate, length, ordered
 from spelgen.settings.tuning.structure import CertificateTuning
-from spelgen.structure.sampling import base_denominators
+from spelgen.structure.recursion import base_denominators
 
 TUNING = CertificateTuning()
 

@@ -11,8 +11,7 @@ import casadi as ca
 import numpy as np
 
 from spelgen.exporting.description import TrainedModel
-from spelgen.structure.recursion import energies
-from spelgen.structure.sampling import Position, base_denominators, motions
+from spelgen.structure.recursion import Position, base_denominators, energies
 
 _Z = ca.sparsify(ca.DM([0, 0, 1]))
 
@@ -96,7 +95,7 @@ def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     for joint, base in enumerate(base_denominators(model.arm)):
         angle = q[joint] / base
         positions.append(Position(ca.cos(angle), ca.sin(angle), q[joint]))
-    result = energies(model.arm, motions(model.arm, positions, float), model.inertias.tolist(), float)
+    result = energies(model.arm, positions, model.inertias.tolist(), float)
     mass = ca.SX(model.n, model.n)
     for (row, column), entry in result.mass.items():
         # one expression for both triangles: half of the work

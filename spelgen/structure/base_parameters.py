@@ -17,9 +17,7 @@ import numpy as np
 from flint import fmpq, fmpq_mat
 
 from spelgen.arm.arm import Arm
-from spelgen.structure import field
-from spelgen.structure.recursion import PARAMETERS, energies, triangle
-from spelgen.structure.sampling import Position, motions
+from spelgen.structure.recursion import PARAMETERS, Position, coefficients
 
 # Parameters that stand for a group if they can; Iyy, hz and m of a turning body can always be regrouped.
 _PREFERRED = ("Izz", "Ixx", "Ixy", "Ixz", "Iyz", "hx", "hy", "m", "Iyy", "hz")
@@ -52,26 +50,18 @@ def base_parameters(arm: Arm, count: int) -> tuple[BaseParameter, ...]:
     order: list[int] = []
     for body in range(len(arm.bodies)):
         order += [10 * body + PARAMETERS.index(name) for name in _PREFERRED]
-    rows = np.concatenate(list(_enough_rows(arm, count)))[:, order]
-    residues = _residues(rows)
-    # which parameters are independent shows in the prime field; the coefficients are then solved for exactly
-    bound = field.pivots(field.row_basis(residues))
-    independent_rows = field.pivots(field.row_basis(residues[:, bound].T))
-    # parameters of zero columns move nothing: no base parameter contains them
-    moving = np.flatnonzero(residues.any(axis=0)).tolist()
-    free = [column for column in moving if column not in bound]
-    coefficients = _solved(rows[np.ix_(independent_rows, bound)], rows[np.ix_(independent_rows, free)])
     result = []
-    for pivot, regrouped in zip(bound, coefficients, strict=True):
-        index = order[pivot]
-        name = parameter_name(index)
-        weights = [(index, Fraction(1))]
-        for column, coefficient in zip(free, regrouped, strict=True):
+    for row in _reduced_rows(arm, count, order):
+        weights = []
+        for index, coefficient in zip(order, row, strict=True):
             if coefficient:
-                weights.append((order[column], Fraction(int(coefficient.p), int(coefficient.q))))
+                weights.append((index, Fraction(int(coefficient.p), int(coefficient.q))))
+        # a row of an echelon form is 1 at its first parameter
+        first, _ = weights[0]
+        name = parameter_name(first)
         if len(weights) > 1:
             name += "R"
-        result.append(BaseParameter(name, index, tuple(weights), _value(arm, weights)))
+        result.append(BaseParameter(name, first, tuple(weights), _value(arm, weights)))
     return tuple(result)
 
 
@@ -85,64 +75,36 @@ def _value(arm: Arm, weights: list[tuple[int, Fraction]]) -> Fraction | None:
     return total
 
 
-def _enough_rows(arm: Arm, count: int) -> list[np.ndarray]:
-    """Return coefficient rows at as many random configurations as it takes to have rank ``count``."""
+def _reduced_rows(arm: Arm, count: int, order: list[int]) -> list[list[fmpq]]:
+    """Return the reduced echelon form of rank ``count`` of coefficients, its columns in this order."""
     generator = random.Random(0)
+    # a constant part of V moves nothing: V counts from where it is here
     reference = _rows(arm, generator)[-1]
-    blocks: list[np.ndarray] = []
-    residues = np.zeros((0, 10 * len(arm.bodies)), dtype=np.uint64)
-    while field.rank(residues) < count:
+    basis: list[list[fmpq]] = []
+    while len(basis) < count:
         rows = _rows(arm, generator)
-        rows[-1] = rows[-1] - reference  # a constant part of V moves nothing
-        blocks.append(rows)
-        residues = np.concatenate([residues, _residues(rows)])
-    return blocks
+        rows[-1] -= reference
+        echelon, rank = fmpq_mat(basis + rows[:, order].tolist()).rref()
+        basis = echelon.table()[:rank]
+    return basis
 
 
 def _rows(arm: Arm, generator: random.Random) -> np.ndarray:
     """Return coefficients of M's entries and of V at one random configuration, (n(n+1)/2 + 1, 10 bodies) of fmpq."""
-    n, parameters = len(arm.coordinates), 10 * len(arm.bodies)
+    parameters = 10 * len(arm.bodies)
     positions = []
-    for _ in range(n):
+    for _ in arm.coordinates:
         t = fmpq(generator.randrange(1, _GRID), generator.randrange(1, _GRID))
         value = fmpq(generator.randrange(1, _GRID), generator.randrange(1, _GRID))
         # t is the tangent of half the angle, so that cosine and sine are rational
         norm = 1 + t * t
         positions.append(Position((1 - t * t) / norm, 2 * t / norm, value))
-    units = np.full((parameters, parameters), fmpq(0))
-    np.fill_diagonal(units, fmpq(1))
-    inertias = [list(units[10 * body : 10 * body + 10]) for body in range(len(arm.bodies))]
-    result = energies(arm, motions(arm, positions, rational), inertias, rational)
-    rows = np.full((n * (n + 1) // 2 + 1, parameters), fmpq(0))
-    for row, key in enumerate(triangle(n)):
-        rows[row] = _row(result.mass[key], parameters)
-    rows[-1] = _row(result.potential, parameters)
-    return rows
-
-
-def _row(element: np.ndarray | int, parameters: int) -> np.ndarray:
-    """Return an element of the ring as coefficients; where nothing moves it is a plain 0."""
-    if isinstance(element, np.ndarray):
-        return element
-    return np.full(parameters, fmpq(0))
-
-
-def _solved(matrix: np.ndarray, right: np.ndarray) -> list[list[fmpq]]:
-    if not right.size:
-        return [[] for _ in matrix]
-    return fmpq_mat(matrix.tolist()).solve(fmpq_mat(right.tolist())).table()
+    units = list(np.eye(parameters, dtype=int).astype(object))
+    elements = coefficients(arm, positions, units, rational)
+    # where nothing moves an element is a plain 0
+    return np.stack([np.broadcast_to(element, parameters) for element in elements])
 
 
 def rational(number: Fraction) -> fmpq:
     """Return the number in FLINT's exact arithmetic."""
     return fmpq(number.numerator, number.denominator)
-
-
-def _residues(rows: np.ndarray) -> np.ndarray:
-    """Return rational numbers as elements of the prime field."""
-    residues = list(map(_residue, rows.ravel().tolist()))
-    return np.array(residues, dtype=np.uint64).reshape(rows.shape)
-
-
-def _residue(number: fmpq) -> int:
-    return int(number.p) % field.PRIME * pow(int(number.q), -1, field.PRIME) % field.PRIME

@@ -15,8 +15,7 @@ from flint import Ordering, fmpq, fmpq_mpoly, fmpq_mpoly_ctx
 
 from spelgen.arm.arm import Arm
 from spelgen.structure.base_parameters import rational
-from spelgen.structure.recursion import energies
-from spelgen.structure.sampling import Position, motions
+from spelgen.structure.recursion import Position, energies
 
 Value: TypeAlias = fmpq_mpoly | fmpq | int
 """A polynomial, or a number where nothing else is needed."""
@@ -90,7 +89,7 @@ class Expansion:
         inertias: list[Sequence[Deferred]] = []
         for body in range(len(arm.bodies)):
             inertias.append(self._parameters[10 * body : 10 * body + 10])
-        self.written = energies(arm, motions(arm, positions, _number), inertias, _number)
+        self.written = energies(arm, positions, inertias, _number)
 
     def polynomial(self, element: Deferred | int, parameter: int, budget: Budget) -> fmpq_mpoly:
         """Return what ``parameter`` (10 body + i) is multiplied by in ``element``. Raises TooLarge."""

@@ -6,14 +6,15 @@ replaced by one-kilogram links.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from math import floor, log10, pi
+from math import floor, isqrt, log10, pi
 
 import numpy as np
 
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.settings.tuning.structure import StructureTuning
-from spelgen.structure.basis import row_of
+from spelgen.structure.basis import Constant, Output, row_of
 from spelgen.structure.sampling import float_energies
 from spelgen.structure.structure import Structure
 
@@ -49,21 +50,17 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
     rng = np.random.default_rng(0)
     ranges = list(map(working_range, arm.coordinates))
     q = np.stack([rng.uniform(lower, upper, TUNING.points) for lower, upper in ranges], axis=-1)
-    # over the workspace: at zero position many couplings happen to vanish
-    mass, from_urdf = _mass_samples(arm, q)
+    from_urdf = arm.has_inertials and _gives_usable_mass(arm, q)
     inertias = nominal_inertias(arm, from_urdf)
+    # over the workspace: at zero position many couplings happen to vanish
+    mass, potential = float_energies(arm, q, inertias)
     means = mass.mean(axis=0)
     rows, columns = np.tril_indices(len(ranges))
     diagonal = rows == columns
     # an entry off the diagonal is at most this, as M is positive definite (Cauchy and Schwarz)
     typical = np.sqrt(means[diagonal][rows] * means[diagonal][columns])
-    n = len(ranges)
-    output_reads = np.zeros((len(structure.outputs), len(means)))
-    for index, output in enumerate(structure.outputs):
-        output_reads[index] = row_of(output.reads, n)
-    constant_reads = np.zeros((len(structure.constants), len(means)))
-    for index, constant in enumerate(structure.constants):
-        constant_reads[index] = row_of(constant.reads, n)
+    output_reads = _reads(structure.outputs, len(ranges))
+    constant_reads = _reads(structure.constants, len(ranges))
     outputs = mass @ output_reads.T
     constants = constant_reads @ means
     # an output that the nominal values hardly move still moves by a part of the entries it enters
@@ -71,7 +68,6 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
     constant_floor = TUNING.least_size * (np.abs(constant_reads) @ typical)
     torque = _gravity_torque(arm, q, inertias)
     inertial = np.sqrt((mass[:, diagonal] ** 2).mean(axis=0))
-    _, potential = float_energies(arm, q, inertias)
     return Nominal(
         output_means=_rounded(outputs.mean(axis=0)),
         output_scales=_rounded(np.maximum(outputs.std(axis=0), output_floor), least=0.0),
@@ -79,9 +75,9 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
         constant_scales=_rounded(np.maximum(np.abs(constants), constant_floor), least=0.0),
         potential_scale=_round(max(float(potential.std()), 1e-3), _DIGITS),
         joint_torque=_rounded(np.hypot(torque, inertial)),
-        mass_sensitivities=_sensitivities(_mass_changes(arm, q, inertias, typical)),
+        mass_sensitivities=_sensitivities(_mass_changes(arm, q, inertias, mass, typical)),
         potential_sensitivities=_sensitivities(torque),
-        least_eigenvalue=_round(_least_eigenvalue(mass, means, n), _DIGITS),
+        least_eigenvalue=_round(_least_eigenvalue(mass), _DIGITS),
         from_urdf=from_urdf,
     )
 
@@ -98,17 +94,19 @@ def working_range(coordinate: Coordinate) -> tuple[float, float]:
     return lower, upper
 
 
-def _mass_samples(arm: Arm, q: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return lower triangles of M at ``q``, and whether the URDF's inertials gave them."""
-    if arm.has_inertials:
-        mass, _ = float_energies(arm, q, nominal_inertias(arm, True))
-        rows, columns = np.tril_indices(q.shape[1])
-        lightest = mass.mean(axis=0)[rows == columns].min()
-        # a joint that carries 1e-12 kg carries a placeholder, which rounding takes for zero
-        if lightest > 1e-11 and _least_eigenvalue(mass, mass.mean(axis=0), q.shape[1]) > 1e-6:
-            return mass, True
-    mass, _ = float_energies(arm, q, nominal_inertias(arm, False))
-    return mass, False
+def _reads(terms: Sequence[Output | Constant], n: int) -> np.ndarray:
+    """Return the weights of M's entries in terms of its smallest form, a row each."""
+    rows = [row_of(term.reads, n) for term in terms]
+    return np.reshape(rows, (-1, n * (n + 1) // 2))
+
+
+def _gives_usable_mass(arm: Arm, q: np.ndarray) -> bool:
+    """Whether the URDF's inertials give every joint something to carry, and M positive definite."""
+    mass, _ = float_energies(arm, q, nominal_inertias(arm, True))
+    rows, columns = np.tril_indices(q.shape[1])
+    lightest = mass.mean(axis=0)[rows == columns].min()
+    # a joint that carries 1e-12 kg carries a placeholder, which rounding takes for zero
+    return bool(lightest > 1e-11 and _least_eigenvalue(mass) > 1e-6)
 
 
 def nominal_inertias(arm: Arm, from_urdf: bool) -> list[list[float]]:
@@ -132,11 +130,13 @@ def _default_inertia(arm: Arm, index: int) -> list[float]:
     return [1.0, *center, *tensor[np.triu_indices(3)]]
 
 
-def _least_eigenvalue(mass: np.ndarray, mean: np.ndarray, n: int) -> float:
-    """Return the least eigenvalue, over the samples, of M relative to ``mean``, 0 where that is not definite."""
-    matrices = np.zeros((len(mass) + 1, n, n))
+def _least_eigenvalue(mass: np.ndarray) -> float:
+    """Return the least eigenvalue, over the samples, of M relative to its mean, 0 where that is not definite."""
+    triangles = np.concatenate([mass, mass.mean(axis=0, keepdims=True)])
+    n = isqrt(2 * triangles.shape[1])
+    matrices = np.zeros((len(triangles), n, n))
     rows, columns = np.tril_indices(n)
-    matrices[:, rows, columns] = matrices[:, columns, rows] = np.concatenate([mass, mean[None]])
+    matrices[:, rows, columns] = matrices[:, columns, rows] = triangles
     samples, reference = matrices[:-1], matrices[-1]
     if np.linalg.eigvalsh(reference)[0] <= 0:
         return 0.0
@@ -157,14 +157,15 @@ def _gravity_torque(arm: Arm, q: np.ndarray, inertias: list[list[float]]) -> np.
     return result
 
 
-def _mass_changes(arm: Arm, q: np.ndarray, inertias: list[list[float]], typical: np.ndarray) -> np.ndarray:
+def _mass_changes(
+    arm: Arm, q: np.ndarray, inertias: list[list[float]], mass: np.ndarray, typical: np.ndarray
+) -> np.ndarray:
     """Return the root mean square change of M's entries, relative to their typical size, as each coordinate moves."""
-    base, _ = float_energies(arm, q, inertias)
     moved = np.stack([q] * q.shape[1])
     for index in range(q.shape[1]):
         moved[index, :, index] = np.roll(q[:, index], 1)  # to where it stands in another sample
-    mass, _ = float_energies(arm, moved, inertias)
-    result: np.ndarray = np.sqrt((((mass - base) / typical) ** 2).mean(axis=(1, 2)))
+    moved_mass, _ = float_energies(arm, moved, inertias)
+    result: np.ndarray = np.sqrt((((moved_mass - mass) / typical) ** 2).mean(axis=(1, 2)))
     return result
 
 

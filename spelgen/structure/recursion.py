@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import combinations_with_replacement
+from math import cos, lcm, sin, tan
 from typing import Any
 
 from spelgen.arm.arm import Arm, Body
@@ -31,7 +32,16 @@ TENSOR = tuple(combinations_with_replacement(range(3), 2))
 
 
 @dataclass(frozen=True)
-class Motion:
+class Position:
+    """Hold one coordinate's position: the cosine and sine of its base angle, and its value where something slides."""
+
+    cos: Element
+    sin: Element
+    value: Element
+
+
+@dataclass(frozen=True)
+class _Motion:
     """Where one body's joint stands: the cosine and sine of its angle, or its displacement."""
 
     cos: Element = 1
@@ -79,15 +89,16 @@ def triangle(n: int) -> list[tuple[int, int]]:
 
 def energies(
     arm: Arm,
-    motions: Sequence[Motion],
+    positions: Sequence[Position],
     inertias: Sequence[Sequence[Element]],
     number: Callable[[Fraction], Element],
 ) -> Energies:
     """Mass matrix and potential energy of ``arm``.
 
-    ``motions`` and ``inertias`` (ten elements each) go by body; ``number`` takes the arm's exact constants
-    into the ring. V is zero for a body at the root's origin and grows against ``arm.gravity``.
+    ``positions`` go by coordinate, ``inertias`` (ten elements each) by body; ``number`` takes the arm's exact
+    constants into the ring. V is zero for a body at the root's origin and grows against ``arm.gravity``.
     """
+    motions = _motions(arm, positions, number)
     poses = [_pose(body, number) for body in arm.bodies]
     composites = [_Inertia(ten[0], tuple(ten[1:4]), tuple(ten[4:10])) for ten in inertias]
     total = _Inertia(0, (0, 0, 0), (0,) * 6)
@@ -106,8 +117,80 @@ def energies(
     return Energies(mass, -_dot(gravity, total.moment))
 
 
+def coefficients(
+    arm: Arm,
+    positions: Sequence[Position],
+    units: Sequence[Element],
+    number: Callable[[Fraction], Element],
+) -> list[Element]:
+    """Return what inertial parameters are multiplied by in M's entries, row by row, and last in V.
+
+    ``units`` are batches, one for each of the arm's parameters, that are 1 for this parameter and 0 for all others.
+    """
+    inertias = [units[10 * body : 10 * body + 10] for body in range(len(arm.bodies))]
+    result = energies(arm, positions, inertias, number)
+    return [*result.mass.values(), result.potential]
+
+
+def _motions(arm: Arm, positions: Sequence[Position], number: Callable[[Fraction], Element]) -> list[_Motion]:
+    """Return how every body's joint has moved when the coordinates stand at ``positions``."""
+    bases = base_denominators(arm)
+    moved = []
+    for body in arm.bodies:
+        position = positions[body.coordinate]
+        if body.kind == "prismatic":
+            slide = position.value
+            if body.multiplier != 1:
+                slide = number(body.multiplier) * slide
+            if body.offset:
+                slide = slide + number(Fraction(str(body.offset)))
+            moved.append(_Motion(slide=slide))
+        else:
+            turns = int(body.multiplier * bases[body.coordinate])
+            c, s = _multiple_angle(position.cos, position.sin, turns)
+            if body.offset:
+                c0, s0 = map(number, circle_point(body.offset))
+                c, s = c0 * c - s0 * s, s0 * c + c0 * s
+            moved.append(_Motion(c, s))
+    return moved
+
+
+def circle_point(angle: float) -> tuple[Fraction, Fraction]:
+    """Return the cosine and sine of an angle [rad], as a rational point of the circle within 1e-13 of it."""
+    # tan(angle / 2) has a pole at pi, and right angles are meant exactly
+    if abs(cos(angle)) < 1e-12 or abs(sin(angle)) < 1e-12:
+        return Fraction(round(cos(angle))), Fraction(round(sin(angle)))
+    t = Fraction(tan(angle / 2)).limit_denominator(10**7)
+    return (1 - t * t) / (1 + t * t), 2 * t / (1 + t * t)
+
+
+def base_denominators(arm: Arm) -> list[int]:
+    """Return by coordinate the d for which every body's angle is a whole multiple of q / d."""
+    denominators = [1] * len(arm.coordinates)
+    for body in arm.bodies:
+        if body.kind == "revolute":
+            index = body.coordinate
+            denominators[index] = lcm(denominators[index], body.multiplier.denominator)
+    return denominators
+
+
+def _multiple_angle(c: Element, s: Element, turns: int) -> tuple[Element, Element]:
+    """Return cosine and sine of ``turns`` times an angle, by repeated doubling."""
+    result: tuple[Element, Element] = (1, 0)
+    # cos and sin of multiples by squaring, as mimic joints may turn twenty times as far
+    for bit in bin(abs(turns))[2:]:
+        x, y = result
+        result = (x * x - y * y, 2 * (x * y))
+        if bit == "1":
+            x, y = result
+            result = (x * c - y * s, y * c + x * s)
+    if turns < 0:
+        return result[0], -result[1]
+    return result
+
+
 def _column(
-    arm: Arm, poses: Sequence[_Pose], motions: Sequence[Motion], index: int, inertia: _Inertia
+    arm: Arm, poses: Sequence[_Pose], motions: Sequence[_Motion], index: int, inertia: _Inertia
 ) -> list[tuple[int, Element]]:
     """The body-level mass-matrix entries of joint ``index`` with itself and each of its ancestors."""
     body = arm.bodies[index]
@@ -151,7 +234,7 @@ def _sum(a: _Inertia, b: _Inertia) -> _Inertia:
     return _Inertia(a.mass + b.mass, moment, tuple(x + y for x, y in zip(a.tensor, b.tensor, strict=True)))
 
 
-def _moved_inertia(body: Body, motion: Motion, inertia: _Inertia) -> _Inertia:
+def _moved_inertia(body: Body, motion: _Motion, inertia: _Inertia) -> _Inertia:
     """The inertia seen from the joint's frame at rest, after the joint has moved about or along z."""
     if body.kind == "prismatic":
         return _translated(((2, motion.slide),), inertia)
@@ -175,7 +258,7 @@ def _moved_inertia(body: Body, motion: Motion, inertia: _Inertia) -> _Inertia:
     )
 
 
-def _moved_wrench(body: Body, motion: Motion, wrench: _Wrench) -> _Wrench:
+def _moved_wrench(body: Body, motion: _Motion, wrench: _Wrench) -> _Wrench:
     (fx, fy, fz), (mx, my, mz) = wrench.force, wrench.moment
     if body.kind == "prismatic":
         return _Wrench(wrench.force, (mx - motion.slide * fy, my + motion.slide * fx, mz))

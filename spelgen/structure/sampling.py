@@ -8,11 +8,10 @@ has moved: what changes between the two depends on the coordinate.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from math import cos, lcm, sin, tan
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,7 +27,7 @@ from spelgen.structure.field import (
     random_residues,
     residue,
 )
-from spelgen.structure.recursion import Element, Motion, energies, triangle
+from spelgen.structure.recursion import Element, Position, base_denominators, coefficients, energies, triangle
 
 if TYPE_CHECKING:
     from spelgen.spec import Assume
@@ -46,15 +45,6 @@ class Samples:
 
     mass: np.ndarray
     potential: np.ndarray
-
-
-@dataclass(frozen=True)
-class Position:
-    """Hold one coordinate's position: the cosine and sine of its base angle, and its value where something slides."""
-
-    cos: Element
-    sin: Element
-    value: Element
 
 
 def field_samples(arm: Arm, assume: Assume, samples: int, seed: int = 0) -> Samples:
@@ -76,9 +66,9 @@ def field_samples(arm: Arm, assume: Assume, samples: int, seed: int = 0) -> Samp
             inertias.append([Residues(random_residues(rng, (samples,))) for _ in range(10)])
         else:
             inertias.append(list(map(residue, body.inertia or (Fraction(0),) * 10)))
-    result = energies(arm, motions(arm, positions, residue), inertias, residue)
+    result = energies(arm, positions, inertias, residue)
     shape = (1 + n, samples)
-    entries = [_residue_values(result.mass[key], shape) for key in triangle(n)]
+    entries = [_residue_values(entry, shape) for entry in result.mass.values()]
     return Samples(np.stack(entries, axis=-1), _residue_values(result.potential, shape))
 
 
@@ -89,18 +79,15 @@ def regressor_rows(arm: Arm, points: int, seed: int = 1) -> np.ndarray:
     the number of base parameters (Gautier and Khalil 1990).
     """
     rng = np.random.default_rng(seed)
-    n, parameters = len(arm.coordinates), 10 * len(arm.bodies)
+    parameters = 10 * len(arm.bodies)
     positions = []
-    for _ in range(n):
+    for _ in arm.coordinates:
         c, s = random_circle_points(rng, points)
         value = random_residues(rng, (points,))
         columns = [Residues(x[:, None]) for x in (c, s, value)]
         positions.append(Position(*columns))
-    # one parameter is 1 and all others are 0, for each of them at every point
     units = list(map(Residues, np.eye(parameters, dtype=np.uint64)))
-    inertias = [units[10 * body : 10 * body + 10] for body in range(len(arm.bodies))]
-    result = energies(arm, motions(arm, positions, residue), inertias, residue)
-    elements = [result.mass[key] for key in triangle(n)] + [result.potential]
+    elements = coefficients(arm, positions, units, residue)
     rows = np.stack([_residue_values(element, (points, parameters)) for element in elements], axis=1)
     # V counts up to a constant: its first row is where it counts from
     rows[:, -1] = difference(rows[:, -1], rows[0, -1])
@@ -127,68 +114,11 @@ def float_energies(arm: Arm, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[np
     for index, base in enumerate(base_denominators(arm)):
         value = q[..., index]
         positions.append(Position(np.cos(value / base), np.sin(value / base), value))
-    result = energies(arm, motions(arm, positions, float), inertias, float)
+    result = energies(arm, positions, inertias, float)
     shape = np.broadcast_shapes(q.shape[:-1], *map(np.shape, inertias[0]))
-    entries = [np.broadcast_to(result.mass[key], shape) for key in triangle(q.shape[-1])]
+    entries = [np.broadcast_to(entry, shape) for entry in result.mass.values()]
     potential = np.broadcast_to(result.potential, shape)
     return np.stack(entries, axis=-1).astype(q.dtype), potential.astype(q.dtype)
-
-
-def motions(arm: Arm, positions: Sequence[Position], number: Callable[[Fraction], Element]) -> list[Motion]:
-    """Return how every body's joint has moved when the coordinates stand at ``positions``."""
-    bases = base_denominators(arm)
-    moved = []
-    for body in arm.bodies:
-        position = positions[body.coordinate]
-        if body.kind == "prismatic":
-            slide = position.value
-            if body.multiplier != 1:
-                slide = number(body.multiplier) * slide
-            if body.offset:
-                slide = slide + number(Fraction(str(body.offset)))
-            moved.append(Motion(slide=slide))
-        else:
-            turns = int(body.multiplier * bases[body.coordinate])
-            c, s = _turned(position.cos, position.sin, turns)
-            if body.offset:
-                c0, s0 = map(number, circle_point(body.offset))
-                c, s = c0 * c - s0 * s, s0 * c + c0 * s
-            moved.append(Motion(c, s))
-    return moved
-
-
-def circle_point(angle: float) -> tuple[Fraction, Fraction]:
-    """Return the cosine and sine of an angle [rad], as a rational point of the circle within 1e-13 of it."""
-    # tan(angle / 2) has a pole at pi, and right angles are meant exactly
-    if abs(cos(angle)) < 1e-12 or abs(sin(angle)) < 1e-12:
-        return Fraction(round(cos(angle))), Fraction(round(sin(angle)))
-    t = Fraction(tan(angle / 2)).limit_denominator(10**7)
-    return (1 - t * t) / (1 + t * t), 2 * t / (1 + t * t)
-
-
-def base_denominators(arm: Arm) -> list[int]:
-    """Return by coordinate the d for which every body's angle is a whole multiple of q / d."""
-    denominators = [1] * len(arm.coordinates)
-    for body in arm.bodies:
-        if body.kind == "revolute":
-            index = body.coordinate
-            denominators[index] = lcm(denominators[index], body.multiplier.denominator)
-    return denominators
-
-
-def _turned(c: Element, s: Element, turns: int) -> tuple[Element, Element]:
-    """Return cosine and sine of ``turns`` times an angle, by repeated doubling."""
-    result: tuple[Element, Element] = (1, 0)
-    # cos and sin of multiples by squaring, as mimic joints may turn twenty times as far
-    for bit in bin(abs(turns))[2:]:
-        x, y = result
-        result = (x * x - y * y, 2 * (x * y))
-        if bit == "1":
-            x, y = result
-            result = (x * c - y * s, y * c + x * s)
-    if turns < 0:
-        return result[0], -result[1]
-    return result
 
 
 def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
