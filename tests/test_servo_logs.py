@@ -38,7 +38,7 @@ def codes(report):
 def test_logs_of_a_servo_arm_are_told(arm, logs):
     found = spelgen.check_logs(logs, arm)
     assert not found.errors and not found.warnings
-    shoulder, elbow = found.servos
+    shoulder, elbow = found.joints
     assert shoulder.steps["q"] == pytest.approx(2 * np.pi / 4096, rel=1e-6)
     assert shoulder.steps["u"] is None
     assert shoulder.u == (min(x.u[:, 0].min() for x in logs), max(x.u[:, 0].max() for x in logs))
@@ -101,7 +101,7 @@ def test_what_is_odd_about_commands_is_told(arm, logs, columns, code):
 
 
 def test_what_is_left_at_rest_is_told(arm):
-    shoulder, elbow = spelgen.check_logs(servo_logs(2, 12.0, swing=0.0), arm).servos
+    shoulder, elbow = spelgen.check_logs(servo_logs(2, 12.0, swing=0.0), arm).joints
     # dry friction and the links' weight hold that much, in ratio to kp
     assert 0.3 * 0.15 / 14 < shoulder.steady_state_error < (0.15 + 0.9) / 14
     assert 0.3 * 0.08 / 9 < elbow.steady_state_error < (0.08 + 0.16) / 9
@@ -109,7 +109,7 @@ def test_what_is_left_at_rest_is_told(arm):
 
 def test_servos_that_give_all_they_can_are_counted(arm):
     far = [replace(x, u=x.u + np.array([6 / 14 + 0.2, 0.0])) for x in servo_logs(1, 8.0)]
-    shoulder = spelgen.check_logs(far, arm).servos[0]
+    shoulder = spelgen.check_logs(far, arm).joints[0]
     assert 0.5 < shoulder.saturated <= 1.0
 
 

@@ -5,29 +5,21 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import reduce
-from operator import add
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spelgen.arm.arm import Coordinate
 from spelgen.dynamics.rigid_bodies import body_chain
 from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.identification.drive_hints import Coupling, drive_problem, find_wrong_torques
-from spelgen.identification.drive_samples import DriveLog, DriveSamples
+from spelgen.identification.drive_samples import DriveLog
 from spelgen.identification.torque_delay import delay_of
-from spelgen.log_checks.check_servo_logs import check_servo_logs
-from spelgen.log_checks.gravity import (
-    GravityFit,
-    find_opposed_inertia,
-    fit_gravity,
-    joined,
-    state_samples,
-)
-from spelgen.log_checks.report import TUNING, JointReport, LogReport, range_fraction
-from spelgen.log_checks.robot_checks import CHECKS, JointEvidence
-from spelgen.log_checks.statistics import Statistics, joint_statistics, statistics
+from spelgen.listing import Listing
+from spelgen.log_checks.check_servo_logs import ServoLogs
+from spelgen.log_checks.gravity import find_opposed_inertia, fit_gravity, joined, state_samples
+from spelgen.log_checks.report import TUNING, JointReport, LogReport, joint_report, torque_tables
+from spelgen.log_checks.robot_checks import CHECKS, SENSE, JointEvidence
+from spelgen.log_checks.statistics import Statistics, statistics
 from spelgen.logs.checks import Finding, Findings, clock_diagnostics, findings, once, run_checks, summarised
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
@@ -37,7 +29,6 @@ if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
     from spelgen.settings.log_mapping import LogMapping
 
-SENSE = next(check for check in CHECKS if check.code == "torque-sense")
 ORDER = replace(
     SENSE, code="torque-order", expected="its own", do="change the names of the columns under 'logs'"
 )
@@ -54,60 +45,33 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
     the joints. Raises LogError without any trajectory, or with one of another number of joints, and
     where an arm's settings say 'input: position', without commands.
     """
+    joints, kinds = arm.arm.joint_names, arm.arm.joint_types
+    checked: TorqueLogs | ServoLogs = TorqueLogs(arm, mapping or arm.settings.logs)
     if arm.settings.input == "position":
-        return check_servo_logs(logs, arm)
-    mapping = mapping or arm.settings.logs
-    joints, kinds, drives = arm.arm.joint_names, arm.arm.joint_types, arm.actuation.drives()
-    moving = DriveLog(kinds, drives, Preprocessing())
+        checked = ServoLogs(arm)
     measured: list[Statistics] = []
-    samples: list[np.ndarray] = []
     examples: list[Trajectory] = []
     notes: list[Diagnostic] = []
     odd: list[Finding] = []
-    declared_codes: list[set[str]] = []
     # one after another: a stream of logs may be larger than memory
     for trajectory in logs:
         require_joints(trajectory, joints)
-        require_torques([trajectory])
+        checked.add(trajectory)
         measured.append(statistics(trajectory))
-        samples.append(state_samples(trajectory, drives.inputs))
-        moving.add(trajectory)
-        declared_codes.append(set(trajectory.accepted))
         odd += findings(trajectory, joints, kinds, measured[-1].agreement)
         notes += clock_diagnostics(trajectory)
         if len(examples) < TUNING.examples:
             examples.append(trajectory)
     if not measured:
         raise LogError("no trajectory", expected="at least one")
-    # what files declare by themselves holds where all of them do
-    accepted = set(mapping.accept) | set.intersection(*declared_codes)
-    notes = once(notes)
     summary = summarised(odd, joints, len(measured))
-    motion = joined(samples)
-    reports = []
-    for index, (coordinate, gravity) in enumerate(
-        zip(arm.arm.coordinates, fit_gravity(arm.arm, motion), strict=True)
-    ):
-        report = _joint_report(index, coordinate, gravity, measured)
-        reports.append(report)
-        evidence = JointEvidence(coordinate, report.low, report.high, report.steps, gravity)
-        passed = accepted
-        # a unit that somebody wrote down is taken as right
-        if mapping.unit("tau", coordinate.name) is not None:
-            passed = accepted.union(UNIT_CODES)
-        where = f"joint {coordinate.name!r}"
-        for check, message in run_checks(CHECKS, evidence, passed):
-            place = f"{where}, tau" if check.severity == "error" else where
-            summary.add(check, message, place)
-    # beside wrong velocities friction is wrong too, and of wrong torques hints about drives would be wrong
-    if not any(note.code == "velocity-is-no-derivative" for note in summary.notes):
-        _check_all_torques(arm, motion, moving.samples(), accepted, summary)
+    reports, tables = checked.joints(measured, summary)
     return LogReport(
         robot=arm.arm.name,
-        files=len({x.clock.file for x in measured} - {None}),
         trajectories=tuple(x.clock for x in measured),
-        joints=tuple(reports),
-        findings=(*notes, *summary.notes),
+        joints=reports,
+        tables=tables,
+        findings=(*once(notes), *summary.notes),
         errors=tuple(summary.errors),
         examples=tuple(examples),
     )
@@ -124,32 +88,72 @@ def require_sound_logs(
     return [note for note in report.findings if note.code in ABOUT_ARM]
 
 
-def _check_all_torques(
-    arm: LoadedArm, motion: np.ndarray, moving: DriveSamples | None, accepted: set[str], summary: Findings
-) -> None:
-    """Add what is wrong with the torques of all joints together, or else a coupling of motors, or else a delay.
+class TorqueLogs:
+    """Check logs of torques beside their arm, from samples that are kept while the logs go by."""
 
-    motion: samples (4, S, n), see `state_samples`.
-    """
-    joints, drives = arm.arm.joint_names, arm.actuation.drives()
-    if not summary.errors and SENSE.code not in accepted:
-        opposed = find_opposed_inertia(arm.arm, motion, drives.speeds)
-        if opposed is not None:
-            summary.add(SENSE, opposed, "tau")
-    if moving is None or summary.errors:
-        return
-    chain = body_chain(arm.arm)
-    problem = drive_problem(chain, drives, moving)
-    if problem is not None:
-        wrong = find_wrong_torques(problem, joints)
-        if wrong is not None and wrong.code not in accepted:
-            summary.add(WRONG_TORQUES[wrong.code], wrong.got, f"joint {joints[wrong.joint]!r}, tau")
+    def __init__(self, arm: LoadedArm, mapping: LogMapping) -> None:
+        self._arm, self._mapping, self._drives = arm, mapping, arm.actuation.drives()
+        self._samples: list[np.ndarray] = []
+        self._moving = DriveLog(arm.arm.joint_types, self._drives, Preprocessing())
+        self._declared: list[set[str]] = []
+
+    def add(self, trajectory: Trajectory) -> None:
+        """Take in a trajectory. Raises LogError without torques."""
+        require_torques([trajectory])
+        self._samples.append(state_samples(trajectory, self._drives.inputs))
+        self._moving.add(trajectory)
+        self._declared.append(set(trajectory.accepted))
+
+    def joints(
+        self, measured: Sequence[Statistics], summary: Findings
+    ) -> tuple[list[JointReport], tuple[Listing, ...]]:
+        """Return what all trajectories show of each joint, with its tables; add what is odd to the summary."""
+        # what files declare by themselves holds where all of them do
+        accepted = set(self._mapping.accept) | set.intersection(*self._declared)
+        motion = joined(self._samples)
+        reports = []
+        fits = fit_gravity(self._arm.arm, motion)
+        for index, (coordinate, gravity) in enumerate(zip(self._arm.arm.coordinates, fits, strict=True)):
+            report = joint_report(index, coordinate, measured, gravity)
+            reports.append(report)
+            passed = accepted
+            # a unit that somebody wrote down is taken as right
+            if self._mapping.unit("tau", coordinate.name) is not None:
+                passed = accepted.union(UNIT_CODES)
+            where = f"joint {coordinate.name!r}"
+            for check, message in run_checks(CHECKS, JointEvidence(coordinate, report), passed):
+                place = f"{where}, tau" if check.severity == "error" else where
+                summary.add(check, message, place)
+        # beside wrong velocities friction is wrong too, and of wrong torques hints about drives would be wrong
+        if not any(note.code == "velocity-is-no-derivative" for note in summary.notes):
+            self._check_together(motion, accepted, summary)
+        return reports, torque_tables(reports)
+
+    def _check_together(self, motion: np.ndarray, accepted: set[str], summary: Findings) -> None:
+        """Add what is wrong with the torques of all joints together, or else a coupling of motors, or else a delay.
+
+        motion: samples (4, S, n), see `state_samples`.
+        """
+        arm, joints, drives = self._arm.arm, self._arm.arm.joint_names, self._drives
+        if not summary.errors and SENSE.code not in accepted:
+            opposed = find_opposed_inertia(arm, motion, drives.speeds)
+            if opposed is not None:
+                summary.add(SENSE, opposed, "tau")
+        moving = self._moving.samples()
+        if moving is None or summary.errors:
             return
-    late = delay_of(moving, problem, arm.arm.joint_types, drives, chain)
-    if late.coupling is not None:
-        summary.notes.append(_coupling_hint(arm, *late.coupling))
-    else:
-        summary.notes.extend(late.notes)
+        chain = body_chain(arm)
+        problem = drive_problem(chain, drives, moving)
+        if problem is not None:
+            wrong = find_wrong_torques(problem, joints)
+            if wrong is not None and wrong.code not in accepted:
+                summary.add(WRONG_TORQUES[wrong.code], wrong.got, f"joint {joints[wrong.joint]!r}, tau")
+                return
+        late = delay_of(moving, problem, arm.joint_types, drives, chain)
+        if late.coupling is not None:
+            summary.notes.append(_coupling_hint(self._arm, *late.coupling))
+        else:
+            summary.notes.extend(late.notes)
 
 
 def _coupling_hint(arm: LoadedArm, coupling: Coupling, remaining: float) -> Diagnostic:
@@ -169,23 +173,3 @@ def _coupling_hint(arm: LoadedArm, coupling: Coupling, remaining: float) -> Diag
         f"of both torques (mean square); say {setting} in the robot's YAML"
     )
     return Diagnostic("warning", COUPLED, f"joint {names[coupling.joint]!r}", None, message)
-
-
-def _joint_report(
-    index: int, coordinate: Coordinate, gravity: GravityFit, measured: Sequence[Statistics]
-) -> JointReport:
-    """Put together what all trajectories show of one joint."""
-    signals = joint_statistics(index, measured)
-    agreement = reduce(add, [x.agreement for x in measured])
-    return JointReport(
-        name=coordinate.name,
-        kind=coordinate.kind,
-        low=signals.low,
-        high=signals.high,
-        range_fraction=range_fraction(coordinate, signals.low["q"], signals.high["q"]),
-        noise=signals.noise or None,
-        steps=signals.steps,
-        velocity_factor=agreement.factor(index) if agreement.xx[index] > 0 else None,
-        velocity_correlation=agreement.correlation(index),
-        gravity=gravity,
-    )

@@ -2,83 +2,67 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from spelgen.errors import Diagnostic, LogError
+from spelgen.listing import Listing
 from spelgen.log_checks.following import DELAYS, NO_DELAY, TUNING, Following, measure_following
-from spelgen.log_checks.gravity import GravityFit
-from spelgen.log_checks.report import range_fraction
+from spelgen.log_checks.report import JointReport, joint_report
 from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
-from spelgen.log_checks.servo_report import ServoJointReport, ServoLogReport
-from spelgen.log_checks.statistics import Clock, JointStatistics, joint_statistics, statistics
-from spelgen.logs.checks import (
-    DEGREES,
-    Finding,
-    clock_diagnostics,
-    findings,
-    is_factor,
-    once,
-    run_checks,
-    summarised,
-)
-from spelgen.logs.trajectory import Trajectory, require_commands, require_joints
+from spelgen.log_checks.servo_report import ServoJointReport, servo_tables
+from spelgen.log_checks.statistics import Statistics
+from spelgen.logs.checks import DEGREES, Findings, is_factor, run_checks
+from spelgen.logs.trajectory import Trajectory, require_commands
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
 
-CHECKS = LogCheckTuning()
-FOLLOWS = CHECKS.agreement
+FOLLOWS = LogCheckTuning().agreement
 
 
-def check_servo_logs(logs: Iterable[Trajectory], arm: LoadedArm) -> ServoLogReport:
-    """Report all about logs of commanded positions; nothing is repaired or raised but what `check_logs` raises."""
-    coordinates = arm.arm.coordinates
-    joints, kinds = arm.arm.joint_names, arm.arm.joint_types
-    logs = list(logs)
-    if not logs:
-        raise LogError("no trajectory", expected="at least one")
-    notes: list[Diagnostic] = []
-    odd: list[Finding] = []
-    for log in logs:
-        require_joints(log, joints)
-        require_commands(log)
-        odd += findings(log, joints, kinds)
-        notes += clock_diagnostics(log)
-    notes = once(notes)
-    summary = summarised(odd, joints, len(logs))
-    following = measure_following(logs, _saturation(arm))
-    measured = list(map(statistics, logs))
-    clocks = [x.clock for x in measured]
-    reports = []
-    for k, coordinate in enumerate(coordinates):
-        signals = joint_statistics(k, measured)
-        report = _joint(arm, k, signals, following)
-        reports.append(report)
-        wrong = _wrong_command(k, joints, following)
-        if wrong is None:
-            # some loggers write measured positions in place of commands
-            copied = all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in logs)
-            summary.notes.extend(_odd_command(k, report, following, copied=copied))
-            evidence = JointEvidence(coordinate, signals.low, signals.high, signals.steps, GravityFit())
-            for check, message in run_checks(POSITION_CHECKS, evidence):
-                summary.add(check, message, f"joint {coordinate.name!r}")
-        else:
-            summary.errors.append(wrong)
-    summary.notes.extend(_sparse(clocks))
-    return ServoLogReport(
-        robot=arm.arm.name,
-        files=len({clock.file for clock in clocks} - {None}),
-        trajectories=tuple(clocks),
-        joints=(),
-        findings=(*notes, *summary.notes),
-        errors=tuple(summary.errors),
-        examples=tuple(logs[: CHECKS.examples]),
-        servos=tuple(reports),
-    )
+class ServoLogs:
+    """Check logs of commanded positions beside their arm."""
+
+    def __init__(self, arm: LoadedArm) -> None:
+        self._arm = arm
+        self._logs: list[Trajectory] = []
+
+    def add(self, trajectory: Trajectory) -> None:
+        """Take in a trajectory. Raises LogError without commands."""
+        require_commands(trajectory)
+        self._logs.append(trajectory)
+
+    def joints(
+        self, measured: Sequence[Statistics], summary: Findings
+    ) -> tuple[list[ServoJointReport], tuple[Listing, ...]]:
+        """Return how each joint follows its commands, with tables; add what is odd to the summary."""
+        following = measure_following(self._logs, _saturation(self._arm))
+        reports = []
+        for k, coordinate in enumerate(self._arm.arm.coordinates):
+            signals = joint_report(k, coordinate, measured)
+            report = _joint(self._arm, k, signals, following)
+            reports.append(report)
+            wrong = _wrong_command(k, self._arm.arm.joint_names, following)
+            if wrong is None:
+                # some loggers write measured positions in place of commands
+                copied = all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in self._logs)
+                summary.notes.extend(_odd_command(k, report, following, copied=copied))
+                for check, message in run_checks(POSITION_CHECKS, JointEvidence(coordinate, signals)):
+                    summary.add(check, message, f"joint {coordinate.name!r}")
+            else:
+                summary.errors.append(wrong)
+        # said once: logs of one robot have one rate
+        sparse = [x.clock for x in measured if x.clock.sample_rate < TUNING.sparse_rate]
+        for clock in sparse[:1]:
+            message = (
+                f"{clock.sample_rate:.3g} Hz: delays and friction need {TUNING.sparse_rate:g} Hz or more"
+            )
+            summary.notes.append(Diagnostic("warning", "sparse", f"trajectory {clock.name}", None, message))
+        return reports, servo_tables(reports)
 
 
 def _saturation(arm: LoadedArm) -> np.ndarray:
@@ -91,8 +75,7 @@ def _saturation(arm: LoadedArm) -> np.ndarray:
     return distances
 
 
-def _joint(arm: LoadedArm, k: int, signals: JointStatistics, following: Following) -> ServoJointReport:
-    coordinate = arm.arm.coordinates[k]
+def _joint(arm: LoadedArm, k: int, signals: JointReport, following: Following) -> ServoJointReport:
     delay, lag = NO_DELAY, None
     if following.moves[k]:
         delay = following.best_delay(k, k)
@@ -101,15 +84,15 @@ def _joint(arm: LoadedArm, k: int, signals: JointStatistics, following: Followin
     if len(following.steady_state_errors[k]):
         # nine tenths: where an arm leans on something it may be anywhere
         steady_state_error = float(np.quantile(np.abs(following.steady_state_errors[k]), 0.9))
-    if arm.settings.joint(coordinate.name).kp is not None:
+    if arm.settings.joint(signals.name).kp is not None:
         saturated = float(following.saturated[k])
     return ServoJointReport(
-        name=coordinate.name,
-        kind=coordinate.kind,
+        name=signals.name,
+        kind=signals.kind,
         q=(signals.low["q"], signals.high["q"]),
         u=(signals.low["u"], signals.high["u"]),
-        range_fraction=range_fraction(coordinate, signals.low["q"], signals.high["q"]),
-        noise=signals.noise.get("q"),
+        range_fraction=signals.range_fraction,
+        noise=(signals.noise or {}).get("q"),
         steps=signals.steps,
         lag=lag,
         tracking_rms=float(following.tracking_rms[delay, k]),
@@ -164,17 +147,6 @@ def _odd_command(
     elif DELAYS[delay] < 0:
         message = f"positions come {-1000 * DELAYS[delay]:.0f} ms before commands: are rows shifted?"
         yield _warning("ahead-of-command", report.name, message)
-
-
-def _sparse(clocks: Sequence[Clock]) -> Iterator[Diagnostic]:
-    for clock in clocks:
-        # said once: logs of one robot have one rate
-        if clock.sample_rate < TUNING.sparse_rate:
-            message = (
-                f"{clock.sample_rate:.3g} Hz: delays and friction need {TUNING.sparse_rate:g} Hz or more"
-            )
-            yield Diagnostic("warning", "sparse", f"trajectory {clock.name}", None, message)
-            return
 
 
 def _warning(code: str, joint: str, message: str) -> Diagnostic:

@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import reduce
+from operator import add
+
+import numpy as np
 
 from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, SpelgenError
 from spelgen.labels import UNITS, counted
 from spelgen.listing import WIDTH, Listing, number
 from spelgen.log_checks.gravity import GravityFit
-from spelgen.log_checks.statistics import Clock
+from spelgen.log_checks.servo_report import ServoJointReport, span
+from spelgen.log_checks.statistics import Clock, Statistics
 from spelgen.logs.trajectory import QUANTITIES, Trajectory
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 TUNING = LogCheckTuning()
+UNFITTED = GravityFit()
 
 
 @dataclass(frozen=True)
 class JointReport:
     """One joint over all trajectories; [rad, m], [rad/s, m/s], [Nm, N]; None where it cannot be told.
 
-    range_fraction: of the joint's range that was visited. noise: standard deviation of what changes from sample
-    to sample. steps: of signals that are quantised. velocity_factor, velocity_correlation: both 1 where qd is
-    dq/dt.
+    low, high, noise, steps: of q, qd and tau, or of q, qd and commands u. range_fraction: of the joint's range that was
+    visited. noise: standard deviation of what changes from sample to sample. steps: of signals that are quantised in
+    most trajectories. velocity_factor, velocity_correlation: both 1 where qd is dq/dt.
     """
 
     name: str
@@ -40,15 +47,23 @@ class JointReport:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LogReport:
-    """What `check_logs` found. errors: why the logs cannot be trained on. examples: trajectories to be drawn."""
+    """What `check_logs` found. errors: why the logs cannot be trained on. examples: trajectories to be drawn.
+
+    joints: of an arm under position servos, how they follow their commands. tables: about the joints.
+    """
 
     robot: str
-    files: int
     trajectories: tuple[Clock, ...]
-    joints: tuple[JointReport, ...]
+    joints: Sequence[JointReport | ServoJointReport]
+    tables: tuple[Listing, ...]
     findings: tuple[Diagnostic, ...]
     errors: tuple[SpelgenError, ...]
     examples: tuple[Trajectory, ...]
+
+    @property
+    def files(self) -> int:
+        """How many files the trajectories were read from."""
+        return len({clock.file for clock in self.trajectories} - {None})
 
     @property
     def samples(self) -> int:
@@ -91,7 +106,7 @@ class LogReport:
 
     def listings(self, limit: int | None = None) -> list[Listing]:
         """Return all tables; of trajectories at most `limit`."""
-        return [clock_table(self, limit), _ranges(self), _signals(self), _physics(self)]
+        return [_clock_table(self.trajectories, limit), *self.tables]
 
     def text(self) -> str:
         """Return the report for a terminal, in 80 columns; the errors are not in it."""
@@ -116,36 +131,84 @@ class LogReport:
         return "".join(map(Listing.html, (table, *self.listings(TUNING.shown))))
 
 
-def clock_table(report: LogReport, limit: int | None) -> Listing:
+def joint_report(
+    index: int, coordinate: Coordinate, measured: Sequence[Statistics], gravity: GravityFit = UNFITTED
+) -> JointReport:
+    """Put together what all trajectories show of one joint."""
+    low, high, noise, steps = {}, {}, {}, {}
+    # the median, since one trajectory with contacts would set the noise of all
+    noisy = [x.noise for x in measured if x.noise]
+    for name in measured[0].low:
+        low[name] = min(float(x.low[name][index]) for x in measured)
+        high[name] = max(float(x.high[name][index]) for x in measured)
+        steps[name] = _common_step([x.steps[name][index] for x in measured])
+        if noisy:
+            noise[name] = float(np.median([x[name][index] for x in noisy]))
+    agreement = reduce(add, [x.agreement for x in measured])
+    return JointReport(
+        name=coordinate.name,
+        kind=coordinate.kind,
+        low=low,
+        high=high,
+        range_fraction=_range_fraction(coordinate, low["q"], high["q"]),
+        noise=noise or None,
+        steps=steps,
+        velocity_factor=agreement.factor(index) if agreement.xx[index] > 0 else None,
+        velocity_correlation=agreement.correlation(index),
+        gravity=gravity,
+    )
+
+
+def _common_step(steps: Sequence[float]) -> float | None:
+    """Return the step of most trajectories, where the signal is quantised in most of them."""
+    finite = [step for step in steps if np.isfinite(step)]
+    return float(np.median(finite)) if 2 * len(finite) > len(steps) else None
+
+
+def _range_fraction(coordinate: Coordinate, low: float, high: float) -> float | None:
+    """Return the part of a joint's range that lies between these positions; None where it has no range."""
+    if coordinate.limits is None:
+        return None
+    # limits of a URDF may be equal or swapped
+    width = coordinate.limits[1] - coordinate.limits[0]
+    return (high - low) / width if width > 0 else None
+
+
+def torque_tables(joints: Sequence[JointReport]) -> tuple[Listing, ...]:
+    """Return the tables of an arm under torques."""
+    return _ranges(joints), _signals(joints), _physics(joints)
+
+
+def _clock_table(trajectories: Sequence[Clock], limit: int | None) -> Listing:
     """Return when samples were taken; of trajectories at most `limit`."""
     head = ("trajectory", "samples", "duration", "sample rate", "jitter", "gaps", "longest")
     rows = []
     # a data set of a thousand episodes would fill the terminal
-    for clock in report.trajectories[:limit]:
+    for clock in trajectories[:limit]:
         longest = f"{clock.longest_gap:.3g} s" if clock.gaps else "-"
         duration, rate = f"{clock.duration:.4g} s", f"{clock.sample_rate:.4g} Hz"
         rows.append((
             clock.name, str(clock.samples), duration, rate, f"{clock.jitter:.1%}", str(clock.gaps), longest,
         ))  # fmt: skip
-    hidden = len(report.trajectories) - len(rows)
+    hidden = len(trajectories) - len(rows)
     return Listing("Clock", head, tuple(rows), f"and {hidden} more" if hidden else "")
 
 
-def _ranges(report: LogReport) -> Listing:
+def _ranges(joints: Sequence[JointReport]) -> Listing:
     head = ("joint", "q", "of its range", "qd", "tau")
     rows = []
-    for joint in report.joints:
+    for joint in joints:
         q, qd, tau = (span(joint.low[name], joint.high[name]) for name in QUANTITIES)
         rows.append((joint.name, q, _percent(joint.range_fraction), qd, tau))
-    kinds = {joint.kind for joint in report.joints}
+    kinds = {joint.kind for joint in joints}
     units = "; ".join(f"{x.position}, {x.velocity}, {x.torque}" for kind, x in UNITS.items() if kind in kinds)
     return Listing(f"Ranges [{units}]", head, tuple(rows))
 
 
-def _signals(report: LogReport) -> Listing:
+def _signals(joints: Sequence[JointReport]) -> Listing:
     head = ("joint", "q noise", "qd noise", "tau noise", "q step", "qd step", "tau step")
     rows = []
-    for joint in report.joints:
+    for joint in joints:
         noise = map((joint.noise or {}).get, QUANTITIES)
         steps = map(joint.steps.get, QUANTITIES)
         rows.append((joint.name, *map(number, noise), *map(number, steps)))
@@ -156,10 +219,10 @@ def _signals(report: LogReport) -> Listing:
     return Listing("Signals", head, tuple(rows), note)
 
 
-def _physics(report: LogReport) -> Listing:
+def _physics(joints: Sequence[JointReport]) -> Listing:
     head = ("joint", "dq/dt : qd", "agree", "gravity in tau", "x URDF")
     rows = []
-    for joint in report.joints:
+    for joint in joints:
         fit = joint.gravity
         # beside a low correlation the factor means nothing
         is_seen = abs(fit.correlation or 0) > TUNING.seen
@@ -173,23 +236,9 @@ def _physics(report: LogReport) -> Listing:
     return Listing("Physics", head, tuple(rows), note)
 
 
-def span(low: float, high: float) -> str:
-    """Return both ends of a range."""
-    return f"{number(low)} .. {number(high)}"
-
-
 def _percent(fraction: float | None) -> str:
     return "-" if fraction is None else f"{fraction:.0%}"
 
 
 def _wrapped(finding: Diagnostic) -> str:
     return textwrap.fill(str(finding), WIDTH, initial_indent="  ", subsequent_indent="    ")
-
-
-def range_fraction(coordinate: Coordinate, low: float, high: float) -> float | None:
-    """Return the part of a joint's range that lies between these positions; None where it has no range."""
-    if coordinate.limits is None:
-        return None
-    # limits of a URDF may be equal or swapped
-    width = coordinate.limits[1] - coordinate.limits[0]
-    return (high - low) / width if width > 0 else None

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from math import nan
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from spelgen.arm.arm import Coordinate
 from spelgen.labels import UNITS
-from spelgen.log_checks.gravity import GravityFit
+from spelgen.log_checks.report import JointReport
 from spelgen.logs.checks import Check
 from spelgen.logs.trajectory import QUANTITIES
 from spelgen.settings.tuning.log_checks import LogCheckTuning
@@ -19,27 +18,19 @@ SAY_UNIT = "write 'units: {tau: ...}' or a 'gain' under 'logs' in the robot's YA
 TORQUE_ERRORS = ("torque-sense", "torque-unit", "torque-beyond-drive")
 
 
-@dataclass(frozen=True)
-class JointEvidence:
-    """Hold what all trajectories show of one joint: the subject of the checks against the robot.
-
-    low, high: of q, qd and tau, or of q, qd and commands u. steps: between the levels of quantised signals among them,
-    None of others.
-    """
+class JointEvidence(NamedTuple):
+    """Hold a joint, and what all trajectories show of it: the subject of the checks against the robot."""
 
     coordinate: Coordinate
-    low: dict[str, float]
-    high: dict[str, float]
-    steps: dict[str, float | None]
-    gravity: GravityFit
+    shown: JointReport
 
     def largest(self, quantity: str) -> float:
         """Return the largest size of "q", "qd" or "tau"."""
-        return max(abs(self.low[quantity]), abs(self.high[quantity]))
+        return max(abs(self.shown.low[quantity]), abs(self.shown.high[quantity]))
 
     def gravity_in_torque(self) -> tuple[float, float]:
         """Return factor and correlation of the URDF's gravity in the torque; NaN where it is too small to be seen."""
-        fit = self.gravity
+        fit = self.shown.gravity
         # of a joint that gravity hardly loads the factor is chance
         if fit.factor is None or fit.correlation is None or (fit.relative_deviation or 0.0) < TUNING.loaded:
             return nan, nan  # which no comparison takes for odd
@@ -53,9 +44,9 @@ def find_beyond_limits(joint: JointEvidence) -> str | None:
         return None
     unit = UNITS[coordinate.kind].position
     for name in ("q", "u"):
-        if name not in joint.low:
+        if name not in joint.shown.low:
             continue
-        low, high = joint.low[name], joint.high[name]
+        low, high = joint.shown.low[name], joint.shown.high[name]
         # a limit overrun by less is the rounding of a logger
         if coordinate.lower is not None and low < coordinate.lower - TUNING.limit_rounding:
             findings.append(f"{name} down to {low:.4g} {unit}, the limit is {coordinate.lower:.4g}")
@@ -108,7 +99,7 @@ def find_coarse(joint: JointEvidence) -> str | None:
     """Find signals that are quantised to steps of their own size."""
     for name in QUANTITIES:
         # a step alone says little: 0.01 Nm is fine for a shoulder and all there is for a wrist
-        step, width = joint.steps[name], joint.high[name] - joint.low[name]
+        step, width = joint.shown.steps[name], joint.shown.high[name] - joint.shown.low[name]
         if step is not None and width < TUNING.levels * step:
             return (
                 f"{name} has steps of {step:.3g} in a range of {width:.3g}: what is smaller than a step, friction and "
@@ -122,8 +113,8 @@ def find_stop(joint: JointEvidence) -> str | None:
     if joint.coordinate.continuous:
         return None
     for limit, reached in (
-        (joint.coordinate.lower, joint.low["q"]),
-        (joint.coordinate.upper, joint.high["q"]),
+        (joint.coordinate.lower, joint.shown.low["q"]),
+        (joint.coordinate.upper, joint.shown.high["q"]),
     ):
         if limit is not None and abs(reached - limit) <= TUNING.limit_rounding:
             return f"q reaches its limit {limit:.4g}: contact with the stop changes the torque; remove such motion"
@@ -136,7 +127,7 @@ def find_no_gravity(joint: JointEvidence) -> str | None:
     if abs(correlation) < 1 - TUNING.seen:
         return (
             f"tau does not move with gravity: their correlation is {correlation:.2g}, while the URDF's gravity torque "
-            f"varies {joint.gravity.relative_deviation:.2g} times as much as tau; is it compensated in the log?"
+            f"varies {joint.shown.gravity.relative_deviation:.2g} times as much as tau; is it compensated in the log?"
         )
     return None
 
@@ -162,11 +153,12 @@ def find_unusual_scale(joint: JointEvidence) -> str | None:
 
 # these need no torques: of arms under position servos, too
 POSITION_CHECKS = [Check("beyond-position-limit", "warning", find_beyond_limits)]
+SENSE = Check(
+    "torque-sense", "error", find_wrong_sense, expected="the URDF's sense",
+    do="write 'sign: -1' or a negative 'gain' of the joint under 'logs', or the gravity of this mounting",
+)  # fmt: skip
 CHECKS: list[Check[JointEvidence]] = [
-    Check(
-        "torque-sense", "error", find_wrong_sense, expected="the URDF's sense",
-        do="write 'sign: -1' or a negative 'gain' of the joint under 'logs', or the gravity of this mounting",
-    ),
+    SENSE,
     Check("torque-unit", "error", find_wrong_unit, expected="Nm or N at the joint", do=SAY_UNIT),
     Check(
         "torque-beyond-drive", "error", find_beyond_drive, unless=("torque-sense", "torque-unit"),

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from spelgen.labels import UNITS
 from spelgen.listing import Listing, number
-from spelgen.log_checks.report import LogReport, clock_table, span
 
 
 @dataclass(frozen=True)
@@ -32,56 +32,46 @@ class ServoJointReport:
     steady_state_error: float | None
     saturated: float | None
 
-    def signals(self) -> tuple[str, ...]:
-        """Return the joint's row among positions and commands."""
-        visited = _format(self.range_fraction, 1, ".0%")
-        steps = (number(self.steps["q"]), number(self.steps["u"]))
-        return (self.name, span(*self.q), visited, span(*self.u), number(self.noise), *steps)
 
-    def following(self) -> tuple[str, ...]:
-        """Return the joint's row among lags and distances."""
-        return (
-            self.name,
-            _format(self.lag, 1000, ".0f", " ms"),
-            _format(self.tracking_rms, 1000, ".3g"),
-            _format(self.steady_state_error, 1000, ".3g"),
-            _format(self.saturated, 1, ".1%"),
-        )
+def servo_tables(joints: Sequence[ServoJointReport]) -> tuple[Listing, ...]:
+    """Return the tables of an arm under position servos."""
+    return _commands(joints), _following(joints)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class ServoLogReport(LogReport):
-    """Report logs of commanded positions."""
+def _commands(joints: Sequence[ServoJointReport]) -> Listing:
+    head = ("joint", "q", "range", "u", "noise", "q step", "u step")
+    rows = []
+    for joint in joints:
+        visited, noise = _format(joint.range_fraction, 1, ".0%"), number(joint.noise)
+        steps = number(joint.steps["q"]), number(joint.steps["u"])
+        rows.append((joint.name, span(*joint.q), visited, span(*joint.u), noise, *steps))
+    kinds = {joint.kind for joint in joints}
+    units = "; ".join(unit.position for kind, unit in UNITS.items() if kind in kinds)
+    note = (
+        "range: how much of the joint's was visited; u: commanded positions; noise: of q, standard deviation of "
+        "what changes from sample to sample, from 50 Hz on; step: between the levels of a quantised signal."
+    )
+    return Listing(f"Positions and commands [{units}]", head, tuple(rows), note)
 
-    servos: tuple[ServoJointReport, ...] = ()
 
-    def to_dict(self) -> dict[str, object]:
-        """Return the JSON form, as of logs of torques but for the joints."""
-        return super().to_dict() | {"joints": list(map(asdict, self.servos))}
+def _following(joints: Sequence[ServoJointReport]) -> Listing:
+    head = ("joint", "lag", "tracking RMS", "steady-state error", "saturated")
+    rows = []
+    for joint in joints:
+        lag, saturated = _format(joint.lag, 1000, ".0f", " ms"), _format(joint.saturated, 1, ".1%")
+        tracking = _format(joint.tracking_rms, 1000, ".3g")
+        rows.append((joint.name, lag, tracking, _format(joint.steady_state_error, 1000, ".3g"), saturated))
+    note = (
+        "lag: delay of positions after commands; tracking RMS: delayed command minus position; steady-state error: "
+        "90th percentile of the distance from the command at rest [mrad, mm]; saturated: fraction of time with "
+        "kp (u - q) beyond the effort limit, if kp is set."
+    )
+    return Listing("Following", head, tuple(rows), note)
 
-    def listings(self, most: int | None = None) -> list[Listing]:
-        """Return all tables; of trajectories at most `most`."""
-        return [clock_table(self, most), self._commands(), self._following()]
 
-    def _commands(self) -> Listing:
-        head = ("joint", "q", "range", "u", "noise", "q step", "u step")
-        kinds = {joint.kind for joint in self.servos}
-        units = "; ".join(unit.position for kind, unit in UNITS.items() if kind in kinds)
-        note = (
-            "range: how much of the joint's was visited; u: commanded positions; noise: of q, standard deviation of "
-            "what changes from sample to sample, from 50 Hz on; step: between the levels of a quantised signal."
-        )
-        rows = tuple(map(ServoJointReport.signals, self.servos))
-        return Listing(f"Positions and commands [{units}]", head, rows, note)
-
-    def _following(self) -> Listing:
-        head = ("joint", "lag", "tracking RMS", "steady-state error", "saturated")
-        note = (
-            "lag: delay of positions after commands; tracking RMS: delayed command minus position; steady-state error: "
-            "90th percentile of the distance from the command at rest [mrad, mm]; saturated: fraction of time with "
-            "kp (u - q) beyond the effort limit, if kp is set."
-        )
-        return Listing("Following", head, tuple(map(ServoJointReport.following, self.servos)), note)
+def span(low: float, high: float) -> str:
+    """Return both ends of a range."""
+    return f"{number(low)} .. {number(high)}"
 
 
 def _format(value: float | None, factor: float, form: str, unit: str = "") -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,16 +50,6 @@ class Statistics:
     agreement: VelocityAgreement
 
 
-@dataclass(frozen=True)
-class JointStatistics:
-    """One joint over all trajectories: the same as numbers; a step is None where most trajectories have none."""
-
-    low: dict[str, float]
-    high: dict[str, float]
-    noise: dict[str, float]
-    steps: dict[str, float | None]
-
-
 def statistics(trajectory: Trajectory) -> Statistics:
     """Return the numbers of one trajectory."""
     low, high, noise, steps = {}, {}, {}, {}
@@ -74,20 +63,6 @@ def statistics(trajectory: Trajectory) -> Statistics:
             noise[name] = noise_level(trajectory.t, signals)
     agreement = velocity_agreement(trajectory)
     return Statistics(clock_of(trajectory), low, high, noise, steps, agreement)
-
-
-def joint_statistics(index: int, measured: Sequence[Statistics]) -> JointStatistics:
-    """Put together what all trajectories show of the signals of one joint."""
-    low, high, noise, steps = {}, {}, {}, {}
-    # the median, since one trajectory with contacts would set the noise of all
-    noisy = [x.noise for x in measured if x.noise]
-    for name in measured[0].low:
-        low[name] = min(float(x.low[name][index]) for x in measured)
-        high[name] = max(float(x.high[name][index]) for x in measured)
-        steps[name] = _common_step([x.steps[name][index] for x in measured])
-        if noisy:
-            noise[name] = float(np.median([x[name][index] for x in noisy]))
-    return JointStatistics(low, high, noise, steps)
 
 
 def clock_of(trajectory: Trajectory) -> Clock:
@@ -146,9 +121,3 @@ def _is_commanded(values: np.ndarray, step: float) -> bool:
     changes = np.abs(np.diff(values))
     # a smooth signal passes such wide levels one after the other
     return bool(np.ptp(values) < TUNING.levels * step and changes[changes > 0].mean() > 1.5 * step)
-
-
-def _common_step(steps: Sequence[float]) -> float | None:
-    """Return the step of most trajectories, where the signal is quantised in most of them."""
-    finite = [step for step in steps if np.isfinite(step)]
-    return float(np.median(finite)) if 2 * len(finite) > len(steps) else None
