@@ -34,7 +34,7 @@ from spelgen.exporting.model_expressions import expression_function
 from spelgen.exporting.onnx_export import called_by_onnx, onnx_model, onnx_session
 from spelgen.exporting.parity import Called, Parity, check_parity
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
-from spelgen.exporting.tip_chain import tip_in_body
+from spelgen.exporting.tip_frame import tip_frame
 from spelgen.exporting.torch_programs import PROGRAMS
 from spelgen.exporting.trained import Trained
 from spelgen.loaded_arm import load_arm
@@ -82,7 +82,7 @@ def parity() -> None:
             onnx = worst(called_by_onnx(files), list(PROGRAMS))
             projection = rigid_body_projection(each.model, each.arm)
             gains = model.inputs
-            text = mjcf_text(projection, gains, tip_in_body(each.arm))
+            text = mjcf_text(projection, gains, tip_frame(each.arm))
             mujoco = _largest(check_mjcf(text, projection, gains, states=STATES))
             print(
                 f"{robot:12s}{preset:12s}" + "".join(f"{x:12.1e}" for x in (*c, casadi, onnx, mujoco)),

@@ -19,7 +19,6 @@ from spelgen.exporting.c_export import c_files
 from spelgen.exporting.c_library import CLibrary, compile_object, link_library, write_c
 from spelgen.exporting.casadi_export import called_by_state, export_casadi
 from spelgen.exporting.describe import identifier
-from spelgen.exporting.description import Bristles
 from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.export import export
 from spelgen.exporting.model_expressions import expression_function
@@ -200,14 +199,15 @@ def test_c_is_sound_whatever_it_is_given(case, compiled):
     assert done.stdout == "1 1\n"
 
 
-BRISTLES = Bristles(np.array([[0.01, 0.1], [0.02, 0.3]]), np.array([[0.3, 0.7], [0.4, 0.6]]))
+REACH = np.array([[0.01, 0.1], [0.02, 0.3]])
+FRACTIONS = np.array([[0.3, 0.7], [0.4, 0.6]])
 
 
 def test_bristles_follow_their_law_along_a_displacement():
     """z' = qd up to the reach, integrated in small steps, there and back."""
     z, dq = ca.SX.sym("z", 4), ca.SX.sym("dq", 2)
-    step = ca.Function("step", [z, dq], [friction_expressions.bristle_step(BRISTLES, z, dq)])
-    found, small, steps, reach = np.zeros(4), np.zeros(4), 4000, BRISTLES.reach.ravel()
+    step = ca.Function("step", [z, dq], [friction_expressions.bristle_step(REACH, z, dq)])
+    found, small, steps, reach = np.zeros(4), np.zeros(4), 4000, REACH.ravel()
     for moved in (np.array([0.05, -0.02]), np.array([-0.01, 0.03]), np.zeros(2)):
         found = step(found, moved).full()[:, 0]
         d = np.repeat(moved / steps, 2)
@@ -221,7 +221,7 @@ def test_bristles_follow_their_law_along_a_displacement():
 def test_c_carries_frictions_memory(tmp_path):
     """Two elements a joint: z turns dry friction, and long sliding bends it fully. NZ says how many numbers."""
     model = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
-    model = replace(model, bristles=BRISTLES)
+    model = replace(model, reach=REACH, friction=model.friction._replace(bristle_fractions=FRACTIONS))
     source = write_c(model, tmp_path)
     assert "#define TWO_LINK_NZ 4" in source.with_suffix(".h").read_text()
     called = CLibrary(link_library(compile_object(source, "gcc"), "gcc"), model)
@@ -232,11 +232,11 @@ def test_c_carries_frictions_memory(tmp_path):
     dry = law.coulomb + law.stribeck / (1 + (1 + rounding) * relative**2 / (relative + rounding) / 8) ** 8
     dry += law.load_dependence * np.hypot(called("gravity", given)["gravity"], law.least_load)
     straight = called("friction", given | {"z": np.zeros((5, 4))})["friction"]
-    bent = (BRISTLES.fractions / BRISTLES.reach * given["z"].reshape(5, 2, 2)).sum(axis=-1)
+    bent = (FRACTIONS / REACH * given["z"].reshape(5, 2, 2)).sum(axis=-1)
     np.testing.assert_allclose(called("friction", given)["friction"], straight + dry * bent)
     slid = called("friction_memory", given)["z_start"].reshape(5, 2, 2)
     direction = np.tanh(qd / law.coulomb_smoothing_velocity)
-    np.testing.assert_allclose(slid, BRISTLES.reach * direction[..., None])
+    np.testing.assert_allclose(slid, REACH * direction[..., None])
 
 
 @needs_gcc
@@ -246,8 +246,8 @@ def test_in_single_precision_a_joint_that_creeps_moves_its_bristles(tmp_path):
     source = write_c(model, tmp_path)
     library = link_library(compile_object(source, "gcc", f"-D{model.name.upper()}_FLOAT"), "gcc")
     called = CLibrary(library, model, np.float32)
-    assert model.bristles is not None
-    z = start = 0.6 * model.bristles.reach.reshape(1, -1)
+    assert model.memory
+    z = start = 0.6 * model.reach.reshape(1, -1)
     given = {"q": np.zeros((1, 2)), "dq": np.full((1, 2), 1e-9)}
     for _ in range(200):
         z = called("friction_step", given | {"z": z})["z_next"]

@@ -24,7 +24,7 @@ from spelgen.building import build
 from spelgen.exporting.describe import servos_of
 from spelgen.exporting.mjcf_file import mjcf_text
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
-from spelgen.exporting.tip_chain import tip_in_body
+from spelgen.exporting.tip_frame import tip_frame
 from spelgen.fitting.servo.windows import ServoWindows
 from spelgen.loaded_arm import LoadedArm
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
@@ -92,7 +92,7 @@ def fit_position_actuators(
     )
     if servos is None or len(arm.arm.bodies) > n or (bodies.motors != np.eye(n)).any():
         return None
-    names, tip = arm.arm.joint_names, tip_in_body(arm)
+    names, tip = arm.arm.joint_names, tip_frame(arm)
 
     def mjcf(kp: np.ndarray, kv: np.ndarray, armature: np.ndarray, dry: np.ndarray) -> str:
         # kv takes a joint's damping too: they are one number but where the torque is limited

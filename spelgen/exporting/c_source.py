@@ -50,8 +50,8 @@ def c_header(model: TrainedModel, entries: Sequence[CEntry], sizes: str) -> str:
             _WIDTH - 4,
         )
     memory = ": none, and z may be NULL"
-    if model.bristles is not None:
-        memory = f": joint by joint, {model.bristles.count} each"
+    if model.memory:
+        memory = f": joint by joint, {model.reach.shape[1]} each"
     return render(
         "model.h.jinja",
         title=_title(model),

@@ -12,24 +12,22 @@ import torch
 from scipy.interpolate import BSpline
 from torch import Tensor
 
+from spelgen.arm.arm import make_arm
 from spelgen.dynamics.protocol import (
     ResidualModel,
-    has_friction_state,
     has_residuals,
     has_rigid_bodies,
     input_of,
 )
 from spelgen.errors import RunError
 from spelgen.exporting.description import (
-    Bristles,
-    FrictionLaw,
     Harmonics,
     Network,
     Residuals,
     Servos,
     TrainedModel,
 )
-from spelgen.exporting.tip_chain import tip_chain
+from spelgen.exporting.tip_frame import tip_frame
 from spelgen.loaded_arm import LoadedArm
 
 if TYPE_CHECKING:
@@ -47,34 +45,30 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
     if not has_rigid_bodies(exact):
         raise _unsupported(f"the preset {preset}, which is not of rigid bodies")
     weights = exact.prepare()
-    _, tip, end = tip_chain(loaded)
+    unrounded = make_arm(loaded.robot, joints=loaded.arm.joint_names, angle_tolerance=0.0)
     # what does not depend on q is one matrix, whatever it comes from
     constant_mass = array(weights.armature)
     residuals = Residuals((), None, None, {}, (), {})
-    bristles = None
-    if has_friction_state(exact):
-        reach: Tensor = exact.friction.bristles.reach
-        bristles = Bristles(array(reach), array(weights.friction.bristle_fractions))
     if has_residuals(exact):
         constant_mass += array(weights.residual.constant).reshape(exact.n, exact.n)
         residuals = _residuals(exact)
     return TrainedModel(
         name=identifier(loaded.arm.name),
         arm=loaded.arm,
+        unrounded=unrounded.bodies,
         preset=preset,
         identifiers=tuple(model.joint_names),
         inertias=array(exact.inertial_parameters),
         constant_mass=constant_mass,
         motors=array(exact.motors),
         residuals=residuals,
-        friction=_friction(weights.friction),
-        bristles=bristles,
+        friction=weights.friction._make(map(array, weights.friction)),
+        reach=array(exact.friction.bristles.reach),
         inputs=array(exact.input_matrix(torch.zeros(exact.n).double())),
         actuated=array(exact.actuated),
         torque_offset=array(exact.torque_offset),
         friction_compensation=array(exact.friction_compensation),
-        tip=tip,
-        tip_end=end,
+        tip=tip_frame(loaded),
         servos=servos_of(exact),
     )
 
@@ -108,11 +102,6 @@ def _unsupported(subject: str) -> RunError:
         expected="closed-form, or hybrid with tanh networks",
         do="--to torch, onnx, mjcf and urdf take every preset",
     )
-
-
-def _friction(constants: Any) -> FrictionLaw:
-    values = constants._asdict()
-    return FrictionLaw(**{name: array(values[name]) for name in FrictionLaw.__annotations__})
 
 
 def _residuals(model: ResidualModel) -> Residuals:

@@ -3,55 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import BSpline
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Arm, Body
 
 
 @dataclass(frozen=True, eq=False)
-class TipJoint:
-    """A joint on the way to the tip: origin (4, 4), then a turn about z or a slide along it by row @ q + offset."""
+class Tip:
+    """The frame of a link: ``pose``, (4, 4), in the frame of the body ``carrier``, -1 for the root link."""
 
-    name: str
-    origin: np.ndarray
-    revolute: bool
-    row: np.ndarray
-    offset: float
-
-
-@dataclass(frozen=True, eq=False)
-class FrictionLaw:
-    """Hold the constants of ``runtime.friction_laws``, (n,) each, in their units."""
-
-    viscous: np.ndarray
-    saturation: np.ndarray
-    saturation_velocity: np.ndarray
-    coulomb: np.ndarray
-    stribeck: np.ndarray
-    stribeck_velocity: np.ndarray
-    stribeck_rounding: np.ndarray
-    coulomb_smoothing_velocity: np.ndarray
-    load_dependence: np.ndarray
-    least_load: np.ndarray
-    memoryless: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Bristles:
-    """The memory of friction: ``count`` elements a joint, (n, count).
-
-    reach: [rad, m]. fractions: of dry friction.
-    """
-
-    reach: np.ndarray
-    fractions: np.ndarray
-
-    @property
-    def count(self) -> int:
-        """How many elements a joint has."""
-        return int(self.reach.shape[1])
+    link: str
+    carrier: int
+    pose: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,28 +89,30 @@ class Servos:
 class TrainedModel:
     """A trained arm of n joints. Units: rad and Nm, or m and N.
 
-    name: for code. inertias: (bodies, 10) about the joints' frames. constant_mass: of rotors and other constants in
-    M, (n, n). motors: (n, n), the drives' speeds by the joints', which friction follows. inputs: G, (n, n);
-    actuated: (n,), 0 for a passive joint. friction_compensation: (n,) torque that the drives add by velocity, unseen.
-    entries: names of the functions that are written; none for all.
+    name: for code. unrounded: the arm's bodies by the angles that the URDF has, for the tip alone, which is compared
+    with other readers of the file. inertias: (bodies, 10) about the joints' frames. constant_mass: of rotors and other
+    constants in M, (n, n). motors: (n, n), the drives' speeds by the joints', which friction follows. friction: the
+    ``FrictionConstants`` of the runtime, as arrays. reach: of the bristles that are its memory, (n, K) [rad, m].
+    inputs: G, (n, n); actuated: (n,), 0 for a passive joint. friction_compensation: (n,) torque that the drives add by
+    velocity, unseen. entries: names of the functions that are written; none for all.
     """
 
     name: str
     arm: Arm
+    unrounded: tuple[Body, ...]
     preset: str
     identifiers: tuple[str, ...]
     inertias: np.ndarray
     constant_mass: np.ndarray
     motors: np.ndarray
     residuals: Residuals
-    friction: FrictionLaw
-    bristles: Bristles | None
+    friction: Any
+    reach: np.ndarray
     inputs: np.ndarray
     actuated: np.ndarray
     torque_offset: np.ndarray
     friction_compensation: np.ndarray
-    tip: tuple[TipJoint, ...]
-    tip_end: np.ndarray
+    tip: Tip
     servos: Servos | None = None
     entries: tuple[str, ...] = ()
 
@@ -156,6 +124,4 @@ class TrainedModel:
     @property
     def memory(self) -> int:
         """How many numbers the memory of friction has."""
-        if self.bristles is None:
-            return 0
-        return self.n * self.bristles.count
+        return int(self.reach.size)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import casadi as ca
 import numpy as np
 
-from spelgen.exporting.description import Bristles, FrictionLaw
 
-
-def law_torque(law: FrictionLaw, qd: ca.SX, gravity: ca.SX, direction: ca.SX) -> ca.SX:
+def law_torque(law: Any, qd: ca.SX, gravity: ca.SX, direction: ca.SX) -> ca.SX:
     """Return the torque of friction, (n, 1) [Nm, N], under this gravity torque.
 
-    direction: of dry friction, from -1 to 1.
+    law: ``FrictionConstants`` of arrays. direction: of dry friction, from -1 to 1.
     """
     load = ca.sqrt(gravity**2 + law.least_load**2)
     dry = law.coulomb + law.load_dependence * load
@@ -30,29 +30,28 @@ def turned(velocity: ca.SX, width: np.ndarray) -> ca.SX:
     return velocity / ca.sqrt(velocity**2 + width**2)
 
 
-def bristle_direction(bristles: Bristles, z: ca.SX) -> ca.SX:
+def bristle_direction(fractions: np.ndarray, reach: np.ndarray, z: ca.SX) -> ca.SX:
     """Return the sum of fraction z / reach over a joint's elements, (n, 1); z: joint by joint, (n K, 1)."""
-    n, count = bristles.reach.shape
-    bent = z * (bristles.fractions / bristles.reach).ravel()
+    n, count = reach.shape
+    bent = z * (fractions / reach).ravel()
     # CasADi reshapes column by column: a joint's elements are a column
     direction: ca.SX = ca.sum1(ca.reshape(bent, count, n)).T
     return direction
 
 
-def sliding_bristles(bristles: Bristles, law: FrictionLaw, qd: ca.SX) -> ca.SX:
-    """Return z of joints that slide at qd for long, (n K, 1)."""
-    direction = ca.tanh(qd / law.coulomb_smoothing_velocity)
-    z: ca.SX = _by_element(bristles, direction) * bristles.reach.ravel()
+def sliding_bristles(reach: np.ndarray, width: np.ndarray, qd: ca.SX) -> ca.SX:
+    """Return z of joints that slide at qd for long, (n K, 1); dry friction turns around over this width."""
+    z: ca.SX = _by_element(reach, ca.tanh(qd / width)) * reach.ravel()
     return z
 
 
-def bristle_step(bristles: Bristles, z: ca.SX, dq: ca.SX) -> ca.SX:
+def bristle_step(reach: np.ndarray, z: ca.SX, dq: ca.SX) -> ca.SX:
     """Return z after a displacement dq one way: bristles bend up to their reach."""
-    reach = bristles.reach.ravel()
-    z_next: ca.SX = ca.fmin(ca.fmax(z + _by_element(bristles, dq), -reach), reach)
+    limit = reach.ravel()
+    z_next: ca.SX = ca.fmin(ca.fmax(z + _by_element(reach, dq), -limit), limit)
     return z_next
 
 
-def _by_element(bristles: Bristles, values: ca.SX) -> ca.SX:
+def _by_element(reach: np.ndarray, values: ca.SX) -> ca.SX:
     """Return a joint's value for each of its elements, (n K, 1)."""
-    return ca.vec(ca.repmat(values.T, bristles.count, 1))
+    return ca.vec(ca.repmat(values.T, reach.shape[1], 1))

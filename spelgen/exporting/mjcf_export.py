@@ -15,7 +15,7 @@ from spelgen.exporting.exported import UNITS, Exported, readme
 from spelgen.exporting.mjcf_file import mjcf_text
 from spelgen.exporting.parity import Parity, Values, random_inputs, relative
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection, rigid_body_projection
-from spelgen.exporting.tip_chain import tip_in_body
+from spelgen.exporting.tip_frame import tip_frame
 from spelgen.exporting.trained import Trained
 from spelgen.settings.tuning.exporting import TUNING
 
@@ -29,7 +29,7 @@ def export_mjcf(trained: Trained) -> Exported:
     exact = copy.deepcopy(trained.model).double().cpu()
     inputs = array(exact.input_matrix(torch.zeros(exact.n, dtype=torch.float64)))
     servos = servos_of(exact)
-    text = mjcf_text(projection, inputs, tip_in_body(trained.arm), servos)
+    text = mjcf_text(projection, inputs, tip_frame(trained.arm), servos)
     parity = check_mjcf(text, projection, inputs, servos)
     checked = f"Checked when exported, by MuJoCo {mujoco.__version__}, friction apart: {parity.summary}"
     actuators = "a motor for each input."

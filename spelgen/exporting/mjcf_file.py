@@ -9,7 +9,7 @@ from lxml import etree
 from scipy.spatial.transform import Rotation
 
 from spelgen.arm.arm import Body
-from spelgen.exporting.description import Servos
+from spelgen.exporting.description import Servos, Tip
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection
 from spelgen.exporting.urdf_file import about_center
 
@@ -20,13 +20,13 @@ _SOLIMPFRICTION = "0.9999 0.9999 0.001 0.5 2"
 def mjcf_text(
     projection: RigidBodyProjection,
     inputs: np.ndarray,
-    tip: tuple[str, int, np.ndarray],
+    tip: Tip,
     servos: Servos | None = None,
 ) -> bytes:
     """Return the MJCF of these bodies.
 
     inputs: G, (n, n), each of whose columns that is not zero becomes an actuator; under position servos each joint has
-    one for its position instead. tip: a link, the body that it moves with, and its pose in that body's frame, (4, 4).
+    one for its position instead.
     """
     arm = projection.arm.arm
     root = etree.Element("mujoco", model=arm.name)
@@ -38,8 +38,8 @@ def mjcf_text(
     for index, body in enumerate(arm.bodies):
         parent = world if body.parent < 0 else bodies[body.parent]
         bodies.append(_body(parent, projection, index))
-    link, carrier, pose = tip
-    etree.SubElement(bodies[carrier], "site", name=link, **_placement(pose[:3, 3], pose[:3, :3]))
+    placement = _placement(tip.pose[:3, 3], tip.pose[:3, :3])
+    etree.SubElement(bodies[tip.carrier], "site", name=tip.link, **placement)
     _followers(root, projection)
     for k in _coupled_motors(projection):
         _tendon(root, f"rotor{k + 1}", projection, projection.motors[k], projection.armature[k])

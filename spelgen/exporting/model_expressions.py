@@ -39,7 +39,7 @@ class ModelExpressions:
         self.inputs["z"] = ca.SX.sym("z", model.memory)
         self.q, self.qd, self.qdd, self.tau, self.dq, self.u, self.z = self.inputs.values()
         self.residuals = residual_symbols(model)
-        self._frames = body_frames(model, self.q)
+        self._frames = body_frames(model.arm.bodies, self.q)
         self._rest = ca.SX(self.n, 1)
 
     def _rigid_torque(self, qd: ca.SX, qdd: ca.SX) -> ca.SX:
@@ -65,11 +65,7 @@ class ModelExpressions:
 
     @cached_property
     def _residual_gravity(self) -> ca.SX:
-        torque = ca.SX(self.n, 1)
-        for name in ("gravity", "torque"):
-            if self.residuals[name].numel():
-                torque = torque + self.residuals[name]
-        return torque
+        return self.residuals["gravity"] + self.residuals["torque"]
 
     @cached_property
     def gravity(self) -> ca.SX:
@@ -90,7 +86,6 @@ class ModelExpressions:
     def friction(self) -> ca.SX:
         """The torques of friction, which follows the speeds of the motors, (n, 1)."""
         law = self.model.friction
-        bristles = self.model.bristles
         motors = self.model.motors
         speed = constant(motors) @ self.qd
         load = self._rest
@@ -98,12 +93,9 @@ class ModelExpressions:
         if law.load_dependence.any():
             load = constant(np.linalg.inv(motors).T) @ self._rigid_gravity
         # a joint's dry friction follows velocity or bristles
-        direction = ca.SX.zeros(self.model.n)
-        if law.memoryless.any():
-            sliding = friction_expressions.turned(speed, law.coulomb_smoothing_velocity)
-            direction = ca.SX(law.memoryless) * sliding
-        if bristles is not None:
-            direction += friction_expressions.bristle_direction(bristles, self.z)
+        sliding = friction_expressions.turned(speed, law.coulomb_smoothing_velocity)
+        direction = constant(law.memoryless) * sliding
+        direction += friction_expressions.bristle_direction(law.bristle_fractions, self.model.reach, self.z)
         torque = friction_expressions.law_torque(law, speed, load, direction)
         for k, joint in enumerate(self.model.residuals.friction):
             torque[joint] *= ca.exp(self.residuals["factor"][k])
@@ -111,18 +103,15 @@ class ModelExpressions:
 
     @property
     def friction_step(self) -> ca.SX:
-        if self.model.bristles is None:
-            return self.z
         return friction_expressions.bristle_step(
-            self.model.bristles, self.z, constant(self.model.motors) @ self.dq
+            self.model.reach, self.z, constant(self.model.motors) @ self.dq
         )
 
     @property
     def friction_memory(self) -> ca.SX:
-        if self.model.bristles is None:
-            return self.z
+        width = self.model.friction.coulomb_smoothing_velocity
         speed = constant(self.model.motors) @ self.qd
-        return friction_expressions.sliding_bristles(self.model.bristles, self.model.friction, speed)
+        return friction_expressions.sliding_bristles(self.model.reach, width, speed)
 
     @cached_property
     def _force(self) -> ca.SX:
@@ -160,10 +149,7 @@ class ModelExpressions:
 
     @property
     def energy(self) -> ca.SX:
-        potential = self._rigid_energies[1]
-        for name in ("energy", "torque_energy"):
-            if self.residuals[name].numel():
-                potential = potential + self.residuals[name]
+        potential = self._rigid_energies[1] + self.residuals["energy"] + self.residuals["torque_energy"]
         return ca.vertcat(0.5 * ca.dot(self.qd, self.momentum), potential)
 
     @property
@@ -223,7 +209,7 @@ def expression_function(entry: EntryPoint, model: TrainedModel) -> ca.Function:
     outputs = [ca.densify(output) for output in result]
     inputs = {name: expressions.inputs[name] for name in entry.inputs}
     for name, symbols in expressions.residuals.items():
-        if symbols.numel() and ca.depends_on(ca.veccat(*outputs), symbols):
+        if symbols.nnz() and ca.depends_on(ca.veccat(*outputs), symbols):
             inputs[RESIDUAL + name] = symbols
     names = list(inputs), list(entry.output_names)
     # what is computed twice becomes one step: by cse

@@ -25,30 +25,32 @@ Scalars = TypeVar("Scalars", ca.SX, ca.MX)
 
 
 def residual_symbols(model: TrainedModel) -> Symbols:
-    """Return symbols for all that a model may have; those of what it has not are empty."""
+    """Return symbols for all that a model may have, zeros for what it has not."""
     n = model.n
-    entries = len(model.residuals.entries)
-    potential = int(model.residuals.potential is not None)
-    torque = int(model.residuals.has_torque)
-    factors = len(model.residuals.friction)
+    residuals = model.residuals
+    entries, factors = len(residuals.entries), len(residuals.friction)
+    has_potential = residuals.potential is not None
     sizes = {
-        "mass": (entries, 1),
+        "mass": (entries, entries, 1),
         # first derivatives along qd: a program takes them in one sweep, without n^2 numbers
-        "rate": (entries, 1),
-        "kinetic": (n if entries else 0, 1),
+        "rate": (entries, entries, 1),
+        "kinetic": (entries, n, 1),
         # jets: second derivatives of forces need these
-        "first": (entries, n),
-        "second": (entries, n * n),
-        "energy": (potential, 1),
-        "gravity": (potential * n, 1),
-        "stiffness": (potential * n, n),
-        "torque": (torque * n, 1),
-        "torque_slope": (torque * n, 1),
-        "torque_energy": (torque, 1),
-        "factor": (factors, 1),
-        "factor_slope": (factors, 1),
+        "first": (entries, entries, n),
+        "second": (entries, entries, n * n),
+        "energy": (has_potential, 1, 1),
+        "gravity": (has_potential, n, 1),
+        "stiffness": (has_potential, n, n),
+        "torque": (residuals.has_torque, n, 1),
+        "torque_slope": (residuals.has_torque, n, 1),
+        "torque_energy": (residuals.has_torque, 1, 1),
+        "factor": (factors, factors, 1),
+        "factor_slope": (factors, factors, 1),
     }
-    return {name: ca.SX.sym(name, *size) for name, size in sizes.items()}
+    symbols: Symbols = {}
+    for name, (exists, *size) in sizes.items():
+        symbols[name] = ca.SX.sym(name, *size) if exists else ca.SX(*size)
+    return symbols
 
 
 def symmetric(model: TrainedModel, values: ca.SX) -> ca.SX:

@@ -7,9 +7,12 @@ out what is structurally zero: zeros of the geometry, and velocities that are gi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import casadi as ca
 import numpy as np
 
+from spelgen.arm.arm import Body
 from spelgen.exporting.description import TrainedModel
 from spelgen.structure.recursion import Position, base_denominators, energies
 
@@ -21,10 +24,10 @@ def constant(values: object) -> ca.DM:
     return ca.sparsify(ca.DM(np.array(values, dtype=float)))
 
 
-def body_frames(model: TrainedModel, q: ca.SX) -> list[tuple[ca.SX, ca.SX]]:
+def body_frames(bodies: Sequence[Body], q: ca.SX) -> list[tuple[ca.SX, ca.SX]]:
     """Return rotation and position of each body's frame in its parent's, at q, (n, 1)."""
     frames: list[tuple[ca.SX, ca.SX]] = []
-    for body in model.arm.bodies:
+    for body in bodies:
         rotation = ca.SX(constant(body.rotation))
         position = ca.SX(constant(body.translation))
         displacement = float(body.multiplier) * q[body.coordinate] + body.offset
