@@ -26,6 +26,10 @@ from spelgen.exporting.parity import check_parity, random_inputs
 from spelgen.exporting.trained import Trained
 from spelgen.loaded_arm import load_arm
 
+ONE_JOINT = """<robot name="one"><link name="base"/>
+<link name="arm"><inertial><origin xyz="0.1 0 0"/><mass value="1"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="hinge" type="continuous"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/></joint></robot>"""
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
 NAMES = list(ENTRY_POINTS)
 BOTH = [("two_link", "closed-form"), ("rpr", "hybrid")]
@@ -116,6 +120,16 @@ def test_followers_motors_and_passive_joints_go_along(preset, tmp_path):
         files, told = c_files(trained)
         assert "from the torch module" in told
         assert b"fast;" not in files["arm_2_fast_int_main.c"]
+
+
+def test_of_one_joint_a_matrix_is_one_number(tmp_path):
+    urdf = tmp_path / "one.urdf"
+    urdf.write_text(ONE_JOINT)
+    arm = load_arm(urdf)
+    trained = Trained(build(arm, "closed-form"), arm)
+    assert export_casadi(trained).summary
+    if shutil.which("gcc"):
+        assert c_files(trained)
 
 
 def test_names_for_code():

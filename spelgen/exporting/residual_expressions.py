@@ -83,16 +83,16 @@ def symbol_slopes(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX, ca
     """Return the symbols that depend on q, (k, 1) each, with their derivatives by it, (k, n)."""
     # the factor of a joint depends on that joint alone
     joints = np.eye(model.n)[list(model.residuals.friction)]
-    slopes = [(symbols["factor"], symbols["factor_slope"] * ca.SX(joints))]
-    if model.residuals.mass is not None:
-        by_joint = ca.horzsplit(symbols["second"], model.n)
-        slopes.append((symbols["mass"], symbols["first"]))
-        slopes.append((ca.vec(symbols["first"]), ca.vertcat(*by_joint)))
-    if model.residuals.potential is not None:
-        slopes.append((symbols["gravity"], symbols["stiffness"]))
-    if model.residuals.has_torque:
-        slopes.append((symbols["torque"], ca.diag(symbols["torque_slope"])))
-    return slopes
+    by_joint = ca.horzsplit(symbols["second"], model.n)
+    slopes = [
+        (symbols["factor"], symbols["factor_slope"] * ca.SX(joints)),
+        (symbols["mass"], symbols["first"]),
+        (ca.vec(symbols["first"]), ca.vertcat(*by_joint)),
+        (symbols["gravity"], symbols["stiffness"]),
+        (symbols["torque"], ca.diag(symbols["torque_slope"])),
+    ]
+    # zeros of what a model has not depend on nothing
+    return [(symbol, slope) for symbol, slope in slopes if symbol.nnz()]
 
 
 def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
