@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.arm.chain import follows
 from spelgen.urdf.robot import Robot
 
 
@@ -28,10 +27,21 @@ def mimic_constraint(robot: Robot, coordinates: Sequence[str]) -> Constraint:
     columns = {name: k for k, name in enumerate(coordinates)}
     moving = [joint.name for joint in robot.joints if joint.moves]
     jacobian, offset = np.zeros((len(moving), len(columns))), np.zeros(len(moving))
-    following = follows(robot)
     for row, name in enumerate(moving):
-        followed = following[name]
-        offset[row] = followed.offset
-        if followed.leader.name in columns:
-            jacobian[row, columns[followed.leader.name]] = followed.multiplier
+        leader, multiplier, shift = _followed(robot, name)
+        offset[row] = shift
+        if leader in columns:
+            jacobian[row, columns[leader]] = multiplier
     return Constraint(tuple(moving), jacobian, offset)
+
+
+def _followed(robot: Robot, name: str) -> tuple[str, float, float]:
+    """What a joint follows in the end: leader, multiplier and offset."""
+    multiplier, offset = 1.0, 0.0
+    while (mimic := robot.joint[name].mimic) is not None:
+        name, multiplier, offset = (
+            mimic.joint,
+            multiplier * mimic.multiplier,
+            offset + multiplier * mimic.offset,
+        )
+    return name, multiplier, offset
