@@ -29,7 +29,7 @@ from characters import read_characters, write_arm
 
 import spelgen
 from spelgen.arm.arm import Arm
-from spelgen.baselines.solver import Solver
+from spelgen.baselines.predictor import Solver
 from spelgen.building import build
 from spelgen.dynamics.bristles import bristle_reach, reach_of
 from spelgen.dynamics.regressor import regressor

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 import spelgen
 from spelgen.baselines.baseline import JudgedArm
 from spelgen.baselines.names import URDF, URDF_WITH_DRIVES
+from spelgen.baselines.predictor import accurate_solver
 from spelgen.baselines.rosenbrock import roll_out_stiff
-from spelgen.baselines.solver import accurate_solver
 from spelgen.baselines.urdf import UrdfValues
 from spelgen.cli.main import app
 from spelgen.dynamics.regressor import regressor, urdf_parameters

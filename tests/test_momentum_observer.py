@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
-from spelgen.baselines.solver import Solver
+from spelgen.baselines.predictor import Solver
 from spelgen.dynamics.protocol import VelocityState
 from spelgen.emission.loading import load_module
 from spelgen.evaluation import momentum_observer

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from spelgen.baselines.baseline import Baseline, JudgedArm
 from spelgen.baselines.names import CONSTANT_VELOCITY
-from spelgen.baselines.predictor import Predictor
-from spelgen.baselines.solver import States
+from spelgen.baselines.predictor import Predictor, States
 from spelgen.logs.windows import Windows
 
 

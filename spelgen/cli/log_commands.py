@@ -151,7 +151,7 @@ def logs(
 def _suggested(paths: list[Path], arm: LoadedArm, file: Path) -> Path:
     """Write the mapping that the first log suggests, and return its file; exit with 1 if the log lacks columns."""
     from spelgen.errors import collect
-    from spelgen.logs.log_files import log_files
+    from spelgen.logs.formats import log_files
     from spelgen.logs.suggest import suggest_mapping
 
     errors: list[SpelgenError] = []

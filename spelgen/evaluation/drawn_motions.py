@@ -12,7 +12,7 @@ import torch
 from scipy.integrate import cumulative_trapezoid
 
 from spelgen.baselines.names import MODEL
-from spelgen.baselines.solver import States
+from spelgen.baselines.predictor import States
 from spelgen.dynamics.bristles import bristles_along
 from spelgen.evaluation.horizons import JudgedLogs
 from spelgen.evaluation.plain import Curve, number

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spelgen.baselines.baseline import CommandFollower, JudgedArm
 from spelgen.baselines.names import MODEL
-from spelgen.baselines.predictor import Predictor, of_dynamics
+from spelgen.baselines.predictor import Predictor, accurate_solver, of_dynamics
 from spelgen.baselines.registry import BASELINES
-from spelgen.baselines.solver import accurate_solver
 from spelgen.dynamics.protocol import input_of
 from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.dynamics.tip import tip_kinematics
@@ -81,37 +80,44 @@ def evaluate(
             f"names also used in training: {', '.join(seen)}; errors on training data are not test errors"
         )
         notes.append(Diagnostic("warning", "tested-on-training-data", "logs", None, message))
-    conditions = _Conditions(baselines or {}, preprocessing, steps, seconds, progress)
-    return JUDGES[input_of(judged.model)](judged, logs, notes, conditions)
+    if input_of(judged.model) == "position":
+        if baselines:
+            raise LogError(
+                "baselines that take torques", expected="none: the model is one of position servos"
+            )
+        return _judge_commands(judged, logs, notes)
+    require_torques(logs)
+    used = _preprocessing(judged.preprocessing, preprocessing, logs)
+    return _judge_torques(judged, logs, notes, used, baselines or {}, (steps, seconds), progress)
 
 
-@dataclass(frozen=True)
-class _Conditions:
-    """Hold under which conditions logs are judged, see `evaluate`."""
-
-    baselines: Mapping[str, RigidDynamics]
-    preprocessing: Preprocessing | None
-    steps: Sequence[int]
-    seconds: Sequence[float]
-    progress: Progress | None
+def _preprocessing(
+    used: Preprocessing | None, wanted: Preprocessing | None, logs: Sequence[Trajectory]
+) -> Preprocessing:
+    """Return how logs are prepared: as is wanted, else as for the fit, if there was one."""
+    if wanted is None and used is not None:
+        return used
+    preprocessing = wanted or Preprocessing()
+    if used is not None and preprocessing.torque_delay is None:  # of the logger, whatever the filter
+        preprocessing = replace(preprocessing, torque_delay=used.torque_delay)
+    return preprocessing.resolved([trajectory.sample_rate for trajectory in logs])
 
 
 def _judge_torques(
-    judged: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic], conditions: _Conditions
+    judged: Subject,
+    logs: Sequence[Trajectory],
+    notes: list[Diagnostic],
+    used: Preprocessing,
+    baselines: Mapping[str, RigidDynamics],
+    ahead: tuple[Sequence[int], Sequence[float]],
+    progress: Progress | None,
 ) -> Results:
     """Judge torques, and the motion that they predict."""
-    require_torques(logs)
-    used, preprocessing, progress = judged.preprocessing, conditions.preprocessing, conditions.progress
-    if preprocessing is not None or used is None:
-        preprocessing = preprocessing or Preprocessing()
-        if used is not None and preprocessing.torque_delay is None:  # of the logger, whatever the filter
-            preprocessing = replace(preprocessing, torque_delay=used.torque_delay)
-        used = preprocessing.resolved([trajectory.sample_rate for trajectory in logs])
     all_samples = dynamics_samples(logs, pauses=True, preprocessing=used, reach=judged.reach)
     samples = [sample for sample in all_samples if len(sample.q)]
     # a rollout takes a start and a sample after it
     tests = JudgedLogs(used.pieces(logs, shortest=2), samples, used, judged.reach, judged.model.joint_types)
-    lengths = horizon_lengths(tests, conditions.steps, conditions.seconds, notes)
+    lengths = horizon_lengths(tests, *ahead, notes)
     probe = tests.windows(judged.window - 1, TUNING.probed_model_windows)
     # residual terms that were not selected add nothing but time
     model = without_idle_residuals(judged.model)
@@ -119,7 +125,7 @@ def _judge_torques(
     predictors = [Predictor(MODEL, solver, model)]
     for baseline in BASELINES:
         predictors += baseline.predictors(JudgedArm(judged.joints, judged.urdf, judged.run, probe, notes))
-    for name, dynamics in conditions.baselines.items():
+    for name, dynamics in baselines.items():
         predictors.append(of_dynamics(name, dynamics, probe))
     tip = _tip(judged, notes)
     horizons: list[Horizon] = []
@@ -168,12 +174,8 @@ def _results(
     )
 
 
-def _judge_commands(
-    judged: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic], conditions: _Conditions
-) -> Results:
+def _judge_commands(judged: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic]) -> Results:
     """Judge the positions that follow commands, which are replayed."""
-    if conditions.baselines:
-        raise LogError("baselines that take torques", expected="none: the model is one of position servos")
     followers: dict[str, CommandFollower] = {}
     for trajectory in logs:
         require_commands(trajectory)
@@ -181,10 +183,6 @@ def _judge_commands(
         followers |= baseline.followers(judged.fit, notes)
     errors, missed = replays(judged.model, logs, followers, notes)
     return replace(_results(judged, logs, replay_traces(missed), notes), replays=errors)
-
-
-JUDGES = {"torque": _judge_torques, "position": _judge_commands}
-"""By the inputs of a model, how it is judged."""
 
 
 def _tip(judged: Subject, notes: list[Diagnostic]) -> TipPosition | None:

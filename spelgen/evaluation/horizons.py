@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from spelgen.baselines.names import observed
-from spelgen.baselines.predictor import Predictor
-from spelgen.baselines.solver import Solver, States
+from spelgen.baselines.predictor import Predictor, Solver, States
 from spelgen.dynamics.bristles import BristleReach
 from spelgen.dynamics.protocol import integrable
 from spelgen.errors import Diagnostic

@@ -15,7 +15,7 @@ from spelgen.files import read_json, write_json
 from spelgen.fleet.schema import FleetRobot
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.chunks import large_files
-from spelgen.logs.log_files import log_files
+from spelgen.logs.formats import log_files
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import split_validation

@@ -12,8 +12,8 @@ import pyarrow as pa
 
 from spelgen.errors import LogError
 from spelgen.files import limited_memory, require_regular_file
-from spelgen.logs.tables import LogFormat, LogTable, make_layout, table_layout, wanted_quantities
-from spelgen.settings.log_mapping import PLAIN, LogMapping
+from spelgen.logs.tables import LogFormat, LogTable, table_layout
+from spelgen.settings.log_mapping import PLAIN, JointColumns, LogColumns, LogMapping
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -49,11 +49,11 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     names = [mapping.log_name(joint) for joint in joints]
     table = _joint_states(path, names, mapping.topic)
     # the messages' own fields, in SI units by definition: the mapping says no columns
-    table_layout(table.schema, names, LogMapping(velocity=mapping.velocity), path)
-    columns = ["t"]
-    for quantity in wanted_quantities(mapping):
-        columns += [PLAIN[quantity].replace("{joint}", name) for name in names]
-    return [LogTable(None, table, make_layout(columns, None, joints, mapping))]
+    logged = {}
+    for joint in joints:
+        logged[joint] = mapping.joint(joint).model_copy(update={"columns": JointColumns()})
+    mapping = mapping.model_copy(update={"columns": LogColumns(), "joints": logged})
+    return [LogTable(None, table, table_layout(table.schema, joints, mapping, path))]
 
 
 def _joint_states(path: Path, names: Sequence[str], topic: str | None) -> pa.Table:

@@ -14,14 +14,14 @@ import pyarrow.parquet
 
 from spelgen.errors import LogError, SpelgenError, collect
 from spelgen.logs.arm_mapping import GivenMapping, LoggedArm, log_source
-from spelgen.logs.clock import clock_start, require_increasing_times
-from spelgen.logs.log_files import log_files
+from spelgen.logs.clock import require_increasing_times
+from spelgen.logs.formats import log_files
 from spelgen.logs.parquet_files import PARQUET
 from spelgen.logs.read import read_logs
 from spelgen.logs.recording import make_trajectory
 from spelgen.logs.tables import Layout, reading, stored_columns, table_layout
 from spelgen.logs.trajectory import Trajectory
-from spelgen.logs.values import values_in_si
+from spelgen.logs.values import clock_start, values_in_si
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.tuning.logs import LogTuning
 

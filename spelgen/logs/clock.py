@@ -1,71 +1,17 @@
-"""Read the times of logs, and put rows in their order."""
+"""Put the rows of logs in the order of their times."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 
 from spelgen.errors import LogError
-from spelgen.logs.columns import column, floats, line_of
 from spelgen.logs.tables import Layout
-from spelgen.settings.log_mapping import TIMES
+from spelgen.logs.values import line_of
 from spelgen.settings.tuning.logs import LogTuning
 
 TUNING = LogTuning()
-
-
-def clock_start(times: pa.ChunkedArray | pa.Array) -> int:
-    """Return from where times count: the first one of a clock that shows the date, else 0."""
-    first = times[:1]
-    try:
-        nanoseconds = _nanoseconds(first)
-    except pa.ArrowInvalid:
-        return 0  # told of by `times_from`, which knows the file
-    if nanoseconds is not None:
-        return nanoseconds[0].as_py() or 0
-    if not (pa.types.is_integer(first.type) or pa.types.is_floating(first.type)):
-        return 0
-    start = first[0].as_py()
-    # seconds since 1970 leave floating-point numbers no digits for what follows
-    return int(start) if start is not None and TUNING.longest_clock < abs(start) < np.inf else 0
-
-
-def times_from(
-    table: pa.Table | pa.RecordBatch, layout: Layout, file: Path, start: int, row: int
-) -> np.ndarray:
-    """Return the times (T,) in the layout's unit, from `start` on."""
-    name = layout.columns[0]
-    times = column(table, name)
-    try:
-        nanoseconds = _nanoseconds(times)
-    except pa.ArrowInvalid as error:
-        raise LogError(
-            f"dates beyond what nanoseconds count ({times.type})", file=file, element=f"column {name}",
-            expected="years from 1678 to 2262", do="check the unit of the stamps",
-        ) from error  # fmt: skip
-    # integers are subtracted before they become floats: 1.7e18 ns keeps no microseconds as a double
-    if nanoseconds is not None and not nanoseconds.null_count:
-        counts: np.ndarray = nanoseconds.to_numpy()
-        return np.asarray((counts - start) * 1e-9 / TIMES[layout.mapping.units.t])
-    if start and nanoseconds is None and not times.null_count:
-        with np.errstate(over="ignore"):  # infinite times are refused below
-            return np.asarray(times.to_numpy() - start, dtype=float)
-    return floats(times, name, file, row)
-
-
-def _nanoseconds(times: pa.ChunkedArray | pa.Array) -> pa.ChunkedArray | pa.Array | None:
-    """Return what a clock with a type of its own says [ns]; None of plain numbers."""
-    if pa.types.is_duration(times.type):
-        wide = pa.duration("ns")
-    elif pa.types.is_time(times.type):
-        wide = pa.time64("ns")
-    elif pa.types.is_temporal(times.type):
-        wide = pa.timestamp("ns")
-    else:
-        return None
-    return times.cast(wide).cast(pa.int64())
 
 
 def in_time_order(

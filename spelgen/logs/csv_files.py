@@ -12,8 +12,8 @@ import pyarrow.csv
 
 from spelgen.errors import LogError
 from spelgen.logs.bags import FIELDS
-from spelgen.logs.columns import is_number
 from spelgen.logs.tables import LogFormat, LogTable, reading, table_layout
+from spelgen.logs.values import is_number
 from spelgen.settings.log_mapping import PLAIN, LogMapping
 from spelgen.settings.tuning.logs import LogTuning
 

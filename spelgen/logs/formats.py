@@ -1,10 +1,15 @@
-"""Hold the formats of logs. A new one is a file like `csv_files.py`, and its name in FORMATS."""
+"""Hold the formats of logs, and find the logs that paths name.
+
+A new format is a file like `csv_files.py`, and its name in FORMATS.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from spelgen.errors import LogError, SpelgenError
+from spelgen.files import local, require_regular_file
 from spelgen.logs.bags import BAG
 from spelgen.logs.csv_files import CSV
 from spelgen.logs.lerobot import LEROBOT
@@ -43,3 +48,50 @@ def describe_formats() -> str:
         if log_format.folder:
             folders.append(log_format.folder)
     return f"{', '.join(suffixes)}, the folder of {' or of '.join(folders)}"
+
+
+def log_files(
+    paths: Path | str | Iterable[Path | str], role: str | None, errors: list[SpelgenError]
+) -> list[Path]:
+    """Return the logs that these paths name, each once; what cannot be one is added to the errors.
+
+    role: "train" or "test": of a folder that holds train.* or test.* files, only those with this stem.
+    """
+    files: dict[Path, None] = {}
+    if isinstance(paths, str | Path):
+        paths = [paths]
+    for name in paths:
+        path = local(name)
+        try:
+            if not path.exists():
+                raise LogError("no such file or folder", file=name, expected="a log", do="check the path")
+            files |= dict.fromkeys(_logs_at(path, role))
+        except LogError as error:
+            errors.append(error)
+    return list(files)
+
+
+def _logs_at(path: Path, role: str | None) -> list[Path]:
+    if format_of(path) is not None:
+        return [path]
+    if path.is_dir():
+        return _folder_logs(path, role)
+    require_regular_file(path, LogError, f"a file: {describe_formats()}")
+    raise LogError(f"a file of kind {path.suffix!r}", file=path, expected=describe_formats())
+
+
+def _folder_logs(folder: Path, role: str | None) -> list[Path]:
+    # hidden files are not recordings: macOS puts "._log.csv" beside log.csv on other file systems
+    visible = (path for path in folder.iterdir() if not path.name.startswith("."))
+    logs = sorted(path for path in visible if format_of(path) is not None)
+    if not logs:
+        raise LogError("a folder without logs", file=folder, expected=describe_formats())
+    has_roles = any(path.stem in ("train", "test") for path in logs)
+    if role is None or not has_roles:
+        return logs
+    selected = [path for path in logs if path.stem == role]
+    if not selected:
+        raise LogError(
+            f"a folder without {role}.* among its logs", file=folder, expected=f"{role}.*, or files by name"
+        )
+    return selected

@@ -14,13 +14,12 @@ import pyarrow.parquet
 from spelgen.errors import LogError, SpelgenError, collect
 from spelgen.files import replacing
 from spelgen.logs.arm_mapping import GivenMapping, LoggedArm, log_source
-from spelgen.logs.clock import clock_start, in_time_order
-from spelgen.logs.formats import read_tables
-from spelgen.logs.log_files import log_files
+from spelgen.logs.clock import in_time_order
+from spelgen.logs.formats import log_files, read_tables
 from spelgen.logs.recording import make_trajectory
 from spelgen.logs.tables import UNITS, UNITS_KEY, LogTable
 from spelgen.logs.trajectory import Trajectory, require_joints
-from spelgen.logs.values import values_in_si
+from spelgen.logs.values import clock_start, values_in_si
 from spelgen.settings.tuning.logs import LogTuning
 
 TUNING = LogTuning()

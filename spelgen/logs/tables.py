@@ -107,20 +107,8 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     if labels and pa.types.is_nested(schema.field(labels).type):
         kind = schema.field(labels).type
         raise LogError(f"values of type {kind}", file=file, element=f"column {labels}", expected="names")
-    return make_layout(columns, labels, joints, mapping, declared=UNITS_KEY in metadata)
-
-
-def make_layout(
-    columns: Sequence[str],
-    labels: str | None,
-    joints: Sequence[str],
-    mapping: LogMapping,
-    *,
-    declared: bool = False,
-) -> Layout:
-    """Return a layout. declared: the file itself says what its units are."""
     accepted: tuple[str, ...] = mapping.accept
-    if declared:
+    if UNITS_KEY in metadata:
         accepted += UNIT_CODES
     elif all(mapping.unit("q", joint) for joint in joints):
         accepted += ("degrees",)

@@ -27,8 +27,7 @@ from spelgen.render.curves import curves
 from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, parameter_tables
 from spelgen.render.plots import Record, coverage_panels
-from spelgen.render.reproduction import commands, files
-from spelgen.render.run_facts import head_numbers, training_facts
+from spelgen.render.run_facts import commands, files, head_numbers, training_facts
 from spelgen.spec import Facts, read_facts
 
 if TYPE_CHECKING:

@@ -1,24 +1,36 @@
-"""A run in figures and words: what a reader wants first, and how it was trained."""
+"""A run in figures and words: what a reader wants first, how it was trained, what it lies in, how it is made again."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import hashlib
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from rich.filesize import decimal
 
 from spelgen.baselines.names import MODEL
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import figures
 from spelgen.fitting.objectives import fit_summary
+from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.torque.report import terms_in_use
 from spelgen.labels import counted
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.render.charts import Chart
 from spelgen.render.plots import Record, loss_chart
+from spelgen.settings.fits import CONFIGS
+from spelgen.settings.training import TrainingSettings
+from spelgen.spec import Facts, Options
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
+
+
+HASHED = 1_000_000_000  # bytes of the largest file whose digest is computed, in some seconds
 
 
 @dataclass(frozen=True)
@@ -115,3 +127,54 @@ def _duration(seconds: float) -> str:
     if minutes < 100:
         return f"{minutes:.1f} min"
     return f"{minutes / 60:.1f} h"
+
+
+def files(folder: Path) -> list[tuple[str, str, str]]:
+    """Return name, size and SHA-256 of every file of the folder but pages and what is being written."""
+    entries = []
+    for path in sorted(folder.iterdir()):
+        # pages are made from the folder and so are no part of what is reproduced
+        if path.is_file() and not path.name.startswith(".") and path.suffix != ".html":
+            size, digest = path.stat().st_size, "not computed of a file above 1 GB"
+            if size <= HASHED:
+                with path.open("rb") as content:
+                    digest = hashlib.file_digest(content, "sha256").hexdigest()
+            entries.append((path.name, decimal(size), digest))
+    return entries
+
+
+def commands(run: RunFolder, facts: Facts, record: Record | None) -> list[str]:
+    """Return what makes a run again, from its config.json; the logs' place is not known to the run."""
+    # the module may name a folder of another machine before its URDF, the run calls it robot.urdf
+    name = Path(facts.urdf).name
+    urdf = shlex.quote(name)
+    lines = []
+    if run.urdf.exists():  # under the name that the module knows it by
+        lines.append(f"cp RUN/{run.urdf.name} {urdf}")
+        if run.settings.exists():
+            lines.append(f"cp RUN/{run.settings.name} {shlex.quote(str(Path(name).with_suffix('.yaml')))}")
+    build = f"spelgen build {urdf}"
+    for key, value in _changed(asdict(facts.options), asdict(Options())).items():
+        words = ",".join(value) if isinstance(value, (list, tuple)) else str(value)
+        build += f" --{key.replace('_', '-')} {shlex.quote(words)}"
+    lines.append(f"{build} -o module.py")
+    if record:
+        defaults = CONFIGS[record["objective"]]().model_dump(mode="json") | asdict(Preprocessing())
+        defaults |= TrainingSettings().model_dump(include={"validation_fraction", "seed"})
+        options = {"validation_fraction": record["validation_fraction"], "seed": record["seed"]}
+        train = (
+            f"spelgen train module.py --robot {urdf} --data LOGS -o RUN2 --objective {record['objective']}"
+        )
+        for key, value in _changed(options | record["config"] | record["preprocessing"], defaults).items():
+            train += f" --set {shlex.quote(f'{key}={value}')}"
+        lines.append(train)
+    return [*lines, "spelgen evaluate RUN2 --data LOGS", "spelgen report RUN2"]
+
+
+def _changed(options: Mapping[str, object], defaults: Mapping[str, object]) -> dict[str, object]:
+    """Return the options that are set to something else than by default."""
+    changed = {}
+    for key, value in options.items():
+        if value is not None and value != defaults.get(key) and not isinstance(value, Mapping):
+            changed[key] = value
+    return changed
