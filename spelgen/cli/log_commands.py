@@ -11,7 +11,7 @@ import typer
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, answer, note, progress_bar, refuse_warnings, say
 from spelgen.cli.options import Accept, AngleTolerance, Force, Joints, Mapping, Robot, Strict, TextOrJson, Tip
-from spelgen.errors import SpelgenError, SpelgenErrors
+from spelgen.errors import SpelgenErrors
 from spelgen.files import write_text
 
 if TYPE_CHECKING:
@@ -154,8 +154,7 @@ def _suggested(paths: list[Path], arm: LoadedArm, file: Path) -> Path:
     from spelgen.logs.formats import log_files
     from spelgen.logs.suggest import suggest_mapping
 
-    errors: list[SpelgenError] = []
-    logs = log_files(paths, None, errors)
+    logs, errors = log_files(paths)
     collect(errors)
     suggestion = suggest_mapping(logs[0], arm.arm.joint_names)
     say(f"wrote {write_text(file, suggestion.text)}; check it, then pass it by --mapping")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spelgen.errors import LogError, RunError, SpelgenError, collect
+from spelgen.errors import LogError, RunError, collect
 from spelgen.files import read_json, write_json
 from spelgen.fleet.schema import FleetRobot
 from spelgen.loaded_arm import LoadedArm, load_arm
@@ -120,8 +120,7 @@ def _roles(robot: FleetRobot, arm: LoadedArm, mapping: LogMapping) -> Split:
 
 def _stamps(robot: FleetRobot) -> list[tuple[str, int, int]]:
     """Return path, size and time of the last change of each log file."""
-    errors: list[SpelgenError] = []
-    files = log_files(robot.data, None, errors)
+    files, errors = log_files(robot.data)
     collect(errors)
     return [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
 

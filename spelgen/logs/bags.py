@@ -13,7 +13,7 @@ import pyarrow as pa
 from spelgen.errors import LogError
 from spelgen.files import limited_memory, require_regular_file
 from spelgen.logs.tables import LogFormat, LogTable, table_layout
-from spelgen.settings.log_mapping import PLAIN, JointColumns, LogColumns, LogMapping
+from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -49,10 +49,8 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     names = [mapping.log_name(joint) for joint in joints]
     table = _joint_states(path, names, mapping.topic)
     # the messages' own fields, in SI units by definition: the mapping says no columns
-    logged = {}
-    for joint in joints:
-        logged[joint] = mapping.joint(joint).model_copy(update={"columns": JointColumns()})
-    mapping = mapping.model_copy(update={"columns": LogColumns(), "joints": logged})
+    mapping = mapping.with_joint_columns(dict.fromkeys(joints, dict.fromkeys(FIELDS)))
+    mapping = mapping.model_copy(update={"columns": LogColumns()})
     return [LogTable(None, table, table_layout(table.schema, joints, mapping, path))]
 
 

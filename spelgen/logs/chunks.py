@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute
 import pyarrow.parquet
 
-from spelgen.errors import LogError, SpelgenError, collect
+from spelgen.errors import LogError, collect
 from spelgen.logs.arm_mapping import GivenMapping, LoggedArm, log_source
 from spelgen.logs.clock import require_increasing_times
 from spelgen.logs.formats import log_files
@@ -84,8 +84,7 @@ def large_files(
 
     Raises LogError where logs of another format lie beside: only Parquet can be read in chunks.
     """
-    errors: list[SpelgenError] = []
-    files = log_files(paths, role, errors)
+    files, errors = log_files(paths, role)
     collect(errors)
     parquet = [file for file in files if file.suffix in PARQUET.suffixes]
     rows = 0

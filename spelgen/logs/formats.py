@@ -51,13 +51,14 @@ def describe_formats() -> str:
 
 
 def log_files(
-    paths: Path | str | Iterable[Path | str], role: str | None, errors: list[SpelgenError]
-) -> list[Path]:
-    """Return the logs that these paths name, each once; what cannot be one is added to the errors.
+    paths: Path | str | Iterable[Path | str], role: str | None = None
+) -> tuple[list[Path], list[SpelgenError]]:
+    """Return the logs that these paths name, each once, and errors about those that cannot be one.
 
     role: "train" or "test": of a folder that holds train.* or test.* files, only those with this stem.
     """
     files: dict[Path, None] = {}
+    errors: list[SpelgenError] = []
     if isinstance(paths, str | Path):
         paths = [paths]
     for name in paths:
@@ -68,7 +69,7 @@ def log_files(
             files |= dict.fromkeys(_logs_at(path, role))
         except LogError as error:
             errors.append(error)
-    return list(files)
+    return list(files), errors
 
 
 def _logs_at(path: Path, role: str | None) -> list[Path]:

@@ -9,7 +9,7 @@ from spelgen.errors import LogError
 from spelgen.files import read_json, require_regular_file
 from spelgen.logs.parquet_files import read_parquet
 from spelgen.logs.tables import LogFormat, LogTable
-from spelgen.settings.log_mapping import JointLog, LogMapping
+from spelgen.settings.log_mapping import LogMapping
 
 INFO = "meta/info.json"
 STATE, ACTION = "observation.state", "action"
@@ -41,7 +41,7 @@ def dataset_mapping(folder: Path, joints: Sequence[str], mapping: LogMapping) ->
     Units stay the mapping's. Raises LogError where a joint is not among these names.
     """
     states, actions = _motor_names(folder, STATE), _motor_names(folder, ACTION)
-    logged: dict[str, JointLog] = {}
+    columns: dict[str, dict[str, str | None]] = {}
     for joint in joints:
         name = mapping.log_name(joint)
         for names in (states, actions):
@@ -50,11 +50,10 @@ def dataset_mapping(folder: Path, joints: Sequence[str], mapping: LogMapping) ->
                     f"the motors {', '.join(names) or 'without names'}", file=folder / INFO, element=f"joint {joint}",
                     expected=f"{name} among them", do="write its name under 'logs', 'joints' in the robot's YAML",
                 )  # fmt: skip
-        columns = {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
-        joint_log = mapping.joint(joint)
-        logged[joint] = joint_log.model_copy(update={"columns": joint_log.columns.model_copy(update=columns)})
+        q, u = f"{STATE}[{states.index(name)}]", f"{ACTION}[{actions.index(name)}]"
+        columns[joint] = {"q": q, "u": u}
     common = mapping.columns.model_copy(update={"t": "timestamp", "trajectory": "episode_index"})
-    return mapping.model_copy(update={"columns": common, "joints": logged})
+    return mapping.with_joint_columns(columns).model_copy(update={"columns": common})
 
 
 def _motor_names(folder: Path, feature: str) -> list[str]:

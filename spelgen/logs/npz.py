@@ -18,7 +18,6 @@ from spelgen.logs.tables import (
     reading,
     stored_columns,
     table_layout,
-    wanted_quantities,
 )
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.tuning.logs import LogTuning
@@ -142,17 +141,15 @@ def _table(
 
 def _with_matrices(arrays: NpzArrays, file: Path, joints: Sequence[str], mapping: LogMapping) -> LogMapping:
     """Return the mapping in which a joint's column is that of a matrix `q` (T, n), where the archive has one."""
-    logged = {joint: mapping.joint(joint) for joint in joints}
-    for quantity in wanted_quantities(mapping):
+    for quantity in mapping.quantities:
         pattern: str = getattr(mapping.columns, quantity)
         matrix = pattern.replace("{joint}", "").rstrip("_")
         if matrix not in arrays or arrays[matrix].ndim != 2:
             continue
         names = [mapping.log_name(joint) for joint in joints]
         for joint, column in zip(joints, _matrix_columns(arrays, matrix, names, file), strict=True):
-            columns = logged[joint].columns.model_copy(update={quantity: f"{matrix}[{column}]"})
-            logged[joint] = logged[joint].model_copy(update={"columns": columns})
-    return mapping.model_copy(update={"joints": logged})
+            mapping = mapping.with_joint_columns({joint: {quantity: f"{matrix}[{column}]"}})
+    return mapping
 
 
 def _matrix_columns(arrays: NpzArrays, matrix: str, joints: Sequence[str], file: Path) -> list[int]:

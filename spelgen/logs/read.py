@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
-from spelgen.errors import LogError, SpelgenError, collect
+from spelgen.errors import LogError, collect
 from spelgen.files import replacing
 from spelgen.logs.arm_mapping import GivenMapping, LoggedArm, log_source
 from spelgen.logs.clock import in_time_order
@@ -46,9 +46,9 @@ def read_logs(
     """
     source = log_source(arm, mapping)
     collect(source.mapping.misfits(source.joints, source.joint_types or joint_types))
-    errors: list[SpelgenError] = []
+    files, errors = log_files(paths, role)
     trajectories: list[Trajectory] = []
-    for file in log_files(paths, role, errors):
+    for file in files:
         try:
             for table in read_tables(file, source.joints, source.mapping):
                 trajectories += _trajectories(table, file)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spelgen.logs.tables import Layout, wanted_quantities
+from spelgen.logs.tables import Layout
 from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.settings.tuning.logs import LogTuning
 
@@ -18,7 +18,7 @@ def make_trajectory(
     data: np.ndarray, layout: Layout, name: str, file: Path, repairs: tuple[str, ...] = ()
 ) -> Trajectory:
     """Return a trajectory of these rows (T, C) in SI units, velocities differentiated where there are none."""
-    quantities = wanted_quantities(layout.mapping)
+    quantities = layout.mapping.quantities
     if layout.mapping.dropouts == "dropped":
         holes = np.any([is_dropout(column) for column in data[:, 1:].T], axis=0)
         if holes.any():

@@ -16,7 +16,6 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
-from spelgen.logs.trajectory import QUANTITIES
 from spelgen.settings.log_mapping import TIMES, LogMapping
 from spelgen.settings.tuning.logs import LogTuning
 
@@ -48,10 +47,9 @@ class Layout:
     def units(self) -> tuple[np.ndarray, np.ndarray]:
         """Return factors and offsets (C,) of the columns: a value in SI units is factor * logged value + offset."""
         factors, offsets = [TIMES[self.mapping.units.t]], [0.0]
-        for quantity in wanted_quantities(self.mapping):
-            for joint in self.joints:
-                factors.append(self.mapping.scale(quantity, joint))
-                offsets.append(self.mapping.offset(quantity, joint))
+        for quantity, joint in self.mapping.signals(self.joints):
+            factors.append(self.mapping.scale(quantity, joint))
+            offsets.append(self.mapping.offset(quantity, joint))
         return np.array(factors), np.array(offsets)
 
 
@@ -80,15 +78,6 @@ class LogFormat:
     folder: str = ""
 
 
-def wanted_quantities(mapping: LogMapping) -> tuple[str, ...]:
-    """Return the quantities that a log must hold."""
-    if mapping.input == "position":
-        return ("q", "u")
-    if mapping.velocity == "differentiated":
-        return ("q", "tau")
-    return QUANTITIES
-
-
 def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, file: Path) -> Layout:
     """Return where a table's columns are. Raises LogError where one is missing, or there twice.
 
@@ -99,8 +88,8 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     if metadata.get(UNITS_KEY) == UNITS:
         mapping = LogMapping(input=mapping.input)
     columns = [mapping.columns.t]
-    for quantity in wanted_quantities(mapping):
-        columns += [mapping.column(quantity, joint) for joint in joints]
+    for quantity, joint in mapping.signals(joints):
+        columns.append(mapping.column(quantity, joint))
     _require_columns(schema.names, columns, file, mapping, joints)
     labels = mapping.columns.trajectory if mapping.columns.trajectory in schema.names else None
     # a list has no text that names a recording
@@ -158,7 +147,7 @@ def missing_columns(
 ) -> LogError:
     """Return the error about columns that are not there."""
     expected = [mapping.columns.t]
-    for quantity in wanted_quantities(mapping):
+    for quantity in mapping.quantities:
         expected.append(getattr(mapping.columns, quantity).replace("{joint}", "<joint>"))
     return LogError(
         f"only the columns {shortened(list(columns), LogTuning().listed)}", file=file,
@@ -172,14 +161,9 @@ def _advice(
 ) -> str:
     """Say what to do about missing columns: offer one that names the same joint and is no other quantity's."""
     owners: dict[str, tuple[str, str]] = {}
-    for quantity in wanted_quantities(mapping):
-        for joint in joints:
-            owners[mapping.column(quantity, joint)] = (quantity, joint)
-    bare = [
-        joint
-        for joint in joints
-        if all(mapping.column(x, joint) in missing for x in wanted_quantities(mapping))
-    ]
+    for quantity, joint in mapping.signals(joints):
+        owners[mapping.column(quantity, joint)] = (quantity, joint)
+    bare = [joint for joint in joints if all(mapping.column(x, joint) in missing for x in mapping.quantities)]
     if bare and len(bare) < len(joints):
         return (
             f"nothing was logged of {', '.join(bare)}: say which joints are the arm's, by --tip, --joints, or 'tip' or "

@@ -6,7 +6,8 @@ tau = sign * gain * unit * value + torque_offset.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import product
 from math import pi
 from typing import Annotated, Literal
 
@@ -14,16 +15,6 @@ from pydantic import Field, model_validator
 
 from spelgen.errors import SettingsError
 from spelgen.settings.values import Group, Number, Positive
-
-PLAIN = {
-    "t": "t",
-    "trajectory": "trajectory",
-    "q": "q_{joint}",
-    "qd": "qd_{joint}",
-    "tau": "tau_{joint}",
-    "u": "u_{joint}",
-}
-"""Columns as spelgen itself writes them."""
 
 _MILLI = 1e-3
 TIMES = {unit: _MILLI**power for power, unit in enumerate(("s", "ms", "us", "ns"))}
@@ -62,12 +53,16 @@ Effort = Literal["Nm", "mNm", "N", "A", "mA"]
 class LogColumns(Group):
     """Names of the columns; `{joint}` stands for the joint's `name`, `{trajectory}` (NPZ) for any text."""
 
-    t: str = PLAIN["t"]
-    trajectory: str = PLAIN["trajectory"]
-    q: str = PLAIN["q"]
-    qd: str = PLAIN["qd"]
-    tau: str = PLAIN["tau"]
-    u: str = PLAIN["u"]
+    t: str = "t"
+    trajectory: str = "trajectory"
+    q: str = "q_{joint}"
+    qd: str = "qd_{joint}"
+    tau: str = "tau_{joint}"
+    u: str = "u_{joint}"
+
+
+PLAIN = LogColumns().model_dump()
+"""Columns as spelgen itself writes them."""
 
 
 class JointColumns(Group):
@@ -141,6 +136,19 @@ class LogMapping(Group):
     accept: tuple[Accepted, ...] = ()
     dropouts: Literal["kept", "dropped"] = "kept"
 
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """The quantities that a log must hold."""
+        if self.input == "position":
+            return ("q", "u")
+        if self.velocity == "differentiated":
+            return ("q", "tau")
+        return ("q", "qd", "tau")
+
+    def signals(self, joints: Sequence[str]) -> list[tuple[str, str]]:
+        """Return quantity and joint of each column, in their order."""
+        return list(product(self.quantities, joints))
+
     def joint(self, name: str) -> JointLog:
         """Return how a joint is logged, by its URDF name."""
         return self.joints.get(name, JointLog())
@@ -159,6 +167,14 @@ class LogMapping(Group):
         """Return the mapping for one recording of a file: `{trajectory}` in the columns' names is its text."""
         named = {key: name.replace("{trajectory}", text) for key, name in self.columns.model_dump().items()}
         return self.model_copy(update={"columns": LogColumns(**named)})
+
+    def with_joint_columns(self, columns: Mapping[str, Mapping[str, str | None]]) -> LogMapping:
+        """Return the mapping with these columns of joints, by joint and quantity."""
+        joints = dict(self.joints)
+        for joint, names in columns.items():
+            logged = self.joint(joint)
+            joints[joint] = logged.model_copy(update={"columns": logged.columns.model_copy(update=names)})
+        return self.model_copy(update={"joints": joints})
 
     def unit(self, quantity: str, joint: str) -> str | None:
         """Return the unit of "q", "qd", "tau" or "u" of a joint, None where none was said; u is measured as q is."""
@@ -186,9 +202,8 @@ class LogMapping(Group):
         """Return what the mapping lacks for these joints, or says of them that cannot be; empty where it fits."""
         errors = []
         kinds: Sequence[str | None] = joint_types or [None] * len(joints)
-        quantities = ("q", "u") if self.input == "position" else ("q", "qd", "tau")
         for joint, kind in zip(joints, kinds, strict=True):
-            for quantity in quantities:
+            for quantity in self.quantities:
                 unit = self.unit(quantity, joint)
                 expected = self._missing(unit, self.joint(joint), kind)
                 if expected:
