@@ -66,24 +66,21 @@ def find_above(limit: Literal["velocity", "effort"], joint: JointEvidence) -> st
     return f"{limit} up to {largest:.4g} {unit}, the limit is {bound:.4g}"
 
 
-def find_wrong_sense(joint: JointEvidence) -> str | None:
-    """Find torques that certainly move against gravity."""
+def find_opposed(seen: float, message: str, joint: JointEvidence) -> str | None:
+    """Find torques that move against gravity, beyond a correlation; message: with the factor."""
     factor, correlation = joint.gravity_in_torque()
-    if correlation < -TUNING.agreement:
-        return f"torques that move against gravity, {factor:.3g} times the URDF's"
-    return None
+    return message.format(factor) if correlation < -seen else None
 
 
-def find_wrong_unit(joint: JointEvidence) -> str | None:
-    """Find torques that certainly move with gravity, by a factor that only another unit has."""
+def find_scaled(seen: float, largest: float, message: str, joint: JointEvidence) -> str | None:
+    """Find torques that move with gravity, beyond a correlation, by too large or too small a factor.
+
+    message: with the factor and its inverse.
+    """
     factor, correlation = joint.gravity_in_torque()
-    if correlation > TUNING.agreement and not _is_within(factor, TUNING.impossible_factor):
-        return f"torques that move with {factor:.3g} times the URDF's gravity torque"
+    if correlation > seen and not 1 / largest < factor < largest:
+        return message.format(factor, 1 / factor)
     return None
-
-
-def _is_within(factor: float, largest: float) -> bool:
-    return 1 / largest < factor < largest
 
 
 def find_beyond_drive(joint: JointEvidence) -> str | None:
@@ -132,34 +129,25 @@ def find_no_gravity(joint: JointEvidence) -> str | None:
     return None
 
 
-def find_against_gravity(joint: JointEvidence) -> str | None:
-    """Find torques that seem to move against gravity."""
-    factor, correlation = joint.gravity_in_torque()
-    if correlation < -TUNING.seen:
-        return f"tau moves against gravity: {factor:.3g} times the URDF's; a sign of tau or q is wrong"
-    return None
-
-
-def find_unusual_scale(joint: JointEvidence) -> str | None:
-    """Find torques that move with gravity, by a factor that errors of inertials do not explain."""
-    factor, correlation = joint.gravity_in_torque()
-    if correlation > TUNING.seen and not _is_within(factor, TUNING.unusual_factor):
-        return (
-            f"tau moves with {factor:.3g} times the URDF's gravity torque; check its unit and gain, or let the "
-            f"gain be found: 'torque: motor', and 'gear: {1 / factor:.3g}' with 'gain: trained' of this joint"
-        )
-    return None
-
-
 # these need no torques: of arms under position servos, too
 POSITION_CHECKS = [Check("beyond-position-limit", "warning", find_beyond_limits)]
 SENSE = Check(
-    "torque-sense", "error", find_wrong_sense, expected="the URDF's sense",
+    "torque-sense", "error",
+    partial(find_opposed, TUNING.agreement, "torques that move against gravity, {:.3g} times the URDF's"),
+    expected="the URDF's sense",
     do="write 'sign: -1' or a negative 'gain' of the joint under 'logs', or the gravity of this mounting",
 )  # fmt: skip
 CHECKS: list[Check[JointEvidence]] = [
     SENSE,
-    Check("torque-unit", "error", find_wrong_unit, expected="Nm or N at the joint", do=SAY_UNIT),
+    # by a factor that only another unit has
+    Check(
+        "torque-unit", "error",
+        partial(
+            find_scaled, TUNING.agreement, TUNING.impossible_factor,
+            "torques that move with {:.3g} times the URDF's gravity torque",
+        ),
+        expected="Nm or N at the joint", do=SAY_UNIT,
+    ),
     Check(
         "torque-beyond-drive", "error", find_beyond_drive, unless=("torque-sense", "torque-unit"),
         expected="Nm or N at the joint", do=SAY_UNIT,
@@ -170,6 +158,22 @@ CHECKS: list[Check[JointEvidence]] = [
     Check("at-a-stop", "warning", find_stop),
     Check("coarse", "warning", find_coarse),
     Check("torque-without-gravity", "warning", find_no_gravity, unless=TORQUE_ERRORS),
-    Check("torque-against-gravity", "warning", find_against_gravity, unless=TORQUE_ERRORS),
-    Check("torque-scale", "warning", find_unusual_scale, unless=TORQUE_ERRORS),
+    Check(
+        "torque-against-gravity", "warning",
+        partial(
+            find_opposed, TUNING.seen,
+            "tau moves against gravity: {:.3g} times the URDF's; a sign of tau or q is wrong",
+        ),
+        unless=TORQUE_ERRORS,
+    ),
+    # by a factor that errors of inertials do not explain
+    Check(
+        "torque-scale", "warning",
+        partial(
+            find_scaled, TUNING.seen, TUNING.unusual_factor,
+            "tau moves with {:.3g} times the URDF's gravity torque; check its unit and gain, or let the "
+            "gain be found: 'torque: motor', and 'gear: {:.3g}' with 'gain: trained' of this joint",
+        ),
+        unless=TORQUE_ERRORS,
+    ),
 ]  # fmt: skip

@@ -9,7 +9,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from spelgen.logs.checks import VelocityAgreement, velocity_agreement
 from spelgen.logs.rates import is_dense
-from spelgen.logs.trajectory import GAP, Trajectory
+from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
 TUNING = LogCheckTuning()
@@ -67,19 +67,17 @@ def statistics(trajectory: Trajectory) -> Statistics:
 
 def clock_of(trajectory: Trajectory) -> Clock:
     """Return when the samples of a trajectory were taken."""
-    steps = np.diff(trajectory.t)
-    is_gap = steps > GAP * np.median(steps) if steps.size else np.zeros(0, bool)
-    gaps = steps[is_gap]
-    regular = steps[~is_gap] if steps.size else np.ones(1)
+    steps = trajectory.regular_steps
+    gaps = len(trajectory) - 1 - len(steps)
     return Clock(
         name=trajectory.name,
         file=None if trajectory.file is None else str(trajectory.file),
         samples=len(trajectory),
         duration=trajectory.duration,
         sample_rate=trajectory.sample_rate,
-        jitter=float(regular.std() / regular.mean()),
-        gaps=len(gaps),
-        longest_gap=float(gaps.max(initial=0.0)),
+        jitter=float(steps.std() / steps.mean()) if steps.size else 0.0,
+        gaps=gaps,
+        longest_gap=float(np.diff(trajectory.t).max()) if gaps else 0.0,
     )
 
 

@@ -81,11 +81,14 @@ class Trajectory:
     @property
     def sample_rate(self) -> float:
         """Samples per second outside gaps [Hz], from the mean step: the median of jittered steps is biased."""
+        steps = self.regular_steps
+        return float(1.0 / steps.mean()) if steps.size else 0.0
+
+    @property
+    def regular_steps(self) -> np.ndarray:
+        """Times between samples [s], but gaps: a pause of a minute would halve the rate."""
         steps = np.diff(self.t)
-        if not steps.size:
-            return 0.0
-        # a pause of a minute would halve the rate
-        return float(1.0 / steps[steps <= GAP * np.median(steps)].mean())
+        return steps[steps <= GAP * np.median(steps)] if steps.size else steps
 
     def __repr__(self) -> str:
         joints = counted(self.q.shape[1], "joint")
