@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -35,7 +34,6 @@ def servo_motions(
     Arguments and errors as of `random_inputs`.
     """
     protocol = settings.simulation
-    servos = SimulatedServos(arm, settings)
     lowest, highest = initial_range(arm, settings)
     middle, width = (lowest + highest) / 2, np.minimum((highest - lowest) / 2, TUNING.widest)
     t = np.arange(round(protocol.duration * protocol.sample_rate) + 1) / protocol.sample_rate
@@ -43,7 +41,7 @@ def servo_motions(
     logs: list[Trajectory] = []
     for number, seed in enumerate(np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories)):
         u = middle + width * _commands(np.random.default_rng(seed), t, len(middle))
-        q = servos.positions(t, u)
+        q = _positions(arm, settings, t, u)
         q = np.round(q / encoder) * encoder
         qd, tau = np.gradient(q, t, axis=0), np.zeros((len(t), 0))
         logs.append(Trajectory(t, q, qd, tau, f"traj_{number:02d}", u=u))
@@ -63,41 +61,35 @@ def _commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:
     return np.asarray(0.5 * (sines + levels[(t / TUNING.held_level).astype(int)]))
 
 
-@dataclass(frozen=True)
-class SimulatedServos:
-    """Hold an arm whose servos, where nothing is said of them, are stiff as their effort and late by `LAG`."""
+def _positions(arm: Arm, settings: Settings, t: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return positions (T, n) from rest at the first command: semi-implicit Euler, dry friction as impulses.
 
-    arm: Arm
-    settings: Settings
-
-    def positions(self, t: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Return positions (T, n) from rest at the first command: semi-implicit Euler, dry friction as impulses.
-
-        The impulse of a joint's dry friction is the one that stops it, or else its largest one (projected Gauss-Seidel,
-        as in physics engines: Catto, Iterative Dynamics with Temporal Coherence, 2005).
-        """
-        dynamics, friction = arm_dynamics(self.arm, self.settings), make_friction(self.arm, self.settings)
-        limit = np.array([coordinate.effort or EFFORT for coordinate in self.arm.coordinates])
-        kp = 2 * limit
-        for joint, coordinate in enumerate(self.arm.coordinates):
-            kp[joint] = self.settings.joint(coordinate.name).kp or kp[joint]
-        kd = LAG * kp
-        interval = t[1] - t[0]
-        steps = int(np.ceil(interval / TUNING.step))
-        h, late = interval / steps, round(self.settings.simulation.delay * steps / interval)
-        damping = np.diag(h / 2 * (kd + friction.viscous))  # at a step's middle, as the positions are
-        impulses = -h * np.stack([friction.forward, friction.backward])
-        q, qd, positions = u[0].copy(), np.zeros(u.shape[1]), np.empty_like(u)
-        for step in range(steps * len(t)):
-            if step % steps == 0:
-                positions[step // steps] = q
-            command = u[max(0, step - late) // steps]
-            torque = np.clip(kp * (command - q) - kd * qd, -limit, limit)
-            force = torque - friction.viscous * qd - dynamics.nonlinear_effects(q, qd)
-            inverse = np.linalg.inv(dynamics.mass_matrix(q) + damping)
-            qd = _slowed(qd + h * inverse @ force, inverse, *impulses)
-            q = q + h * qd
-        return positions
+    Servos of which nothing is said are stiff as their effort and late by `LAG`. The impulse of a joint's dry friction
+    is the one that stops it, or else its largest one (projected Gauss-Seidel, as in physics engines: Catto, Iterative
+    Dynamics with Temporal Coherence, 2005).
+    """
+    dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings)
+    limit = np.array([coordinate.effort or EFFORT for coordinate in arm.coordinates])
+    kp = 2 * limit
+    for joint, coordinate in enumerate(arm.coordinates):
+        kp[joint] = settings.joint(coordinate.name).kp or kp[joint]
+    kd = LAG * kp
+    interval = t[1] - t[0]
+    steps = int(np.ceil(interval / TUNING.step))
+    h, late = interval / steps, round(settings.simulation.delay * steps / interval)
+    damping = np.diag(h / 2 * (kd + friction.viscous))  # at a step's middle, as the positions are
+    impulses = -h * np.stack([friction.forward, friction.backward])
+    q, qd, positions = u[0].copy(), np.zeros(u.shape[1]), np.empty_like(u)
+    for step in range(steps * len(t)):
+        if step % steps == 0:
+            positions[step // steps] = q
+        command = u[max(0, step - late) // steps]
+        torque = np.clip(kp * (command - q) - kd * qd, -limit, limit)
+        force = torque - friction.viscous * qd - dynamics.nonlinear_effects(q, qd)
+        inverse = np.linalg.inv(dynamics.mass_matrix(q) + damping)
+        qd = _slowed(qd + h * inverse @ force, inverse, *impulses)
+        q = q + h * qd
+    return positions
 
 
 def _slowed(qd: np.ndarray, inverse: np.ndarray, least: np.ndarray, most: np.ndarray) -> np.ndarray:
