@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -181,8 +180,8 @@ def end_errors(
     mean = torch.cat([q_relative, qd_relative]).mean(dim=0, keepdim=True)
     tip_mm = None
     if tip is not None:
-        distance = 1000 * _rms((tip(q) - tip(measured_q)).norm(dim=-1)).item()
-        tip_mm = distance if math.isfinite(distance) else None
+        distance = _rms((tip(q) - tip(measured_q)).norm(dim=-1, keepdim=True))
+        (tip_mm,) = finite(1000 * distance)
     return StateErrors(
         finite(q_error), finite(qd_error), finite(q_relative), finite(qd_relative), finite(mean)[0], tip_mm
     )

@@ -84,7 +84,7 @@ def replays(
     """
     pieces: list[Trajectory] = []
     for log in logs:
-        pieces += [piece for piece in split_at_gaps(log) if len(piece) > 2]
+        pieces += split_at_gaps(log, shortest=3)
     windows: list[LogRows] = []
     first_qd: list[np.ndarray] = []
     for piece in pieces:

@@ -112,8 +112,7 @@ def _roles(robot: FleetRobot, arm: LoadedArm, mapping: LogMapping) -> Split:
         simulated = simulate(arm)
         return simulated.train, simulated.test
     train = read_logs(robot.data, arm, mapping, "train")
-    everything = read_logs(robot.data, arm, mapping, None)
-    if {log.file for log in everything} == {log.file for log in train}:
+    if log_files(robot.data, "train") == log_files(robot.data):
         return train, []
     return train, read_logs(robot.data, arm, mapping, "test")
 

@@ -48,7 +48,7 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
     """Measure n joints over recordings; saturation: (n,) distances from the command at which torque is at its limit."""
     pieces = []
     for log in logs:
-        pieces += [piece for piece in split_at_gaps(log) if len(piece) >= FILTER_SAMPLES]
+        pieces += split_at_gaps(log, shortest=FILTER_SAMPLES)
     n = len(saturation)
     q = _joined([_midpoints(piece.q) for piece in pieces], n)
     # means differ by the static error, which is no matter of delay

@@ -42,7 +42,7 @@ def state_samples(trajectory: Trajectory, inputs: np.ndarray) -> np.ndarray:
 
     Accelerations are differences within gap-free pieces. inputs: G, (n, n).
     """
-    pieces = [piece for piece in split_at_gaps(trajectory) if len(piece) > 2]
+    pieces = split_at_gaps(trajectory, shortest=3)
     if not pieces:
         return np.zeros((4, 0, trajectory.q.shape[1]))
     stride = -(-sum(map(len, pieces)) // TUNING.gravity_samples)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from spelgen.dynamics.bristles import BristleReach, bristles_along, direction_al
 from spelgen.logs.filtering import low_pass, low_pass_regular, resample
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import shows_accelerations
-from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.settings.tuning.identification import IdentificationTuning
 from spelgen.settings.tuning.logs import LogTuning
 
@@ -81,16 +80,8 @@ def dynamics_samples(
 
 def long_pieces(trajectory: Trajectory, gap: float) -> list[Trajectory]:
     """Return the pieces between holes of which a filter leaves something."""
-    steps = np.diff(trajectory.t)
-    if not steps.size:
-        return []
-    holes = np.flatnonzero(steps > max(gap * np.median(steps), HOLE)) + 1
-    pieces = []
-    for start, stop in pairwise([0, *holes, len(trajectory)]):
-        piece = trajectory[start:stop]
-        if piece.duration >= SHORTEST:
-            pieces.append(piece)
-    return pieces
+    pieces = split_at_gaps(trajectory, gap, HOLE)
+    return [piece for piece in pieces if piece.duration >= SHORTEST]
 
 
 def _columns(

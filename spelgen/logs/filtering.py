@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from spelgen.errors import LogError, SpelgenError, collect
+from spelgen.errors import SpelgenError, collect
 from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import GAP, Trajectory, split_at_gaps
 from spelgen.settings.tuning.logs import LogTuning
@@ -29,11 +29,8 @@ def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:
     t = trajectory.t
     mean_rate = (len(t) - 1) / (t[-1] - t[0])
     if cutoff >= mean_rate / 2:
-        raise LogError(
-            f"a filter of {cutoff:g} Hz on samples at {mean_rate:.3g} Hz", file=trajectory.file,
-            element=f"trajectory {trajectory.name}", expected=f"below {mean_rate / 2:.3g} Hz",
-            do="lower or drop the filter",
-        )  # fmt: skip
+        got = f"a filter of {cutoff:g} Hz on samples at {mean_rate:.3g} Hz"
+        raise trajectory.error(got, f"below {mean_rate / 2:.3g} Hz", "lower or drop the filter")
     grid = np.linspace(t[0], t[-1], len(t))
     filtered = []
     for signals in (
@@ -94,11 +91,9 @@ def prepare(
         pieces = split_at_gaps(trajectory, gap)
         long_enough = [piece for piece in pieces if len(piece) >= shortest]
         if not long_enough:
-            errors.append(LogError(
-                f"{max(map(len, pieces))} samples without a gap", file=trajectory.file,
-                element=f"trajectory {trajectory.name}", expected=f"at least {shortest}, one window",
-                do="record longer or train with a shorter window",
-            ))  # fmt: skip
+            got = f"{max(map(len, pieces))} samples without a gap"
+            do = "record longer or train with a shorter window"
+            errors.append(trajectory.error(got, f"at least {shortest}, one window", do))
         for piece in long_enough:
             prepared.append(piece if cutoff is None else low_pass(piece, cutoff))
     collect(errors)

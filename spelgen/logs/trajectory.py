@@ -57,7 +57,7 @@ class Trajectory:
         backward = np.flatnonzero(np.diff(self.t) < TUNING.shortest_step)
         if backward.size:
             k = backward[0]
-            raise self._error("t", f"{self.t[k + 1]:g} s after {self.t[k]:g} s", "increasing times")
+            raise self.error(f"{self.t[k + 1]:g} s after {self.t[k]:g} s", "increasing times", column="t")
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -106,18 +106,18 @@ class Trajectory:
             return np.asarray(values, dtype=float)
         except (TypeError, ValueError) as error:
             got = f"{type(values).__name__} ({error})"
-            raise self._error(column, got, "an array of numbers") from error
+            raise self.error(got, "an array of numbers", column=column) from error
 
     def _require_shapes(self) -> None:
         if self.t.ndim != 1 or not self.t.size:
-            raise self._error("t", f"an array of shape {self.t.shape}", "(T,), a time for each sample")
+            raise self.error(f"an array of shape {self.t.shape}", "(T,), a time for each sample", column="t")
         samples = len(self.t)
         joints = self.q.shape[1] if self.q.ndim == 2 else "n"
         for column in self.quantities:
             shape = getattr(self, column).shape
             if len(shape) != 2 or shape != (samples, joints):
                 expected = f"({samples}, {joints}), a row for each time and a column for each joint"
-                raise self._error(column, f"an array of shape {shape}", expected)
+                raise self.error(f"an array of shape {shape}", expected, column=column)
 
     def _require_possible(self, column: str, possible: np.ndarray) -> None:
         """Raise LogError where a column holds a value that is not possible, both of one shape."""
@@ -128,29 +128,28 @@ class Trajectory:
         expected = "finite numbers"
         if np.isfinite(value).all():
             expected = f"numbers below {TUNING.latest if column == 't' else TUNING.largest_value:g}"
-        raise self._error(column, f"{value.tolist()} at sample {row}", expected)
+        raise self.error(f"{value.tolist()} at sample {row}", expected, column=column)
 
-    def _error(self, column: str, got: str, expected: str) -> LogError:
-        return LogError(got, file=self.file, element=f"trajectory {self.name}: {column}", expected=expected)
+    def error(self, got: str, expected: str, do: str | None = None, column: str = "") -> LogError:
+        """Return an error about the recording, or about one of its columns."""
+        element = f"trajectory {self.name}"
+        if column:
+            element += f": {column}"
+        return LogError(got, file=self.file, element=element, expected=expected, do=do)
 
 
 def require_torques(trajectories: Sequence[Trajectory]) -> None:
     """Raise LogError where no torques were logged."""
     for trajectory in trajectories:
         if trajectory.u is not None:
-            raise LogError(
-                "commanded positions and no torques", file=trajectory.file, element=f"trajectory {trajectory.name}",
-                expected="torques", do="arms under position servos are fitted and judged by `train` and `evaluate`",
-            )  # fmt: skip
+            do = "arms under position servos are fitted and judged by `train` and `evaluate`"
+            raise trajectory.error("commanded positions and no torques", "torques", do)
 
 
 def require_commands(trajectory: Trajectory) -> np.ndarray:
     """Return its commanded positions, (T, n). Raises LogError where none were logged."""
     if trajectory.u is None:
-        raise LogError(
-            "no commanded positions", file=trajectory.file, element=f"trajectory {trajectory.name}",
-            expected="u: this arm has position servos",
-        )  # fmt: skip
+        raise trajectory.error("no commanded positions", "u: this arm has position servos")
     return trajectory.u
 
 
@@ -168,24 +167,24 @@ def require_joints(trajectory: Trajectory, joints: Sequence[str]) -> None:
     """Raise LogError unless the trajectory has a column for each of these joints."""
     count = trajectory.q.shape[1]
     if count != len(joints):
-        raise LogError(
-            f"{count} joints", file=trajectory.file, element=f"trajectory {trajectory.name}",
-            expected=f"{len(joints)}: {', '.join(joints)}",
-        )  # fmt: skip
+        raise trajectory.error(f"{count} joints", f"{len(joints)}: {', '.join(joints)}")
 
 
-def gap_ends(t: np.ndarray, gap: float = GAP) -> list[int]:
-    """Return where the gap-free pieces of these times (T,) begin, and T. gap: in median steps."""
+def gap_ends(t: np.ndarray, gap: float = GAP, hole: float = 0.0) -> list[int]:
+    """Return where the gap-free pieces of these times (T,) begin, and T. gap: in median steps; hole: least one [s]."""
     steps = np.diff(t)
     # of ten thousand recordings hardly one has a gap, and a median takes longer than all else here
     if not steps.size or steps.max() <= gap * steps.min():
         return [0, len(t)]
-    return [0, *(np.flatnonzero(steps > gap * np.median(steps)) + 1).tolist(), len(t)]
+    return [0, *(np.flatnonzero(steps > max(gap * np.median(steps), hole)) + 1).tolist(), len(t)]
 
 
-def split_at_gaps(trajectory: Trajectory, gap: float = GAP) -> list[Trajectory]:
-    """Return the gap-free pieces, in order, all under the trajectory's name."""
-    ends = gap_ends(trajectory.t, gap)
-    if len(ends) == 2:
-        return [trajectory]
-    return [trajectory[start:stop] for start, stop in pairwise(ends)]
+def split_at_gaps(
+    trajectory: Trajectory, gap: float = GAP, hole: float = 0.0, *, shortest: int = 1
+) -> list[Trajectory]:
+    """Return the gap-free pieces of at least so many samples, in order, all under the trajectory's name."""
+    ends = gap_ends(trajectory.t, gap, hole)
+    pieces = [trajectory]
+    if len(ends) > 2:
+        pieces = [trajectory[start:stop] for start, stop in pairwise(ends)]
+    return [piece for piece in pieces if len(piece) >= shortest]
