@@ -115,6 +115,11 @@ def _in_short(text: str) -> str:
     return f"{text[:half]}... ({len(text)} characters) ...{text[-half:]}"
 
 
+def in_one_line(error: BaseException) -> str:
+    """Return the kind of an exception and what it says."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
 def collect(errors: Sequence[SpelgenError]) -> None:
     """Raise what was gathered: nothing, the one error, or a ``SpelgenErrors`` of several."""
     if len(errors) == 1:

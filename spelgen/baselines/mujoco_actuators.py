@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from spelgen.baselines.baseline import Baseline, CommandFollower
 from spelgen.baselines.names import POSITION_ACTUATORS
 from spelgen.baselines.run_arm import run_arm, run_logs
-from spelgen.errors import Diagnostic, LogError, RunError
+from spelgen.errors import Diagnostic, LogError, RunError, in_one_line
 from spelgen.files import write_json
 from spelgen.fitting.dataset import digest
 from spelgen.fitting.fitted import Fit
@@ -67,9 +67,8 @@ def kept_actuators(run: RunFolder) -> dict[str, CommandFollower]:
     try:
         return {POSITION_ACTUATORS: PositionActuators.from_dict(record[KEPT])}
     except (KeyError, TypeError, ValueError, SyntaxError) as error:
-        reason = " ".join(str(error).split())
         raise RunError(
-            f"actuators of MuJoCo that cannot be used ({type(error).__name__}: {reason})",
+            f"actuators of MuJoCo that cannot be used ({in_one_line(error)})",
             file=run.baseline,
             expected="what `spelgen train` wrote",
             do="train again, or remove the file",

@@ -8,7 +8,7 @@ from __future__ import annotations
 from spelgen.baselines.baseline import Baseline, JudgedArm
 from spelgen.baselines.names import URDF, URDF_WITH_DRIVES
 from spelgen.baselines.predictor import Predictor, of_dynamics
-from spelgen.errors import Diagnostic
+from spelgen.errors import Diagnostic, in_one_line
 
 
 class UrdfValues(Baseline):
@@ -28,8 +28,7 @@ class UrdfValues(Baseline):
                 driven = urdf_dynamics(judged.urdf, judged.joints, drives=True)
                 predictors.append(of_dynamics(URDF_WITH_DRIVES, driven, judged.probe))
         except Exception as error:  # Pinocchio and its parser raise many kinds; the evaluation stands without
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
-            judged.notes.append(_missing(judged.urdf.name, reason))
+            judged.notes.append(_missing(judged.urdf.name, in_one_line(error)))
             return []
         return predictors
 

@@ -16,7 +16,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from spelgen.cli.command import name_values
-from spelgen.errors import SpelgenError
+from spelgen.errors import SpelgenError, in_one_line
 from spelgen.files import local, with_addresses, write_text
 from spelgen.labels import counted, printable
 
@@ -106,7 +106,7 @@ def _message(error: BaseException, debug: bool) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror.lower()
     hint = "" if debug else "; --debug shows where"
-    return f"spelgen: unexpected {type(error).__name__}: {' '.join(str(error).split())}{hint}"
+    return f"spelgen: unexpected {in_one_line(error)}{hint}"
 
 
 @contextmanager

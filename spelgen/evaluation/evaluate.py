@@ -14,7 +14,7 @@ from spelgen.baselines.registry import BASELINES
 from spelgen.dynamics.protocol import input_of
 from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.dynamics.tip import tip_kinematics
-from spelgen.errors import Diagnostic, LogError
+from spelgen.errors import Diagnostic, LogError, in_one_line
 from spelgen.evaluation.horizons import (
     Horizon,
     JudgedLogs,
@@ -191,6 +191,6 @@ def _tip(judged: Subject, notes: list[Diagnostic]) -> TipPosition | None:
     try:
         return tip_kinematics(judged.urdf, judged.tip, joints=judged.joints).position
     except Exception as error:  # pytorch-kinematics raises many kinds; the evaluation stands without
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        notes.append(Diagnostic("info", "no-tip", judged.urdf.name, None, f"no tip errors: {reason}"))
+        message = f"no tip errors: {in_one_line(error)}"
+        notes.append(Diagnostic("info", "no-tip", judged.urdf.name, None, message))
         return None

@@ -11,7 +11,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
 
-from spelgen.errors import RunError, SpelgenError
+from spelgen.errors import RunError, SpelgenError, in_one_line
 from spelgen.files import write_json
 from spelgen.fleet.jobs import Job, RunResult, run_job
 from spelgen.fleet.prepare import Preparation, PreparedArm, prepare
@@ -121,7 +121,6 @@ def _job(fleet: Fleet, folder: Path, arm: PreparedArm, preset: str, seed: int, s
 
 def one_line(error: Exception) -> str:
     """Return an exception in one line."""
-    text = " ".join(str(error).split())
     if isinstance(error, SpelgenError):
-        return text
-    return f"unexpected {type(error).__name__}: {text}"
+        return " ".join(str(error).split())
+    return f"unexpected {in_one_line(error)}"

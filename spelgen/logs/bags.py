@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import pyarrow as pa
 
-from spelgen.errors import LogError
+from spelgen.errors import LogError, in_one_line
 from spelgen.files import limited_memory, require_regular_file
 from spelgen.logs.tables import LogFormat, LogTable, table_layout
 from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
@@ -140,7 +140,7 @@ def _messages(path: Path, topic: str | None) -> Iterator[tuple[int, JointState]]
         except (LogError, GeneratorExit):
             raise
         except Exception as error:  # rosbags, its storages and their decompressors raise many kinds
-            reason = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".")
+            reason = in_one_line(error).rstrip(".")
             raise LogError(f"an unreadable ROS 2 bag ({reason})", file=path) from error
 
 

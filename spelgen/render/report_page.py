@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from jinja2 import TemplateError
 
 from spelgen.baselines.run_arm import run_arm
-from spelgen.errors import RunError, SpelgenError
+from spelgen.errors import RunError, SpelgenError, in_one_line
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.traces import Traces
@@ -146,7 +146,7 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
         return _rendered(run, robot)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, TemplateError) as error:
         raise RunError(
-            f"files without the data of a report ({type(error).__name__}: {error})",
+            f"files without the data of a report ({in_one_line(error)})",
             file=run.folder.path,
             do="run `spelgen evaluate` again",
         ) from error
