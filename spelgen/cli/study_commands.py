@@ -61,9 +61,7 @@ def compare(
     if urdf_error is not None and steps is not None:
         raise UsageError("--steps: does not apply with --urdf-error, which uses the training defaults")
     variants = {variant.name: variant for variant in (ablation_variants() if ablation else VARIANTS)}
-    chosen = list(variants)
-    if presets is not None:
-        chosen = [name.strip() for name in presets.split(",")]
+    chosen = options.names(presets) or list(variants)
     for name in chosen:
         if name not in variants:
             raise SpelgenError(
