@@ -15,14 +15,11 @@ from spelgen.loaded_arm import load_arm
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
-from spelgen.runtime.bristles import Bristles
+from spelgen.runtime.bristles import Bristles, moved_bristles
 from spelgen.runtime.friction_laws import FrictionLaws
-from spelgen.runtime.joints import Joints
+from spelgen.runtime.sliding_friction import SlidingFriction
 
-JOINTS = Joints(
-    revolute=(True, False), center=(0.0, 0.0), reach=(3.0, 1.0), speed=(2.0, 0.5), friction=(1.5, 4.0),
-    armature=(0.0, 0.0),
-)  # fmt: skip
+FRICTION, SPEED = (1.5, 4.0), (2.0, 0.5)
 REACH = [[3e-4, 3e-3, 3e-2], [3e-5, 3e-4, 3e-3]]
 
 
@@ -52,13 +49,15 @@ def test_a_step_of_any_length_is_exact_along_one_way():
     way = torch.tensor([0.02, -0.003]).double()
     parts = z
     for part in torch.rand(50, 1).double().softmax(dim=0):
-        parts = bristles.moved(parts, part * way)
+        parts = moved_bristles(parts, (part * way).unsqueeze(-1), bristles.reach)
     # Fifty sums of a way of 20 mrad round by some 1e-17, and an element may end at zero.
-    torch.testing.assert_close(parts, bristles.moved(z, way), rtol=1e-12, atol=1e-15)
+    torch.testing.assert_close(
+        parts, moved_bristles(z, way.unsqueeze(-1), bristles.reach), rtol=1e-12, atol=1e-15
+    )
 
 
 def test_load_dependent_friction_is_smooth_at_right_angles():
-    laws = FrictionLaws(JOINTS)
+    laws = SlidingFriction(FRICTION, SPEED)
     constants = laws.prepare()
     still = torch.ones(2).double()
 
@@ -75,7 +74,7 @@ def test_load_dependent_friction_is_smooth_at_right_angles():
 
 def test_bristles_store_and_dissipate_but_never_give_more_than_they_hold():
     """d/dt stored energy = power taken - what is lost, and what is lost is never negative."""
-    laws = FrictionLaws(JOINTS, REACH)
+    laws = FrictionLaws(FRICTION, SPEED, REACH)
     with torch.no_grad():
         for weight in laws.parameters():
             weight += torch.randn(weight.shape, generator=torch.Generator().manual_seed(1)).double()

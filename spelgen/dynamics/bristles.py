@@ -45,7 +45,8 @@ def bristle_reach(model: Any) -> BristleReach:
     """Of a model."""
     if not has_friction_state(model):
         return BristleReach(np.zeros((model.n, 0)))
-    tensors = (model.friction.bristles.reach, model.motors, model.friction.sharp_velocity)
+    width = model.friction.prepare().coulomb_smoothing_velocity
+    tensors = (model.friction.bristles.reach, model.motors, width)
     arrays = [x.detach().cpu().double().numpy() for x in tensors]
     return BristleReach(*arrays)
 

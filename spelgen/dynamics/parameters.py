@@ -33,7 +33,7 @@ def parameter_table(model: nn.Module) -> dict[str, ParameterInfo]:
     table = {name: NETWORK for name, _ in model.named_parameters()}
     for path, module in model.named_modules():
         for declared in type(module).__mro__:
-            for name, kind, unit in vars(declared).get("kinds", ()):
+            for name, kind, unit, *_ in vars(declared).get("kinds", ()):
                 if getattr(module, name) is not None:  # a part may do without
                     table[f"{path}.{name}" if path else name] = ParameterInfo(kind, unit)
     return table

@@ -7,7 +7,6 @@ from typing import Any
 from spelgen.arm.arm import Arm
 from spelgen.runtime.body_chain import BodyChain
 from spelgen.runtime.parts import Row
-from spelgen.runtime.rigid_body import Bodies
 
 
 def body_chain(arm: Arm) -> BodyChain:
@@ -16,12 +15,9 @@ def body_chain(arm: Arm) -> BodyChain:
     for body in arm.bodies:
         geometry = tuple(map(_row, body.rotation)), _row(body.translation)
         is_revolute, ratio = body.kind == "revolute", float(body.multiplier)
-        # a chain is geometry: inertia stays empty
-        rows.append((body.parent, body.coordinate, is_revolute, ratio, body.offset, *geometry, ()))
-    bodies = Bodies(*zip(*rows, strict=True))
-    return BodyChain(len(arm.coordinates), bodies, _row(arm.gravity))
+        rows.append((body.parent, body.coordinate, is_revolute, ratio, body.offset, *geometry))
+    return BodyChain(len(arm.coordinates), _row(arm.gravity), *zip(*rows, strict=True))
 
 
 def _row(values: tuple[object, object, object]) -> Row:
-    x, y, z = map(float, values)  # type: ignore[arg-type]
-    return x, y, z
+    return tuple(map(float, values))  # type: ignore[arg-type]

@@ -74,10 +74,10 @@ def kinds(spec: ModelSpec) -> dict[str, str]:
 def parts(spec: ModelSpec) -> tuple[str, str]:
     """Return the types of what the model is made of, and the statements that make and return it."""
     body = _Body()
-    body.give("Joints", body.let("joints", _joints(spec)))
     if spec.bodies:
         _rigid_bodies(body, spec)
     else:
+        body.give("Joints", body.let("joints", _joints(spec)))
         _networks(body, spec)
     body.lines.append(" " * _INDENT + laid_out("return ", tuple(body.values), _INDENT))
     return ", ".join(body.types), "\n".join(body.lines)
@@ -206,22 +206,20 @@ def _columns(rows: Sequence[object], *names: str) -> dict[str, object]:
 
 def _joints(spec: ModelSpec) -> Call:
     """The call that makes the table of the joints."""
-    armature = _columns(spec.joints, "armature")
-    if spec.bodies:
-        armature["armature"] = _known_armature(spec)
     return call(
         "Joints",
         revolute=_revolute(spec.joints),
         **_columns(spec.joints, "center", "reach", "speed", "friction"),
-        **armature,
+        armature=_armature(spec),
     )
 
 
-def _known_armature(spec: ModelSpec) -> tuple[float, ...]:
-    """What the drives add to M: one that nothing is known of still has somewhere to start."""
+def _armature(spec: ModelSpec) -> object:
+    """What the drives add to M: one beside bodies that nothing is known of still has somewhere to start."""
     mean, armature = mean_mass(spec), []
     for k, joint in enumerate(spec.joints):
-        armature.append(joint.armature or float(f"{TUNING.least_armature * mean[k][k]:.3g}"))
+        least = float(f"{TUNING.least_armature * mean[k][k]:.3g}") if spec.bodies else 0.0
+        armature.append(joint.armature or least)
     return tuple(armature)
 
 
@@ -232,23 +230,38 @@ def _revolute(parts: Sequence[JointSpec | BodySpec]) -> tuple[bool, ...]:
 
 def _rigid_bodies(body: _Body, spec: ModelSpec) -> None:
     """Add the bodies, and what stands beside them."""
-    bodies = call(
-        "Bodies",
+    chain = call(
+        "BodyChain",
+        n=len(spec.joints),
+        gravity=spec.gravity,
         **_columns(spec.bodies, "parent", "joint"),
         revolute=_revolute(spec.bodies),
         **_columns(spec.bodies, "ratio", "offset", "rotation", "position"),
-        inertia=tuple(map(attrgetter("reference"), spec.bodies)),
     )
-    reach: list[object] = []
-    if spec.design.memory == "bristles":
-        for joint in spec.joints:
-            reach.append(BRISTLE_REACH[joint.kind])
-    body.give("Bodies", body.let("bodies", bodies))
-    body.give("Row", spec.gravity)
-    body.give("Rows", tuple(reach))
-    body.give("Rows", spec.motor_speeds)
+    inertias = tuple(map(attrgetter("reference"), spec.bodies))
+    body.give("BodyChain", body.let("chain", chain))
+    body.give("InertialParameters", body.let("bodies", call("InertialParameters", *inertias)))
+    usual, armature = _columns(spec.joints, "friction", "speed"), _armature(spec)
+    if spec.design.net != "none":
+        body.let("joints", _joints(spec))
+        usual = {"friction": Code("joints.friction"), "speed": Code("joints.speed")}
+        armature = Code("joints.armature")
+    body.give("FrictionLaws", body.let("friction", _friction_laws(spec, usual)))
+    body.give("Row", armature)
     if spec.design.net != "none":
         _residuals(body, spec)
+    if spec.motor_speeds:
+        body.give("Rows", spec.motor_speeds)
+
+
+def _friction_laws(spec: ModelSpec, usual: dict[str, object]) -> Call:
+    """The call that makes friction's laws, of joints with these usual sizes of friction and velocities."""
+    if spec.design.memory == "none":
+        return call("SlidingFriction", **usual)
+    reach: list[object] = []
+    for joint in spec.joints:
+        reach.append(BRISTLE_REACH[joint.kind])
+    return call("FrictionLaws", **usual, reach=tuple(reach))
 
 
 def _residuals(body: _Body, spec: ModelSpec) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -9,8 +10,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import vector
+from spelgen.runtime.parts import Row, Rows
 from spelgen.runtime.port_hamiltonian import applied
-from spelgen.runtime.rigid_body import Bodies, crossed, motion_table, pushed_along
+from spelgen.runtime.rigid_body import crossed, motion_table, pushed_along
 
 
 class Chain(NamedTuple):
@@ -30,19 +32,30 @@ class BodyChain(nn.Module):
     over all that carries a body, or that it carries, are products with a mask, so few operations are left.
     """
 
-    def __init__(self, n: int, bodies: Bodies, gravity: tuple[float, float, float]) -> None:
+    def __init__(
+        self,
+        n: int,
+        gravity: Row,
+        parent: Sequence[int],  # of each body; -1: the base
+        joint: Sequence[int],
+        revolute: Sequence[bool],  # whether a body turns about its frame's z, or slides along it,
+        ratio: Row,  # by ratio * q + offset
+        offset: Row,
+        rotation: Sequence[Rows],  # of the joint's frame in its parent's
+        position: Rows,  # likewise [m]
+    ) -> None:
         super().__init__()
-        self.parents, count = bodies.parent, len(bodies.parent)
+        self.parents, count = parent, len(parent)
         reading = torch.zeros(count, 6, count, dtype=torch.float64)
         carriers = torch.eye(count, dtype=torch.float64)
         ratios = torch.zeros(count, n, dtype=torch.float64)
-        for index, parent in enumerate(bodies.parent):
-            ratios[index, bodies.joint[index]] = bodies.ratio[index]
+        for index, carrier in enumerate(parent):
+            ratios[index, joint[index]] = ratio[index]
             # an inverse's rows are columns whose halves are swapped
-            reading[index, 5 if bodies.revolute[index] else 2, index] = 1
-            if parent >= 0:
-                carriers[:, index] += carriers[:, parent]
-        table, fixed = motion_table(bodies)
+            reading[index, 5 if revolute[index] else 2, index] = 1
+            if carrier >= 0:
+                carriers[:, index] += carriers[:, carrier]
+        table, fixed = motion_table(revolute, rotation, position)
         self.table = nn.Buffer(table)  # see ``motion_table``
         self.fixed = nn.Buffer(fixed)
         # where axes stand in ``frames``, (6 bodies, bodies)
@@ -53,7 +66,7 @@ class BodyChain(nn.Module):
         # acceleration of the base that stands for gravity, (6,)
         self.base = nn.Buffer(vector((0, 0, 0, *(-g for g in gravity))))
         # displacements are ratios q + offset, (bodies, n) and (bodies,)
-        self.ratios, self.offset = nn.Buffer(ratios), nn.Buffer(vector(bodies.offset))
+        self.ratios, self.offset = nn.Buffer(ratios), nn.Buffer(vector(offset))
 
     def forward(self, q: Tensor) -> Chain:
         """The bodies at q, (..., n)."""
@@ -96,10 +109,3 @@ class BodyChain(nn.Module):
         rising = applied(momenta, self.accelerations(pose, qd, turning))
         pushed = pushed_along(twists, self.at_base(pose, applied(momenta.mT, qd)))
         return rising + self.by_joints(pose.axes, pushed)
-
-    def energy(self, pose: Chain, inertia: Tensor) -> Tensor:
-        """The bodies' energy in gravity, (...) [J]; zero at the base's origin."""
-        # of all bodies together; the moment of mass stands in the inertia's upper right block
-        total = pose.frames @ inertia @ pose.frames.mT
-        moment = torch.stack([total[..., 2, 4], total[..., 0, 5], total[..., 1, 3]], dim=-1)
-        return applied(moment.unsqueeze(-2), self.base[3:]).squeeze(-1)

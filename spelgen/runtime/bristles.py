@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor, nn
+
+from spelgen.runtime.parts import Rows
 
 
 class Bristles(nn.Module):
@@ -16,20 +16,15 @@ class Bristles(nn.Module):
     closes its loop, so a joint that stiction stops does not creep where its load oscillates.
     """
 
-    reach: Tensor  # (n, K), a joint's shortest first
-
-    def __init__(self, reach: Sequence[Sequence[float]]) -> None:
+    def __init__(self, reach: Rows) -> None:
         super().__init__()
-        self.register_buffer("reach", torch.tensor(reach, dtype=torch.float64))
+        # (n, K), a joint's shortest first
+        self.reach = nn.Buffer(torch.tensor(reach, dtype=torch.float64))
 
     def rate(self, qd: Tensor, z: Tensor) -> Tensor:
         """z', (..., n, K)."""
         qd = qd.unsqueeze(-1)
         return qd * (qd.sign() * z < self.reach)
-
-    def moved(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """z after joints went one way by (..., n), exactly."""
-        return moved_bristles(z, displacement.unsqueeze(-1), self.reach)
 
 
 def moved_bristles(z: Tensor, displacement: Tensor, reach: Tensor) -> Tensor:

@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.bristles import Bristles
-from spelgen.runtime.joints import Joints, vector
+from spelgen.runtime.joints import vector
+from spelgen.runtime.parts import Row, Rows
 
-# where the constants start, relative to a joint's usual friction and speed
-STRIBECK = 0.3  # dry friction that only slow motion has
-STRIBECK_VELOCITY = 0.03  # where that has faded
-STRIBECK_ROUNDING = (
-    10.0  # by that velocity: above 1 the fall is nearly a Gaussian, far below it begins at rest
-)
-SMOOTHING_VELOCITY = 0.006  # over which dry friction turns around
-# the same of joints whose friction has no memory though others' has: a wider turn looks like memory
-SHARP_VELOCITY = 0.001
-SATURATION_VELOCITY = 0.2  # where viscous friction begins to grow more slowly
-LOAD_DEPENDENCE = 0.03  # dry friction by gravity torque
+SHARP_VELOCITY = 0.001  # over which dry friction turns around without memory, by usual velocity
 # below this fraction of usual friction a gravity torque's size is rounded off: at right angles it passes
 # zero, where |x| has no derivative
 LEAST_LOAD = 0.01
@@ -32,13 +22,13 @@ class FrictionConstants(NamedTuple):
 
     viscous: Tensor  # [Nm s/rad, N s/m]
     saturation: Tensor  # viscous friction that stops growing [Nm, N]
-    saturation_velocity: Tensor  # [rad/s, m/s]
+    saturation_velocity: Tensor  # where it begins to [rad/s, m/s]
     coulomb: Tensor  # [Nm, N]
-    stribeck: Tensor  # [Nm, N]
-    stribeck_velocity: Tensor  # [rad/s, m/s]
-    stribeck_rounding: Tensor  # by that velocity
-    coulomb_smoothing_velocity: Tensor  # [rad/s, m/s]
+    stribeck: Tensor  # dry friction that only slow motion has [Nm, N]
+    stribeck_velocity: Tensor  # where that has faded [rad/s, m/s]
     load_dependence: Tensor  # dry friction by gravity torque
+    stribeck_rounding: Tensor  # by that velocity
+    coulomb_smoothing_velocity: Tensor  # over which dry friction turns around [rad/s, m/s]
     least_load: Tensor  # [Nm, N]
     bristle_fractions: Tensor  # of dry friction, (n, K); a joint's add up to one, or are zero
     memoryless: Tensor  # 1 where dry friction follows velocity alone, 0 where bristles
@@ -54,92 +44,64 @@ class FrictionLaws(nn.Module):
 
     The direction, from -1 to 1, is that of the bristles, sum of fraction z / reach; at joints without
     memory, or where nothing is known of the way here, turned(qd, coulomb_smoothing_velocity).
-    No law has an exponential: a control loop has them in a third of the time. The Stribeck effect is the
+    No law has an exponential: a control loop has them in a third of the time. The Stribeck effect is
     nearly the Gaussian of Armstrong-Helouvry (Control of Machines with Friction, 1991) where r is large, and
     the exponential of Bo and Pavelescu (Wear 82:277, 1982), without its corner at rest, where it is small.
     """
 
-    kinds = (
-        ("raw_viscous", "sizes", "Nm s/rad, N s/m"),
-        ("raw_saturation", "sizes", "Nm, N"),
-        ("raw_saturation_velocity", "velocities", "rad/s, m/s"),
-        ("raw_coulomb", "sizes", "Nm, N"),
-        ("raw_stribeck", "sizes", "Nm, N"),
-        ("raw_stribeck_velocity", "velocities", "rad/s, m/s"),
-        ("raw_coulomb_smoothing_velocity", "velocities", "rad/s, m/s"),
-        ("raw_load_dependence", "load_dependence", "1"),
-        ("raw_bristle_fractions", "fractions", "1"),
+    # with the constants that zeros stand for, by a joint's usual friction and velocity
+    kinds: tuple[tuple[str, str, str, float], ...] = (
+        ("raw_viscous", "sizes", "Nm s/rad, N s/m", 1.0),
+        ("raw_saturation", "sizes", "Nm, N", 1.0),
+        ("raw_saturation_velocity", "velocities", "rad/s, m/s", 0.2),
+        ("raw_coulomb", "sizes", "Nm, N", 1.0),
+        ("raw_stribeck", "sizes", "Nm, N", 0.3),
+        ("raw_stribeck_velocity", "velocities", "rad/s, m/s", 0.03),
+        ("raw_load_dependence", "load_dependence", "1", 0.03),
+        ("raw_bristle_fractions", "fractions", "1", 1.0),
     )
 
-    nominal: Tensor
-    speed: Tensor
-    memoryless: Tensor
-    stribeck_rounding: Tensor
-    raw_coulomb_smoothing_velocity: nn.Parameter | None
-    raw_bristle_fractions: nn.Parameter | None
-
-    def __init__(self, joints: Joints, reach: Sequence[Sequence[float]] = ()) -> None:
+    def __init__(self, friction: Row, speed: Row, reach: Rows) -> None:
         super().__init__()
-        self.register_buffer("nominal", vector(joints.friction))
-        self.register_buffer("speed", vector(joints.speed))
-        self.bristles = Bristles(reach or [[]] * len(joints.speed))
-        start = torch.zeros(len(joints.speed), dtype=torch.float64)
+        self.nominal, self.speed = nn.Buffer(vector(friction)), nn.Buffer(vector(speed))
+        self.bristles = Bristles(reach)
         # no parameter: a fit to torques compares both forms
-        self.register_buffer("memoryless", torch.full_like(start, 0.0 if reach else 1.0))
-        self.register_buffer("stribeck_rounding", torch.full_like(start, STRIBECK_ROUNDING))
-        self.raw_viscous = nn.Parameter(start.clone())
-        self.raw_saturation = nn.Parameter(start.clone())
-        self.raw_saturation_velocity = nn.Parameter(start.clone())
-        self.raw_coulomb = nn.Parameter(start.clone())
-        self.raw_stribeck = nn.Parameter(start.clone())
-        self.raw_stribeck_velocity = nn.Parameter(start.clone())
-        self.raw_load_dependence = nn.Parameter(start.clone())
-        # dry friction turns around by displacement or by velocity, never by both
-        smoothing = None if reach else nn.Parameter(start.clone())
-        self.register_parameter("raw_coulomb_smoothing_velocity", smoothing)
-        fractions = nn.Parameter(torch.zeros_like(self.bristles.reach)) if reach else None
-        self.register_parameter("raw_bristle_fractions", fractions)
-
-    @property
-    def sharp_velocity(self) -> Tensor:
-        """Over which dry friction turns around, (n,), where a joint has no memory though others have."""
-        return SHARP_VELOCITY * self.speed
+        self.memoryless = nn.Buffer(torch.zeros_like(self.speed))
+        self.stribeck_rounding = nn.Buffer(torch.full_like(self.speed, 10.0))
+        for name, *_ in FrictionLaws.kinds[:-1]:
+            self.register_parameter(name, nn.Parameter(torch.zeros_like(self.speed)))
+        self.raw_bristle_fractions = nn.Parameter(torch.zeros_like(self.bristles.reach))
 
     def prepare(self) -> FrictionConstants:
         """The constants, in their units."""
-        size, speed = self.nominal, self.speed
-        smoothing, fractions = self.raw_coulomb_smoothing_velocity, self.raw_bristle_fractions
+        fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
+        return self.constants(SHARP_VELOCITY * self.speed, fractions)
+
+    def constants(self, smoothing_velocity: Tensor, bristle_fractions: Tensor) -> FrictionConstants:
+        """The constants, where dry friction turns around like this."""
+        size, speed, values = self.nominal, self.speed, {}
+        units = {"Nm s/rad, N s/m": size / speed, "Nm, N": size, "rad/s, m/s": speed, "1": size.sign()}
+        for name, _, unit, start in FrictionLaws.kinds[:-1]:
+            weight: Tensor = getattr(self, name)
+            values[name.removeprefix("raw_")] = start * units[unit] * weight.exp()
         return FrictionConstants(
-            viscous=size / speed * self.raw_viscous.exp(),
-            saturation=size * self.raw_saturation.exp(),
-            saturation_velocity=SATURATION_VELOCITY * speed * self.raw_saturation_velocity.exp(),
-            coulomb=size * self.raw_coulomb.exp(),
-            stribeck=STRIBECK * size * self.raw_stribeck.exp(),
-            stribeck_velocity=STRIBECK_VELOCITY * speed * self.raw_stribeck_velocity.exp(),
+            **values,
             stribeck_rounding=self.stribeck_rounding,
-            coulomb_smoothing_velocity=self.sharp_velocity
-            if smoothing is None
-            else SMOOTHING_VELOCITY * speed * smoothing.exp(),
-            load_dependence=LOAD_DEPENDENCE * size.sign() * self.raw_load_dependence.exp(),
+            coulomb_smoothing_velocity=smoothing_velocity,
             least_load=LEAST_LOAD * torch.where(size > 0, size, 1.0),
-            bristle_fractions=self.bristles.reach if fractions is None else self._remembered(fractions),
+            bristle_fractions=bristle_fractions,
             memoryless=self.memoryless,
         )
 
-    def _remembered(self, fractions: Tensor) -> Tensor:
-        return fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
-
-    def resistance(self, qd: Tensor, gravity: Tensor, constants: FrictionConstants) -> Tensor:
+    def resistance(self, qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
         """The diagonal of D, (..., n): friction torque by velocity, of joints that slide."""
-        c = constants
-        slope = torch.rsqrt(qd * qd + c.coulomb_smoothing_velocity**2)
-        return self.viscosity(qd, c) + self.dry(qd, gravity, c) * slope
+        return self.viscosity(qd, c) + self.dry(qd, gravity, c) * turning(qd, c.coulomb_smoothing_velocity)
 
     def forward(
         self,
         qd: Tensor,
         gravity: Tensor,
-        constants: FrictionConstants,
+        c: FrictionConstants,
         z: Tensor | None = None,
         direction: Tensor | None = None,
     ) -> Tensor:
@@ -148,9 +110,8 @@ class FrictionLaws(nn.Module):
         z: None where nothing is known of the way here; all joints are then without memory.
         direction: (..., n) of joints without memory; None: that of qd.
         """
-        c = constants
         if direction is None:
-            direction = turned(qd, c.coulomb_smoothing_velocity)
+            direction = qd * turning(qd, c.coulomb_smoothing_velocity)
         if z is not None:
             bent = (c.bristle_fractions / self.bristles.reach * z).sum(dim=-1)
             direction = bent + c.memoryless * direction
@@ -165,15 +126,15 @@ class FrictionLaws(nn.Module):
         direction = (qd / self.prepare().coulomb_smoothing_velocity).tanh()
         return direction.unsqueeze(-1) * self.bristles.reach
 
-    def stored_energy(self, z: Tensor, constants: FrictionConstants) -> Tensor:
+    def stored_energy(self, z: Tensor, c: FrictionConstants) -> Tensor:
         """What the bristles of Coulomb friction give back, (...) [J]."""
-        stored = constants.bristle_fractions * z.square() / self.bristles.reach
-        return 0.5 * (constants.coulomb * stored.sum(dim=-1)).sum(dim=-1)
+        stored = c.bristle_fractions * z.square() / self.bristles.reach
+        return 0.5 * (c.coulomb * stored.sum(dim=-1)).sum(dim=-1)
 
     @staticmethod
     def viscosity(qd: Tensor, c: FrictionConstants) -> Tensor:
         """Torque by velocity, (..., n)."""
-        return c.viscous + c.saturation * torch.rsqrt(qd * qd + c.saturation_velocity**2)
+        return c.viscous + c.saturation * turning(qd, c.saturation_velocity)
 
     @staticmethod
     def dry(qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
@@ -186,6 +147,6 @@ class FrictionLaws(nn.Module):
         return c.coulomb + c.stribeck * slow + c.load_dependence * load
 
 
-def turned(velocity: Tensor, width: Tensor) -> Tensor:
-    """A direction from -1 to 1 that turns around over this width of velocities, (..., n)."""
-    return velocity * torch.rsqrt(velocity * velocity + width**2)
+def turning(velocity: Tensor, width: Tensor) -> Tensor:
+    """1 / sqrt(velocity^2 + width^2), (..., n): times the velocity it turns around over this width."""
+    return torch.rsqrt(velocity * velocity + width**2)

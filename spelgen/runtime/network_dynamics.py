@@ -47,6 +47,11 @@ class NetworkDynamics(PortHamiltonian):
         pose: NetworkPose = self.at(q)
         return self.potential.forward(pose.encoded, pose.prepared["potential"])[0].squeeze(-1)
 
+    def gravity(self, q: Tensor | NetworkPose) -> Tensor:
+        """Return dV/dq, (..., n) [Nm, N]."""
+        pose: NetworkPose = self.at(q)
+        return -self.lagrangian_gradient(pose, torch.zeros_like(pose.mass[..., 0]))
+
     def lagrangian_gradient(self, q: Tensor | NetworkPose, qd: Tensor) -> Tensor:
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
         pose: NetworkPose = self.at(q, qd)
@@ -71,3 +76,9 @@ class NetworkDynamics(PortHamiltonian):
         """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
         pose: NetworkPose = self.at(q, qd)
         return self.friction.forward(pose.encoded, qd, pose.prepared["friction"], torch.eye(self.n).to(qd))
+
+    def forward(self, t: Tensor, state: Tensor) -> Tensor:
+        """Return the rate of (q, p), (..., 2 n), or of (q, p, tau), where tau is held."""
+        q, p, tau = state.tensor_split((self.n, 2 * self.n), dim=-1)
+        qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare())
+        return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)

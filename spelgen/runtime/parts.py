@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-Row = tuple[float, float, float]
+Row = Sequence[float]
 Rows = Sequence[Sequence[float]]
 Pairs = Sequence[tuple[float, float]]
 Layout = Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]  # a matrix by functions and constants

@@ -26,10 +26,10 @@ class PortHamiltonian(nn.Module):
     """
 
     n: int
-    # networks and rigid bodies have these each of their own
-    prepare: Callable[..., Prepared]
+    prepare: Callable[..., Prepared]  # networks and rigid bodies have each their own of these
     configuration: Callable[[Tensor, Prepared], Pose]
     potential_energy: Callable[[Tensor | Pose], Tensor]  # V, (...) [J]
+    gravity: Callable[[Tensor | Pose], Tensor]  # dV/dq, (..., n) [Nm, N]
     lagrangian_gradient: Callable[[Tensor | Pose, Tensor], Tensor]  # d/dq of 1/2 qd^T M qd - V
     nonlinear_effects: Callable[[Tensor | Pose, Tensor], Tensor]  # Coriolis, centrifugal, gravity torque
     friction_torque: Callable[..., Tensor]  # D(q, qd) qd
@@ -52,11 +52,6 @@ class PortHamiltonian(nn.Module):
         """Return M(q), (..., n, n) [kg m^2, kg m, kg]."""
         mass: Tensor = self.at(q).mass
         return mass
-
-    def gravity(self, q: Tensor | Pose) -> Tensor:
-        """Return dV/dq, (..., n) [Nm, N]."""
-        pose = self.at(q)
-        return -self.lagrangian_gradient(pose, torch.zeros_like(pose.mass[..., 0]))
 
     def input_matrix(self, q: Tensor) -> Tensor:
         """Return G(q), (..., n, n): an input is the torque of its own joint."""
@@ -106,9 +101,3 @@ class PortHamiltonian(nn.Module):
         qd = self.velocity(pose, p)
         force = self.lagrangian_gradient(pose, qd) - self.friction_torque(pose, qd, *state)
         return qd, force if tau is None else force + self.input_force(pose, qd, tau)
-
-    def forward(self, t: Tensor, state: Tensor) -> Tensor:
-        """Return the rate of (q, p), (..., 2 n), or of (q, p, tau), where tau is held."""
-        q, p, tau = state.tensor_split((self.n, 2 * self.n), dim=-1)
-        qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare())
-        return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from spelgen.runtime.joints import Joints
+from spelgen.runtime.body_chain import BodyChain
+from spelgen.runtime.friction_laws import FrictionLaws
 from spelgen.runtime.parts import Row, Rows
 from spelgen.runtime.residual_terms import ResidualTerms
-from spelgen.runtime.rigid_body import Bodies
+from spelgen.runtime.rigid_body import InertialParameters
 from spelgen.runtime.rigid_body_dynamics import Motion, RigidBodyDynamics, RigidPrepared
 
 
@@ -18,14 +19,14 @@ class ResidualDynamics(RigidBodyDynamics):
 
     def __init__(
         self,
-        joints: Joints,
-        bodies: Bodies,
-        gravity: Row,
-        reach: Rows,
-        motors: Rows,
+        chain: BodyChain,
+        bodies: InertialParameters,
+        friction: FrictionLaws,
+        armature: Row,
         residuals: ResidualTerms,
+        motors: Rows = (),
     ) -> None:
-        super().__init__(joints, bodies, gravity, reach, motors)
+        super().__init__(chain, bodies, friction, armature, motors)
         self.residuals = residuals
 
     def prepare(self) -> RigidPrepared:

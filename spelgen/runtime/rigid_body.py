@@ -2,28 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import vector
-from spelgen.runtime.parts import Row
-
-
-class Bodies(NamedTuple):
-    """All that moves rigidly with a joint, an entry for each; a body turns about its frame's z, or
-    slides along it, by ratio * q + offset.
-    """
-
-    parent: tuple[int, ...]  # -1: the base
-    joint: tuple[int, ...]
-    revolute: tuple[bool, ...]
-    ratio: tuple[float, ...]
-    offset: tuple[float, ...]
-    rotation: tuple[tuple[Row, Row, Row], ...]  # of the joint's frame in its parent's
-    position: tuple[Row, ...]  # likewise [m]
-    inertia: tuple[tuple[float, ...], ...]  # nominal m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz about the joint
+from spelgen.runtime.parts import Row, Rows
 
 
 def skew(a: Tensor) -> Tensor:
@@ -32,31 +17,6 @@ def skew(a: Tensor) -> Tensor:
     zero = torch.zeros_like(x)
     entries = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
     return torch.unflatten(entries, -1, (3, 3))
-
-
-def motion_table(bodies: Bodies) -> tuple[Tensor, Tensor]:
-    """Return what takes cos, sin and value of displacements to what takes twists from parents' frames.
-
-    (36 bodies, 3 bodies), and what is added, (36 bodies,).
-    """
-    count = len(bodies.parent)
-    by_term = torch.zeros(count, 6, 6, 3, count, dtype=torch.float64)
-    fixed = torch.zeros(count, 6, 6, dtype=torch.float64)
-    turn = skew(vector((0, 0, 1)))
-    turning, sliding = torch.zeros(2, 3, 6, 6, dtype=torch.float64)
-    turning[1] = torch.ops.aten.block_diag([-turn, -turn])
-    turning[0] = -turning[1] @ turning[1]
-    sliding[2, 3:, :3] = -turn
-    for index, revolute in enumerate(bodies.revolute):
-        # (w, v) at the frame of a body that has not moved
-        rotation = torch.stack([vector(row) for row in bodies.rotation[index]]).mT
-        start = torch.ops.aten.block_diag([rotation, rotation])
-        start[3:, :3] = -rotation @ skew(vector(bodies.position[index]))
-        # a motion takes it to (1 + (cos - 1) terms[0] + sin terms[1] + value terms[2]) start
-        terms = (turning if revolute else sliding) @ start
-        by_term[index, :, :, :, index] = terms.permute(2, 1, 0)
-        fixed[index] = (start - terms[0]).mT
-    return by_term.reshape(36 * count, 3 * count), fixed.flatten()
 
 
 def crossed(twists: Tensor, axes: Tensor) -> Tensor:
@@ -71,6 +31,28 @@ def pushed_along(twists: Tensor, momenta: Tensor) -> Tensor:
     (w, u), (n, f) = twists.chunk(2, dim=-2), momenta.chunk(2, dim=-2)
     angular = torch.linalg.cross(w, n, dim=-2) + torch.linalg.cross(u, f, dim=-2)
     return torch.cat([angular, torch.linalg.cross(w, f, dim=-2)], dim=-2)
+
+
+def motion_table(revolute: Sequence[bool], rotation: Sequence[Rows], position: Rows) -> tuple[Tensor, Tensor]:
+    """Return what takes cos, sin and value of displacements to what takes twists from parents' frames.
+
+    (36 bodies, 3 bodies), and what is added, (36 bodies,).
+    """
+    count, identity = len(revolute), torch.eye(6, dtype=torch.float64)
+    table = torch.zeros(count, 6, 6, 3, count, dtype=torch.float64)
+    fixed = torch.zeros(count, 6, 6, dtype=torch.float64)
+    for index, turns in enumerate(revolute):
+        # (w, v) at the frame of a body that has not moved
+        turn = torch.stack([vector(row) for row in rotation[index]]).mT
+        start = torch.ops.aten.block_diag([turn, turn])
+        start[3:, :3] = -turn @ skew(vector(position[index]))
+        # to turn by x takes it to (1 + sin x rate + (1 - cos x) rate^2) start, to slide to (1 + x rate) start
+        rate = -crossed(identity[:, 2:3] if turns else identity[:, 5:], identity)
+        square = rate @ rate @ start
+        table[index, :, :, 0, index] = -square.mT
+        table[index, :, :, 1 if turns else 2, index] = (rate @ start).mT
+        fixed[index] = (start + square).mT
+    return table.reshape(36 * count, 3 * count), fixed.flatten()
 
 
 def spatial_inertia(ten: Tensor) -> Tensor:
@@ -118,9 +100,9 @@ class InertialParameters(nn.Module):
 
     kinds = (("raw", "bodies", "kg, kg m, kg m^2"),)
 
-    def __init__(self, bodies: Bodies) -> None:
+    def __init__(self, *inertia: Row) -> None:
         super().__init__()
-        nominal = torch.stack([vector(ten) for ten in bodies.inertia])
+        nominal = torch.stack([vector(ten) for ten in inertia])
         self.factors = nn.Buffer(upper_cholesky(pseudo_inertia(nominal)))
         row, column = torch.triu_indices(4, 4)
         self.triangle = nn.Buffer(torch.eye(16, dtype=torch.float64)[4 * row + column])

@@ -8,11 +8,12 @@ import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.body_chain import BodyChain, Chain
+from spelgen.runtime.bristles import moved_bristles
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
-from spelgen.runtime.joints import Joints, vector
+from spelgen.runtime.joints import vector
 from spelgen.runtime.parts import Row, Rows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
-from spelgen.runtime.rigid_body import Bodies, InertialParameters, spatial_inertia
+from spelgen.runtime.rigid_body import InertialParameters, spatial_inertia
 
 
 class RigidPrepared(NamedTuple):
@@ -50,21 +51,25 @@ class RigidBodyDynamics(PortHamiltonian):
     )
 
     def __init__(
-        self, joints: Joints, bodies: Bodies, gravity: Row, reach: Rows = (), motors: Rows = ()
+        self,
+        chain: BodyChain,
+        bodies: InertialParameters,
+        friction: FrictionLaws,
+        armature: Row,  # nominal, of the drives [kg m^2, kg]
+        motors: Rows = (),
     ) -> None:
         super().__init__()
         # 1 where the measured torque moves a joint, (n,)
         self.actuated = nn.Buffer(self.input_matrix(vector([0.0] * self.n)).any(dim=0).double())
-        n, zeros = len(joints.speed), torch.zeros(len(joints.speed), dtype=torch.float64)
-        self.elements = len(reach[0]) if reach else 0
-        self.chain = BodyChain(n, bodies, gravity)
+        zeros = torch.zeros(self.n, dtype=torch.float64)
+        self.elements = friction.bristles.reach.shape[1]
         self.basis = nn.Buffer(spatial_inertia(torch.eye(10).double()))
-        self.bodies, self.friction = InertialParameters(bodies), FrictionLaws(joints, reach)
-        self.nominal_armature = nn.Buffer(vector(joints.armature))
+        self.chain, self.bodies, self.friction = chain, bodies, friction
+        self.nominal_armature = nn.Buffer(vector(armature))
         self.raw_armature = nn.Parameter(zeros.clone())  # its logarithm
         # C, (n, n), and its inverse; each drive moves its own joint alone where it is not given
         rows = [vector(row) for row in motors]
-        self.motors = nn.Buffer(torch.stack(rows) if rows else torch.eye(n).double())
+        self.motors = nn.Buffer(torch.stack(rows) if rows else torch.eye(self.n).double())
         self.loads = nn.Buffer(torch.linalg.inv(self.motors))
         # of the measured torque, in units of the joints' usual friction
         self.raw_offset = nn.Parameter(zeros.clone())
@@ -117,7 +122,10 @@ class RigidBodyDynamics(PortHamiltonian):
     def potential_energy(self, q: Tensor | Motion) -> Tensor:
         """Return V(q), (...) [J]; zero for a mass at the base's origin."""
         pose: Motion = self.at(q)
-        return self.chain.energy(pose.chain, pose.prepared.inertia)
+        # the moment of mass of all bodies together stands in their inertia's upper right block
+        total = pose.chain.frames @ pose.prepared.inertia @ pose.chain.frames.mT
+        moment = torch.stack([total[..., 2, 4], total[..., 0, 5], total[..., 1, 3]], dim=-1)
+        return applied(moment.unsqueeze(-2), self.chain.base[3:]).squeeze(-1)
 
     def gravity(self, q: Tensor | Motion) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
@@ -161,7 +169,8 @@ class RigidBodyDynamics(PortHamiltonian):
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
         """Return z after joints went one way by (..., n), exactly."""
-        return self.friction.bristles.moved(z, displacement @ self.motors.mT)
+        path = (displacement @ self.motors.mT).unsqueeze(-1)
+        return moved_bristles(z, path, self.friction.bristles.reach)
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
         """Return the rate of (q, p, z), (..., 2 n + n K), or of (q, p, z, tau), where tau is held.
@@ -169,13 +178,14 @@ class RigidBodyDynamics(PortHamiltonian):
         A state that is too short for z has none: friction is then that of joints which slide.
         """
         n, size = self.n, self.n * self.elements
-        if not size or state.shape[-1] < 2 * n + size:
-            return super().forward(t, state)
+        if state.shape[-1] < 2 * n + size:
+            size = 0
         q, p, flat, tau = state.tensor_split((n, 2 * n, 2 * n + size), dim=-1)
-        z = flat.reshape(*flat.shape[:-1], n, self.elements)
+        z = flat.reshape(*flat.shape[:-1], n, -1) if size else None
         qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare(), z)
-        rate = self.friction.bristles.rate(qd @ self.motors.mT, z).flatten(-2)
-        return torch.cat([qd, force, rate, torch.zeros_like(tau)], dim=-1)
+        if z is not None:
+            flat = self.friction.bristles.rate(qd @ self.motors.mT, z).flatten(-2)
+        return torch.cat([qd, force, flat, torch.zeros_like(tau)], dim=-1)
 
     def input_force(self, pose: Motion, qd: Tensor, tau: Tensor) -> Tensor:
         """Return G (tau - torque offset) + friction compensation qd, (..., n) [Nm, N]."""

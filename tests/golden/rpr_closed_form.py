@@ -37,35 +37,31 @@ FACTS = r"""{"format": 7, "robot": "rpr", "urdf": "rpr.urdf",
 # ---- this arm; `Model`, at the end of the file, is made of these parts ----
 
 
-def make_parts(seed: int) -> tuple[Joints, Bodies, Row, Rows, Rows]:
+def make_parts(seed: int) -> tuple[BodyChain, InertialParameters, FrictionLaws, Row]:
     """Return what this arm's `Model` is made of, with random weights of this seed."""
-    joints = Joints(
-        revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
-        speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
-    )  # fmt: skip
-    bodies = Bodies(
-        parent=(-1, 0, 1), joint=(0, 1, 2), revolute=(True, False, True), ratio=(1.0, 1.0, 1.0),
-        offset=(0.0, 0.0, 0.0),
+    chain = BodyChain(
+        n=3, gravity=(0.0, 0.0, -9.81), parent=(-1, 0, 1), joint=(0, 1, 2), revolute=(True, False, True),
+        ratio=(1.0, 1.0, 1.0), offset=(0.0, 0.0, 0.0),
         rotation=(
             ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
             ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
             ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
         ),
         position=((0.0, 0.0, 0.0), (0.0, 0.0, 0.154), (0.0, -0.0203, 0.0)),
-        inertia=(
-            (5.01, 0.0, 0.0, -4.48896, 4.13010816, 0.0, 0.0, 4.12210816, 0.0, 0.018),
-            (4.25, 0.0, -0.086275, -27.4125, 179.3223764, 0.0, 0.0, 179.320625, -0.55647375, 0.0077513825),
-            (1.08, 0.0, 0.09936, -0.05832, 0.0142904, 0.0, 0.0, 0.00425851, 0.00536544, 0.0102504),
-        ),
     )  # fmt: skip
-    return (
-        joints, bodies, (0.0, 0.0, -9.81),
-        (
+    bodies = InertialParameters(
+        (5.01, 0.0, 0.0, -4.48896, 4.13010816, 0.0, 0.0, 4.12210816, 0.0, 0.018),
+        (4.25, 0.0, -0.086275, -27.4125, 179.3223764, 0.0, 0.0, 179.320625, -0.55647375, 0.0077513825),
+        (1.08, 0.0, 0.09936, -0.05832, 0.0142904, 0.0, 0.0, 0.00425851, 0.00536544, 0.0102504),
+    )  # fmt: skip
+    friction = FrictionLaws(
+        friction=(0.4, 0.4, 0.4), speed=(3.0, 1.0, 6.0),
+        reach=(
             (0.0001, 0.0004, 0.0016, 0.0064, 0.025, 0.1), (1e-05, 4e-05, 0.00016, 0.00064, 0.0025, 0.01),
             (0.0001, 0.0004, 0.0016, 0.0064, 0.025, 0.1),
         ),
-        (),
     )  # fmt: skip
+    return (chain, bodies, friction, (2.19, 0.782, 0.106))
 
 
 class Model(RigidBodyDynamics):

@@ -1,0 +1,26 @@
+"""Friction by the same laws, without memory."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
+from spelgen.runtime.parts import Row
+
+
+class SlidingFriction(FrictionLaws):
+    """Friction that has no bristles: what is dry turns around over a velocity that is trained."""
+
+    kinds = (("raw_coulomb_smoothing_velocity", "velocities", "rad/s, m/s", 0.006),)
+
+    def __init__(self, friction: Row, speed: Row) -> None:
+        super().__init__(friction, speed, [[]] * len(speed))
+        self.memoryless.fill_(1.0)
+        self.raw_coulomb_smoothing_velocity = nn.Parameter(torch.zeros_like(self.speed))
+        self.register_parameter("raw_bristle_fractions", None)
+
+    def prepare(self) -> FrictionConstants:
+        """The constants, in their units."""
+        velocity = self.kinds[0][3] * self.speed * self.raw_coulomb_smoothing_velocity.exp()
+        return self.constants(velocity, self.bristles.reach)
