@@ -229,7 +229,13 @@ def _revolute(parts: Sequence[JointSpec | BodySpec]) -> tuple[bool, ...]:
 
 
 def _rigid_bodies(body: _Body, spec: ModelSpec) -> None:
-    """Add the bodies, and what stands beside them."""
+    """Add what stands beside bodies, if anything does, and the bodies."""
+    usual, armature = _columns(spec.joints, "friction", "speed"), _armature(spec)
+    if spec.design.net != "none":
+        body.let("joints", _joints(spec))
+        usual = {"friction": Code("joints.friction"), "speed": Code("joints.speed")}
+        armature = Code("joints.armature")
+        _residuals(body, spec)
     chain = call(
         "BodyChain",
         n=len(spec.joints),
@@ -241,15 +247,8 @@ def _rigid_bodies(body: _Body, spec: ModelSpec) -> None:
     inertias = tuple(map(attrgetter("reference"), spec.bodies))
     body.give("BodyChain", body.let("chain", chain))
     body.give("InertialParameters", body.let("bodies", call("InertialParameters", *inertias)))
-    usual, armature = _columns(spec.joints, "friction", "speed"), _armature(spec)
-    if spec.design.net != "none":
-        body.let("joints", _joints(spec))
-        usual = {"friction": Code("joints.friction"), "speed": Code("joints.speed")}
-        armature = Code("joints.armature")
     body.give("FrictionLaws", body.let("friction", _friction_laws(spec, usual)))
     body.give("Row", armature)
-    if spec.design.net != "none":
-        _residuals(body, spec)
     if spec.motor_speeds:
         body.give("Rows", spec.motor_speeds)
 

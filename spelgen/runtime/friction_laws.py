@@ -117,15 +117,6 @@ class FrictionLaws(nn.Module):
             direction = bent + c.memoryless * direction
         return self.viscosity(qd, c) * qd + self.dry(qd, gravity, c) * direction
 
-    def sliding(self, qd: Tensor) -> Tensor:
-        """The bristles z, (..., n, K), of joints that have long gone this way.
-
-        Near the smoothing velocity they bear up to 7.4 % more than friction without z, far above it the same.
-        """
-        # bent as far as they go a few widths on: the rest of an algebraic turn would be a stiff transient
-        direction = (qd / self.prepare().coulomb_smoothing_velocity).tanh()
-        return direction.unsqueeze(-1) * self.bristles.reach
-
     def stored_energy(self, z: Tensor, c: FrictionConstants) -> Tensor:
         """What the bristles of Coulomb friction give back, (...) [J]."""
         stored = c.bristle_fractions * z.square() / self.bristles.reach

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from torch import Tensor
 
-from spelgen.runtime.body_chain import BodyChain
-from spelgen.runtime.friction_laws import FrictionLaws
-from spelgen.runtime.parts import Row, Rows
 from spelgen.runtime.residual_terms import ResidualTerms
-from spelgen.runtime.rigid_body import InertialParameters
 from spelgen.runtime.rigid_body_dynamics import Motion, RigidBodyDynamics, RigidPrepared
 
 
@@ -17,16 +15,8 @@ class ResidualDynamics(RigidBodyDynamics):
 
     residuals: ResidualTerms | None
 
-    def __init__(
-        self,
-        chain: BodyChain,
-        bodies: InertialParameters,
-        friction: FrictionLaws,
-        armature: Row,
-        residuals: ResidualTerms,
-        motors: Rows = (),
-    ) -> None:
-        super().__init__(chain, bodies, friction, armature, motors)
+    def __init__(self, residuals: ResidualTerms, *rigid: Any) -> None:
+        super().__init__(*rigid)
         self.residuals = residuals
 
     def prepare(self) -> RigidPrepared:

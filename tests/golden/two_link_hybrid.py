@@ -46,8 +46,21 @@ def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
     return symmetric([m11], [f1, c1])
 
 
-def make_parts(seed: int) -> tuple[BodyChain, InertialParameters, FrictionLaws, Row, ResidualTerms]:
+def make_parts(seed: int) -> tuple[ResidualTerms, BodyChain, InertialParameters, FrictionLaws, Row]:
     """Return what this arm's `Model` is made of, with random weights of this seed."""
+    joints = Joints(
+        revolute=(True, True), center=(0.0, 0.0), reach=(3.14159, 3.14159), speed=(10.0, 10.0),
+        friction=(1.0, 1.0), armature=(0.1, 0.1),
+    )  # fmt: skip
+    generator = torch.Generator().manual_seed(seed)
+    network = Network(generator, ((0.02, 1.0), (0.02, 1.0)), hidden=(((1,), 64),), outputs=(((1,), 1),))
+    potential = Network(
+        generator, ((1.0, 0.307), (1.0, 0.307)), hidden=(((0, 1), 32),), outputs=(((0, 1), 1),)
+    )
+    residuals = ResidualTerms(
+        joints, (1.0, 1.0), mass_entries, functions=1, constants=2, network=network, potential=potential,
+        scale=10.8194,
+    )  # fmt: skip
     chain = BodyChain(
         n=2, gravity=(0.0, -9.81, 0.0), parent=(-1, 0), joint=(0, 1), revolute=(True, True), ratio=(1.0, 1.0),
         offset=(0.0, 0.0),
@@ -61,24 +74,11 @@ def make_parts(seed: int) -> tuple[BodyChain, InertialParameters, FrictionLaws, 
         (1.0, 0.5, 0.0, 0.0, 0.6, 0.0, 0.0, 0.85, 0.0, 1.25),
         (1.0, 0.5, 0.0, 0.0, 0.6, 0.0, 0.0, 0.85, 0.0, 1.25),
     )  # fmt: skip
-    joints = Joints(
-        revolute=(True, True), center=(0.0, 0.0), reach=(3.14159, 3.14159), speed=(10.0, 10.0),
-        friction=(1.0, 1.0), armature=(0.1, 0.1),
-    )  # fmt: skip
     friction = FrictionLaws(
         friction=joints.friction, speed=joints.speed,
         reach=((0.0001, 0.0004, 0.0016, 0.0064, 0.025, 0.1), (0.0001, 0.0004, 0.0016, 0.0064, 0.025, 0.1)),
     )  # fmt: skip
-    generator = torch.Generator().manual_seed(seed)
-    network = Network(generator, ((0.02, 1.0), (0.02, 1.0)), hidden=(((1,), 64),), outputs=(((1,), 1),))
-    potential = Network(
-        generator, ((1.0, 0.307), (1.0, 0.307)), hidden=(((0, 1), 32),), outputs=(((0, 1), 1),)
-    )
-    residuals = ResidualTerms(
-        joints, (1.0, 1.0), mass_entries, functions=1, constants=2, network=network, potential=potential,
-        scale=10.8194,
-    )  # fmt: skip
-    return (chain, bodies, friction, joints.armature, residuals)
+    return (residuals, chain, bodies, friction, joints.armature)
 
 
 class Model(ResidualDynamics):
