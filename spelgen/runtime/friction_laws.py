@@ -11,7 +11,8 @@ from spelgen.runtime.bristles import Bristles
 from spelgen.runtime.joints import vector
 from spelgen.runtime.parts import Row, Rows
 
-SHARP_VELOCITY = 0.001  # over which dry friction turns around without memory, by usual velocity
+# over which dry friction turns around without memory, by usual velocity: a wider turn looks like memory
+SHARP_VELOCITY = 0.001
 # below this fraction of usual friction a gravity torque's size is rounded off: at right angles it passes
 # zero, where |x| has no derivative
 LEAST_LOAD = 0.01
@@ -49,7 +50,7 @@ class FrictionLaws(nn.Module):
     the exponential of Bo and Pavelescu (Wear 82:277, 1982), without its corner at rest, where it is small.
     """
 
-    # with the constants that zeros stand for, by a joint's usual friction and velocity
+    # weight, kind, unit, and the constant that a zero stands for, by usual friction and velocity
     kinds: tuple[tuple[str, str, str, float], ...] = (
         ("raw_viscous", "sizes", "Nm s/rad, N s/m", 1.0),
         ("raw_saturation", "sizes", "Nm, N", 1.0),

@@ -8,8 +8,7 @@ from torch import nn
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
 from spelgen.runtime.parts import Row
 
-# where it starts, by usual velocity: a narrower turn looks like memory
-SMOOTHING_VELOCITY = 0.006
+SMOOTHING_VELOCITY = 0.006  # over which dry friction turns around to start from, by usual velocity
 
 
 class SlidingFriction(FrictionLaws):
