@@ -25,6 +25,7 @@ import torch
 from spelgen.building import build
 from spelgen.dynamics.pinocchio_arm import pinocchio_model
 from spelgen.exporting.c_library import CLibrary, compile_object, compiler, link_library, write_c
+from spelgen.exporting.c_source import c_entries
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
 from spelgen.exporting.description import FrictionLaw, TrainedModel
 from spelgen.exporting.entry_points import ENTRY_POINTS
@@ -100,7 +101,7 @@ def library(model: TrainedModel, folder: Path, flag: str, kind: type) -> CLibrar
     program, own_folder = compiler(), folder / kind.__name__
     assert program is not None
     own_folder.mkdir()
-    compiled = compile_object(write_c(model, own_folder), program, *([flag] * bool(flag)))
+    compiled = compile_object(write_c(model, c_entries(model), own_folder), program, *([flag] * bool(flag)))
     return CLibrary(link_library(compiled, program), model, kind)
 
 
@@ -222,7 +223,7 @@ def time_c(model: TrainedModel, *, beside_casadi: bool) -> None:
                     f'{{ const double *arg[20]; double *res[20]; RUN("CasADi\'s C of {entry.name}", {call}); }}'
                 )
                 sources.append(f"{entry.name}_casadi.c")
-        write_c(model, place)
+        write_c(model, c_entries(model), place)
         text = TIMED.format(
             name=name, include=include, n=model.n, nz=model.memory, square=max(6 * model.n, model.n**2, 16),
             calls=CALLS, runs="\n".join(runs),

@@ -49,7 +49,7 @@ class LoadedArm:
     @cached_property
     def base_parameters(self) -> tuple[BaseParameter, ...]:
         """The combinations of inertial parameters that the motion depends on."""
-        return base_parameters(self.arm, self.structure.base_parameter_count)
+        return base_parameters(self.arm)
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:

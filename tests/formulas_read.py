@@ -15,12 +15,12 @@ from spelgen.structure.base_parameters import base_parameters
 CLOSE = 1e-10
 
 
-def assert_equal_to_pinocchio(arm: Arm, rows: dict[str, str], count: int, tolerance: float = CLOSE) -> None:
+def assert_equal_to_pinocchio(arm: Arm, rows: dict[str, str], tolerance: float = CLOSE) -> None:
     """Every expression at random positions, with the base parameters of ``arm``."""
     engine = arm_dynamics(arm, Settings())
     n = len(arm.coordinates)
     names = {"cos": np.cos, "sin": np.sin}
-    names |= {each.name: float(each.value) for each in base_parameters(arm, count)}
+    names |= {each.name: float(each.value) for each in base_parameters(arm)}
     origin = dict.fromkeys((f"q{k + 1}" for k in range(n)), 0.0)
     points = np.random.default_rng(3).uniform(-2, 2, (3, n))
     for q in points:

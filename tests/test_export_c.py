@@ -17,6 +17,7 @@ from spelgen.errors import RunError
 from spelgen.exporting import friction_expressions, parity
 from spelgen.exporting.c_export import c_files
 from spelgen.exporting.c_library import CLibrary, compile_object, link_library, write_c
+from spelgen.exporting.c_source import c_entries
 from spelgen.exporting.casadi_export import called_by_state, export_casadi
 from spelgen.exporting.describe import identifier
 from spelgen.exporting.entry_points import ENTRY_POINTS
@@ -146,7 +147,7 @@ def test_the_longest_name_is_a_name(tmp_path):
     described = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
     model = replace(described, name=identifier("gen3" * 20))
     assert len(model.name) == 40
-    assert compile_object(write_c(model, tmp_path), "gcc").exists()
+    assert compile_object(write_c(model, c_entries(model), tmp_path), "gcc").exists()
 
 
 def test_a_wrong_export_is_refused():
@@ -236,7 +237,7 @@ def test_c_carries_frictions_memory(tmp_path):
     """Two elements a joint: z turns dry friction, and long sliding bends it fully. NZ says how many numbers."""
     model = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
     model = replace(model, reach=REACH, friction=model.friction._replace(bristle_fractions=FRACTIONS))
-    source = write_c(model, tmp_path)
+    source = write_c(model, c_entries(model), tmp_path)
     assert "#define TWO_LINK_NZ 4" in source.with_suffix(".h").read_text()
     called = CLibrary(link_library(compile_object(source, "gcc"), "gcc"), model)
     given = random_inputs(model.arm.coordinates, 5, 4)
@@ -257,7 +258,7 @@ def test_c_carries_frictions_memory(tmp_path):
 def test_in_single_precision_a_joint_that_creeps_moves_its_bristles(tmp_path):
     """1e-6 rad/s at 1 kHz: near its reach of 0.1 rad a bristle in float would stay, or move by seven times as much."""
     model = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
-    source = write_c(model, tmp_path)
+    source = write_c(model, c_entries(model), tmp_path)
     library = link_library(compile_object(source, "gcc", f"-D{model.name.upper()}_FLOAT"), "gcc")
     called = CLibrary(library, model, np.float32)
     assert model.memory

@@ -51,7 +51,9 @@ def closed_form(model, robot):
 
 def c_library(model, folder):
     """The model's C, compiled."""
-    return CLibrary(link_library(compile_object(write_c(model, folder), "gcc"), "gcc"), model)
+    return CLibrary(
+        link_library(compile_object(write_c(model, c_entries(model), folder), "gcc"), "gcc"), model
+    )
 
 
 def test_what_is_zero_is_left_out():

@@ -67,7 +67,7 @@ def test_smallest_form_is_exact(robots, robot):
     loaded = load_arm(robots / f"{robot}.urdf")
     structure = derive(loaded.arm)
     keys = triangle(len(structure.joints))
-    mass = float_samples(loaded.arm, "kinematics", 50, seed=9).mass[0]
+    mass = float_samples(loaded.arm, "kinematics", 50, seed=9)[0]
     rebuilt = np.zeros_like(mass)
     for term in (*structure.outputs, *structure.constants):
         value = sum(float(weight) * mass[:, keys.index((i, j))] for i, j, weight in term.reads)
@@ -116,7 +116,7 @@ def test_edo_by_singular_values(shared):
     arm = make_arm(read_urdf(shared / "arms" / "edo.urdf"), joints=joints)
     structure = derive(arm)
     assert (len(structure.outputs), structure.outputs_from(3)) == (20, 9)
-    samples = float_samples(arm, "kinematics", 400).mass
+    samples = float_samples(arm, "kinematics", 400)
     changes = np.concatenate([samples[k + 1] - samples[0] for k in range(3)])
     sizes = np.linalg.svd(changes, compute_uv=False)
     sizes /= sizes[0]

@@ -13,7 +13,6 @@ from spelgen.arm.arm import Arm
 from spelgen.certificate import reasons
 from spelgen.certificate.axes import Axes, is_plain
 from spelgen.labels import axes_told, entry_name, joints_told, listed
-from spelgen.structure.basis import Constant, Output
 from spelgen.structure.structure import Entry, Structure
 
 Reason = str | None
@@ -97,8 +96,7 @@ class _Words:
     def equalities(self) -> Iterator[Fact]:
         """Yield entries that are equal, or opposite, at every configuration: the smallest form writes them alike."""
         terms: dict[tuple[int, int], dict[int, Fraction]] = {}
-        terms_of_m: list[Output | Constant] = [*self.structure.outputs, *self.structure.constants]
-        for number, term in enumerate(terms_of_m):
+        for number, term in enumerate((*self.structure.outputs, *self.structure.constants)):
             for row, column, factor in term.basis:
                 terms.setdefault((row, column), {})[number] = factor
         groups: dict[tuple[tuple[int, Fraction], ...], dict[tuple[int, int], bool]] = {}

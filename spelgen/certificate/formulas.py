@@ -204,7 +204,7 @@ class _Writer:
 
     def __init__(self, arm: Arm, structure: Structure):
         self._at_urdf_values = structure.assume == "inertials"
-        self.base = base_parameters(arm, structure.base_parameter_count)
+        self.base = base_parameters(arm)
         if self._at_urdf_values:
             self.base = tuple(base for base in self.base if base.value)
         self._expansion = Expansion(arm)

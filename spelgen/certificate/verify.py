@@ -20,7 +20,7 @@ from spelgen.certificate.verification import Check, Verdict, Verification, size_
 from spelgen.errors import SpelgenError, shortened
 from spelgen.labels import entry_name, joints_in_ranges
 from spelgen.settings.tuning.structure import CertificateTuning
-from spelgen.structure.basis import Constant, Output, row_of
+from spelgen.structure.basis import row_of
 from spelgen.structure.structure import Structure
 from spelgen.urdf.robot import Robot
 
@@ -157,15 +157,14 @@ def _smallest_form(case: _Case) -> Iterator[Check]:
     n = len(structure.joints)
     rebuilt = np.zeros_like(samples.mass)
     rows = []
-    terms: list[Output | Constant] = [*structure.outputs, *structure.constants]
-    for term in terms:
+    for term in (*structure.outputs, *structure.constants):
         reads = row_of(term.reads, n)
         values = samples.mass @ (reads * samples.scale)
         rebuilt += values[..., None] * row_of(term.basis, n) / samples.scale
         # relative to what the sum would be if nothing cancelled
         moves = np.abs(values[1:] - values[0]).max(axis=1) / (np.abs(reads) @ samples.scale)
         name = "a constant"
-        if isinstance(term, Output) and term.joints:
+        if term.joints:
             name = f"an output of {joints_in_ranges(term.joints)}"
             moves[list(term.joints)] = 0.0
         rows.append((name, float(moves.max()), False))

@@ -29,12 +29,13 @@ def export_c(trained: Trained) -> Exported:
 def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
     """Return header and source by name, and a sentence on how they were checked."""
     model, program = trained.described, compiler()
+    entries = c_entries(model)
     sizes, checked = (
         "Sizes were not measured: no C compiler was found",
         "Not checked: no C compiler was there.",
     )
     with tempfile.TemporaryDirectory() as folder:
-        source = write_c(model, Path(folder))
+        source = write_c(model, entries, Path(folder))
         content = source.read_bytes()
         if program is not None:
             compiled = compile_object(source, program)
@@ -43,5 +44,5 @@ def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
             parity = check_parity(library, trained, list(entry_points(model)), TUNING.tolerance)
             checked = f"Checked when exported, compiled by {Path(program).name}: {parity.summary}."
     # again, for the sizes are known after it was compiled
-    header = c_header(model, c_entries(model), sizes)
+    header = c_header(model, entries, sizes)
     return {f"{model.name}.h": header.encode(), f"{model.name}.c": content}, checked

@@ -7,13 +7,13 @@ import platform
 import re
 import shutil
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from spelgen.errors import RunError
-from spelgen.exporting.c_source import c_entries, c_header, c_source
+from spelgen.exporting.c_source import CEntry, c_header, c_source
 from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.entry_points import entry_points
 from spelgen.exporting.parity import Values
@@ -31,9 +31,8 @@ def compiler() -> str | None:
     return None
 
 
-def write_c(model: TrainedModel, folder: Path) -> Path:
+def write_c(model: TrainedModel, entries: Sequence[CEntry], folder: Path) -> Path:
     """Write header and source into a folder and return the source's path."""
-    entries = c_entries(model)
     source = folder / f"{model.name}.c"
     source.write_text(c_source(model, entries))
     source.with_suffix(".h").write_text(c_header(model, entries, ""))

@@ -17,7 +17,6 @@ from spelgen.identification.friction import BRISTLES, FrictionModel
 from spelgen.settings.tuning.identification import IdentificationTuning
 from spelgen.structure.base_parameters import base_parameters as body_base_parameters
 from spelgen.structure.base_parameters import parameter_name
-from spelgen.structure.structure import base_parameter_count
 
 TUNING = IdentificationTuning()
 
@@ -60,7 +59,7 @@ def base_parameters(
 ) -> BaseParameters:
     """Return the base parameters of ``arm`` and of this friction of its drives (see ``FrictionModel.columns``)."""
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
-    exact = body_base_parameters(arm, base_parameter_count(arm))
+    exact = body_base_parameters(arm)
     names = list(map(parameter_name, range(inertial)))
     for effect in friction.effects:
         names += [f"{effect}{joint + 1}" for joint in range(n)]

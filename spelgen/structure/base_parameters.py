@@ -17,7 +17,9 @@ import numpy as np
 from flint import fmpq, fmpq_mat
 
 from spelgen.arm.arm import Arm
+from spelgen.structure import field
 from spelgen.structure.recursion import PARAMETERS, Position, coefficients
+from spelgen.structure.sampling import regressor_rows
 
 # Parameters that stand for a group if they can; Iyy, hz and m of a turning body can always be regrouped.
 _PREFERRED = ("Izz", "Ixx", "Ixy", "Ixz", "Iyz", "hx", "hy", "m", "Iyy", "hz")
@@ -44,14 +46,30 @@ def parameter_name(index: int) -> str:
     return f"{PARAMETERS[index % 10]}{index // 10 + 1}"
 
 
+@lru_cache(maxsize=16)
+def base_parameter_count(arm: Arm) -> int:
+    """Return the rank of the inverse-dynamics regressor.
+
+    So many combinations of inertial parameters move the arm differently.
+    """
+    points = 7  # enough for all but few arms of up to seven joints
+    while True:
+        rows = regressor_rows(arm, points + 2)
+        found = field.rank(rows)
+        # the rows of the last points would have raised an unfinished rank, all but surely
+        if field.rank(rows[: len(rows) * points // (points + 2)]) == found:
+            return found
+        points *= 2
+
+
 @lru_cache(maxsize=16)  # of one arm they are asked for by least squares, logs and closed forms
-def base_parameters(arm: Arm, count: int) -> tuple[BaseParameter, ...]:
-    """Return the ``count`` base parameters of ``arm``, by body from the root."""
+def base_parameters(arm: Arm) -> tuple[BaseParameter, ...]:
+    """Return the base parameters of ``arm``, by body from the root."""
     order: list[int] = []
     for body in range(len(arm.bodies)):
         order += [10 * body + PARAMETERS.index(name) for name in _PREFERRED]
     result = []
-    for row in _reduced_rows(arm, count, order):
+    for row in _reduced_rows(arm, order):
         weights = []
         for index, coefficient in zip(order, row, strict=True):
             if coefficient:
@@ -75,13 +93,13 @@ def _value(arm: Arm, weights: list[tuple[int, Fraction]]) -> Fraction | None:
     return total
 
 
-def _reduced_rows(arm: Arm, count: int, order: list[int]) -> list[list[fmpq]]:
-    """Return the reduced echelon form of rank ``count`` of coefficients, its columns in this order."""
+def _reduced_rows(arm: Arm, order: list[int]) -> list[list[fmpq]]:
+    """Return the reduced echelon form of all coefficients, its columns in this order."""
     generator = random.Random(0)
     # a constant part of V moves nothing: V counts from where it is here
     reference = _rows(arm, generator)[-1]
     basis: list[list[fmpq]] = []
-    while len(basis) < count:
+    while len(basis) < base_parameter_count(arm):
         rows = _rows(arm, generator)
         rows[-1] -= reference
         echelon, rank = fmpq_mat(basis + rows[:, order].tolist()).rref()

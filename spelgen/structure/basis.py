@@ -35,21 +35,13 @@ def row_of(weights: Weights, n: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Output:
-    """Hold one function f(q) of ``joints`` that is left open.
+class Term:
+    """Hold one term of M: a function f(q) of ``joints`` that is left open, or a constant, of no joints.
 
-    f is the sum of ``reads`` x M, and ``basis`` takes it to M.
+    It is the sum of ``reads`` x M, and ``basis`` takes it to M.
     """
 
     joints: tuple[int, ...]
-    reads: Weights
-    basis: Weights
-
-
-@dataclass(frozen=True)
-class Constant:
-    """Hold one constant c = sum of ``reads`` x M, which enters M through ``basis``."""
-
     reads: Weights
     basis: Weights
 
@@ -63,7 +55,7 @@ class _Reading:
     values: np.ndarray
 
 
-def smallest_form(spans: Spans) -> tuple[tuple[Output, ...], tuple[Constant, ...]]:
+def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     """Return the outputs and constants of the smallest exact form."""
     readings = list(_readings(spans))
     entries = len(spans.keys)
@@ -76,10 +68,10 @@ def smallest_form(spans: Spans) -> tuple[tuple[Output, ...], tuple[Constant, ...
     outputs = []
     for r, row, row_values in zip(readings, basis, basis_values, strict=True):
         reads = _weights(spans, r.weights, r.values)
-        outputs.append(Output(r.joints, reads, _weights(spans, row, row_values)))
+        outputs.append(Term(r.joints, reads, _weights(spans, row, row_values)))
     # what the outputs do not explain cannot vary, so its span is that of the constants
     constant = field.difference(spans.mass, field.product(field.product(spans.mass, weights.T), basis))
-    rest_values = spans.float_mass - spans.float_mass @ values.T @ basis_values
+    rest_values = spans.floats[0] - spans.floats[0] @ values.T @ basis_values
     return tuple(outputs), _constants(spans, readings, (constant, rest_values), (basis, basis_values))
 
 
@@ -88,7 +80,7 @@ def _constants(
     readings: list[_Reading],
     constant: tuple[np.ndarray, np.ndarray],
     basis: tuple[np.ndarray, np.ndarray],
-) -> tuple[Constant, ...]:
+) -> tuple[Term, ...]:
     """Return a basis of what the outputs leave of W.
 
     Entries that are constant themselves are the first choice for a constant.
@@ -110,7 +102,7 @@ def _constants(
                 scaled = field.product(np.array([[coefficient]], dtype=np.uint64), output.weights[None])[0]
                 reading = field.difference(reading, scaled)
                 reading_values = reading_values - basis[1][j, pivot] * output.values
-        constants.append(Constant(_weights(spans, reading, reading_values), _weights(spans, row, values)))
+        constants.append(Term((), _weights(spans, reading, reading_values), _weights(spans, row, values)))
     return tuple(constants)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.settings.tuning.structure import StructureTuning
-from spelgen.structure.basis import Constant, Output, row_of
+from spelgen.structure.basis import Term, row_of
 from spelgen.structure.sampling import float_energies
 from spelgen.structure.structure import Structure
 
@@ -94,7 +94,7 @@ def working_range(coordinate: Coordinate) -> tuple[float, float]:
     return lower, upper
 
 
-def _reads(terms: Sequence[Output | Constant], n: int) -> np.ndarray:
+def _reads(terms: Sequence[Term], n: int) -> np.ndarray:
     """Return the weights of M's entries in terms of its smallest form, a row each."""
     rows = [row_of(term.reads, n) for term in terms]
     return np.reshape(rows, (-1, n * (n + 1) // 2))

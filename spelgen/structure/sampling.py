@@ -9,7 +9,6 @@ has moved: what changes between the two depends on the coordinate.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -36,20 +35,13 @@ Ten = Sequence[Element]
 TUNING = StructureTuning()
 
 
-@dataclass(frozen=True)
-class Samples:
-    """Hold ``mass`` (1 + n, samples, n(n+1)/2) and ``potential`` (1 + n, samples).
+def field_samples(arm: Arm, assume: Assume, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return M, (1 + n, samples, n(n+1)/2), and V, (1 + n, samples), in the field of 2^61 - 1.
 
-    Block 0 is the base, block k has coordinate k moved.
+    Block 0 is the base, block k has coordinate k moved. Under ``kinematics`` every sample has inertial parameters of
+    its own.
     """
-
-    mass: np.ndarray
-    potential: np.ndarray
-
-
-def field_samples(arm: Arm, assume: Assume, samples: int, seed: int = 0) -> Samples:
-    """Return samples in the field of 2^61 - 1; under ``kinematics`` every sample has inertial parameters of its own."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     n = len(arm.coordinates)
     positions = []
     for index in range(n):
@@ -69,16 +61,16 @@ def field_samples(arm: Arm, assume: Assume, samples: int, seed: int = 0) -> Samp
     result = energies(arm, positions, inertias, residue)
     shape = (1 + n, samples)
     entries = [_residue_values(entry, shape) for entry in result.mass.values()]
-    return Samples(np.stack(entries, axis=-1), _residue_values(result.potential, shape))
+    return np.stack(entries, axis=-1), _residue_values(result.potential, shape)
 
 
-def regressor_rows(arm: Arm, points: int, seed: int = 1) -> np.ndarray:
+def regressor_rows(arm: Arm, points: int) -> np.ndarray:
     """Return rows of the energy regressor in the field, ((n(n+1)/2 + 1) points, 10 bodies).
 
     M(q) and V(q) - V(q0) are linear in the inertial parameters and fix the torque, so the rows' rank is
     the number of base parameters (Gautier and Khalil 1990).
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     parameters = 10 * len(arm.bodies)
     positions = []
     for _ in arm.coordinates:
@@ -94,8 +86,8 @@ def regressor_rows(arm: Arm, points: int, seed: int = 1) -> np.ndarray:
     return rows.reshape(-1, parameters)
 
 
-def float_samples(arm: Arm, assume: Assume, samples: int, seed: int = 2) -> Samples:
-    """Return the same kind of samples in double precision."""
+def float_samples(arm: Arm, assume: Assume, samples: int, seed: int = 2) -> np.ndarray:
+    """Return the same kind of samples of M in double precision."""
     rng = np.random.default_rng(seed)
     n = len(arm.coordinates)
     q = [_one_moved(rng.uniform(-3.0, 3.0, 2 * samples), index, 1 + n) for index in range(n)]
@@ -105,7 +97,8 @@ def float_samples(arm: Arm, assume: Assume, samples: int, seed: int = 2) -> Samp
             inertias.append([rng.normal(size=samples) for _ in range(10)])
         else:
             inertias.append(list(map(float, body.inertia or (0,) * 10)))
-    return Samples(*float_energies(arm, np.stack(q, axis=-1), inertias))
+    mass, _ = float_energies(arm, np.stack(q, axis=-1), inertias)
+    return mass
 
 
 def float_energies(arm: Arm, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[np.ndarray, np.ndarray]:
@@ -148,11 +141,11 @@ class Spans:
         # a span of dimension d shows in d samples, and the spare ones would have shown a larger one, all but
         # surely
         count = len(self.keys) + TUNING.spare_samples
-        samples = field_samples(arm, assume, count)
+        mass, potential = field_samples(arm, assume, count)
         self._arm, self._assume, self._count = arm, assume, count
-        self.mass = samples.mass[0]
-        self.changes = [difference(moved, samples.mass[0]) for moved in samples.mass[1:]]
-        self.potential_changes = (samples.potential[1:] != samples.potential[0]).any(axis=1).tolist()
+        self.mass = mass[0]
+        self.changes = [difference(moved, mass[0]) for moved in mass[1:]]
+        self.potential_changes = (potential[1:] != potential[0]).any(axis=1).tolist()
 
     @cached_property
     def entry_joints(self) -> list[frozenset[int]]:
@@ -179,23 +172,17 @@ class Spans:
         return basis
 
     @cached_property
-    def floats(self) -> Samples:
-        """Return twice as many samples in double precision, for the sizes of coefficients.
+    def floats(self) -> np.ndarray:
+        """Return twice as many samples of M in double precision, for the sizes of coefficients.
 
         Their zeros and ranks come from the field.
         """
         return float_samples(self._arm, self._assume, 2 * self._count)
 
-    @property
-    def float_mass(self) -> np.ndarray:
-        """Rows that span W in double precision."""
-        result: np.ndarray = self.floats.mass[0]
-        return result
-
     def float_changes(self, joints: frozenset[int]) -> np.ndarray:
         """Rows that span the changes made by ``joints``, in double precision."""
-        base = self.floats.mass[0]
-        return np.concatenate([self.floats.mass[k + 1] - base for k in sorted(joints)] or [base[:0]])
+        base = self.floats[0]
+        return np.concatenate([base[:0], *(self.floats[k + 1] - base for k in sorted(joints))])
 
     def outside(self, joints: frozenset[int]) -> np.ndarray:
         """Rows that span the changes made by joints outside ``joints``, as coordinates in the basis of U."""

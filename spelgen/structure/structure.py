@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Literal
 
 from spelgen.arm.arm import Arm
 from spelgen.errors import ArmError
-from spelgen.structure import field
-from spelgen.structure.basis import Constant, Output, smallest_form
-from spelgen.structure.sampling import Spans, regressor_rows
+from spelgen.structure.base_parameters import base_parameter_count
+from spelgen.structure.basis import Term, smallest_form
+from spelgen.structure.sampling import Spans
 
 if TYPE_CHECKING:
     from spelgen.spec import Assume
@@ -43,8 +43,8 @@ class Structure:
     assume: Assume
     joints: tuple[str, ...]
     entries: tuple[Entry, ...]
-    outputs: tuple[Output, ...]
-    constants: tuple[Constant, ...]
+    outputs: tuple[Term, ...]
+    constants: tuple[Term, ...]
     potential: tuple[int, ...]
     """Coordinates the potential energy depends on; none when gravity does no work."""
     passive: tuple[int, ...]
@@ -83,22 +83,6 @@ def derive(arm: Arm, assume: Assume = "kinematics") -> Structure:
         passive=tuple(k for k, coordinate in enumerate(arm.coordinates) if coordinate.passive),
         base_parameter_count=base_parameter_count(arm),
     )
-
-
-@lru_cache(maxsize=16)
-def base_parameter_count(arm: Arm) -> int:
-    """Return the rank of the inverse-dynamics regressor.
-
-    So many combinations of inertial parameters move the arm differently.
-    """
-    points = 7  # enough for all but few arms of up to seven joints
-    while True:
-        rows = regressor_rows(arm, points + 2)
-        found = field.rank(rows)
-        # the rows of the last points would have raised an unfinished rank, all but surely
-        if field.rank(rows[: len(rows) * points // (points + 2)]) == found:
-            return found
-        points *= 2
 
 
 def _entry(spans: Spans, index: int) -> Entry:
