@@ -18,6 +18,7 @@ from spelgen.fitting.torque.jacobian import TUNING, TorqueJacobian
 from spelgen.fitting.torque.problem import State, TorqueProblem
 from spelgen.fitting.torque.residuals import SelectedResidual, refit_residuals, select_residuals
 from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.fitting.torque.weights import bound_friction
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
@@ -59,6 +60,8 @@ def fit_torque(
         samples = TorqueSamples.of(samples, TUNING.decimation)
     samples = samples.thinned(_most_samples(model))
     subset = samples.thinned(TUNING.subset)
+    if adapt is None:
+        bound_friction(model, subset.columns)
     problem = TorqueProblem(TorqueJacobian(model, subset), prior or _default_prior(adapt), adapt)
     select_memory = adapt is None and model.elements > 0
     if select_memory:

@@ -16,13 +16,11 @@ from spelgen.fitting.torque.body_steps import moved_bodies
 from spelgen.fitting.torque.samples import Block, TorqueSamples
 from spelgen.fitting.torque.weights import RigidWeights
 from spelgen.settings.tuning.fitting import TorqueTuning
-from spelgen.settings.tuning.identification import IdentificationTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 TUNING = TorqueTuning()
-MOVING = IdentificationTuning().moving
 LOGARITHMS = ("armature", "sizes", "load_dependence")
 
 
@@ -88,7 +86,6 @@ class TorqueJacobian:
         self.model: Any = model
         self.samples = samples
         self.rigid = RigidWeights(model)
-        self.start = self.rigid.flattened(self.rigid.start)
         self._functional = FunctionalModel(model)
         of_bodies = {
             name: torch.full_like(x, name == self.rigid.bodies) for name, x in self.rigid.start.items()
@@ -98,17 +95,6 @@ class TorqueJacobian:
         self._moves = self._moved_joints()
         self._colours = _colours(self._drives.double().mT @ self._drives.double() > 0)
         self._blocks = [self._with_regressors(block) for block in samples.blocks(TUNING.block)]
-
-    def start_by_torque(self) -> torch.Tensor:
-        """Return the weights (K,) as they are, with no friction larger than the deviation of its drive's torque."""
-        weights, motors, speed = self.rigid.named(self.start), self.model.motors, self.samples.columns.qd
-        deviation = (self._joint_torque() @ torch.linalg.inv(motors)).std(dim=0)
-        # a drive that stands still, or gives no torque, shows no friction
-        bounded = (deviation > 0) & ((speed @ motors.mT).abs().amax(dim=0) > MOVING)
-        largest = (deviation / self.model.friction.nominal).log()
-        for name in self.rigid.of_kind("sizes"):
-            weights[name] = torch.where(bounded, weights[name].minimum(largest), weights[name])
-        return self.rigid.flattened(weights)
 
     def squares(self, x: torch.Tensor) -> torch.Tensor:
         """Return sums of squares (n,) of the missing torque [Nm^2, N^2], as logged where gains are trained."""

@@ -37,10 +37,8 @@ class TorqueProblem:
     """
 
     def __init__(self, jacobian: TorqueJacobian, prior: GaussianPrior, adapt: Adaptation | None) -> None:
-        self.start, self.guess, self.adapt = jacobian.start, prior, adapt
-        if adapt is None:
-            self.start = jacobian.start_by_torque()
         rigid = jacobian.rigid
+        self.start, self.guess, self.adapt = rigid.flattened(rigid.start), prior, adapt
         self.compensated = rigid.start[rigid.compensation] != 0
         self.covariance = torch.zeros(len(self.start), len(self.start)).double()
         self.kinds = adapted_kinds(rigid.start, rigid.kinds)

@@ -8,7 +8,9 @@ import torch
 
 from spelgen.dynamics.parameters import parameter_table
 from spelgen.fitting.functional_model import Weights
+from spelgen.fitting.torque.samples import Block
 from spelgen.settings.fits import Adaptation
+from spelgen.settings.tuning.identification import IdentificationTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -18,6 +20,7 @@ RIGID = (
     "fractions",
 )  # fmt: skip
 """Kinds of parameters of bodies, drives and friction laws: all but what stands beside them."""
+MOVING = IdentificationTuning().moving
 DAILY = ("sizes", "velocities", "load_dependence", "fractions", "offset")  # kinds that change from day to day
 
 
@@ -70,3 +73,25 @@ class RigidWeights:
         else:
             masks[self.compensation] = compensated
         return self.flattened(masks)
+
+
+def bound_friction(model: EmittedModel, samples: Block) -> None:
+    """Let no usual friction of the model be larger than the deviation of its drive's torque.
+
+    It is guessed from efforts, which many URDFs have as placeholders: offsets in its units would pass for weights.
+    """
+    rigid, motors = RigidWeights(model), model.motors
+    with torch.no_grad():
+        torque = samples.tau @ model.input_matrix(samples.q[:1])[0].mT @ torch.linalg.inv(motors)
+        largest = torque.std(dim=0) / model.friction.nominal
+        # a drive that stands still, or gives no torque, shows no friction
+        shown = (largest > 0) & ((samples.qd @ motors.mT).abs().amax(dim=0) > MOVING)
+        largest = torch.where(shown, largest, torch.inf)
+        change = largest.clamp(max=1.0)
+        model.friction.nominal *= change
+    weights = dict(rigid.start)
+    for name in rigid.of_kind("sizes"):
+        weights[name] = weights[name].minimum(largest.log()) - change.log()
+    for name in rigid.of_kind("offset", "friction_compensation"):
+        weights[name] = weights[name] / change
+    rigid.write(rigid.flattened(weights))
