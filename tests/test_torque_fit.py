@@ -600,6 +600,22 @@ def test_a_spring_as_strong_as_gravity_does_not_drive_bodies_away(emitted, robot
     assert nmse(model, sprung(0.0, seed=9)) < 1e-4
 
 
+def test_a_spring_is_found_where_splines_of_it_lead_astray(robots):
+    """Bodies took over what they could of it, and a tenth of the motion is where no other is."""
+    t = torch.linspace(0, 60, 1200).double()[:, None] * torch.tensor([1.1, 1.7])
+    noise = 0.01 * torch.randn(t.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    q = 0.4 * t.sin()
+    q[720:840] += 1.5
+    slope = torch.stack([q[:, 0].sin(), q[:, 0].cos(), torch.ones(len(q))], dim=1).double()
+    gains = {0: torch.linalg.inv(slope.mT @ slope), 1: torch.zeros(0, 0).double()}
+    bodies = RigidResponse((slope, slope[:, :0]), gains)
+    spring = bodies.remaining(0, 3 * q[:, :1]) * torch.tensor([1.0, 0.0]).double()
+    samples = ResidualSamples(q, 0.4 * t.cos(), 0 * q, spring + noise, 0 * q)
+    model = build(robots / "two_link.urdf", "hybrid")
+    found = select_residuals(model, samples, bodies, 5.0)
+    assert [(x.name, x.joint, x.straight) for x in found] == [("raw_torque_splines", 0, True)]
+
+
 def test_no_friction_is_guessed_that_torques_do_not_have_room_for(emitted, robots):
     """The efforts of the URDF are placeholders, a million times what the arm ever gives."""
     true = drawn(emitted["two_link"][0], seed=3, deviation=0.3)

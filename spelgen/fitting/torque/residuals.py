@@ -39,20 +39,20 @@ WIDEST = 0.99 * LARGEST  # weights of friction's logarithm: beyond, the model's 
 @dataclass(frozen=True)
 class SelectedResidual:
     """A part that was selected. gain: the fraction by which the squares of the torque fell that was missed where it
-    acts, in held-out samples.
+    acts, in held-out samples. straight: of functions, a straight line alone.
     """
 
     name: str
     joint: int | None
     gain: float
+    straight: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
     """A function of one joint.
 
-    The model's parameter of that name has a row (W,) for it, in units of ``scale``. Weights are those of ``lines``,
-    (W, L), which are sums over the row, and then the row's own: P = L + W.
+    The model's parameter of that name has a row for it, in units of ``scale``: ``basis`` (W, P) times its weights (P,).
     features: (T, P); in a selection, of torques what bodies and laws cannot take over.
     force: (n,) how its torque acts on the joints.
     groups: (P,) which weights have a scale in common.
@@ -64,26 +64,34 @@ class _Candidate:
     scale: float
     features: torch.Tensor
     force: torch.Tensor
-    lines: torch.Tensor
+    basis: torch.Tensor
     groups: torch.Tensor
     friction: torch.Tensor | None
 
-    def weights(self, functions: Any) -> torch.Tensor:
-        """Return weights (P,) that give the model's."""
+    @property
+    def straight(self) -> bool:
+        """Return whether it is a straight line alone."""
+        return len(self.groups) == 1
+
+    def contains(self, other: _Candidate) -> bool:
+        """Return whether this can be all that another candidate can be."""
+        alike = (self.parameter, self.joint) == (other.parameter, other.joint)
+        return alike and (other.straight or not self.straight)
+
+    def row(self, functions: Any) -> torch.Tensor:
+        """Return the model's."""
         if self.friction is not None:
-            row = functions.friction_logarithms()[self.joint]
+            row: torch.Tensor = functions.friction_logarithms()[self.joint]
         else:
             row = functions.get_parameter(self.parameter)[self.joint] * self.scale
-        return F.pad(row.detach(), (self.lines.shape[1], 0))
+        return row.detach()
 
-    def write(self, functions: Any, weights: torch.Tensor) -> None:
-        """Make them the model's."""
-        count = self.lines.shape[1]
-        weights = self.lines @ weights[:count] + weights[count:]
+    def write(self, functions: Any, row: torch.Tensor) -> None:
+        """Make it the model's."""
         if self.friction is not None:
-            weights = LARGEST * (weights.clamp(-WIDEST, WIDEST) / LARGEST).atanh()
+            row = LARGEST * (row.clamp(-WIDEST, WIDEST) / LARGEST).atanh()
         with torch.no_grad():
-            functions.get_parameter(self.parameter)[self.joint] = weights / self.scale
+            functions.get_parameter(self.parameter)[self.joint] = row / self.scale
 
     def torque(self, weights: torch.Tensor, rows: slice = EVERY) -> torch.Tensor:
         """Return what they add to these samples (T,)."""
@@ -113,11 +121,14 @@ def select_residuals(
     while best := _best(candidates, missing, missing_early, noise, correlation):
         candidate, gain, torque_early = best
         weights = _fit_candidate(candidate, candidate.target(missing, noise), correlation)
-        candidate.write(model.residuals, weights)
+        candidate.write(model.residuals, candidate.row(model.residuals) + candidate.basis @ weights)
         missing = missing - candidate.torque(weights).unsqueeze(-1) * candidate.force
         missing_early = missing_early - torque_early.unsqueeze(-1) * candidate.force
-        candidates.remove(candidate)
-        selected.append(SelectedResidual(candidate.parameter, candidate.joint, gain))
+        candidates = [x for x in candidates if not candidate.contains(x)]
+        for line in [x for x in selected if (x.name, x.joint) == (candidate.parameter, candidate.joint)]:
+            selected.remove(line)  # splines contain it
+            gain = 1 - (1 - gain) * (1 - line.gain)
+        selected.append(SelectedResidual(candidate.parameter, candidate.joint, gain, candidate.straight))
     return [*selected, *_select_networks(model, samples._replace(missing=missing), correlation)]
 
 
@@ -133,12 +144,15 @@ def refit_residuals(
     To all that is missed where ``rigid`` is None, else as far as bodies and laws cannot follow.
     """
     noise, missing, functions = _noise(samples.missing), samples.missing, model.residuals
-    chosen = {(residual.name, residual.joint) for residual in selected}
+    chosen = {(residual.name, residual.joint, residual.straight) for residual in selected}
     for candidate in _candidates(model, samples, rigid, chosen):
-        present = (candidate.features @ candidate.weights(functions)).unsqueeze(-1) * candidate.force
+        row = candidate.row(functions)
+        present = (candidate.features @ torch.linalg.pinv(candidate.basis) @ row).unsqueeze(
+            -1
+        ) * candidate.force
         target = candidate.target(missing + present, noise)
         weights = _fit_candidate(candidate, target, correlation)
-        candidate.write(functions, weights)
+        candidate.write(functions, candidate.basis @ weights)
         changed = (candidate.features @ weights).unsqueeze(-1) * candidate.force
         missing = missing + present - changed
 
@@ -171,7 +185,7 @@ def _candidates(
     model: Any,
     samples: ResidualSamples,
     rigid: RigidResponse | None,
-    chosen: Collection[tuple[str, int | None]] | None = None,
+    chosen: Collection[tuple[str, int | None, bool]] | None = None,
 ) -> Iterator[_Candidate]:
     """Yield what could be selected: smooth torques, friction that varies, and ripple.
 
@@ -182,29 +196,36 @@ def _candidates(
         splines, ripple = functions.splines(samples.q), functions.revolute * functions.waves(samples.q)
     joints, unit = torch.eye(len(motors)).to(motors), functions.unit.flatten()
     alike, pairs = torch.zeros(SPLINES), torch.arange(ripple.shape[-1] // 2).repeat(2)
-    # a straight line, and what is not straight: a spring is known where no motion has been
-    line = torch.linspace(-1, 1, SPLINES).double().unsqueeze(-1)
     varied = splines * samples.friction.unsqueeze(-1)
+    # a straight line by itself, too: it goes on as it is where splines lead astray, outside of what was seen
+    line, row = torch.linspace(-1, 1, SPLINES).double().unsqueeze(-1), torch.eye(SPLINES).double()
     kinds = (
-        ("raw_torque_splines", splines, unit, joints, line, F.pad(alike + 1, (1, 0))),
-        (FRICTION, varied, torch.ones(len(motors)), motors, line[:, :0], alike),
-        ("raw_torque_ripple", ripple, unit, joints, torch.zeros(len(pairs), 0).double(), pairs),
+        ("raw_torque_splines", splines, unit, joints, line, alike[:1]),
+        (
+            "raw_torque_splines",
+            splines,
+            unit,
+            joints,
+            torch.cat([line, row], dim=1),
+            F.pad(alike + 1, (1, 0)),
+        ),
+        (FRICTION, varied, torch.ones(len(motors)), motors, row, alike),
+        ("raw_torque_ripple", ripple, unit, joints, torch.eye(len(pairs)).double(), pairs),
     )
-    for parameter, features, scale, force, lines, groups in kinds:
+    for parameter, features, scale, force, basis, groups in kinds:
         for joint in range(len(motors)):
-            if chosen is not None and (parameter, joint) not in chosen:
+            if chosen is not None and (parameter, joint, len(groups) == 1) not in chosen:
                 continue
             columns = features[:, joint]
             if not columns.any() or scale[joint] <= 0:
                 continue
-            columns = torch.cat([columns @ lines, columns], dim=1)
-            friction = None
+            columns, friction = columns @ basis, None
             if parameter == FRICTION:
                 friction = samples.friction[:, joint]
             elif rigid is not None:
                 columns = rigid.remaining(joint, columns)
             yield _Candidate(
-                parameter, joint, float(scale[joint]), columns, force[joint], lines, groups, friction
+                parameter, joint, float(scale[joint]), columns, force[joint], basis, groups, friction
             )
 
 
