@@ -6,7 +6,8 @@ therefore compared as far as they cannot: a partial regression (Frisch and Waugh
 A function of one joint is fitted without each tenth of the samples in turn, and without a gap beside it, since errors
 of neighbours are alike. It can be selected where the tenths gain, beyond luck, and where the last half of the samples
 gains by it, too, after a fit of it and of those before it to the first half: one motion often repeats what another does
-not. The function that gains most comes first. Networks of several joints are judged on the last half alone.
+not. The function that gains most comes first; a straight line of torque by position is one, as splines of a spring that
+bodies pass for lead astray where no other motion is. Networks of several joints are judged on the last half alone.
 
 Functions are linear in their weights, which are found with their scale by maximising the marginal likelihood (MacKay,
 Neural Computation 4:415, 1992); networks are found by L-BFGS from a normal distribution of their weights.
@@ -115,7 +116,7 @@ def select_residuals(
     first, last = _halves(len(samples.q), correlation)
     if first.stop < last.start - first.stop:  # the gap leaves next to nothing of so few samples
         return []
-    noise, selected = _noise(samples.missing), []
+    noise, selected = _noise(samples.missing), dict[tuple[str, int], SelectedResidual]()
     missing = missing_early = samples.missing  # the latter by the same parts, fitted to the first half
     candidates = list(_candidates(model, samples, rigid))
     while best := _best(candidates, missing, missing_early, noise, correlation):
@@ -125,11 +126,11 @@ def select_residuals(
         missing = missing - candidate.torque(weights).unsqueeze(-1) * candidate.force
         missing_early = missing_early - torque_early.unsqueeze(-1) * candidate.force
         candidates = [x for x in candidates if not candidate.contains(x)]
-        for line in [x for x in selected if (x.name, x.joint) == (candidate.parameter, candidate.joint)]:
-            selected.remove(line)  # splines contain it
-            gain = 1 - (1 - gain) * (1 - line.gain)
-        selected.append(SelectedResidual(candidate.parameter, candidate.joint, gain, candidate.straight))
-    return [*selected, *_select_networks(model, samples._replace(missing=missing), correlation)]
+        key = candidate.parameter, candidate.joint
+        if key in selected:  # a straight line, which splines contain
+            gain = 1 - (1 - gain) * (1 - selected[key].gain)
+        selected[key] = SelectedResidual(*key, gain, candidate.straight)
+    return [*selected.values(), *_select_networks(model, samples._replace(missing=missing), correlation)]
 
 
 def refit_residuals(
