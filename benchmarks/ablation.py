@@ -30,6 +30,7 @@ import truth
 from real_logs import first, mean, samples_of, torque_of, trained
 
 from spelgen.fitting import levenberg_marquardt
+from spelgen.fitting.torque import fit as torque_fit
 from spelgen.fitting.torque import jacobian as torque_jacobian
 from spelgen.fitting.torque import prior as torque_prior
 from spelgen.fitting.torque import problem as torque_problem
@@ -76,9 +77,8 @@ def remember_always(problem: Any, state: Any) -> Any:
     return problem.solve(problem._first_fit(state.x, state.steps), torque_jacobian.TUNING.rounds)
 
 
-def as_it_is(jacobian: Any) -> Any:
-    """Stand in for `start_by_torque`: friction is guessed by efforts alone."""
-    return jacobian.start
+def leave(model: Any, samples: Any) -> None:
+    """Stand in for `bound_friction`: friction is guessed by efforts alone."""
 
 
 def nothing(response: Any, joint: int, torque: Any) -> Any:
@@ -88,7 +88,6 @@ def nothing(response: Any, joint: int, torque: Any) -> Any:
 
 def mechanisms() -> list[Mechanism]:
     """All that are switched off."""
-    jacobian = torque_jacobian.TorqueJacobian
     return [
         Mechanism("ends of recordings left out", tuned(dynamics_samples, unsettled=0.0)),
         Mechanism("correlated errors (5 samples)", tuned(torque_jacobian, correlation_length=1.0)),
@@ -99,7 +98,7 @@ def mechanisms() -> list[Mechanism]:
         Mechanism("that of armatures", ((torque_prior, "ADAPTED", ("bodies", "offset")),)),
         Mechanism("memory by evidence", ((torque_problem.TorqueProblem, "select_memory", remember_always),)),
         Mechanism("weak evidence yields to all joints'", tuned(torque_jacobian, memory_evidence=0.0)),
-        Mechanism("no more friction than torque", ((jacobian, "start_by_torque", as_it_is),)),
+        Mechanism("no more friction than torque", ((torque_fit, "bound_friction", leave),)),
         Mechanism("friction compensated unseen", tuned(torque_jacobian, compensation_explained=NEVER)),
         Mechanism("every second sample alone", tuned(torque_jacobian, decimation=1)),
         Mechanism("few samples first", tuned(torque_jacobian, subset=2**40)),

@@ -123,7 +123,8 @@ def test_the_fit_knows_that_a_motor_moves_both_joints(wrist):
     z = bristles_along(moved(module, 4.0)[0], bristle_reach(model))[::40]
     jacobian = TorqueJacobian(model, TorqueSamples.of([DynamicsSamples("x", *motion, tau, z)]))
     noise = torch.ones(6).double()
-    x = jacobian.start + 0.1 * torch.randn(len(jacobian.start), generator=torch.Generator().manual_seed(0))
+    start = jacobian.rigid.flattened(jacobian.rigid.start)
+    x = start + 0.1 * torch.randn(len(start), generator=torch.Generator().manual_seed(0))
     _, slope = jacobian.normal_equations(x, noise)
     for k in range(len(x)):
         step = torch.zeros_like(x)
