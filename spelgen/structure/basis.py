@@ -120,7 +120,9 @@ def _readings(spans: Spans) -> Iterator[_Reading]:
         candidates = _candidates(spans, joints, outside, tried)
         while missing:
             weights, values = next(candidates)
-            extended = np.concatenate([chosen, field.product(weights[None], spans.varying.T)])
+            entries = np.flatnonzero(weights)  # mostly few of all
+            changes = field.product(weights[None, entries], spans.varying.T[entries])
+            extended = np.concatenate([chosen, changes])
             if field.rank(extended) == len(extended):
                 chosen = extended
                 missing -= 1
