@@ -117,16 +117,17 @@ def _readings(spans: Spans) -> Iterator[_Reading]:
         missing = 0
         if len(kernel):
             missing = field.rank(np.concatenate([chosen, kernel])) - len(chosen)
-        candidates = _candidates(spans, joints, outside, tried)
-        while missing:
-            weights, values = next(candidates)
-            entries = np.flatnonzero(weights)  # mostly few of all
-            changes = field.product(weights[None, entries], spans.varying.T[entries])
-            extended = np.concatenate([chosen, changes])
-            if field.rank(extended) == len(extended):
-                chosen = extended
-                missing -= 1
-                yield _Reading(tuple(sorted(joints)), weights, values)
+        for candidates in (_single_entries, _sums_of_entries):
+            if missing:
+                readouts = list(candidates(spans, joints, outside, tried))
+                weights = np.array([w for w, _ in readouts], dtype=np.uint64).reshape(-1, len(spans.keys))
+                rows = np.concatenate([chosen, field.product(weights, spans.varying.T)])
+                # columns of an echelon form have their pivots where they do not depend on those before
+                independent = field.pivots(field.row_basis(rows.T))
+                for index in independent[len(chosen) :]:
+                    yield _Reading(tuple(sorted(joints)), *readouts[index - len(chosen)])
+                missing -= len(independent) - len(chosen)
+                chosen = rows[independent]
 
 
 def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
@@ -143,18 +144,27 @@ def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
                 yield frozenset((first, *later[:size]))
 
 
-def _candidates(
-    spans: Spans, joints: frozenset[int], outside: np.ndarray, tried: set[int]
+def _single_entries(
+    spans: Spans, joints: frozenset[int], _: np.ndarray, tried: set[int]
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield read-outs that depend on ``joints`` only: single entries of M, then the sparsest sums of entries.
+    """Yield read-outs of single entries of M that depend on ``joints`` only.
 
-    ``outside`` is the basis of the changes made by all other joints, in the basis of U. Entries that were ``tried``
-    for fewer joints are chosen or depend on those that are: they are left out, and those of now are put in.
+    Entries that were ``tried`` for fewer joints are chosen or depend on those that are: they are left out, and those of
+    now are put in.
     """
     for index in reversed(range(len(spans.keys))):
         if index not in tried and spans.entry_joints[index] and spans.entry_joints[index] <= joints:
             tried.add(index)
             yield _single(spans, index)
+
+
+def _sums_of_entries(
+    spans: Spans, joints: frozenset[int], outside: np.ndarray, _: set[int]
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the sparsest sums of entries that depend on ``joints`` only.
+
+    ``outside`` is the basis of the changes made by all other joints, in the basis of U.
+    """
     order = spans.order
     rows = spans.changes_of(outside)[:, order]  # an echelon form, as those of both are
     bound = [order[pivot] for pivot in field.pivots(rows)]
