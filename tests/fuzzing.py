@@ -1,7 +1,8 @@
 """How files drawn at random are tried: in `make test` always the same few, in `make fuzz` new ones until time is up.
 
-A test hands over what it does with one example, which must end within SECONDS as users may expect: with an answer or a
-SpelgenError whose lines name what is wrong. The memory that all of them took is looked at in the end.
+A test hands over what it does with one example, which must end within SECONDS (of the reference in machine.py) as
+users may expect: with an answer or a SpelgenError whose lines name what is wrong. The memory that all of them took is
+looked at in the end.
 """
 
 from __future__ import annotations
@@ -11,10 +12,12 @@ import resource
 import signal
 import time
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
+from machine import slowness
 
 from spelgen.errors import SpelgenError
 
@@ -55,8 +58,9 @@ def answered(use: Callable[[], Any]) -> bool:
     """Whether there was an answer; if not, that it was refused as users may expect."""
     for each in (signal.SIGALRM, signal.SIGPROF):
         signal.signal(each, _late)
-    signal.setitimer(signal.ITIMER_PROF, SECONDS)  # of its own time: others may use the machine
-    signal.alarm(10 * SECONDS)  # and what waits uses none
+    seconds = SECONDS * _slowness()
+    signal.setitimer(signal.ITIMER_PROF, seconds)  # of its own time: others may use the machine
+    signal.alarm(int(10 * seconds))  # and what waits uses none
     try:
         use()
         return True
@@ -66,6 +70,11 @@ def answered(use: Callable[[], Any]) -> bool:
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
         signal.alarm(0)
+
+
+@cache
+def _slowness() -> float:
+    return slowness()
 
 
 def _late(number: int, frame: object) -> None:

@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 import torch
+from machine import in_time
 
 from spelgen.building import build
 from spelgen.comparison.metrics import RunResult
@@ -162,7 +163,7 @@ def test_twenty_thousand_recordings_of_two_samples_take_seconds(tmp_path, arm):
     logs = read_logs(tmp_path / "log.parquet", arm)
     assert len(logs) == count
     check_logs(logs[: count // 4], arm)
-    assert time.process_time() - begin < 10
+    assert in_time(time.process_time() - begin, 10)
 
 
 def test_a_name_of_a_megabyte_on_every_row_is_kept_once(tmp_path, arm):

@@ -6,6 +6,7 @@ import time
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from machine import in_time
 
 from spelgen.arm.arm import make_arm
 from spelgen.errors import ArmError, SpelgenError
@@ -440,14 +441,14 @@ class TestSafety:
             joint(turned, name=f"j{i}", kind=kind if i else "revolute", parent=f"l{i}", child=f"l{i + 1}")
             for i in range(300)
         )
-        start = time.perf_counter()
+        begin = time.process_time()
         robot = read_urdf(write(links + joints))
         if bodies is None:
             with pytest.raises(ArmError, match="got 300 joints, expected at most 16"):
                 make_arm(robot)
         else:
             assert len(make_arm(robot).bodies) == bodies
-        assert time.perf_counter() - start < 5
+        assert in_time(time.process_time() - begin, 5)
 
     @given(data=st.data())
     @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

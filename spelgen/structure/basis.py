@@ -117,17 +117,17 @@ def _readings(spans: Spans) -> Iterator[_Reading]:
         missing = 0
         if len(kernel):
             missing = field.rank(np.concatenate([chosen, kernel])) - len(chosen)
-        for candidates in (_single_entries, _sums_of_entries):
-            if missing:
-                readouts = list(candidates(spans, joints, outside, tried))
-                weights = np.array([w for w, _ in readouts], dtype=np.uint64).reshape(-1, len(spans.keys))
-                rows = np.concatenate([chosen, field.product(weights, spans.varying.T)])
-                # columns of an echelon form have their pivots where they do not depend on those before
-                independent = field.pivots(field.row_basis(rows.T))
-                for index in independent[len(chosen) :]:
-                    yield _Reading(tuple(sorted(joints)), *readouts[index - len(chosen)])
-                missing -= len(independent) - len(chosen)
-                chosen = rows[independent]
+        candidates = _candidates(spans, joints, outside, tried)
+        while missing:
+            readouts = next(candidates)
+            weights = np.array([w for w, _ in readouts], dtype=np.uint64).reshape(-1, len(spans.keys))
+            rows = np.concatenate([chosen, field.product(weights, spans.varying.T)])
+            # columns of an echelon form have their pivots where they do not depend on those before
+            independent = field.pivots(field.row_basis(rows.T))
+            for index in independent[len(chosen) :]:
+                yield _Reading(tuple(sorted(joints)), *readouts[index - len(chosen)])
+            missing -= len(independent) - len(chosen)
+            chosen = rows[independent]
 
 
 def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
@@ -144,27 +144,20 @@ def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
                 yield frozenset((first, *later[:size]))
 
 
-def _single_entries(
-    spans: Spans, joints: frozenset[int], _: np.ndarray, tried: set[int]
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield read-outs of single entries of M that depend on ``joints`` only.
+def _candidates(
+    spans: Spans, joints: frozenset[int], outside: np.ndarray, tried: set[int]
+) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
+    """Yield read-outs that depend on ``joints`` only: single entries of M, then the sparsest sums of entries.
 
-    Entries that were ``tried`` for fewer joints are chosen or depend on those that are: they are left out, and those of
-    now are put in.
+    ``outside`` is the basis of the changes made by all other joints, in the basis of U. Entries that were ``tried``
+    for fewer joints are chosen or depend on those that are: they are left out, and those of now are put in.
     """
+    singles = []
     for index in reversed(range(len(spans.keys))):
         if index not in tried and spans.entry_joints[index] and spans.entry_joints[index] <= joints:
             tried.add(index)
-            yield _single(spans, index)
-
-
-def _sums_of_entries(
-    spans: Spans, joints: frozenset[int], outside: np.ndarray, _: set[int]
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the sparsest sums of entries that depend on ``joints`` only.
-
-    ``outside`` is the basis of the changes made by all other joints, in the basis of U.
-    """
+            singles.append(_single(spans, index))
+    yield singles
     order = spans.order
     rows = spans.changes_of(outside)[:, order]  # an echelon form, as those of both are
     bound = [order[pivot] for pivot in field.pivots(rows)]
@@ -174,13 +167,15 @@ def _sums_of_entries(
     free = [index for index in range(len(spans.keys)) if index not in set(bound)]
     samples = spans.float_changes(frozenset(range(spans.n)) - joints)
     coefficients = _solved(samples[:, bound], samples[:, free])
+    sums = []
     for row in sorted(kernel, key=np.count_nonzero):
         # each row of a null space is 1 at one free entry, and elsewhere nonzero at bound ones only
         (entry,) = set(np.flatnonzero(row).tolist()) - set(bound)
         values = np.zeros(len(row))
         values[entry] = 1.0
         values[bound] = -coefficients[:, free.index(entry)]
-        yield row, np.where(row != 0, values, 0.0)
+        sums.append((row, np.where(row != 0, values, 0.0)))
+    yield sums
 
 
 def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:

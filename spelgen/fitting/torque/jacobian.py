@@ -14,7 +14,7 @@ from spelgen.dynamics.residuals import friction_factor, residual_torque
 from spelgen.fitting.functional_model import FunctionalModel, Weights
 from spelgen.fitting.torque.body_steps import moved_bodies
 from spelgen.fitting.torque.samples import Block, TorqueSamples
-from spelgen.fitting.torque.weights import RigidWeights
+from spelgen.fitting.torque.weights import RigidWeights, joint_torque
 from spelgen.settings.tuning.fitting import TorqueTuning
 
 if TYPE_CHECKING:
@@ -189,14 +189,7 @@ class TorqueJacobian:
 
     def torque_deviation(self) -> torch.Tensor:
         """Return standard deviations (n,) of the measured torque, as the joints feel it."""
-        return self._joint_torque().std(dim=0)
-
-    def _joint_torque(self) -> torch.Tensor:
-        """Return the measured torque (T, n), as the joints feel it."""
-        columns = self.samples.columns
-        with torch.no_grad():
-            torque: torch.Tensor = columns.tau @ self.model.input_matrix(columns.q[:1])[0].mT
-        return torque
+        return joint_torque(self.model, self.samples.columns).std(dim=0)
 
     def by_velocity(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return of the missing torque the slope by velocity (n,) [Nm s/rad, N s/m], how much of its sum of squares

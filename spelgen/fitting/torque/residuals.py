@@ -174,9 +174,10 @@ def _best(
     for candidate in candidates:
         target, target_early = candidate.target(missing, noise), candidate.target(missing_early, noise)
         gain = _held_out_gain(candidate, target, correlation)
+        if gain is None:
+            continue
         # where splines gain, too, they explain a spring better than the straight line alone
-        preferred = best is None or candidate.contains(best[0]) or (gain or 0.0) > best[1]
-        if gain is None or not preferred:
+        if best is not None and gain <= best[1] and not candidate.contains(best[0]):
             continue
         torque_early = candidate.torque(_fit_candidate(candidate, target_early, correlation, first))
         if (target_early - torque_early)[last].square().sum() < target_early[last].square().sum():

@@ -75,6 +75,13 @@ class RigidWeights:
         return self.flattened(masks)
 
 
+def joint_torque(model: EmittedModel, samples: Block) -> torch.Tensor:
+    """Return the measured torque (T, n), as the joints feel it."""
+    with torch.no_grad():
+        torque: torch.Tensor = samples.tau @ model.input_matrix(samples.q[:1])[0].mT
+    return torque
+
+
 def bound_friction(model: EmittedModel, samples: Block) -> None:
     """Let no usual friction of the model be larger than the deviation of its drive's torque.
 
@@ -82,8 +89,8 @@ def bound_friction(model: EmittedModel, samples: Block) -> None:
     """
     rigid, motors = RigidWeights(model), model.motors
     with torch.no_grad():
-        torque = samples.tau @ model.input_matrix(samples.q[:1])[0].mT @ torch.linalg.inv(motors)
-        largest = torque.std(dim=0) / model.friction.nominal
+        of_drives = joint_torque(model, samples) @ torch.linalg.inv(motors)
+        largest = of_drives.std(dim=0) / model.friction.nominal
         # a drive that stands still, or gives no torque, shows no friction
         shown = (largest > 0) & ((samples.qd @ motors.mT).abs().amax(dim=0) > MOVING)
         largest = torch.where(shown, largest, torch.inf)

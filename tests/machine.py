@@ -1,0 +1,30 @@
+"""Bounds of processor time, on machines of any speed.
+
+A bound is given in seconds of a machine on which ``_loop`` takes REFERENCE of them, as on a laptop of 2024. A machine
+that is slower, or busy, has as much more as a loop of today takes there.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+
+REFERENCE = 0.04  # s
+
+
+def in_time(seconds: float, bound: float) -> bool:
+    """Return whether ``seconds`` of processor time, just now and here, are less than ``bound`` of the reference's."""
+    return seconds < bound or seconds < bound * slowness()
+
+
+def slowness() -> float:
+    """Return how many times as long as the reference this machine takes for the same loop; at least 1."""
+    return max(1.0, statistics.median(_loop() for _ in range(5)) / REFERENCE)
+
+
+def _loop() -> float:
+    begin = time.process_time()
+    total = 0
+    for number in range(1_000_000):
+        total += number * number
+    return time.process_time() - begin
