@@ -27,7 +27,7 @@ from spelgen.fitting.fitted import load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_lock import locked
 from spelgen.fitting.train import train
-from spelgen.fitting.window import loop
+from spelgen.fitting.window import objective as window_objective
 from spelgen.fitting.window import problem as window_problem
 from spelgen.logs import chunks
 from spelgen.logs.read import write_logs
@@ -183,7 +183,7 @@ def test_killed_between_any_two_writes_nothing_is_lost(start, tmp_path):
 
 def test_an_interruption_before_the_first_checkpoint_leaves_no_run(start, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(loop, "measure", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(window_objective, "measure", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             trained(start, tmp_path / "run")
     trained(start, tmp_path / "run")

@@ -24,6 +24,7 @@ from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.subject import read_test_logs
 from spelgen.fitting.dataset import TrainingData, prepare_data
 from spelgen.fitting.fit import RunOptions
+from spelgen.fitting.objective import FitRequest
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.rollout import (
@@ -37,9 +38,7 @@ from spelgen.fitting.rollout import (
     rollout_loss,
 )
 from spelgen.fitting.train import train
-from spelgen.fitting.validation import Validation
-from spelgen.fitting.window.loop import TrainingLoop
-from spelgen.fitting.window.problem import WindowProblem
+from spelgen.fitting.window.rollout import RolloutObjective
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows
@@ -289,7 +288,7 @@ def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(logs, tmp_path, m
         calls.append(torch.is_grad_enabled())
         return loss * math.nan if sum(calls) == 25 and calls[-1] else loss
 
-    monkeypatch.setattr("spelgen.fitting.window.loop.rollout_loss", blown_up_once)
+    monkeypatch.setattr("spelgen.fitting.window.rollout.rollout_loss", blown_up_once)
     result = train(STAND_IN, [logs], tmp_path / "run", QUICK)
     records = lines(tmp_path / "run")
     assert result.status == "finished"
@@ -305,7 +304,7 @@ def test_numbers_that_never_recover_end_the_run(logs, tmp_path, monkeypatch, opt
         loss = rollout_loss(model, windows, scales, substeps)
         return loss * math.nan if torch.is_grad_enabled() else loss
 
-    monkeypatch.setattr("spelgen.fitting.window.loop.rollout_loss", blown_up)
+    monkeypatch.setattr("spelgen.fitting.window.rollout.rollout_loss", blown_up)
     with pytest.raises(RunError) as caught:
         train(STAND_IN, [logs], tmp_path / "run", quick(optimizer=optimizer))
     assert str(caught.value) == (
@@ -451,10 +450,16 @@ def prepared(logs: Path) -> TrainingData:
     return prepare_data(read_logs([logs], JOINTS), JOINTS, ("revolute", "revolute"), Preprocessing())
 
 
-def loop_of(logs: Path, config: Rollout, **options) -> TrainingLoop:
-    model, data = load_module(STAND_IN), prepared(logs)
-    problem = WindowProblem(model, data, config)
-    return TrainingLoop(problem, Validation(model, data, batch=problem.batch), config, **options)
+def loop_of(logs: Path, config: Rollout) -> RolloutObjective:
+    request = FitRequest(
+        load_module(STAND_IN), read_logs([logs], JOINTS), config, Preprocessing(), 0.25, 0, None, None, "cpu", 1,
+        time.monotonic(), None,
+    )  # fmt: skip
+    loop = RolloutObjective(request)
+    loop.prepare()
+    loop.begin()
+    loop._start_clock()
+    return loop
 
 
 def test_validation_windows_come_from_other_trajectories(logs):
@@ -573,7 +578,8 @@ def test_the_allowed_time_is_kept_within_an_epoch(logs, monkeypatch):
 
     monkeypatch.setattr(MiniBatchAdamW, "run", slow)
     config = quick(epochs=10**6, patience=10**6, max_minutes=1.0, momentum_steps=0)
-    loop = loop_of(logs, config, seconds=12.0)
+    loop = loop_of(logs, config)
+    loop.seconds = 12.0
     loop.problem.epoch_steps = 10**6
     with TrainingProgress(show=False) as progress:
         assert loop.run(progress, lambda: None) == "out of time"

@@ -11,7 +11,8 @@ from spelgen.fitting.objective import FitRequest, FitSummary, Objective
 from spelgen.fitting.run_record import ReadContent
 from spelgen.fitting.servo.objective import ServoObjective
 from spelgen.fitting.torque.objective import TorqueObjective
-from spelgen.fitting.window.objectives import MomentumObjective, RolloutObjective
+from spelgen.fitting.window.momentum import MomentumObjective
+from spelgen.fitting.window.rollout import RolloutObjective
 from spelgen.logs.rates import shows_accelerations
 from spelgen.settings.fits import FitConfig, fit_config
 

@@ -1,54 +1,42 @@
-"""Steps on the weak form of the equations, which needs no ODE solve and brings a model near its windows."""
+"""The objective momentum: steps on the weak form of the equations alone."""
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, ClassVar
 
-import torch
-
-from spelgen.fitting.rollout import momentum_loss
-from spelgen.fitting.validation import Measured, measure
-from spelgen.fitting.window.problem import TUNING, Clock, WindowProblem
-from spelgen.logs.windows import Windows
+from spelgen.errors import Diagnostic
+from spelgen.fitting.objective import Status
+from spelgen.fitting.run_record import Content
+from spelgen.fitting.window.objective import WindowObjective
+from spelgen.fitting.window.problem import TUNING
 
 if TYPE_CHECKING:
     from spelgen.fitting.progress import TrainingProgress
-    from spelgen.fitting.validation import Validation
 
 
-def momentum_stage(
-    problem: WindowProblem,
-    validation: Validation,
-    start: Measured,
-    clock: Clock,
-    progress: TrainingProgress,
-    seed: int,
-) -> Measured:
-    """Take the momentum steps from ``start``, where the model is; return the better of both ends, which it then has.
+class MomentumObjective(WindowObjective):
+    """Steps on the weak form, kept where they predict validation windows better."""
 
-    An interruption here starts the stage again on resumption.
-    """
-    steps, model = problem.config.momentum_steps, problem.model
-    optimizer = problem.optimizer(torch.Generator().manual_seed(seed))
+    name: ClassVar[str] = "momentum"
 
-    def loss(windows: Windows) -> torch.Tensor:
-        return momentum_loss(model, windows, problem.scales) + problem.penalty()
+    def begin(self) -> list[Diagnostic]:
+        """Measure the model as it is."""
+        self._set_up()
+        return self.notes
 
-    for done in range(0, steps, problem.call_steps):
-        spent = clock.fraction(clock.seconds) / TUNING.momentum_fraction
-        if spent >= 1.0:
-            break
+    def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
+        """Go on from the weights so far; steps that were not all taken start again."""
+        self._set_up()
+        self._restore(checkpoint)
 
-        def rate(step: int, done: int = done, spent: float = spent) -> float:
-            return TUNING.momentum_factor * problem.learning_rate(max((done + step) / steps, spent))
-
-        value = optimizer.run(loss, problem.training, min(problem.call_steps, steps - done), rate)
-        if optimizer.stalled or not math.isfinite(value):
-            break
-        progress.momentum(min(done + problem.call_steps, steps), steps, value)
-    end = measure(model, validation)
-    if end.loss < start.loss:
-        return end
-    model.load_state_dict(start.weights)
-    return start
+    def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
+        """See `Objective`."""
+        status: Status = "finished"
+        if not self.momentum_done:
+            self._start_clock()
+            self._momentum_stage(progress)
+            if self.clock.fraction(self.seconds) >= TUNING.momentum_fraction:
+                status = "out of time"
+        save()
+        return status

@@ -34,7 +34,7 @@ class ValidationTuning:
 
 @dataclass(frozen=True)
 class WindowTuning:
-    """Steps on windows (`fitting.window.problem`, `fitting.window.momentum`)."""
+    """Steps on windows (`fitting.window.problem`, `fitting.window.objective`)."""
 
     epoch_steps: int = 20  # at least; few windows are passed over several times between validations
     warm_up: float = 0.02  # [1] of all steps, over which the learning rate rises
@@ -45,7 +45,7 @@ class WindowTuning:
 
 @dataclass(frozen=True)
 class LoopTuning:
-    """Epochs of predicted windows (`fitting.window.loop`)."""
+    """Epochs of predicted windows (`fitting.window.rollout`)."""
 
     first_stage: float = 0.8  # [1] of all steps or minutes, at most, while residuals of rigid bodies rest
     second_patience: int = 3  # epochs: residuals that belong to the arm soon help

@@ -1,76 +1,69 @@
-"""The loop of a fit to predicted windows: epochs, validation, checkpoints, and what happens when numbers blow up."""
+"""The objective rollout: epochs of predicted windows, checkpoints, and what happens when numbers blow up."""
 
 from __future__ import annotations
 
 import copy
 import math
 from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
+from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.dynamics.residuals import idle_residuals
-from spelgen.errors import RunError
+from spelgen.errors import Diagnostic, RunError
 from spelgen.fitting.optimizers import WindowOptimizer
-from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.rollout import rollout_loss
 from spelgen.fitting.run_record import Content
-from spelgen.fitting.validation import Measured, Validation, measure
-from spelgen.fitting.window.momentum import momentum_stage
-from spelgen.fitting.window.problem import Clock, WindowProblem
+from spelgen.fitting.torque.objective import fit_torques, torque_samples
+from spelgen.fitting.window.objective import WindowObjective
+from spelgen.logs.rates import SLOWEST
 from spelgen.logs.windows import Windows
-from spelgen.settings.fits import Rollout
+from spelgen.settings.fits import Rollout, TorqueFit
 from spelgen.settings.tuning.fitting import LoopTuning
 
 if TYPE_CHECKING:
     from spelgen.fitting.objective import Status
+    from spelgen.fitting.progress import TrainingProgress
 
 TUNING = LoopTuning()
 
-PLAIN = (
-    "epoch", "step", "best_epoch", "best_loss", "best_weights", "rollbacks", "learning_rate_factor", "seconds",
-    "substeps", "momentum_done", "resting", "stage_from", "stage_epoch",
-)  # fmt: skip
 
+class RolloutObjective(WindowObjective):
+    """Torques first, of rigid bodies; then momentum; then predicted windows, epoch by epoch.
 
-class TrainingLoop:
-    """The changing state of one fit; `state` is all of it, so a resumed run repeats the same numbers.
-
-    config: a resolved one. seconds: what was spent before, of the allowed time. folder: of the run, for messages.
+    A checkpoint has all of the changing state, so that a resumed run repeats the same numbers.
 
     What stands beside rigid bodies and was not selected before rests until the bodies are done, for short windows are
     explained by it too, and worse. It then moves from the best weights so far, and stays where validation says so.
     """
 
-    def __init__(
-        self,
-        problem: WindowProblem,
-        validation: Validation,
-        config: Rollout,
-        *,
-        seed: int = 0,
-        seconds: float = 0.0,
-        folder: Path | None = None,
-    ) -> None:
-        self.problem, self.validation, self.config = problem, validation, config
-        self.model = problem.model
-        self.seed, self.folder = seed, folder
-        self.generator = torch.Generator().manual_seed(seed)
-        self.resting, self.stage_from, self.stage_epoch = idle_residuals(self.model), 0.0, 0
+    name: ClassVar[str] = "rollout"
+    config: Rollout
+    kept: ClassVar[tuple[str, ...]] = (
+        *WindowObjective.kept, "rollbacks", "learning_rate_factor", "resting", "stage_from", "stage_epoch",
+    )  # fmt: skip
+
+    def begin(self) -> list[Diagnostic]:
+        """Fit torques, and measure the model then."""
+        if self.config.torque_first and has_rigid_bodies(self.model):
+            self.notes += self._torque_stage()
+        self._set_up_epochs()
+        return self.notes
+
+    def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
+        """Go on from the last whole epoch."""
+        self._set_up_epochs()
+        self._restore(checkpoint)
         self.optimizer = self._optimizer()
-        self.epoch = self.step = self.best_epoch = self.rollbacks = 0
-        self.learning_rate_factor, self.seconds = 1.0, seconds
-        self.clock = Clock(config.max_minutes, seconds)
-        self._step_seconds, self._validation_seconds = 0.0, 0.0
-        self.momentum_done = not config.momentum_steps
-        self.history: list[Content] = []
-        start = measure(self.model, validation)
-        self.substeps, self.best_loss, self.best_weights = start.substeps, start.loss, start.weights
+        self.model.load_state_dict(checkpoint["model"])
+        self.optimizer.load_state_dict(checkpoint["optimizer"])
+        self.generator.set_state(checkpoint["generator"])
+        self.history = history[: self.epoch]
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
         """Go on until an end is reached; ``save`` is called after each epoch."""
-        self.clock = Clock(self.config.max_minutes, self.seconds)
+        self._start_clock()
         if not self.momentum_done:
             self._momentum_stage(progress)
             save()
@@ -82,18 +75,34 @@ class TrainingLoop:
             progress.epoch(record, self.config.epochs)
         return end
 
+    def checkpoint(self) -> Content:
+        """See `Objective`."""
+        state = {"model": self.model.state_dict(), "optimizer": self.optimizer.state_dict()}
+        return super().checkpoint() | state | {"generator": self.generator.get_state()}
+
+    def _torque_stage(self) -> list[Diagnostic]:
+        samples = torque_samples(self.model, self.data)
+        if samples is not None:
+            return fit_torques(self.model, samples, TorqueFit())
+        message = (
+            f"no torque fit: no log that moves has {SLOWEST:g} Hz for a second; windows alone are fitted"
+        )
+        return [Diagnostic("warning", "no-torque-fit", "logs", None, message)]
+
+    def _set_up_epochs(self) -> None:
+        """Measure the model as it is, and make an optimizer."""
+        self._set_up(self.config.solver, self.config.substeps)
+        self.generator = torch.Generator().manual_seed(self.request.seed)
+        self.resting, self.stage_from, self.stage_epoch = idle_residuals(self.model), 0.0, 0
+        self.optimizer = self._optimizer()
+        self.rollbacks, self.learning_rate_factor = 0, 1.0
+        self._step_seconds, self._validation_seconds = 0.0, 0.0
+
     def _optimizer(self) -> WindowOptimizer:
         """Return one of the weights that do not rest."""
         for name, parameter in self.model.named_parameters():
             parameter.requires_grad_(name not in self.resting)
         return self.problem.optimizer(self.generator)
-
-    def _momentum_stage(self, progress: TrainingProgress) -> None:
-        start = Measured(self.substeps, self.best_loss, self.best_weights)
-        best = momentum_stage(self.problem, self.validation, start, self.clock, progress, self.seed)
-        self.substeps, self.best_loss, self.best_weights = best.substeps, best.loss, best.weights
-        self.momentum_done = True
-        self.seconds = self.clock.seconds
 
     def _rollout_loss(self, windows: Windows) -> torch.Tensor:
         scales, solver = self.problem.scales, self.config.solver
@@ -187,29 +196,13 @@ class TrainingLoop:
         self.model.load_state_dict(weights)
         if self.rollbacks > TUNING.rollbacks:
             advice = "check units and signs of the logs"
-            if self.folder is not None:
+            if self.request.folder is not None:
                 advice += "; the best model so far is kept in model.pt"
             raise RunError(
                 f"losses that are not finite, after {TUNING.rollbacks} attempts at half the learning rate each",
-                file=self.folder,
+                file=self.request.folder,
                 do=advice,
             )
         self.optimizer.load_state_dict(optimizer)
         self.step = step
         self.learning_rate_factor /= 2
-
-    def state(self) -> Content:
-        """Return all that a resumed run needs: what checkpoint.pt holds."""
-        state = {name: getattr(self, name) for name in PLAIN}
-        state["model"], state["optimizer"] = self.model.state_dict(), self.optimizer.state_dict()
-        return state | {"generator": self.generator.get_state()}
-
-    def restore(self, state: Content, history: list[Content]) -> None:
-        """Continue from what `state` gave, after so many epochs."""
-        for name in PLAIN:
-            setattr(self, name, state[name])
-        self.optimizer = self._optimizer()
-        self.model.load_state_dict(state["model"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.generator.set_state(state["generator"])
-        self.history[:] = history[: self.epoch]
