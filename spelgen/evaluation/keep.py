@@ -23,7 +23,7 @@ def keep_baseline(folder: Path | str, logs: Iterable[Path | str] | Sequence[Traj
     actuators are fitted, where MuJoCo is installed: to files when an evaluation first needs them, for it takes as long
     as the fit.
     """
-    run = RunFolder(Path(folder))
+    run = RunFolder(folder)
     trajectories: list[Trajectory] = []
     files: list[str] = []
     for log in logs:

@@ -108,7 +108,7 @@ def read_test_logs(
     folder: Path | str, paths: Iterable[Path | str], mapping: GivenMapping = None
 ) -> list[Trajectory]:
     """Return logs of a run's arm (a folder's test.* where there are such), mapped as those that it was trained on."""
-    run = RunFolder(Path(folder))
+    run = RunFolder(folder)
     record, facts = run.read_config(), read_facts(run.module)
     if mapping is None:
         mapping = LogMapping(**record["mapping"])

@@ -132,7 +132,7 @@ def _nearest_bodies(model: EmittedModel, arm: LoadedArm, q: Tensor) -> EmittedMo
         distance: Tensor = mean_mass_error + mean_gravity_error + ridge
         return distance
 
-    minimise(bodies, distance, TUNING.steps)
+    minimise(bodies, lambda: [distance()], TUNING.steps)
     return bodies.requires_grad_(False)
 
 

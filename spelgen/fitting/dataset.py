@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -140,6 +140,12 @@ def digest(trajectories: Iterable[Trajectory]) -> str:
     """Return a fingerprint of every number."""
     numbers = hashlib.sha256()
     for trajectory in trajectories:
-        for array in (trajectory.t, trajectory.q, trajectory.qd, trajectory.tau):
-            numbers.update(np.ascontiguousarray(array).data)
+        for part in numbers_of(trajectory):
+            numbers.update(part)
     return numbers.hexdigest()
+
+
+def numbers_of(trajectory: Trajectory) -> Iterator[memoryview]:
+    """Yield what is digested of a trajectory."""
+    for array in (trajectory.t, trajectory.q, trajectory.qd, trajectory.tau):
+        yield np.ascontiguousarray(array).data

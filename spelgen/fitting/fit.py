@@ -89,7 +89,7 @@ def fit(
     a run or cannot be resumed with this.
     """
     began = options.began or time.monotonic()
-    run = None if folder is None else RunFolder(Path(folder))
+    run = None if folder is None else RunFolder(folder)
     logs = [logs] if isinstance(logs, Trajectory) else logs
     config = _config(model, logs, config)
     urdf = run.urdf if run is not None and options.resume else _urdf(arm)
@@ -174,7 +174,7 @@ def _resume(objective: Objective, run: RunFolder) -> None:
         objective.resume(checkpoint, run.read_metrics(), run.read_config())
     except (KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
         raise RunError("a checkpoint of another model", file=run.checkpoint, do="start a new run") from error
-    run.keep_metrics(len(objective.history))
+    run.write_metrics(objective.history)  # epochs after the checkpoint will be run again
 
 
 def _writer(objective: Objective, run: RunFolder | None) -> Callable[[], None]:

@@ -129,7 +129,7 @@ class Fit:
         """
         if not hasattr(self.model, "source"):
             raise RunError("a model without a module", expected="one of spelgen.build or spelgen.load_module")
-        run = RunFolder(Path(folder))
+        run = RunFolder(folder)
         with locked(run.path):
             run.start(self.model.source, self.urdf, force=force)
             run.write_metrics(self.history)
@@ -172,7 +172,7 @@ def load_run(folder: Path | str, *, trust: bool = False) -> Fit:
     Its module is a program: unless it ran in this process before, it must be what spelgen itself writes for the robot
     in the folder, or `trust` be true.
     """
-    run = RunFolder(Path(folder))
+    run = RunFolder(folder)
     record = run.read_config()
     return Fit(
         model=trained_model(run, trust=trust),

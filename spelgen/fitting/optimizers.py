@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 
@@ -18,9 +18,9 @@ from spelgen.settings.tuning.fitting import OptimizerTuning
 
 TUNING = OptimizerTuning()
 
-Loss = Callable[[Any], torch.Tensor]  # of windows, or of what else is given to the optimizer
+Loss = Callable[[Windows], torch.Tensor]
 LearningRate = Callable[[int], float]
-Blocks = Callable[[], Iterable[Any]]  # the same ones whenever it is called
+Parts = Callable[[], Iterable[torch.Tensor]]  # summands of a loss, of which one at a time is in memory
 
 
 class WindowOptimizer(Protocol):
@@ -123,21 +123,21 @@ class LBFGS:
             tolerance_change=1e-15,
         )
 
-    def run(self, loss: Loss, windows: Any, steps: int, learning_rate: LearningRate) -> float:
+    def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
         """See ``WindowOptimizer``; the loss where it ends, NaN where no evaluation was finite."""
-        return self.run_on_blocks(loss, lambda: [windows], steps)
+        return self.minimise(lambda: [loss(windows)], steps)
 
-    def run_on_blocks(self, loss: Loss, blocks: Blocks, steps: int) -> float:
-        """As ``run``, of a loss that is the sum over blocks, of which one at a time is in memory."""
+    def minimise(self, parts: Parts, steps: int) -> float:
+        """As ``run``, of a loss that is the sum of its parts."""
         group = self._optimizer.param_groups[0]
         group["max_iter"], group["max_eval"] = steps, steps
         self._finite = False
-        self._optimizer.step(lambda: self._evaluated(loss, blocks))
+        self._optimizer.step(lambda: self._evaluated(parts))
         if not self._finite:
             return math.nan
         try:
             with torch.no_grad():
-                total = torch.stack([loss(block) for block in blocks()]).sum()
+                total = torch.stack(list(parts())).sum()
                 penalised = (total + self._penalty()).item()
         except torch.linalg.LinAlgError:
             return math.nan
@@ -153,12 +153,13 @@ class LBFGS:
         """Whether two calls in a row found next to nothing."""
         return self._waits > 1
 
-    def _evaluated(self, loss: Loss, blocks: Blocks) -> torch.Tensor:
+    def _evaluated(self, parts: Parts) -> torch.Tensor:
         self._optimizer.zero_grad()
         try:
             value = torch.zeros((), dtype=torch.float64)
-            for number, block in enumerate(blocks()):
-                part = loss(block) if number else loss(block) + self._penalty()
+            for number, part in enumerate(parts()):
+                if number == 0:
+                    part = part + self._penalty()
                 part.backward()
                 value = value + part.detach()
             slopes = torch.cat([x.grad.flatten() for x in self._parameters if x.grad is not None])
@@ -187,25 +188,13 @@ class LBFGS:
         self._last, self._waits = state["reached"], state["waits"]
 
 
-def minimise(
-    model: torch.nn.Module,
-    loss: Callable[[], torch.Tensor],
-    evaluations: int,
-    weight_decay: float = 0.0,
-) -> int:
-    """Move the model's weights down ``loss`` by ``LBFGS``; return how many evaluations that took.
+def minimise(model: torch.nn.Module, parts: Parts, evaluations: int, weight_decay: float = 0.0) -> int:
+    """Move the model's weights down the sum of ``parts`` by ``LBFGS``; return how many evaluations that took.
 
     It ends where that stalls, or after about so many evaluations.
     """
-    return minimise_sum(model, lambda _: loss(), lambda: [None], evaluations, weight_decay)
-
-
-def minimise_sum(
-    model: torch.nn.Module, loss: Loss, blocks: Blocks, evaluations: int, weight_decay: float = 0.0
-) -> int:
-    """As ``minimise``, of the sum of ``loss`` over ``blocks``, of which one at a time is in memory."""
     optimizer, count = LBFGS(model, weight_decay), 0
     while count < evaluations and not optimizer.stalled:
-        optimizer.run_on_blocks(loss, blocks, TUNING.call)
+        optimizer.minimise(parts, TUNING.call)
         count += TUNING.call
     return count

@@ -29,7 +29,7 @@ class TrainingProgress:
         )
         self._bar = Progress(*columns, TextColumn("{task.fields[state]}"), console=self._console)
         self._task = self._bar.add_task("training", total=None, visible=False, state="")
-        self._said = ""  # of the stage that goes on, where there is no terminal
+        self._line = ""  # of the stage that goes on, where there is no terminal
 
     def __enter__(self) -> TrainingProgress:
         if self._show and self._console.is_terminal:
@@ -51,37 +51,30 @@ class TrainingProgress:
 
     def momentum(self, step: int, steps: int, loss: float) -> None:
         """Show how far the momentum steps are."""
-        self._bar.update(
-            self._task,
-            description="momentum",
-            completed=step,
-            total=steps,
-            visible=True,
-            state=f"loss {loss:.3g}",
-        )
-        self._said = f"momentum: {step} steps, loss {loss:.3g}"
-        if step == steps:
-            self._end_stage()
+        state = f"loss {loss:.3g}"
+        self._show_stage("momentum", step, steps, state, f"{step} steps, {state}")
 
     def round(self, number: int, rounds: int, steps: int, rms: float) -> None:
         """Show how far a fit of servos is: the round of so many, steps in all, errors [rad, m]."""
         state = f"{steps} steps, errors {1000 * rms:.3g} mrad"
-        self._bar.update(
-            self._task, description="servos", completed=number, total=rounds, visible=True, state=state
-        )
-        self._said = f"servos: {state}"
+        self._show_stage("servos", number, rounds, state, state)
 
     def epoch(self, record: Content, epochs: int) -> None:
         """Show one line of metrics.jsonl, of so many epochs at most."""
-        if not self._said.startswith("training"):
-            self._end_stage()
-            self._bar.reset(self._task, description="training", total=epochs, visible=True)
         state = f"validation {record['validation']:.3g}, best {record['best']:.3g}"
-        self._bar.update(self._task, completed=record["epoch"], state=state)
         rate, epochs_done = record["step"] / record["seconds"], counted(record["epoch"], "epoch")
-        self._said = f"training: {epochs_done}, loss {record['loss']:.3g}, {state}, {rate:.1f} steps/s"
+        line = f"{epochs_done}, loss {record['loss']:.3g}, {state}, {rate:.1f} steps/s"
+        self._show_stage("training", record["epoch"], epochs, state, line)
+
+    def _show_stage(self, stage: str, done: int, total: int, state: str, line: str) -> None:
+        """Show a stage by its state in the bar, and in the end by a line where there is no terminal."""
+        if not self._line.startswith(stage):
+            self._end_stage()
+            self._bar.reset(self._task, description=stage, total=total, visible=True)
+        self._bar.update(self._task, completed=done, state=state)
+        self._line = f"{stage}: {line}"
 
     def _end_stage(self) -> None:
-        if self._said and self._show and not self._console.is_terminal:
-            self._console.print(self._said, markup=False)
-        self._said = ""
+        if self._line and self._show and not self._console.is_terminal:
+            self._console.print(self._line, markup=False)
+        self._line = ""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,56 +35,25 @@ if TYPE_CHECKING:
 LARGEST_STATE = 2**29  # bytes of model.pt or checkpoint.pt, unpacked
 
 
-@dataclass(frozen=True)
 class RunFolder:
     """The files of one training run.
 
-    module.py: the trained module's source. robot.urdf, robot.yaml: its robot, where known. config.json: how
-    it was trained. metrics.jsonl: a line per epoch. checkpoint.pt: everything needed to go on. model.pt:
-    the best state_dict so far.
-    evaluation.json: what `evaluate` found. least_squares.json: what least squares found.
+    module: the trained module's source. urdf, settings: of its robot, where known. config: how it was trained. metrics:
+    a line per epoch. checkpoint: everything needed to go on. weights: the best state_dict so far. evaluation: what
+    `evaluate` found. baseline: what least squares found.
     """
 
-    path: Path
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "path", local(self.path))
-
-    @property
-    def module(self) -> Path:
-        return self.path / "module.py"
-
-    @property
-    def urdf(self) -> Path:
-        return self.path / "robot.urdf"
-
-    @property
-    def settings(self) -> Path:
-        return self.path / "robot.yaml"
-
-    @property
-    def config(self) -> Path:
-        return self.path / "config.json"
-
-    @property
-    def metrics(self) -> Path:
-        return self.path / "metrics.jsonl"
-
-    @property
-    def checkpoint(self) -> Path:
-        return self.path / "checkpoint.pt"
-
-    @property
-    def weights(self) -> Path:
-        return self.path / "model.pt"
-
-    @property
-    def evaluation(self) -> Path:
-        return self.path / "evaluation.json"
-
-    @property
-    def baseline(self) -> Path:
-        return self.path / "least_squares.json"
+    def __init__(self, path: Path | str) -> None:
+        self.path = local(path)
+        self.module = self.path / "module.py"
+        self.urdf = self.path / "robot.urdf"
+        self.settings = self.path / "robot.yaml"
+        self.config = self.path / "config.json"
+        self.metrics = self.path / "metrics.jsonl"
+        self.checkpoint = self.path / "checkpoint.pt"
+        self.weights = self.path / "model.pt"
+        self.evaluation = self.path / "evaluation.json"
+        self.baseline = self.path / "least_squares.json"
 
     def require_free(self, *, force: bool) -> None:
         """Raise RunError where a run lies, unless it may be replaced."""
@@ -105,15 +73,12 @@ class RunFolder:
         """
         self.require_free(force=force)
         robot = self._robot_files(urdf)  # before anything is removed: they may be this very run's copies
-        robot_files = (self.urdf, self.settings)
-        found = (
-            self.metrics,
-            self.checkpoint,
-            self.weights,
-            self.evaluation,
+        # first what makes it a run
+        old_files = (
+            self.config, self.urdf, self.settings, self.metrics, self.checkpoint, self.weights, self.evaluation,
             self.baseline,
-        )
-        for old in (self.config, *robot_files, *found):  # first what makes it a run
+        )  # fmt: skip
+        for old in old_files:
             remove(old)
         for path, content in [(self.module, source.encode()), *robot]:
             write_bytes(path, content)
@@ -137,20 +102,17 @@ class RunFolder:
         sent(self.metrics)
 
     def write_metrics(self, records: Sequence[Content]) -> None:
-        """All lines of metrics.jsonl; no file for none."""
+        """Make these all lines of metrics.jsonl; no file for none."""
         if records:
             write_bytes(self.metrics, "".join(json.dumps(record) + "\n" for record in records).encode())
-
-    def keep_metrics(self, epochs: int) -> None:
-        """Drop lines of epochs after the checkpoint: they will be run again."""
-        if self.metrics.exists():
-            lines = _text(self.metrics, "replace").splitlines(keepends=True)
-            write_bytes(self.metrics, "".join(lines[:epochs]).encode())
+        else:
+            remove(self.metrics)
 
     def read_metrics(self) -> list[Content]:
         """The lines of metrics.jsonl, without a last one that is torn."""
-        lines = _text(self.metrics, "replace").splitlines() if self.metrics.exists() else []
-        records = []
+        lines, records = [], []
+        if self.metrics.exists():
+            lines = read_bytes(self.metrics, RunError).decode("utf-8", "replace").splitlines()
         for count, line in enumerate(lines, start=1):
             try:
                 record = json.loads(line)
@@ -206,11 +168,6 @@ class RunFolder:
             # looked up when it is needed: what fits knows no symbolic algebra, and this derives the arm anew
             import_module("spelgen.trust").require_own_module(self.module, self.urdf)
         return load_module(self.module)
-
-
-def _text(path: Path, errors: str = "strict") -> str:
-    """The text of a file; RunError for a pipe, which might never end, and for one that would fill the memory."""
-    return read_bytes(path, RunError).decode("utf-8", errors)
 
 
 def _require_unpacked_size(path: Path) -> None:

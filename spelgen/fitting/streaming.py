@@ -17,6 +17,7 @@ from spelgen.fitting.dataset import (
     TrainingData,
     WindowChoice,
     WindowCutting,
+    numbers_of,
 )
 from spelgen.fitting.rollout import loss_scales
 from spelgen.logs.checks import Finding, clock_diagnostics, findings, summarised
@@ -133,8 +134,8 @@ def _read_once(logs: LargeLogs) -> LogContents:
         rates.append(trajectory.sample_rate)
         problems += findings(trajectory, logs.joints, logs.joint_types)
         clock_notes += clock_diagnostics(trajectory)
-        for array in (trajectory.t, trajectory.q, trajectory.qd, trajectory.tau):
-            numbers.update(np.ascontiguousarray(array).data)
+        for part in numbers_of(trajectory):
+            numbers.update(part)
     summary = summarised(problems, logs.joints, len(chunks))
     collect(summary.errors)
     # the last samples of a recording may be a chunk of their own, too short to tell a rate

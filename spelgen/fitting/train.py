@@ -58,7 +58,7 @@ def train(
     before, and logs are read as spelgen writes them where ``options`` has no mapping.
     Raises ModuleError, LogError, and RunError when the folder holds a run or cannot be resumed with this.
     """
-    run, module = RunFolder(Path(folder)), Path(module)
+    run, module = RunFolder(folder), Path(module)
     robot = None
     notes: list[Diagnostic] = []
     if options.resume:
@@ -88,7 +88,7 @@ def train(
 def _new_model(module: Path, source: Path | str | None, *, trust: bool) -> EmittedModel:
     if source is None:
         return load_module(module)
-    return fitted_model(RunFolder(Path(source)), trust=trust)
+    return fitted_model(RunFolder(source), trust=trust)
 
 
 def open_logs(

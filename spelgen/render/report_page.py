@@ -41,7 +41,7 @@ class Run:
     """Read what a run folder holds, each file when it is first needed; None stands for what the folder lacks."""
 
     def __init__(self, folder: Path | str) -> None:
-        self.folder = RunFolder(Path(folder))
+        self.folder = RunFolder(folder)
 
     @cached_property
     def facts(self) -> Facts:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import torch
 
-from spelgen.fitting.optimizers import minimise_sum
-from spelgen.fitting.torque.samples import Block, TorqueSamples
+from spelgen.fitting.optimizers import minimise
+from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import DEFAULTS, Adaptation
 
@@ -42,15 +42,15 @@ def fit_networks(
     scale = samples.columns.tau.std(dim=0)
     scale = torch.maximum(scale, 1e-2 * scale.amax())
 
-    def missed(block: tuple[int, Block]) -> torch.Tensor:
-        number, (q, qd, qdd, tau, _) = block
-        error = ((model.inverse_dynamics(q, qd, qdd) - tau) / scale).square()
-        part = error.mean() if count <= BLOCK else error.sum() / (count * joints)
-        if number or penalty is None:
-            return part
-        return part + penalty()
+    def missed() -> Iterator[torch.Tensor]:
+        for number, (q, qd, qdd, tau, _) in enumerate(samples.blocks(BLOCK)):
+            error = ((model.inverse_dynamics(q, qd, qdd) - tau) / scale).square()
+            part = error.mean() if count <= BLOCK else error.sum() / (count * joints)
+            if number == 0 and penalty is not None:
+                part = part + penalty()
+            yield part
 
-    return minimise_sum(model, missed, lambda: enumerate(samples.blocks(BLOCK)), evaluations, weight_decay)
+    return minimise(model, missed, evaluations, weight_decay)
 
 
 def adapt_networks(

@@ -365,7 +365,7 @@ def _fit_network(
             return 0.5 * (error / noise).square().sum() / correlation
 
         network.load_state_dict(start)
-        minimise(network, cost, evaluations, weight_decay=1.0)
+        minimise(network, lambda: [cost()], evaluations, weight_decay=1.0)
 
     first, last = _halves(len(samples.q), correlation)
     # most networks explain nothing, which few evaluations show
