@@ -25,7 +25,7 @@ from spelgen.fitting.torque.jacobian import ResidualSamples
 from spelgen.fitting.torque.objective import fit_torques
 from spelgen.fitting.torque.residuals import select_residuals
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
-from spelgen.fitting.window.problem import WindowProblem
+from spelgen.fitting.window.objective import WindowObjective
 from spelgen.fleet import jobs
 from spelgen.identification.least_squares import deviations
 from spelgen.loaded_arm import load_arm
@@ -215,7 +215,7 @@ def test_straying_from_the_urdf_costs_what_the_docs_say(robots, monkeypatch):
     expected = np.square(varied).sum() / 50 / 2 + np.square(gravity.numpy() / 2).mean()
     assert float(regularizer.loss(model)) == pytest.approx(expected)
     windows = SimpleNamespace(regularizer=regularizer, model=model, config=Rollout(urdf_weight=0.7))
-    assert float(WindowProblem.penalty(windows)) == pytest.approx(0.7 * expected)
+    assert float(WindowObjective.penalty(windows)) == pytest.approx(0.7 * expected)
     penalties = []
 
     def fit_networks(model, samples, decay, penalty, evaluations):

@@ -28,7 +28,6 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_lock import locked
 from spelgen.fitting.train import train
 from spelgen.fitting.window import objective as window_objective
-from spelgen.fitting.window import problem as window_problem
 from spelgen.logs import chunks
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
@@ -57,7 +56,7 @@ def motions(count: int = 4, samples: int = 25) -> list[Trajectory]:
 def short_epochs():
     """Two steps an epoch: what is written, and when, is the same after twenty."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(window_problem, "TUNING", WindowTuning(epoch_steps=2))
+        patch.setattr(window_objective, "TUNING", WindowTuning(epoch_steps=2))
         yield
 
 

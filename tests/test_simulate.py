@@ -37,7 +37,8 @@ def load(path):
 
 
 def run(arm, settings, start, t, tau):
-    return rollout(arm_dynamics(arm, settings), make_friction(arm, settings), np.array(start), t, tau)
+    dynamics = arm_dynamics(arm, settings, make_friction(arm, settings))
+    return rollout(dynamics, np.array(start), t, tau)
 
 
 class TestMotion:
@@ -95,7 +96,7 @@ class TestMotion:
             return np.concatenate([qd, engine.forward_dynamics(q, qd, force), [qd @ force]])
 
         t = np.array([0.0, 0.5])
-        end = rollout(engine, friction, start[:6], t, np.stack([tau, tau]))[-1]
+        end = rollout(arm_dynamics(rpr, settings, friction), start[:6], t, np.stack([tau, tau]))[-1]
         other = solve_ivp(derivative, t, start, method="Radau", rtol=1e-10, atol=1e-12).y[:, -1]
         np.testing.assert_allclose(end, other[:6], atol=1e-8)
         data = engine.model.createData()
@@ -247,7 +248,7 @@ class TestIntegration:
         random = np.random.default_rng(0)
         start = np.concatenate([random.uniform(-1, 1, n), random.uniform(-0.5, 0.5, n)])
         t, tau = np.linspace(0.0, 0.25, 6), random.normal(size=(6, n))
-        states = integration.rollout(engine, friction, start, t, tau)
+        states = integration.rollout(arm_dynamics(chosen, settings, friction), start, t, tau)
         for k in range(len(t) - 1):
 
             def derivative(_, state, torque=tau[k]):

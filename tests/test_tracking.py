@@ -193,7 +193,8 @@ def test_motors_behind_gears_get_their_share_and_a_passive_joint_none():
 
 def test_the_arm_is_held_against_its_weight_from_the_start(loaded):
     """Without gains and without a sine to follow, what the controller starts with keeps the arm at rest."""
-    engine, friction = arm_dynamics(loaded.arm, loaded.settings), make_friction(loaded.arm, loaded.settings)
+    friction = make_friction(loaded.arm, loaded.settings)
+    engine = arm_dynamics(loaded.arm, loaded.settings, friction)
     still = sines(np.full(N, 0.4), 0.0, 0.125, np.zeros(N), np.arange(50) / 125)
     settings = changed(loaded.settings, duration=0.4)
     held = record(engine, friction, np.eye(N), still, tuned_gains(np.zeros(N), 3.0), settings)

@@ -242,7 +242,7 @@ class Interrupted(TrainingProgress):
 
 @pytest.mark.parametrize(("optimizer", "steps"), [("adamw", 20), ("lbfgs", 3)])
 def test_resuming_repeats_what_would_have_been(logs, tmp_path, monkeypatch, optimizer, steps):
-    monkeypatch.setattr("spelgen.fitting.window.problem.TUNING", WindowTuning(epoch_steps=steps))
+    monkeypatch.setattr("spelgen.fitting.window.objective.TUNING", WindowTuning(epoch_steps=steps))
     config = quick(optimizer=optimizer, momentum_steps=20 if optimizer == "adamw" else 0)
     straight, broken = tmp_path / "straight", tmp_path / "broken"
     train(STAND_IN, [logs], straight, config)
@@ -472,7 +472,7 @@ def test_validation_windows_come_from_other_trajectories(logs):
 def test_the_learning_rate_rises_and_falls(logs, tmp_path):
     loop = loop_of(logs, QUICK)
     rates = []
-    for step in range(QUICK.epochs * loop.problem.epoch_steps):
+    for step in range(QUICK.epochs * loop.epoch_steps):
         loop.step = step
         rates.append(loop._rate())
     peak = int(np.argmax(rates))
@@ -567,9 +567,7 @@ def test_progress_on_a_terminal_is_one_line_of_80_columns(monkeypatch):
 def test_the_allowed_time_is_kept_within_an_epoch(logs, monkeypatch):
     """An epoch of a million steps of 20 ms would take hours: by a clock that only steps move."""
     now = [100.0]
-    monkeypatch.setattr(
-        "spelgen.fitting.window.problem.time", types.SimpleNamespace(monotonic=lambda: now[0])
-    )
+    monkeypatch.setattr("spelgen.fitting.window.clock.time", types.SimpleNamespace(monotonic=lambda: now[0]))
     run = MiniBatchAdamW.run
 
     def slow(self, loss, windows, steps, rate):
@@ -580,7 +578,7 @@ def test_the_allowed_time_is_kept_within_an_epoch(logs, monkeypatch):
     config = quick(epochs=10**6, patience=10**6, max_minutes=1.0, momentum_steps=0)
     loop = loop_of(logs, config)
     loop.seconds = 12.0
-    loop.problem.epoch_steps = 10**6
+    loop.epoch_steps = 10**6
     with TrainingProgress(show=False) as progress:
         assert loop.run(progress, lambda: None) == "out of time"
     assert 0.95 * 60 < now[0] - 100.0 + 12.0 <= 1.05 * 60

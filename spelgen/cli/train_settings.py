@@ -143,20 +143,18 @@ def _new_config(
 ) -> FitConfig | None:
     """Return the configuration for a model; None where the logs' rates decide and are not known yet."""
     from spelgen.dynamics.protocol import has_rigid_bodies
-    from spelgen.fitting.objectives import default_config
-    from spelgen.settings.fits import fit_config
+    from spelgen.fitting.objectives import chosen_config
 
-    rigid_bodies, options, defaults = has_rigid_bodies(model), request.options, dict(settings.options)
+    options, defaults = request.options, dict(settings.options)
     objective = request.objective or settings.objective
-    if objective is not None:
-        if request.warm_start and objective == "rollout" and rigid_bodies:
-            defaults["torque_first"] = False  # it would start the bodies anew
-        return fit_config(objective, rigid_bodies=rigid_bodies, options=options, defaults=defaults)
-    if rates is None and rigid_bodies:
-        return None  # torques need dense logs, which are not read yet
-    if TIME_LIMIT in options:  # whoever sets it cannot know which objective the logs will lead to
+    if request.warm_start and objective == "rollout" and has_rigid_bodies(model):
+        defaults["torque_first"] = False  # it would start the bodies anew
+    if objective is None and TIME_LIMIT in options:
+        # whoever sets it cannot know which objective the logs will lead to
         defaults[TIME_LIMIT] = options.pop(TIME_LIMIT)
-    config = default_config(model, rates or [], options, defaults)
+    config = chosen_config(model, rates, objective, options, defaults)
+    if config is None:
+        return None
     if TIME_LIMIT in request.values and TIME_LIMIT not in type(config).model_fields:
         note(f"info: max_minutes limits fits to windows; these logs are fitted by {config.objective}")
     return config

@@ -29,12 +29,10 @@ from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.rollout import loss_scales, rollout_loss
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.train import train
-from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows
 from spelgen.settings.fits import DEFAULTS, Rollout
 from spelgen.settings.tuning.comparison import ComparisonTuning
-from spelgen.spec import read_facts
 from spelgen.tasks import RunTasks
 
 if TYPE_CHECKING:
@@ -87,10 +85,7 @@ def _run(study: Study, task: tuple[Variant, int]) -> RunResult:
 def _measure(
     study: Study, variant: str, seed: int, seconds: float, substeps: int, model: EmittedModel
 ) -> RunResult:
-    joints = read_facts(study.module(study.variants[0])).joints
-    decimation = study.preprocessing.decimation or 1
-    training = read_logs([study.logs], joints, role="train")
-    testing = read_logs([study.logs], joints, role="test")
+    decimation, training, testing = study.decimation, study.read_logs("train"), study.read_logs("test")
     steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = thinned(testing, steps + 1, decimation)
     low = torch.tensor(study.low, dtype=torch.float64)
@@ -134,9 +129,7 @@ def predict_example(
 
 def time_steps(study: Study) -> dict[str, float]:
     """Return by variant the median time of a training step, without the update of the weights [s]."""
-    joints = read_facts(study.module(study.variants[0])).joints
-    training = read_logs([study.logs], joints, role="train")
-    windows = thinned(training, study.window, study.preprocessing.decimation or 1)
+    windows = thinned(study.read_logs("train"), study.window, study.decimation)
     windows = windows[: (study.training or Rollout()).batch or DEFAULTS.batch]
     times = {}
     torch.set_num_threads(1)

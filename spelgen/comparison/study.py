@@ -21,14 +21,16 @@ from spelgen.comparison.metrics import RunResult
 from spelgen.design import Design, Net, Preset, load_design
 from spelgen.errors import RunError, SettingsError
 from spelgen.files import read_json, write_json, write_text
-from spelgen.fitting.window.problem import TUNING
+from spelgen.fitting.window.objective import TUNING
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.read import write_logs
+from spelgen.logs.read import read_logs, write_logs
+from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.fits import Rollout, fit_config
 from spelgen.settings.settings import Settings
+from spelgen.spec import read_facts
 from spelgen.structure.nominal import working_range
 from spelgen.trust import require_own_module
 
@@ -99,6 +101,11 @@ class Study:
         return (self.training or Rollout()).window
 
     @property
+    def decimation(self) -> int:
+        """Samples of a log from one sample of a window to the next."""
+        return self.preprocessing.decimation or 1
+
+    @property
     def logs(self) -> Path:
         return self.folder / "logs"
 
@@ -108,6 +115,10 @@ class Study:
 
     def module(self, variant: Variant) -> Path:
         return self.folder / f"{variant.name.replace('-', '_')}.py"
+
+    def read_logs(self, role: str) -> list[Trajectory]:
+        """Return the logs to `train` on or to `test` with."""
+        return read_logs([self.logs], read_facts(self.module(self.variants[0])).joints, role=role)
 
     def run(self, variant: Variant, seed: int) -> Path:
         return self.folder / "runs" / f"{variant.name}-{seed}"

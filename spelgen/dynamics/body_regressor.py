@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,3 +27,11 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
     columns = torch.unflatten(pose.twists, -1, (-1, 6)).transpose(-3, -2)  # (..., bodies, n, 6)
     rows: Tensor = (columns @ wrenches).transpose(-3, -2)
     return rows.reshape(*q.shape, 10 * len(chain.parents))
+
+
+def chain_regressor(chain: BodyChain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+    """Return the same (T, n, 10 bodies) of arrays (T, n)."""
+    # copies: torch takes no views that run backwards, as filters give them
+    states = [torch.from_numpy(np.array(x, dtype=float)) for x in (q, qd, qdd)]
+    with torch.no_grad():
+        return np.asarray(regressor_of(chain, *states))

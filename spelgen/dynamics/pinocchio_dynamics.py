@@ -51,15 +51,9 @@ class PinocchioDynamics:
         self.model, self.data = model, model.createData()
         self.friction, self.inputs = friction, inputs
         self.jacobian, self.offset = np.zeros((model.nv, constraint.jacobian.shape[1])), np.zeros(model.nv)
-        circles, lines = list[tuple[int, int]](), list[tuple[int, int]]()
         for name, row, offset in zip(constraint.names, constraint.jacobian, constraint.offset, strict=True):
-            joint = model.joints[model.getJointId(name)]
-            self.jacobian[joint.idx_v], self.offset[joint.idx_v] = row, offset
-            (lines if joint.nq == 1 else circles).append((joint.idx_q, joint.idx_v))
-        # where a joint's position stands in a configuration, and in a velocity
-        self._circles = circles
-        self._lines = np.array(lines, dtype=np.int64).reshape(-1, 2)
-        self._plain = not circles and model.nq == model.nv == len(lines)
+            index = model.joints[model.getJointId(name)].idx_v
+            self.jacobian[index], self.offset[index] = row, offset
         # coordinates are the model's joints in its order: products with the identity took longer than `aba` itself
         self._same = np.array_equal(self.jacobian, np.eye(self.n)) and not self.offset.any()
 
@@ -123,16 +117,18 @@ class PinocchioDynamics:
 
     def configuration(self, q: np.ndarray) -> np.ndarray:
         """Pinocchio's configuration (..., nq) at q (..., n)."""
-        if self._same and self._plain:
+        if not self._same:
+            q = q @ self.jacobian.T + self.offset
+        if self.model.nq == self.model.nv:
             return q
-        positions = q @ self.jacobian.T + self.offset
-        if self._plain:
-            return positions
         configuration: np.ndarray = np.tile(pin.neutral(self.model), (*q.shape[:-1], 1))
-        configuration[..., self._lines[:, 0]] = positions[..., self._lines[:, 1]]
-        for index, row in self._circles:  # a continuous joint is (cos, sin) in Pinocchio
-            configuration[..., index] = np.cos(positions[..., row])
-            configuration[..., index + 1] = np.sin(positions[..., row])
+        for joint in self.model.joints[1:]:
+            position = q[..., joint.idx_v]
+            if joint.nq == 1:
+                configuration[..., joint.idx_q] = position
+            elif joint.nq == 2:  # a continuous joint is (cos, sin) in Pinocchio
+                configuration[..., joint.idx_q] = np.cos(position)
+                configuration[..., joint.idx_q + 1] = np.sin(position)
         return configuration
 
     def _by_joint(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.body_regressor import regressor_of
+from spelgen.dynamics.body_regressor import chain_regressor
 from spelgen.dynamics.rigid_bodies import body_chain
 
 
@@ -15,9 +14,7 @@ def regressor(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.nd
 
     Column 10 b + i belongs to parameter i of ``arm.bodies[b]``, in the order of ``Body.inertia``.
     """
-    # copies: torch takes no views that run backwards, as filters give them
-    states = [torch.from_numpy(np.array(x, dtype=float)) for x in (q, qd, qdd)]
-    return np.asarray(regressor_of(body_chain(arm), *states))
+    return chain_regressor(body_chain(arm), q, qd, qdd)
 
 
 def urdf_parameters(arm: Arm) -> np.ndarray:

@@ -90,11 +90,9 @@ class Excitation:
         for quantity in ("q", "qd", "qdd"):
             head += [f"{quantity}_{coordinate.name}" for coordinate in self.arm.coordinates]
         motion, file = self.motion, io.StringIO()
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(head)
+        csv.writer(file, lineterminator="\n").writerow(head)
         rows = np.concatenate([motion.t[:, None], motion.q, motion.qd, motion.qdd], axis=1)
-        for row in np.round(rows, 9):
-            writer.writerow([f"{x + 0.0:.9f}" for x in row])  # adding zero turns -0 into 0
+        np.savetxt(file, np.round(rows, 9) + 0.0, "%.9f", ",")  # adding zero turns -0 into 0
         return file.getvalue()
 
     def __repr__(self) -> str:

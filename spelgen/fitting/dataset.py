@@ -21,14 +21,30 @@ from spelgen.settings.tuning.fitting import ValidationTuning
 TUNING = ValidationTuning()
 
 
+@dataclass(frozen=True)
+class WindowChoice:
+    """Which windows are cut, and which are set aside.
+
+    validation: trajectories, or the fraction of the logs that is set aside, whole trajectories drawn by the seed
+    before anything is cut, so that no sample is in both parts. window, stride, reach: see `cut_windows`.
+    """
+
+    window: int = 5
+    stride: int = 1
+    validation: float | Sequence[Trajectory] = 0.25
+    seed: int = 0
+    reach: BristleReach | None = None
+
+
+DEFAULT_CHOICE = WindowChoice()
+
+
 @dataclass(frozen=True, eq=False)
 class WindowCutting:
-    """How windows are cut: see `cut_windows`. preprocessing: a resolved one."""
+    """How the chosen windows are cut of logs that are prepared like this. preprocessing: a resolved one."""
 
-    window: int
-    stride: int
+    choice: WindowChoice
     preprocessing: Preprocessing
-    reach: BristleReach | None = None
 
     @property
     def decimation(self) -> int:
@@ -38,18 +54,18 @@ class WindowCutting:
     @property
     def shortest(self) -> int:
         """Samples of one window."""
-        return (self.window - 1) * self.decimation + 1
+        return (self.choice.window - 1) * self.decimation + 1
 
     def count(self, samples: int) -> int:
         """Return how many windows a gap-free piece of so many samples has."""
-        return window_count(samples, self.window, self.stride, self.decimation)
+        return window_count(samples, self.choice.window, self.choice.stride, self.decimation)
 
     def windows(self, trajectories: Sequence[Trajectory]) -> Windows:
         """Return all windows of these trajectories, filtered piece by piece."""
         pieces = self.preprocessing.pieces(trajectories, shortest=self.shortest)
-        filtered = self.preprocessing.filtered
+        filtered, choice = self.preprocessing.filtered, self.choice
         return cut_windows(
-            pieces, self.window, self.stride, self.decimation, measured=filtered, reach=self.reach
+            pieces, choice.window, choice.stride, self.decimation, measured=filtered, reach=choice.reach
         )
 
 
@@ -75,24 +91,6 @@ class TrainingData:
     chunks: tuple[Chunk, ...] = ()
 
 
-@dataclass(frozen=True)
-class WindowChoice:
-    """Which windows are cut, and which are set aside.
-
-    validation: trajectories, or the fraction of the logs that is set aside, whole trajectories drawn by the seed
-    before anything is cut, so that no sample is in both parts. window, stride, reach: see `cut_windows`.
-    """
-
-    window: int = 5
-    stride: int = 1
-    validation: float | Sequence[Trajectory] = 0.25
-    seed: int = 0
-    reach: BristleReach | None = None
-
-
-DEFAULT_CHOICE = WindowChoice()
-
-
 def prepare_data(
     trajectories: Sequence[Trajectory],
     joints: Sequence[str],
@@ -112,7 +110,7 @@ def prepare_data(
     require_torques(everything)
     notes = check(everything, joints, joint_types)
     resolved = preprocessing.resolved([x.sample_rate for x in everything])
-    cutting = WindowCutting(choice.window, choice.stride, resolved, choice.reach)
+    cutting = WindowCutting(choice, resolved)
     windows = cutting.windows(split.training)
     return TrainingData(
         training=windows,

@@ -13,7 +13,7 @@ from spelgen.errors import Diagnostic, RunError, SettingsError
 from spelgen.files import write_json
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.objective import FitRequest, Logs, Objective, Status, record_of
-from spelgen.fitting.objectives import default_config, objective_of
+from spelgen.fitting.objectives import chosen_config, objective_of
 from spelgen.fitting.process import require_device, termination_as_interrupt, threads_of_torch
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.run_folder import RunFolder
@@ -108,7 +108,7 @@ def fit(
         require_device(options.device)
         prepared = objective.prepare()
         notes = [*prepared.notes, *options.notes]
-        record = record_of(request, prepared, rigid_bodies=has_rigid_bodies(model))
+        record = record_of(request, prepared)
         if run is not None and options.resume:
             require_same(run.read_config(), record, run.path)
             _resume(objective, run)
@@ -144,7 +144,7 @@ def fit(
 def _config(model: EmittedModel, logs: Logs, config: FitConfig | None) -> FitConfig:
     """Return the configuration, by default what suits the model and its logs. Raises what `fit` raises for it."""
     if config is None:
-        config = default_config(model, sample_rates(logs))
+        config = chosen_config(model, sample_rates(logs))
     if not isinstance(config, FitConfig):
         raise SettingsError(
             f"{config!r} as the configuration of a fit",
@@ -185,8 +185,7 @@ def _writer(objective: Objective, run: RunFolder | None) -> Callable[[], None]:
         nonlocal written
         if run is None:
             return
-        for epoch in objective.history[written:]:
-            run.append_metrics(epoch)
+        run.append_metrics(objective.history[written:])
         written = len(objective.history)
         checkpoint = objective.checkpoint()
         run.save(checkpoint["best_weights"], checkpoint)

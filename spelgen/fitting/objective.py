@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, Protocol
 
+from spelgen.dynamics.protocol import has_rigid_bodies, input_of
 from spelgen.errors import Diagnostic
 from spelgen.fitting.run_record import Content, ReadContent
 from spelgen.fitting.streaming import LargeLogs
@@ -63,7 +64,6 @@ class PreparedLogs:
     validation: tuple[str, ...]
     training_windows: int
     validation_windows: int
-    mapping: LogMapping
     notes: tuple[Diagnostic, ...]
     further: dict[str, object] = field(default_factory=dict)
 
@@ -130,9 +130,10 @@ class Objective(Protocol):
         """Return what config.json says of how it went, beside what `prepare` told."""
 
 
-def record_of(request: FitRequest, prepared: PreparedLogs, *, rigid_bodies: bool) -> Content:
+def record_of(request: FitRequest, prepared: PreparedLogs) -> Content:
     """Return what goes into config.json: options that were used, resolved, and nothing that does not apply."""
     model, facts = request.model, getattr(request.model, "facts", None)
+    mapping = request.mapping or LogMapping(input=input_of(model))
     fraction = request.validation if prepared.validation and isinstance(request.validation, float) else None
     return {
         "schema": 2,
@@ -140,7 +141,7 @@ def record_of(request: FitRequest, prepared: PreparedLogs, *, rigid_bodies: bool
         "preset": facts.options.preset if facts else None,
         "joints": list(logged_joints(model)),
         "objective": prepared.config.objective,
-        "config": prepared.config.record(rigid_bodies=rigid_bodies),
+        "config": prepared.config.record(rigid_bodies=has_rigid_bodies(model)),
         "preprocessing": asdict(prepared.preprocessing),
         "validation_fraction": fraction,
         "seed": request.seed,
@@ -150,7 +151,7 @@ def record_of(request: FitRequest, prepared: PreparedLogs, *, rigid_bodies: bool
         "training_windows": prepared.training_windows,
         "validation_windows": prepared.validation_windows,
         **prepared.further,
-        "mapping": prepared.mapping.model_dump(exclude_defaults=True),
+        "mapping": mapping.model_dump(exclude_defaults=True),
         "device": request.device,
         "threads": request.threads,
     }

@@ -59,14 +59,22 @@ def default_objective(model: EmittedModel, rates: Sequence[float]) -> str:
     return "rollout"
 
 
-def default_config(
+def chosen_config(
     model: EmittedModel,
-    rates: Sequence[float],
+    rates: Sequence[float] | None,
+    objective: str | None = None,
     options: Mapping[str, object] | None = None,
     defaults: Mapping[str, object] | None = None,
-) -> FitConfig:
-    """Return the configuration of `default_objective`; options and defaults as for `fit_config`."""
-    objective, rigid_bodies = default_objective(model, rates), has_rigid_bodies(model)
-    if rigid_bodies and objective == "rollout":  # bodies need no regularizer where nobody asks for one
-        defaults = {"urdf_weight": 0.0, **(defaults or {})}
+) -> FitConfig | None:
+    """Return the configuration of an objective, by default of `default_objective`.
+
+    options, defaults: as for `fit_config`. rates: None before logs are read; None is returned where these decide.
+    """
+    rigid_bodies = has_rigid_bodies(model)
+    if objective is None:
+        if rates is None and rigid_bodies:
+            return None
+        objective = default_objective(model, rates or [])
+        if rigid_bodies and objective == "rollout":  # bodies need no regularizer where nobody asks for one
+            defaults = {"urdf_weight": 0.0, **(defaults or {})}
     return fit_config(objective, rigid_bodies=rigid_bodies, options=options, defaults=defaults)

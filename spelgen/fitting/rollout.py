@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 
@@ -92,8 +91,7 @@ def position_difference(
     return difference - 2 * math.pi * torch.where(revolute, turns, 0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class LossScales:
+class LossScales(NamedTuple):
     """Hold one unit of error of q, qd and tau.
 
     q, qd: for each sample but the first and joint (K-1, n), the root mean square change since the window's first
@@ -106,7 +104,7 @@ class LossScales:
 
     def to(self, device: str | torch.device) -> LossScales:
         """The same scales on another device."""
-        return LossScales(self.q.to(device), self.qd.to(device), self.tau.to(device))
+        return LossScales(*(x.to(device) for x in self))
 
 
 def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:

@@ -95,10 +95,12 @@ class RunFolder:
         write_state(self.weights, weights)
         write_state(self.checkpoint, checkpoint)
 
-    def append_metrics(self, record: Content) -> None:
-        """Add one line to metrics.jsonl."""
+    def append_metrics(self, records: Sequence[Content]) -> None:
+        """Add lines to metrics.jsonl."""
+        if not records:
+            return
         with naming(self.metrics), self.metrics.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(record) + "\n")
+            file.writelines(json.dumps(record) + "\n" for record in records)
         sent(self.metrics)
 
     def write_metrics(self, records: Sequence[Content]) -> None:

@@ -71,7 +71,7 @@ def prepare_streamed(
         logs = replace(logs, gap=preprocessing.gap)
     contents = logs.contents
     resolved = preprocessing.resolved(contents.rates)
-    cutting = WindowCutting(choice.window, choice.stride, resolved, choice.reach)
+    cutting = WindowCutting(choice, resolved)
     counts = [sum(map(cutting.count, pieces)) for pieces in contents.pieces]
     usable = np.flatnonzero(counts).tolist()
     chosen = _split(usable, cutting, choice)

@@ -12,7 +12,6 @@ from spelgen.fitting.run_record import Content, ReadContent
 from spelgen.fitting.streaming import LargeLogs, prepare_streamed
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
 from spelgen.settings.fits import FitConfig
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.spec import logged_joints
 
 
@@ -61,9 +60,8 @@ class TorqueLogObjective:
             validation=data.validation_names,
             training_windows=data.size,
             validation_windows=len(data.validation),
-            mapping=self.request.mapping or LogMapping(),
             notes=data.diagnostics,
-            further={"scales": {name: getattr(data.scales, name).tolist() for name in ("q", "qd", "tau")}},
+            further={"scales": {name: x.tolist() for name, x in data.scales._asdict().items()}},
         )
 
     def _regularizer(

@@ -19,13 +19,13 @@ from spelgen.evaluation.subject import read_test_logs
 from spelgen.files import read_bytes, read_json, write_json, write_text
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.fitted import load_run
-from spelgen.fitting.objectives import default_config
+from spelgen.fitting.objectives import chosen_config
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.train import train
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.pipeline import generate
-from spelgen.settings.fits import FitConfig, fit_config
+from spelgen.settings.fits import FitConfig
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.settings import load_settings
 from spelgen.settings.training import TrainingSettings
@@ -103,26 +103,17 @@ def run_job(job: Job) -> RunResult:
     _remove_foreign_run(job, run)
     training = _training(job)
     resume = run.config.exists()
-    common: dict[str, Any] = {
-        "preprocessing": Preprocessing(**training.preprocessing),
-        "validation": training.validation_fraction,
-        "seed": job.seed,
-        "options": RunOptions(mapping=job.mapping, resume=resume, force=not resume),
-    }
-    if resume:
-        fit = train(run.module, job.train, job.folder, **common)
-    else:
-        config = partial(_config, training)
-        fit = train(_module(job), job.train, job.folder, config, urdf=job.urdf, **common)
+    fit = train(
+        run.module if resume else _module(job), job.train, job.folder, partial(_config, training), urdf=job.urdf,
+        preprocessing=Preprocessing(**training.preprocessing), validation=training.validation_fraction,
+        seed=job.seed, options=RunOptions(mapping=job.mapping, resume=resume, force=not resume),
+    )  # fmt: skip
     # a worker that is asked to end leaves a checkpoint, from which the next one goes on
     if fit.status == "interrupted":
         raise KeyboardInterrupt
     result = {
         "key": job.key,
-        "robot": job.robot,
-        "preset": job.preset,
-        "seed": job.seed,
-        "split": job.split,
+        **job.model_dump(include={"robot", "preset", "seed", "split"}),
         "status": fit.status,
         "parameters": fit.parameters,
         "validation": fit.best_validation,
@@ -159,15 +150,11 @@ def _config(
     training: TrainingSettings, model: EmittedModel, rates: Sequence[float] | None
 ) -> FitConfig | None:
     """Return the objective that is asked for, or that suits the model and its logs, with its own options."""
-    rigid_bodies = has_rigid_bodies(model)
+    objective = training.objective
     # rigid bodies are not fitted to momenta: a fleet of several presets asks for these where they are
-    if training.objective is not None and not (rigid_bodies and training.objective == "momentum"):
-        return fit_config(
-            training.objective, rigid_bodies=rigid_bodies, options={}, defaults=training.options
-        )
-    if rates is None and rigid_bodies:
-        return None  # the logs decide
-    return default_config(model, rates or [], {}, training.options)
+    if objective == "momentum" and has_rigid_bodies(model):
+        objective = None
+    return chosen_config(model, rates, objective, {}, training.options)
 
 
 def _judged(job: Job, run: RunFolder) -> RunResult:

@@ -54,16 +54,14 @@ class BaseParameters:
         return result
 
 
-def base_parameters(
-    arm: Arm, friction: FrictionModel, motors: np.ndarray | None = None, seed: int = 0
-) -> BaseParameters:
+def base_parameters(arm: Arm, friction: FrictionModel, motors: np.ndarray | None = None) -> BaseParameters:
     """Return the base parameters of ``arm`` and of this friction of its drives (see ``FrictionModel.columns``)."""
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     exact = body_base_parameters(arm)
     names = list(map(parameter_name, range(inertial)))
     for effect in friction.effects:
         names += [f"{effect}{joint + 1}" for joint in range(n)]
-    columns = _columns(arm, friction, motors, len(names), seed)
+    columns = _columns(arm, friction, motors, len(names))
     candidates = np.array([parameter.index for parameter in exact] + list(range(inertial, len(names))))
     # what is left of each column beside all before it
     remainder = np.abs(np.diag(np.linalg.qr(columns[:, candidates], mode="r")))
@@ -80,14 +78,12 @@ def base_parameters(
     return BaseParameters(tuple(base_names), chosen, combination, tuple(names), len(exact))
 
 
-def _columns(
-    arm: Arm, friction: FrictionModel, motors: np.ndarray | None, count: int, seed: int
-) -> np.ndarray:
+def _columns(arm: Arm, friction: FrictionModel, motors: np.ndarray | None, count: int) -> np.ndarray:
     """Return the whole regressor at random states, (rows, count)."""
     n = len(arm.coordinates)
     shape = (2 * count // n + 1, n)  # twice as many equations as parameters
-    q, qd, qdd = np.random.default_rng(seed).uniform(-3.0, 3.0, (3, *shape))
-    bent = np.random.default_rng(seed + 1).uniform(-1.0, 1.0, (*shape, len(BRISTLES)))
+    q, qd, qdd = np.random.default_rng(0).uniform(-3.0, 3.0, (3, *shape))
+    bent = np.random.default_rng(1).uniform(-1.0, 1.0, (*shape, len(BRISTLES)))
     rows = np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd, bent, motors)], axis=2)
     return rows.reshape(-1, count)
 

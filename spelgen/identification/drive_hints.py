@@ -15,12 +15,11 @@ from itertools import combinations_with_replacement, permutations
 from typing import Literal
 
 import numpy as np
-import torch
 from scipy.optimize import minimize_scalar
 from scipy.special import stdtrit
 
 from spelgen.arm.actuation import Drives
-from spelgen.dynamics.body_regressor import regressor_of
+from spelgen.dynamics.body_regressor import chain_regressor
 from spelgen.identification.drive_samples import DriveSamples
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.least_squares import block_products
@@ -68,9 +67,7 @@ def drive_rows(
 
     q, qd, qdd: (S, n). speeds: C, (n, n), of the motors, by the couplings that are known.
     """
-    with torch.no_grad():
-        # copies: torch takes no views that run backwards, as filters give them
-        bodies = regressor_of(chain, *(torch.from_numpy(x.copy()) for x in (q, qd, qdd))).numpy()
+    bodies = chain_regressor(chain, q, qd, qdd)
     return np.concatenate([bodies, FRICTION.columns(qd, qdd, None, speeds)], axis=2)
 
 

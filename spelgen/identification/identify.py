@@ -15,10 +15,10 @@ from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.regressor import regressor
 from spelgen.dynamics.rigid_bodies import body_chain
 from spelgen.errors import Diagnostic, LogError
-from spelgen.identification.base_parameters import BaseParameters, base_parameters
+from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.friction import FrictionModel
 from spelgen.identification.identification import Identification
-from spelgen.identification.least_squares import Columns, Solution, Triangles, deviations, reduce, solve
+from spelgen.identification.least_squares import Columns, Solution, deviations, reduce, solve
 from spelgen.identification.method import LeastSquares
 from spelgen.identification.torque_delay import TorqueDelay, find_torque_delay
 from spelgen.loaded_arm import LoadedArm, load_arm
@@ -104,9 +104,34 @@ def _least_squares(bodies: _BodyRows, method: LeastSquares, drives: Drives | Non
         )
     rows = _Rows(bodies, method.friction, None if drives is None else drives.speeds)
     base = base_parameters(bodies.arm, method.friction, rows.motors)
+    triangles = reduce(rows.blocks())
+    # a joint whose torque never changes must not weigh everything
+    torque_range = np.maximum(triangles.deviation, 1e-3 * triangles.deviation.max())
+    weights = np.ones_like(torque_range) if method.weights == "equal" else 1.0 / torque_range
     # each base parameter stands for the parameter that it is named after
-    fit = _fit(rows, base.columns, method)
-    return replace(_result(rows, method, base, fit), drives=drives)
+    solution = solve(triangles, weights, base.columns)
+    noise = rows.noise(solution, torque_range)
+    # with the weights "noise" again, by what was left of each joint's torque
+    for _ in range(TUNING.rounds if method.weights == "noise" else 0):
+        weights = 1.0 / noise
+        solution = solve(triangles, weights, base.columns)
+        noise = rows.noise(solution, torque_range)
+    squares = triangles.squares(solution.parameters) / triangles.count
+    return Identification(
+        arm=bodies.arm,
+        method=method,
+        base=base,
+        parameters=solution.parameters,
+        values=base.combination @ solution.parameters,
+        deviations=solution.deviations(triangles, weights**2 * noise, base.combination[:, base.columns]),
+        condition=solution.condition,
+        unseen=len(base) - solution.rank,
+        residual=np.sqrt(squares),
+        nmse=squares / np.where(triangles.deviation > 0, triangles.deviation, np.nan) ** 2,
+        trajectories=tuple(x.name for x in bodies.samples),
+        samples=triangles.count,
+        drives=drives,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,63 +172,8 @@ class _Rows:
             drives = self.friction.columns(block.qd, block.qdd, bent, self.motors)
             yield np.concatenate([bodies, drives], axis=2), block.tau
 
-    def residuals(self, parameters: np.ndarray) -> list[np.ndarray]:
-        return [regressors @ parameters - tau for regressors, tau in self.blocks()]
-
-
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """Hold a solution, its weights (n,), and the errors that it leaves: standard deviations (n,) as if independent."""
-
-    triangles: Triangles
-    solution: Solution
-    weights: np.ndarray
-    noise: np.ndarray
-
-    def deviations(self, combination: np.ndarray) -> np.ndarray:
-        """Return those of combinations (r, K) of the fitted parameters, for errors as large as they are."""
-        variance = np.square(self.weights**2 * self.noise)
-        # a sandwich, for weights need not be the inverse of what the errors turned out to be: a sum of squares
-        rows = self.triangles.factors[..., self.solution.columns]
-        effects = (combination @ self.solution.covariance) @ rows.swapaxes(1, 2)
-        return np.asarray(np.sqrt(np.tensordot(variance, np.square(effects).sum(axis=2), 1)))
-
-
-def _fit(rows: _Rows, columns: np.ndarray, method: LeastSquares) -> _Fit:
-    """Fit the parameters of these columns; with the weights "noise" again, by what was left of each joint's torque."""
-    triangles = reduce(rows.blocks())
-    deviation = triangles.deviation
-    # a joint whose torque never changes must not weigh everything
-    torque_range = np.maximum(deviation, 1e-3 * deviation.max())
-    weights = np.ones_like(torque_range) if method.weights == "equal" else 1.0 / torque_range
-    rounds = TUNING.rounds if method.weights == "noise" else 0
-    for _ in range(rounds):
-        noise = _noise(rows, solve(triangles, weights, columns), torque_range)
-        weights = 1.0 / noise
-    solution = solve(triangles, weights, columns)
-    return _Fit(triangles, solution, weights, _noise(rows, solution, torque_range))
-
-
-def _noise(rows: _Rows, solution: Solution, torque_range: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (n,) of the errors that a solution leaves."""
-    noise = deviations(rows.residuals(solution.parameters), solution.rank)
-    return np.asarray(np.maximum(noise, TUNING.least_noise * torque_range))
-
-
-def _result(rows: _Rows, method: LeastSquares, base: BaseParameters, fit: _Fit) -> Identification:
-    triangles, solution = fit.triangles, fit.solution
-    squares = triangles.squares(solution.parameters) / triangles.count
-    return Identification(
-        arm=rows.bodies.arm,
-        method=method,
-        base=base,
-        parameters=solution.parameters,
-        values=base.combination @ solution.parameters,
-        deviations=fit.deviations(base.combination[:, base.columns]),
-        condition=solution.condition,
-        unseen=len(base) - solution.rank,
-        residual=np.sqrt(squares),
-        nmse=squares / np.where(triangles.deviation > 0, triangles.deviation, np.nan) ** 2,
-        trajectories=tuple(x.name for x in rows.bodies.samples),
-        samples=triangles.count,
-    )
+    def noise(self, solution: Solution, torque_range: np.ndarray) -> np.ndarray:
+        """Return the standard deviations (n,), as if independent, of the errors that a solution leaves."""
+        residuals = [regressors @ solution.parameters - tau for regressors, tau in self.blocks()]
+        noise = deviations(residuals, solution.rank)
+        return np.asarray(np.maximum(noise, TUNING.least_noise * torque_range))

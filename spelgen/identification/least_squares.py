@@ -77,6 +77,16 @@ class Solution:
     condition: float
     rank: int
 
+    def deviations(self, triangles: Triangles, errors: np.ndarray, combination: np.ndarray) -> np.ndarray:
+        """Return the standard deviations of combinations (k, r) of the fitted parameters.
+
+        errors: (n,) standard deviations of the joints' torques, times the squares of their weights: a sandwich, for
+        weights need not be the inverse of what the errors turned out to be.
+        """
+        rows = triangles.factors[..., self.columns]
+        effects = (combination @ self.covariance) @ rows.swapaxes(1, 2)
+        return np.asarray(np.sqrt(np.tensordot(np.square(errors), np.square(effects).sum(axis=2), 1)))
+
 
 def solve(triangles: Triangles, weights: np.ndarray, columns: np.ndarray) -> Solution:
     """Return the parameters of these columns (r,) with the least weighted squares; weights (n,) by joint.

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 from scipy.special import stdtrit
 
 from spelgen.arm.actuation import Drives
-from spelgen.dynamics.body_regressor import regressor_of
+from spelgen.dynamics.body_regressor import chain_regressor
 from spelgen.dynamics.bristles import reach_of
 from spelgen.errors import Diagnostic
 from spelgen.identification.drive_hints import Coupling, DriveProblem, drive_problem, find_coupling
@@ -117,8 +116,7 @@ def _likely_delay(
     q, qd, qdd, z, direction, tau = samples
     if tau.std(axis=0).max() <= TUNING.negligible * np.abs(tau).max():  # a constant, with rounding
         return NO_DELAY
-    with torch.no_grad():
-        bodies = regressor_of(chain, *map(torch.from_numpy, (q, qd, qdd))).numpy()
+    bodies = chain_regressor(chain, q, qd, qdd)
     estimates = []
     # dry friction with and without memory, through the filter of the torques: a delay that only one form shows is its
     # error

@@ -13,7 +13,6 @@ from itertools import pairwise
 import numpy as np
 from scipy.integrate import ODEintWarning, odeint
 
-from spelgen.dynamics.joint_friction import Friction
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import RunError
 from spelgen.settings.tuning.simulation import SimulationTuning
@@ -23,7 +22,6 @@ TUNING = SimulationTuning()
 
 def rollout(
     dynamics: PinocchioDynamics,
-    friction: Friction,
     start: np.ndarray,
     t: np.ndarray,
     tau: np.ndarray,
@@ -45,7 +43,7 @@ def rollout(
 
         def derivative(_: float, state: np.ndarray, torque: np.ndarray = torque) -> np.ndarray:
             qd = state[n:]
-            return np.concatenate([qd, dynamics.forward_dynamics(state[:n], qd, torque - friction(qd))])
+            return np.concatenate([qd, dynamics.forward_dynamics(state[:n], qd, torque)])
 
         if not np.isfinite(derivative(0.0, states[first])).all():
             raise _stuck(t[first], "an acceleration is not finite")

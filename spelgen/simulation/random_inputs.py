@@ -33,7 +33,7 @@ def random_inputs(
     RunError when the motion cannot be integrated.
     """
     protocol = settings.simulation
-    dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings, drives and drives.speeds)
+    dynamics = arm_dynamics(arm, settings, make_friction(arm, settings, drives and drives.speeds))
     lowest, highest = initial_range(arm, settings)
     torques = [_torques(coordinate, settings) for coordinate in arm.coordinates]
     t = np.arange(round(protocol.duration * protocol.sample_rate) + 1) / protocol.sample_rate
@@ -45,7 +45,7 @@ def random_inputs(
         start = np.concatenate([random.uniform(lowest, highest), np.zeros(lowest.size)])
         tau = np.stack([random.choice(choices, size=t.size) for choices in torques], axis=1)
         effect = tau if drives is None else tau @ drives.inputs.T
-        states = rollout(dynamics, friction, start, t, effect)
+        states = rollout(dynamics, start, t, effect)
         q, qd = np.split(states, 2, axis=1)
         trajectories.append(Trajectory(t, q, qd, tau, f"traj_{number:02d}"))
         if progress is not None:

@@ -72,7 +72,8 @@ def track(
     differences of these, and the motors' torques. Arguments and errors as for `random_inputs`.
     """
     protocol = settings.simulation
-    dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings, drives and drives.speeds)
+    friction = make_friction(arm, settings, drives and drives.speeds)
+    dynamics = arm_dynamics(arm, settings, friction)
     inputs = np.eye(len(arm.coordinates)) if drives is None else drives.inputs
     middle = np.mean(initial_range(arm, settings), axis=0)
     ticks = np.arange(_ticks(settings)) * (1.0 / settings.tracking.control_rate)
@@ -157,7 +158,7 @@ def record(
         tau = to_motors @ effort
         t = k * tick + np.arange(samples + 1) / settings.simulation.sample_rate
         torque = np.tile(inputs @ tau, (samples + 1, 1))
-        passed = rollout(dynamics, friction, state, t, torque, TUNING.seen_loosening)
+        passed = rollout(dynamics, state, t, torque, TUNING.seen_loosening)
         states.append(passed[:-1])
         torques.append(np.tile(tau, (samples, 1)))
         state = passed[-1]

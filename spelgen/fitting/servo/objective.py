@@ -32,7 +32,6 @@ from spelgen.fitting.servo.windows import servo_windows
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.checks import check
 from spelgen.logs.trajectory import Trajectory, require_commands, require_joints
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.tuning.servo import ServoSolverTuning
 
 if TYPE_CHECKING:
@@ -74,7 +73,6 @@ class ServoObjective:
             validation=(),
             training_windows=len(self._windows.q),
             validation_windows=0,
-            mapping=request.mapping or LogMapping(input="position"),
             notes=tuple(notes),
         )
 

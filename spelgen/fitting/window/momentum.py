@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 from spelgen.errors import Diagnostic
 from spelgen.fitting.objective import Status
 from spelgen.fitting.run_record import Content
-from spelgen.fitting.window.objective import WindowObjective
-from spelgen.fitting.window.problem import TUNING
+from spelgen.fitting.window.objective import TUNING, WindowObjective
 
 if TYPE_CHECKING:
     from spelgen.fitting.progress import TrainingProgress

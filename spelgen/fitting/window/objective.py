@@ -10,25 +10,29 @@ import torch
 
 from spelgen.errors import LogError
 from spelgen.fitting.objective import FitRequest, PreparedLogs
+from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
 from spelgen.fitting.rollout import momentum_loss
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.torque_logs import TorqueLogObjective
 from spelgen.fitting.validation import Measured, Validation, measure
-from spelgen.fitting.window.problem import TUNING, Clock, WindowProblem
+from spelgen.fitting.window.clock import Clock
 from spelgen.logs.windows import Windows
-from spelgen.settings.fits import Solver, WindowConfig
+from spelgen.settings.fits import DEFAULTS, Solver, WindowConfig
+from spelgen.settings.tuning.fitting import WindowTuning
 
 if TYPE_CHECKING:
     from spelgen.errors import Diagnostic
     from spelgen.fitting.progress import TrainingProgress
+
+TUNING = WindowTuning()
 
 
 class WindowObjective(TorqueLogObjective):
     """An objective that fits windows, all of which are in memory.
 
     best_loss, best_weights: of the best model so far, by validation. substeps: of the integrator between samples.
-    seconds: of the allowed time that is gone.
+    seconds: of the allowed time that is gone. call_steps, epoch_steps: in a call of the optimizer, and in an epoch.
     """
 
     config: WindowConfig  # resolved by `prepare`
@@ -66,9 +70,16 @@ class WindowObjective(TorqueLogObjective):
         """Measure the model as it is; solver, substeps: of the validation, as in `Rollout`."""
         device = self.request.device
         self.seconds = time.monotonic() - self.request.began
-        self.problem = WindowProblem(self.model, self.data, self.config, device, self.regularizer)
+        self.model.to(device)
+        self.training, self.scales = self.data.training.to(device), self.data.scales.to(device)
+        if self.regularizer is not None:
+            self.regularizer = self.regularizer.to(device)
+        self.batch = min(self.config.batch or DEFAULTS.batch, len(self.training))
+        self.call_steps = self.epoch_steps = TUNING.epoch_steps
+        if not self._takes_all:
+            self.epoch_steps = max(TUNING.epoch_steps, -(-len(self.training) // self.batch))
         self.validation = Validation(
-            self.model, self.data, device, batch=self.problem.batch, solver=solver, substeps=substeps
+            self.model, self.data, device, batch=self.batch, solver=solver, substeps=substeps
         )
         self._keep(measure(self.model, self.validation))
         self.momentum_done = not self.config.momentum_steps
@@ -86,29 +97,54 @@ class WindowObjective(TorqueLogObjective):
     def _start_clock(self) -> None:
         self.clock = Clock(self.config.max_minutes, self.seconds)
 
+    @property
+    def _takes_all(self) -> bool:
+        """Whether a step takes all windows at once."""
+        return self.config.optimizer == "lbfgs"
+
+    def _new_optimizer(self, generator: torch.Generator) -> WindowOptimizer:
+        """Return one from the present weights, of those that require a gradient; ``generator`` orders batches."""
+        decay = self.config.weight_decay or 0.0
+        if self._takes_all:
+            return LBFGS(self.model, decay)
+        return MiniBatchAdamW(self.model, self.batch, decay, generator)
+
+    def penalty(self) -> torch.Tensor | float:
+        """Return what straying from the URDF costs."""
+        if self.regularizer is None:
+            return 0.0
+        return self.config.urdf_weight * self.regularizer.loss(self.model)
+
+    def learning_rate(self, fraction: float) -> float:
+        """Return the learning rate when this much of training is done: a linear rise times a cosine down."""
+        cosine = (1 + math.cos(math.pi * min(fraction, 1.0))) / 2
+        fall = TUNING.final_rate + (1 - TUNING.final_rate) * cosine
+        rise = min(1.0, (fraction + 1e-3) / TUNING.warm_up)
+        return (self.config.learning_rate or DEFAULTS.learning_rate) * rise * fall
+
     def _momentum_stage(self, progress: TrainingProgress) -> None:
         """Take the momentum steps, which need no ODE solve, and keep them where validation says so.
 
         An interruption here starts the stage again on resumption.
         """
-        model, problem, steps = self.model, self.problem, self.config.momentum_steps
-        optimizer = problem.optimizer(torch.Generator().manual_seed(self.request.seed))
+        model, call, steps = self.model, self.call_steps, self.config.momentum_steps
+        optimizer = self._new_optimizer(torch.Generator().manual_seed(self.request.seed))
 
         def loss(windows: Windows) -> torch.Tensor:
-            return momentum_loss(model, windows, problem.scales) + problem.penalty()
+            return momentum_loss(model, windows, self.scales) + self.penalty()
 
-        for done in range(0, steps, problem.call_steps):
+        for done in range(0, steps, call):
             spent = self.clock.fraction(self.clock.seconds) / TUNING.momentum_fraction
             if spent >= 1.0:
                 break
 
             def rate(step: int, done: int = done, spent: float = spent) -> float:
-                return TUNING.momentum_factor * problem.learning_rate(max((done + step) / steps, spent))
+                return TUNING.momentum_factor * self.learning_rate(max((done + step) / steps, spent))
 
-            value = optimizer.run(loss, problem.training, min(problem.call_steps, steps - done), rate)
+            value = optimizer.run(loss, self.training, min(call, steps - done), rate)
             if optimizer.stalled or not math.isfinite(value):
                 break
-            progress.momentum(min(done + problem.call_steps, steps), steps, value)
+            progress.momentum(min(done + call, steps), steps, value)
         end = measure(model, self.validation)
         if end.loss < self.best_loss:
             self._keep(end)

@@ -102,11 +102,11 @@ class RolloutObjective(WindowObjective):
         """Return one of the weights that do not rest."""
         for name, parameter in self.model.named_parameters():
             parameter.requires_grad_(name not in self.resting)
-        return self.problem.optimizer(self.generator)
+        return self._new_optimizer(self.generator)
 
     def _rollout_loss(self, windows: Windows) -> torch.Tensor:
-        scales, solver = self.problem.scales, self.config.solver
-        return rollout_loss(self.model, windows, scales, self.substeps, solver) + self.problem.penalty()
+        scales, solver = self.scales, self.config.solver
+        return rollout_loss(self.model, windows, scales, self.substeps, solver) + self.penalty()
 
     def _end(self) -> Status | None:
         if self.epoch >= self.config.epochs or self.optimizer.stalled:
@@ -152,29 +152,29 @@ class RolloutObjective(WindowObjective):
     def _train_epoch(self) -> float:
         """Return the mean loss over the epoch's steps; NaN as soon as a step has no finite loss or gradient."""
         steps, start = self._steps_in_time(), self.clock.seconds
-        loss = self.optimizer.run(self._rollout_loss, self.problem.training, steps, self._rate)
+        loss = self.optimizer.run(self._rollout_loss, self.training, steps, self._rate)
         self._step_seconds = (self.clock.seconds - start) / steps
         self.step += steps
         return loss
 
     def _steps_in_time(self) -> int:
         """Return the steps of the next epoch: all, or as many as the remaining time allows at the pace so far."""
-        steps = self.problem.epoch_steps
+        steps = self.epoch_steps
         if math.isinf(self.clock.allowed):
             return steps
         if not self._step_seconds:
-            return min(steps, self.problem.call_steps)
+            return min(steps, self.call_steps)
         remaining = self.clock.allowed - self.clock.seconds - self._validation_seconds
         return max(1, min(steps, int(remaining / self._step_seconds)))
 
     def _rate(self, ahead: int = 0) -> float:
         """Return the learning rate so many steps ahead, over all steps or minutes, whichever end sooner."""
         fraction = (self._done(ahead) - self.stage_from) / (self._stage_end - self.stage_from)
-        return self.learning_rate_factor * self.problem.learning_rate(fraction)
+        return self.learning_rate_factor * self.learning_rate(fraction)
 
     def _done(self, ahead: int = 0) -> float:
         """Return the fraction of all steps or minutes that is gone so many steps ahead."""
-        steps = self.config.epochs * self.problem.epoch_steps
+        steps = self.config.epochs * self.epoch_steps
         return max((self.step + ahead) / steps, self.clock.fraction(self.seconds))
 
     @property

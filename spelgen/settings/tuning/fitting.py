@@ -34,7 +34,7 @@ class ValidationTuning:
 
 @dataclass(frozen=True)
 class WindowTuning:
-    """Steps on windows (`fitting.window.problem`, `fitting.window.objective`)."""
+    """Steps on windows (`fitting.window.objective`)."""
 
     epoch_steps: int = 20  # at least; few windows are passed over several times between validations
     warm_up: float = 0.02  # [1] of all steps, over which the learning rate rises
