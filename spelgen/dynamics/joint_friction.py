@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+
+from spelgen.settings.joint import JointSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,3 +47,26 @@ class Friction:
     @cached_property
     def _even(self) -> np.ndarray:
         return np.asarray(0.5 * (self.forward + self.backward))
+
+
+def joint_friction(
+    joints: Iterable[Any],
+    drives: Mapping[str, JointSettings],
+    smoothing_velocity: float,
+    speeds: np.ndarray | None,
+) -> Friction:
+    """Return the friction of joints: that of a joint's drive where this is known, else its URDF's <dynamics>.
+
+    joints: of a URDF, or an arm's coordinates.
+    """
+    losses = []
+    for joint in joints:
+        if joint.name in drives:
+            drive = drives[joint.name]
+            losses.append((drive.viscous, *drive.coulomb))
+        else:
+            losses.append((joint.damping, joint.friction, -joint.friction))
+    if speeds is not None and np.array_equal(speeds, np.eye(len(speeds))):
+        speeds = None
+    viscous, forward, backward = np.array(losses).T
+    return Friction(viscous, forward, backward, smoothing_velocity, speeds)

@@ -54,8 +54,7 @@ def _without_inertial(name: str) -> ArmError:
 def _armature(arm: Arm, settings: Settings, joint_name: str) -> float:
     if joint_name not in arm.joint_names:
         return 0.0  # a mimic joint has no motor of its own
-    joint = settings.joint(joint_name)
-    return joint.rotor_inertia * joint.gear**2
+    return settings.joint(joint_name).armature
 
 
 def _inertia(parameters: np.ndarray) -> pin.Inertia:

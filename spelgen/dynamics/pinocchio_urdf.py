@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from spelgen.arm.actuation import derive_actuation
 from spelgen.dynamics.constraint import mimic_constraint
-from spelgen.dynamics.joint_friction import Friction
+from spelgen.dynamics.joint_friction import joint_friction
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.settings.settings import load_settings
 from spelgen.urdf.document import urdf_bytes
@@ -35,20 +35,15 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
     missing = [name for name in constraint.names if not model.existJointName(name)]
     if missing:
         raise ValueError(f"Pinocchio sees no joint {', '.join(missing)}")
-    by_joint = settings.joints if drives else {}
-    damping = np.array([robot.joint[name].damping for name in joints])
-    coulomb = np.array([robot.joint[name].friction for name in joints])
-    forward, backward = coulomb, -coulomb
-    for k, name in enumerate(joints):
-        if name in by_joint:
-            damping[k], (forward[k], backward[k]) = by_joint[name].viscous, by_joint[name].coulomb
-            index = model.joints[model.getJointId(name)].idx_v
-            model.armature[index] = by_joint[name].rotor_inertia * by_joint[name].gear ** 2
-
     motors = derive_actuation(robot, settings, joints).drives()
-    # a file's own friction is the joints', that of drives the motors'
-    speeds = motors.speeds if drives else None
-    friction = Friction(damping, forward, backward, COULOMB_SMOOTHING_VELOCITY, speeds)
+    by_joint, speeds = {}, None  # a file's own friction is the joints', that of drives the motors'
+    if drives:
+        by_joint, speeds = settings.joints, motors.speeds
+    for name in joints:
+        if name in by_joint:
+            model.armature[model.joints[model.getJointId(name)].idx_v] = by_joint[name].armature
+    moving = [robot.joint[name] for name in joints]
+    friction = joint_friction(moving, by_joint, COULOMB_SMOOTHING_VELOCITY, speeds)
     return PinocchioDynamics(model, constraint, friction, motors.inputs)
 
 

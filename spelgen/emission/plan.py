@@ -134,7 +134,7 @@ def _joint(
         reach=float(f"{(high - low) / 2:.6g}"),
         speed=speed,
         friction=float(f"{_friction(coordinate, sizes, index):.3g}"),
-        armature=float(f"{drive.rotor_inertia * drive.gear**2 or _guessed_armature(coordinate):.3g}"),
+        armature=float(f"{drive.armature or _guessed_armature(coordinate):.3g}"),
         gear=drive.gear,
         mass_sensitivity=sizes.mass_sensitivities[index],
         potential_sensitivity=sizes.potential_sensitivities[index],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, Protocol
 
@@ -50,22 +50,16 @@ class FitRequest:
 
 @dataclass(frozen=True)
 class PreparedLogs:
-    """Hold what `Objective.prepare` tells of the logs, for config.json and for people.
+    """Hold what `Objective.prepare` tells of the logs.
 
-    config, preprocessing: with all that depends on the logs decided. digest: of every number.
-    training, validation: names of trajectories. training_windows, validation_windows: how many there are.
-    further: what else the record says of this objective.
+    config, preprocessing: with all that depends on the logs decided. record: what config.json says of the logs, see
+    `run_record.Record`. notes: for people.
     """
 
     config: FitConfig
     preprocessing: Preprocessing
-    digest: str
-    training: tuple[str, ...]
-    validation: tuple[str, ...]
-    training_windows: int
-    validation_windows: int
-    notes: tuple[Diagnostic, ...]
-    further: dict[str, object] = field(default_factory=dict)
+    record: Content
+    notes: Sequence[Diagnostic]
 
 
 @dataclass(frozen=True)
@@ -134,7 +128,11 @@ def record_of(request: FitRequest, prepared: PreparedLogs) -> Content:
     """Return what goes into config.json: options that were used, resolved, and nothing that does not apply."""
     model, facts = request.model, getattr(request.model, "facts", None)
     mapping = request.mapping or LogMapping(input=input_of(model))
-    fraction = request.validation if prepared.validation and isinstance(request.validation, float) else None
+    fraction = (
+        request.validation
+        if prepared.record["validation"] and isinstance(request.validation, float)
+        else None
+    )
     return {
         "schema": 2,
         "robot": facts.robot if facts else type(model).__name__,
@@ -145,12 +143,7 @@ def record_of(request: FitRequest, prepared: PreparedLogs) -> Content:
         "preprocessing": asdict(prepared.preprocessing),
         "validation_fraction": fraction,
         "seed": request.seed,
-        "data_digest": prepared.digest,
-        "training": list(prepared.training),
-        "validation": list(prepared.validation),
-        "training_windows": prepared.training_windows,
-        "validation_windows": prepared.validation_windows,
-        **prepared.further,
+        **prepared.record,
         "mapping": mapping.model_dump(exclude_defaults=True),
         "device": request.device,
         "threads": request.threads,

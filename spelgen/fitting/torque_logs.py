@@ -55,13 +55,15 @@ class TorqueLogObjective:
         return PreparedLogs(
             config=config,
             preprocessing=data.preprocessing,
-            digest=data.digest,
-            training=data.training_names,
-            validation=data.validation_names,
-            training_windows=data.size,
-            validation_windows=len(data.validation),
+            record={
+                "data_digest": data.digest,
+                "training": list(data.training_names),
+                "validation": list(data.validation_names),
+                "training_windows": data.size,
+                "validation_windows": len(data.validation),
+                "scales": {name: x.tolist() for name, x in data.scales._asdict().items()},
+            },
             notes=data.diagnostics,
-            further={"scales": {name: x.tolist() for name, x in data.scales._asdict().items()}},
         )
 
     def _regularizer(

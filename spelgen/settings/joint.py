@@ -13,7 +13,7 @@ from spelgen.settings.values import Group, Inputs, NonNegative, Number, Positive
 class JointSettings(Group):
     """Drive of one joint; N and m in place of Nm and rad when it is prismatic.
 
-    rotor_inertia: of the motor, before the gear [kg m^2]; the joint feels rotor_inertia * gear^2.
+    rotor_inertia: of the motor, before the gear [kg m^2].
     gear: motor turns per joint turn.
     viscous: friction torque per joint velocity, after the gear [Nm s/rad].
     coulomb: friction torque for qd > 0 and for qd < 0, after the gear [Nm], e.g. (0.395, -0.435).
@@ -31,6 +31,11 @@ class JointSettings(Group):
     kp: Positive | None = None
     gain: Literal["known", "trained"] = "known"
     inputs: Inputs | None = None
+
+    @property
+    def armature(self) -> float:
+        """Rotor inertia as the joint feels it [kg m^2]."""
+        return self.rotor_inertia * self.gear**2
 
     @field_validator("coulomb")
     @classmethod

@@ -68,12 +68,14 @@ class ServoObjective:
         return PreparedLogs(
             config=request.config,
             preprocessing=request.preprocessing,
-            digest=digest(self._logs),
-            training=tuple(log.name for log in self._logs),
-            validation=(),
-            training_windows=len(self._windows.q),
-            validation_windows=0,
-            notes=tuple(notes),
+            record={
+                "data_digest": digest(self._logs),
+                "training": [log.name for log in self._logs],
+                "validation": [],
+                "training_windows": len(self._windows.q),
+                "validation_windows": 0,
+            },
+            notes=notes,
         )
 
     def begin(self) -> list[Diagnostic]:
