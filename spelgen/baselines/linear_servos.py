@@ -18,5 +18,5 @@ class FittedServos(Baseline):
             message = "no linear servos to compare with: they are fitted by `train`"
             notes.append(Diagnostic("info", "no-linear-servos", "logs", None, message))
             return {}
-        servos = LinearServos.from_dict(fit.record["servo"]["linear"])
+        servos = LinearServos(**fit.record["servo"]["linear"])
         return {LINEAR_SERVOS: servos, DELAYED_COMMAND: DelayedCommand(servos.late)}

@@ -17,12 +17,12 @@ TUNING = ServoIntervalTuning()
 
 def by_stretch(windows: NormalEquations, stretches: torch.Tensor) -> NormalEquations:
     """Return the sums of windows' normal equations (W, ...) over the stretches that these are of, (W,)."""
-    count = int(stretches.max()) + 1
-    curvature = windows.curvature.new_zeros(count, *windows.curvature.shape[1:])
-    descent = windows.descent.new_zeros(count, *windows.descent.shape[1:])
-    return NormalEquations(
-        curvature.index_add(0, stretches, windows.curvature), descent.index_add(0, stretches, windows.descent)
-    )
+
+    def summed(terms: torch.Tensor) -> torch.Tensor:
+        sums = terms.new_zeros(int(stretches.max()) + 1, *terms.shape[1:])
+        return sums.index_add(0, stretches, terms)
+
+    return NormalEquations(*map(summed, windows))
 
 
 def covariance(windows: NormalEquations, precision: torch.Tensor, halved: torch.Tensor) -> torch.Tensor:

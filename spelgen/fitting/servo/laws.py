@@ -78,7 +78,7 @@ def divided(problem: ServoProblem, x: ServoParameters, fraction: float) -> Servo
     joints[row(DEAD_ZONE)] = fraction * dry / problem.model.kp.detach()
     # the parameter is a logarithm
     joints[row(COULOMB)] += torch.tensor(1 - fraction).log()
-    return replace(problem.rows.with_dead_zones(x), joints=joints)
+    return replace(x, joints=joints, active=torch.ones_like(x.active))
 
 
 def sliding_friction(friction: Any, qd: torch.Tensor, gravity: torch.Tensor) -> torch.Tensor:

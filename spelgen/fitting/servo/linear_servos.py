@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from scipy.linalg import expm
@@ -15,12 +14,8 @@ from spelgen.fitting.servo.windows import ServoWindows
 from spelgen.logs.commands import LogRows, delayed_commands
 
 LATEST = 0.4  # s, of delays
-START = (
-    np.log(20.0),
-    0.0,
-    0.02,
-    0.0,
-)  # logarithms of frequency [rad/s] and damping ratio; delay [s]; offset [rad, m]
+# logarithms of frequency [rad/s] and damping ratio; delay [s]; offset [rad, m]
+START = (np.log(20.0), 0.0, 0.02, 0.0)
 BOUNDS = ((-np.inf, -np.inf, 0.0, -np.inf), (np.inf, np.inf, LATEST, np.inf))
 
 
@@ -43,25 +38,12 @@ class LinearServos:
     late: the one delay [s] by which commands themselves are nearest to positions.
     """
 
-    frequency: tuple[float, ...]
-    damping: tuple[float, ...]
-    delay: tuple[float, ...]
-    offset: tuple[float, ...]
+    frequency: Sequence[float]
+    damping: Sequence[float]
+    delay: Sequence[float]
+    offset: Sequence[float]
     late: float
     about = "a linear second-order servo at each joint, fitted to windows of the training logs"
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the JSON form."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, record: Mapping[str, Any]) -> LinearServos:
-        """Read what `to_dict` gave."""
-        frequency, damping, delay, offset = (
-            tuple(np.atleast_1d(record[name]).tolist())
-            for name in ("frequency", "damping", "delay", "offset")
-        )
-        return cls(frequency, damping, delay, offset, float(record["late"]))
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return positions (K, n) after each interval of each part of a log, from q and qd (parts, n)."""
@@ -105,7 +87,7 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
         fits.append(least_squares(residuals, START, bounds=BOUNDS, x_scale="jac", max_nfev=30).x)
     columns = np.array(fits).T
     columns[:2] = np.exp(columns[:2])
-    frequency, damping, delay, offset = map(tuple, columns.tolist())
+    frequency, damping, delay, offset = columns.tolist()
     return LinearServos(frequency, damping, delay, offset, float(late))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
@@ -137,8 +137,8 @@ class ServoObjective:
         end, solved = solution(problem, x)
         problem.write(end)
         record = servo_record(problem, solved, end, self._steps)
-        linear = fit_linear_servos(self._windows.thinned(TUNING.sparse_windows)).to_dict()
-        self._results["servo"] = record | {"linear": linear}
+        linear = fit_linear_servos(self._windows.thinned(TUNING.sparse_windows))
+        self._results["servo"] = record | {"linear": asdict(linear)}
         self._take_checkpoint(float(np.sqrt(np.square(record["rms"]).mean())))
 
     @staticmethod

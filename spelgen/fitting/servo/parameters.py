@@ -112,11 +112,6 @@ class ParameterRows:
         others = torch.tensor([1.0] * len(x.bodies) + [TUNING.delay]).double()
         return torch.cat([joints.flatten(), others]) ** -2
 
-    def with_dead_zones(self, x: ServoParameters) -> ServoParameters:
-        """Return the parameters with dead zones fitted at every joint."""
-        active = torch.ones_like(x.active)
-        return replace(x, active=active)
-
 
 def body_parameters(model: EmittedModel) -> torch.nn.Parameter:
     """Return what the bodies' inertial parameters are made of, (B, 10)."""

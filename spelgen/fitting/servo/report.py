@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypedDict
 
@@ -77,7 +77,7 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     there; what the step changes is added to the covariance. Parameters stay at x where the step raises the cost.
     """
     # a dead zone that a joint does not have makes its dry friction no better known
-    free, errors = problem.rows.with_dead_zones(x), problem.residuals(x)
+    free, errors = replace(x, active=torch.ones_like(x.active)), problem.residuals(x)
     windows = problem.window_equations(free, errors)
     windows = by_stretch(windows, problem.windows.stretches(TUNING.stretches))
     precision = problem.rows.precision(free)
@@ -216,21 +216,13 @@ def servo_listing(record: ServoRecord) -> Listing:
 
 def open_text(record: ServoRecord) -> str:
     """Return what the logs leave open."""
-    _, undetermined = identifiability(record["joints"])
-    if not undetermined:
+    names = []
+    for joint in record["joints"]:
+        left = (ratio for ratio in UNITS if not joint[ratio]["determined"])
+        names += [f"{LABELS[ratio]} of {joint['joint']}" for ratio in left]
+    if not names:
         return "All ratios are determined"
-    return f"Not determined by these logs: {', '.join(undetermined)}"
-
-
-def identifiability(joints: Sequence[JointRecord]) -> tuple[list[str], list[str]]:
-    """Return the names of ratios that are determined, and of those that are not."""
-    determined: list[str] = []
-    undetermined: list[str] = []
-    for joint in joints:
-        for ratio in UNITS:
-            names = determined if joint[ratio]["determined"] else undetermined
-            names.append(f"{LABELS[ratio]} of {joint['joint']}")
-    return determined, undetermined
+    return f"Not determined by these logs: {', '.join(names)}"
 
 
 def _shown(interval: Interval | None) -> str:
