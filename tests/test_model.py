@@ -172,13 +172,13 @@ def test_energy_stays_without_input_and_dissipation(robot, tmp_path):
     with torch.no_grad():
         prepared, q, p = model.prepare(), at, model.momentum(at, qd)
         energies = [model.hamiltonian(q, p)]
+        without_memory = q.unsqueeze(-1)[..., :0]
+
+        def rhs(q, momentum, _):
+            return model.port_hamiltonian_rhs(q, momentum, None, prepared)
+
         for step in range(1250):
-
-            def rhs(moved, momentum, q=q):
-                return model.port_hamiltonian_rhs(q + moved, momentum, None, prepared)
-
-            moved, p, _ = runge_kutta(rhs, p, 1.6e-3)
-            q = q + moved
+            q, p, _, _ = runge_kutta(model, rhs, q, p, without_memory, 1.6e-3)
             if step % 50 == 49:
                 energies.append(model.hamiltonian(q, p))
     drift = torch.stack(energies) - energies[0]

@@ -29,10 +29,12 @@ from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.rollout import loss_scales, rollout_loss
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.train import train
+from spelgen.loaded_arm import load_arm
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows
 from spelgen.settings.fits import DEFAULTS, Rollout
 from spelgen.settings.tuning.comparison import ComparisonTuning
+from spelgen.structure.nominal import working_range
 from spelgen.tasks import RunTasks
 
 if TYPE_CHECKING:
@@ -88,8 +90,9 @@ def _measure(
     decimation, training, testing = study.decimation, study.read_logs("train"), study.read_logs("test")
     steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = thinned(testing, steps + 1, decimation)
-    low = torch.tensor(study.low, dtype=torch.float64)
-    high = torch.tensor(study.high, dtype=torch.float64)
+    # M is looked at where the arm may be
+    ranges = list(map(working_range, load_arm(study.source).arm.coordinates))
+    low, high = torch.tensor(ranges, dtype=torch.float64).T
     example = predict_example(of_dynamics(variant, model, far), testing, steps, decimation)
     along = []  # no test trajectory may be long enough
     if example is not None:

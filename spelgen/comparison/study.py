@@ -31,7 +31,6 @@ from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.fits import Rollout, fit_config
 from spelgen.settings.settings import Settings
 from spelgen.spec import read_facts
-from spelgen.structure.nominal import working_range
 from spelgen.trust import require_own_module
 
 SCHEMA = 5
@@ -80,7 +79,7 @@ class Study:
     source: the robot's own URDF. logs: train.parquet and test.parquet. kinematics.urdf: what the models are
     built from. modules and runs by variant and seed; each finished run holds result.json. training: None, as
     `spelgen train` does by itself. urdf_error: of the inertials that the models know (see `with_wrong_inertials`);
-    None: they know none. low, high: range of q [rad; m] in which M is looked at.
+    None: they know none.
     """
 
     folder: Path
@@ -92,8 +91,6 @@ class Study:
     validation_fraction: float
     variants: tuple[Variant, ...]
     urdf_error: float | None
-    low: tuple[float, ...]
-    high: tuple[float, ...]
 
     @property
     def window(self) -> int:
@@ -161,7 +158,6 @@ def prepare_study(
     settings = settings.model_copy(
         update={"seeds": seeds or settings.seeds, "steps": steps or settings.steps}
     )
-    ranges = list(map(working_range, loaded.arm.coordinates))
     training = None
     if urdf_error is None:
         training = _training(loaded.settings, settings)
@@ -176,8 +172,6 @@ def prepare_study(
         validation_fraction=loaded.settings.training.validation_fraction,
         variants=tuple(variants),
         urdf_error=urdf_error,
-        low=tuple(low for low, _ in ranges),
-        high=tuple(high for _, high in ranges),
     )
     description = _description(study, loaded)
     path = folder / "study.json"

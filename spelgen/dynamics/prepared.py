@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from spelgen.dynamics.pose import poses
-from spelgen.dynamics.protocol import known_past, memory_after, sliding_memory
+from spelgen.dynamics.protocol import known_past, sliding_memory
 from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.dynamics.runge_kutta import runge_kutta
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
@@ -176,12 +176,10 @@ class PreparedModel:
     def _stepped(
         self, accelerations: Callable[..., Tensor], start: State, tau: Tensor, dt: float, substeps: int
     ) -> State:
+        def rhs(q: Tensor, speed: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+            return speed, accelerations(q, speed, tau, z)
+
         q, qd, z = start
         for _ in range(substeps):
-
-            def rhs(moved: Tensor, speed: Tensor, q: Tensor = q, z: Tensor = z) -> tuple[Tensor, Tensor]:
-                return speed, accelerations(q + moved, speed, tau, memory_after(self._model, z, moved))
-
-            moved, qd, _ = runge_kutta(rhs, qd, dt / substeps)
-            q, z = q + moved, memory_after(self._model, z, moved)
+            q, qd, z, _ = runge_kutta(self._model, rhs, q, qd, z, dt / substeps)
         return State(q, qd, z)

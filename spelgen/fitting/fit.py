@@ -157,7 +157,7 @@ def _config(model: EmittedModel, logs: Logs, config: FitConfig | None) -> FitCon
 def sample_rates(logs: Logs) -> list[float]:
     """Return those of all logs [Hz] that are long enough for accelerations."""
     if isinstance(logs, LargeLogs):
-        return logs.rates
+        return logs.contents.rates
     return [log.sample_rate for log in logs if log.duration >= SHORTEST]
 
 

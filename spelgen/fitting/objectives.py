@@ -19,12 +19,8 @@ from spelgen.settings.fits import FitConfig, fit_config
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-OBJECTIVES: dict[str, type[Objective]] = {
-    TorqueObjective.name: TorqueObjective,
-    MomentumObjective.name: MomentumObjective,
-    RolloutObjective.name: RolloutObjective,
-    ServoObjective.name: ServoObjective,
-}
+ALL: tuple[type[Objective], ...] = (TorqueObjective, MomentumObjective, RolloutObjective, ServoObjective)
+OBJECTIVES = {objective.name: objective for objective in ALL}
 
 
 def fit_summary(record: ReadContent) -> FitSummary | None:

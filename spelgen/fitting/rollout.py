@@ -11,7 +11,6 @@ import torch
 
 from spelgen.dynamics.protocol import (
     known_past,
-    memory_after,
     memory_along,
     sliding_memory,
 )
@@ -50,11 +49,9 @@ def roll_out(
     z = sliding_memory(model, windows.qd[:, 0]) if windows.z is None else windows.z
     positions, velocities = [], []
     for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
-        step = dt.unsqueeze(-1) / substeps
+        rhs, step = partial(_rhs, model, tau, prepared), dt.unsqueeze(-1) / substeps
         for substep in range(substeps):
-            rhs = partial(_rhs, model, q, z, tau, prepared)
-            moved, p, qd = runge_kutta(rhs, p, step)
-            q, z = q + moved, memory_after(model, z, moved)
+            q, p, z, qd = runge_kutta(model, rhs, q, p, z, step)
             if substep == 0:
                 velocities.append(qd)  # of the sample that the interval starts at
         positions.append(q)
@@ -64,16 +61,14 @@ def roll_out(
 
 def _rhs(
     model: PortHamiltonian,
-    q: torch.Tensor,
-    z: torch.Tensor,
     tau: torch.Tensor,
     prepared: Any,
-    moved: torch.Tensor,
+    q: torch.Tensor,
     p: torch.Tensor,
+    z: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return q' and p' where joints have moved so far from q, where friction's memory was z."""
-    past = known_past(model, memory_after(model, z, moved))
-    return model.port_hamiltonian_rhs(q + moved, p, tau, prepared, *past)
+    """Return q' and p' under a held input, where friction's memory is z."""
+    return model.port_hamiltonian_rhs(q, p, tau, prepared, *known_past(model, z))
 
 
 def position_difference(

@@ -43,11 +43,6 @@ class LargeLogs:
         """What a pass over the files tells. Raises LogError, and SettingsError where the mapping does not fit."""
         return _read_once(self)
 
-    @property
-    def rates(self) -> list[float]:
-        """Sample rates [Hz]."""
-        return self.contents.rates
-
 
 @dataclass(frozen=True, eq=False)
 class LogContents:

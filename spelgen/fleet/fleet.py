@@ -105,17 +105,14 @@ def _job(fleet: Fleet, folder: Path, arm: PreparedArm, preset: str, seed: int, s
         seed=seed,
         split=split,
         folder=folder / "runs" / arm.name / f"{label}-seed{seed}-split{split}",
-        urdf=robot.urdf,
         train=training,
         test=testing,
         data=arm.key,
         mapping=arm.mapping,
-        joints=robot.joints,
-        tip=robot.tip,
         design=preset,
-        width=fleet.width,
-        depth=fleet.depth,
         training=fleet.training,
+        **robot.model_dump(include={"urdf", "joints", "tip"}),
+        **fleet.model_dump(include={"width", "depth"}),
     )
 
 
