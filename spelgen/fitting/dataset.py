@@ -138,8 +138,8 @@ def digest(trajectories: Iterable[Trajectory]) -> str:
     """Return a fingerprint of every number."""
     numbers = hashlib.sha256()
     for trajectory in trajectories:
-        for part in numbers_of(trajectory):
-            numbers.update(part)
+        for array in numbers_of(trajectory):
+            numbers.update(array)
     return numbers.hexdigest()
 
 

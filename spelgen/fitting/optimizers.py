@@ -20,7 +20,7 @@ TUNING = OptimizerTuning()
 
 Loss = Callable[[Windows], torch.Tensor]
 LearningRate = Callable[[int], float]
-Parts = Callable[[], Iterable[torch.Tensor]]  # summands of a loss, of which one at a time is in memory
+Summands = Callable[[], Iterable[torch.Tensor]]  # of a loss; one at a time is in memory
 
 
 class WindowOptimizer(Protocol):
@@ -127,17 +127,17 @@ class LBFGS:
         """See ``WindowOptimizer``; the loss where it ends, NaN where no evaluation was finite."""
         return self.minimise(lambda: [loss(windows)], steps)
 
-    def minimise(self, parts: Parts, steps: int) -> float:
-        """As ``run``, of a loss that is the sum of its parts."""
+    def minimise(self, summands: Summands, steps: int) -> float:
+        """As ``run``, of a loss that is the sum of its summands."""
         group = self._optimizer.param_groups[0]
         group["max_iter"], group["max_eval"] = steps, steps
         self._finite = False
-        self._optimizer.step(lambda: self._evaluated(parts))
+        self._optimizer.step(lambda: self._evaluated(summands))
         if not self._finite:
             return math.nan
         try:
             with torch.no_grad():
-                total = torch.stack(list(parts())).sum()
+                total = torch.stack(list(summands())).sum()
                 penalised = (total + self._penalty()).item()
         except torch.linalg.LinAlgError:
             return math.nan
@@ -153,15 +153,15 @@ class LBFGS:
         """Whether two calls in a row found next to nothing."""
         return self._waits > 1
 
-    def _evaluated(self, parts: Parts) -> torch.Tensor:
+    def _evaluated(self, summands: Summands) -> torch.Tensor:
         self._optimizer.zero_grad()
         try:
             value = torch.zeros((), dtype=torch.float64)
-            for number, part in enumerate(parts()):
+            for number, summand in enumerate(summands()):
                 if number == 0:
-                    part = part + self._penalty()
-                part.backward()
-                value = value + part.detach()
+                    summand = summand + self._penalty()
+                summand.backward()
+                value = value + summand.detach()
             slopes = torch.cat([x.grad.flatten() for x in self._parameters if x.grad is not None])
             if value.isfinite() and slopes.isfinite().all():
                 self._finite = True
@@ -188,13 +188,13 @@ class LBFGS:
         self._last, self._waits = state["reached"], state["waits"]
 
 
-def minimise(model: torch.nn.Module, parts: Parts, evaluations: int, weight_decay: float = 0.0) -> int:
-    """Move the model's weights down the sum of ``parts`` by ``LBFGS``; return how many evaluations that took.
+def minimise(model: torch.nn.Module, summands: Summands, evaluations: int, weight_decay: float = 0.0) -> int:
+    """Move the model's weights down the sum of ``summands`` by ``LBFGS``; return how many evaluations that took.
 
     It ends where that stalls, or after about so many evaluations.
     """
     optimizer, count = LBFGS(model, weight_decay), 0
     while count < evaluations and not optimizer.stalled:
-        optimizer.minimise(parts, TUNING.call)
+        optimizer.minimise(summands, TUNING.call)
         count += TUNING.call
     return count

@@ -129,8 +129,8 @@ def _read_once(logs: LargeLogs) -> LogContents:
         rates.append(trajectory.sample_rate)
         problems += findings(trajectory, logs.joints, logs.joint_types)
         clock_notes += clock_diagnostics(trajectory)
-        for part in numbers_of(trajectory):
-            numbers.update(part)
+        for array in numbers_of(trajectory):
+            numbers.update(array)
     summary = summarised(problems, logs.joints, len(chunks))
     collect(summary.errors)
     # the last samples of a recording may be a chunk of their own, too short to tell a rate
