@@ -212,6 +212,18 @@ def test_intervals_count_errors_that_are_alike_once():
     )  # a fiftieth of it, if samples were all new
 
 
+def test_intervals_leave_out_whole_motions(logs):
+    numbers = {}
+    for count in (1, 3, 4, 5):
+        windows = servo_windows(logs[:count], Preprocessing())
+        stretches = windows.stretches(4, 6).tolist()
+        numbers[count] = len(set(stretches))
+        by_log = {(log.name, stretch) for (log, _), stretch in zip(windows.parts, stretches, strict=True)}
+        assert len(by_log) == numbers[count]  # none is of two logs
+    # three logs are too few to tell how their motions differ: each is cut in two
+    assert numbers == {1: 5, 3: 6, 4: 4, 5: 5}
+
+
 def test_a_known_kp_stays(tmp_path, logs, monkeypatch):
     monkeypatch.setattr(objective, "TUNING", replace(objective.TUNING, steps=1))
     monkeypatch.setattr(objective, "ROUNDS", 1)

@@ -79,7 +79,7 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     # a dead zone that a joint does not have makes its dry friction no better known
     free, errors = replace(x, active=torch.ones_like(x.active)), problem.residuals(x)
     windows = problem.window_equations(free, errors)
-    windows = by_stretch(windows, problem.windows.stretches(TUNING.stretches))
+    windows = by_stretch(windows, problem.windows.stretches(TUNING.logs, TUNING.stretches))
     precision = problem.rows.precision(free)
     step = problem.with_prior(windows, x).step()
     # where the fit ends, the slopes of all windows and of the prior add up to nothing

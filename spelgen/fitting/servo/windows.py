@@ -65,12 +65,12 @@ class ServoWindows:
             self.parts[some], self.q[some], self.qd[some], self.dt[some], self.settling, -(-self.steps // 2)
         )
 
-    def stretches(self, count: int) -> torch.Tensor:
-        """Return the number (W,) of the stretch that each window is of: logs, cut into equal parts where there are
-        fewer than so many.
+    def stretches(self, logs: int, count: int) -> torch.Tensor:
+        """Return the number (W,) of the stretch that each window is of: logs, or where there are fewer than so many,
+        equal parts of them, at least ``count``.
         """
         sizes = Counter(log.name for log, _ in self.parts)
-        cuts = -(-count // len(sizes))
+        cuts = 1 if len(sizes) >= logs else -(-count // len(sizes))
         numbers: dict[tuple[str, int], int] = {}
         passed: Counter[str] = Counter()
         result = []
