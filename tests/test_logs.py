@@ -15,7 +15,7 @@ from spelgen.errors import Diagnostic, LogError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.checks import check, once
 from spelgen.logs.chunks import scan
-from spelgen.logs.filtering import low_pass, prepare, resample
+from spelgen.logs.filtering import low_pass, prepare, regular_times, resampled
 from spelgen.logs.rates import automatic_cutoff, automatic_decimation, shows_accelerations
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.trajectory import split_at_gaps
@@ -378,9 +378,9 @@ def test_a_trajectory_without_a_whole_window_is_refused():
 def test_logs_may_begin_at_any_time(rate, first):
     t = first + np.arange(41) / rate
     line = np.stack([t, 2 * t], axis=1)
-    resampled = resample(Trajectory(t, line, line, line), 100.0)
-    assert resampled.t[-1] > t[-1]  # by rounding
-    np.testing.assert_allclose(resampled.q[:, 1], 2 * resampled.t, atol=1e-12)
+    regular = regular_times(t, 100.0)
+    assert regular[-1] > t[-1]  # by rounding
+    np.testing.assert_allclose(resampled(t, line, regular, rate)[:, 1], 2 * regular, atol=1e-12)
 
 
 def test_the_filter_has_no_delay_and_takes_out_noise():

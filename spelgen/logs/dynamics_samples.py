@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from spelgen.dynamics.bristles import BristleReach, bristles_along, direction_along
-from spelgen.logs.filtering import low_pass, low_pass_regular, resample
+from spelgen.logs.filtering import interpolated, low_passed, regular_times, resampled
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
@@ -56,7 +56,7 @@ def dynamics_samples(
 ) -> list[DynamicsSamples]:
     """Return the moving samples of each dense enough trajectory.
 
-    At 100 Hz (logs from 24 Hz on are interpolated, see `resample`), through the zero-phase low-pass of
+    At 100 Hz (logs from 24 Hz on are interpolated, see `resampled`), through the zero-phase low-pass of
     ``preprocessing``, by default of 8 Hz, on q, qd and tau (before the change of rate where the log is denser, after
     it where not), qdd by central differences of the filtered qd, only samples with some |qd| > 0.02 rad/s; pieces
     between gaps separately, without what the filter makes up at both ends. ``pauses``: all samples from the first that
@@ -89,28 +89,29 @@ def _columns(
 ) -> list[np.ndarray]:
     """Return q, qd, qdd, tau, and z where a reach is given, of the selected samples of a piece."""
     cutoff = preprocessing.acceleration_cutoff
-    smooth = _at_common_rate(piece, cutoff)
-    qdd = np.gradient(smooth.qd, smooth.t, axis=0)
-    selected = is_moving(smooth.qd)
+    t = regular_times(piece.t, FREQUENCY)
+    q, qd, tau = (_as_sampled(piece, x, t, cutoff) for x in (piece.q, piece.qd, piece.tau))
+    qdd = np.gradient(qd, t, axis=0)
+    selected = is_moving(qd)
     if cutoff is not None:  # a filter that begins or ends within a motion makes up what it does not see
         unsettled = round(TUNING.unsettled * FREQUENCY / cutoff)
         selected[:unsettled] = selected[len(selected) - unsettled :] = False
     if pauses and selected.any():
         moving = np.flatnonzero(selected)
         selected[moving[0] : moving[-1]] = True
-    columns = [smooth.q, smooth.qd, qdd, smooth.tau]
+    columns = [q, qd, qdd, tau]
     if reach is not None and reach.elements:
-        z = bristles_along(smooth.q, reach)
-        # the torque's steps where joints turn around went through the filter, so must these
-        if cutoff is not None:
-            for joint in range(z.shape[1]):  # the filter copies what it gets several times
-                z[:, joint] = low_pass_regular(z[:, joint], FREQUENCY, cutoff)
-        columns.append(z)
-        direction = direction_along(smooth.qd, reach)
+        # the torque steps where joints turn around, at the log's own times, and then went through filter and change of
+        # rate: so must these, else a step is wrong by up to a sample's time, and passes for inertia
+        if cutoff is None:
+            path, speed = piece.q, piece.qd
+        else:
+            path, speed = interpolated(t, q, piece.t), interpolated(t, qd, piece.t)
+        z = np.moveaxis(bristles_along(path, reach), 2, 0)  # one element at a time: all are as many logs
+        columns.append(np.stack([_as_sampled(piece, x, t, cutoff) for x in z], axis=2))
+        direction = direction_along(speed, reach)
         if direction is not None:
-            if cutoff is not None:  # the filter gives a reversed view, which torch does not take
-                direction = low_pass_regular(direction, FREQUENCY, cutoff).copy()
-            columns.append(direction)
+            columns.append(_as_sampled(piece, direction, t, cutoff))
     return columns if selected.all() else [x[selected] for x in columns]
 
 
@@ -119,10 +120,12 @@ def is_moving(qd: np.ndarray) -> np.ndarray:
     return np.asarray((np.abs(qd) > TUNING.moving).any(axis=1))
 
 
-def _at_common_rate(piece: Trajectory, cutoff: float | None) -> Trajectory:
+def _as_sampled(piece: Trajectory, signals: np.ndarray, t: np.ndarray, cutoff: float | None) -> np.ndarray:
+    """Return signals at a piece's own times at these regular times, through the filter."""
+    rate = piece.sample_rate
     if cutoff is None:
-        return resample(piece, FREQUENCY)
+        return resampled(piece.t, signals, t, rate)
     # filtered at the higher of the two rates: what the lower one would fold back is gone by then
-    if piece.sample_rate > 1.5 * FREQUENCY:
-        return resample(low_pass(piece, cutoff), FREQUENCY)
-    return low_pass(resample(piece, FREQUENCY), cutoff)
+    if rate > 1.5 * FREQUENCY:
+        return resampled(piece.t, low_passed(piece.t, signals, cutoff), t, rate)
+    return low_passed(t, resampled(piece.t, signals, t, rate), cutoff)

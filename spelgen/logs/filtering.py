@@ -19,29 +19,39 @@ TUNING = LogTuning()
 def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:
     """Return one gap-free piece with q, qd and tau through a zero-phase Butterworth low-pass.
 
-    cutoff [Hz]. The filter needs a regular grid: the signals are interpolated (cubic) to the piece's mean
-    rate, filtered and interpolated back, so that the result stands at the log's own times. All three go
-    through the same filter, so that a linear system's filtered input still explains its filtered output.
-    Raises LogError where the piece is too slow for this cutoff.
+    cutoff [Hz]. All three go through the same filter, so that a linear system's filtered input still explains its
+    filtered output. Raises LogError where the piece is too slow for this cutoff.
     """
-    from scipy.interpolate import CubicSpline  # takes long to import, as in `low_pass_regular`
-
-    t = trajectory.t
-    mean_rate = (len(t) - 1) / (t[-1] - t[0])
+    mean_rate = _mean_rate(trajectory.t)
     if cutoff >= mean_rate / 2:
         got = f"a filter of {cutoff:g} Hz on samples at {mean_rate:.3g} Hz"
         raise trajectory.error(got, f"below {mean_rate / 2:.3g} Hz", "lower or drop the filter")
-    grid = np.linspace(t[0], t[-1], len(t))
-    filtered = []
-    for signals in (
-        trajectory.q,
-        trajectory.qd,
-        trajectory.tau,
-    ):  # one at a time: a spline is four times as large
-        on_grid = low_pass_regular(CubicSpline(t, signals)(grid), mean_rate, cutoff)
-        filtered.append(CubicSpline(grid, on_grid)(t))
-    q, qd, tau = filtered
+    signals = trajectory.q, trajectory.qd, trajectory.tau
+    q, qd, tau = (low_passed(trajectory.t, x, cutoff) for x in signals)
     return replace(trajectory, q=q, qd=qd, tau=tau)
+
+
+def low_passed(t: np.ndarray, signals: np.ndarray, cutoff: float) -> np.ndarray:
+    """Return signals (T, ...) at times t through that filter.
+
+    It needs a regular grid: they are interpolated (cubic) to the mean rate, filtered and interpolated back.
+    """
+    grid = np.linspace(t[0], t[-1], len(t))
+    return interpolated(grid, low_pass_regular(interpolated(t, signals, grid), _mean_rate(t), cutoff), t)
+
+
+def interpolated(t: np.ndarray, signals: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return signals (T, ...) at times t at other times, on a cubic; as they are where these are the same times."""
+    if len(t) == len(at) and np.abs(t - at).max() < 1e-6 / _mean_rate(t):
+        return signals
+    from scipy.interpolate import CubicSpline  # takes long to import, as in `low_pass_regular`
+
+    values: np.ndarray = CubicSpline(t, signals)(at)
+    return values
+
+
+def _mean_rate(t: np.ndarray) -> float:
+    return float((len(t) - 1) / (t[-1] - t[0]))
 
 
 def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndarray:
@@ -51,8 +61,8 @@ def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndar
 
     # three periods of the cutoff settle the ends
     padding = min(len(signals) - 1, int(3 * rate / cutoff))
-    filtered: np.ndarray = sosfiltfilt(_sections(rate, cutoff), signals, axis=0, padlen=padding)
-    return filtered
+    filtered = sosfiltfilt(_sections(rate, cutoff), signals, axis=0, padlen=padding)
+    return np.ascontiguousarray(filtered)  # the filter gives a reversed view, which torch does not take
 
 
 @lru_cache(maxsize=8)  # logs of a robot have few rates
@@ -64,18 +74,20 @@ def _sections(rate: float, cutoff: float) -> np.ndarray:
     return sections
 
 
-def resample(trajectory: Trajectory, frequency: float) -> Trajectory:
-    """Return one gap-free piece at a regular rate [Hz]: between dense samples on lines, between others on a cubic."""
+def regular_times(t: np.ndarray, frequency: float) -> np.ndarray:
+    """Return the times of a regular rate [Hz] within the times t."""
+    return np.arange(t[0], t[-1], 1.0 / frequency)
+
+
+def resampled(t: np.ndarray, signals: np.ndarray, at: np.ndarray, rate: float) -> np.ndarray:
+    """Return signals (T, ...) of that rate [Hz] at other times: between dense samples on lines, else on a cubic."""
     from scipy.interpolate import interp1d  # takes long to import, as in `low_pass_regular`
 
-    t = np.arange(trajectory.t[0], trajectory.t[-1], 1.0 / frequency)
     # a line between samples that are far apart would cut off the peaks of the motion
-    kind = "linear" if is_dense(trajectory.sample_rate) else "cubic"
-    signals = (trajectory.q, trajectory.qd, trajectory.tau)
+    kind = "linear" if is_dense(rate) else "cubic"
     # by rounding the last time may lie just behind the last sample
-    ends = "extrapolate"
-    q, qd, tau = (interp1d(trajectory.t, x, kind, axis=0, fill_value=ends)(t) for x in signals)
-    return replace(trajectory, t=t, q=q, qd=qd, tau=tau)
+    values: np.ndarray = interp1d(t, signals, kind, axis=0, fill_value="extrapolate")(at)
+    return values
 
 
 def prepare(
