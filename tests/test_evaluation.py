@@ -402,7 +402,7 @@ def test_steps_of_dry_friction_are_filtered_as_the_torque_is(robots):
         tau = model.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd))).numpy()
     samples = dynamics_samples([Trajectory(t, q, qd, tau)], reach=bristle_reach(model))
     error = torque_errors(model, samples).mean_nmse
-    assert error < 1e-4
+    assert error < 2e-6  # 8e-7; steps that are taken at 100 Hz, not at the times of the log, leave 5e-6
     unfiltered = [replace(x, direction=None) for x in samples]
     assert torque_errors(model, unfiltered).mean_nmse > 10 * error
 

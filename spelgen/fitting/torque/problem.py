@@ -144,6 +144,8 @@ class TorqueProblem:
 
     def around(self, state: State) -> tuple[ResidualSamples, RigidResponse]:
         """Return what bodies and laws miss after a fit, and how they would follow what else explained it."""
+        self.normal_equations(state.x, state.residuals)
+        self._find_covariance()  # under the noise of now: what followed too far would show a spring that is none
         response = self.jacobian.response(state.x, self.noise, self.covariance)
         return self.jacobian.residual_samples(state.x), response
 
@@ -169,14 +171,17 @@ class TorqueProblem:
             state = self._steps(state, TUNING.steps)
             previous = self.noise
             self.set_noise(state.residuals)
-            free = self.free
-            self.covariance[free[:, None] & free] = torch.linalg.inv(self.curvature).flatten()
+            self._find_covariance()
             if self.adapt != "load":
                 away = state.x - self.start
                 self.set_prior(most_probable(self.prior, self.guess, self.kinds, away, self.covariance))
             if number + 1 >= rounds and (self.noise > TUNING.noise_settled * previous).all():
                 break
         return state
+
+    def _find_covariance(self) -> None:
+        free = self.free
+        self.covariance[free[:, None] & free] = torch.linalg.inv(self.curvature).flatten()
 
     def _steps(self, state: State, most: int) -> State:
         """Take steps under the noise and prior of now."""

@@ -6,8 +6,7 @@ therefore compared as far as they cannot: a partial regression (Frisch and Waugh
 A function of one joint is fitted without each tenth of the samples in turn, and without a gap beside it, since errors
 of neighbours are alike. It can be selected where the tenths gain, beyond luck, and where the last half of the samples
 gains by it, too, after a fit of it and of those before it to the first half: one motion often repeats what another does
-not. The function that gains most comes first; a straight line of torque by position is one, as splines of a spring that
-bodies pass for lead astray where no other motion is. Networks of several joints are judged on the last half alone.
+not. The function that gains most comes first. Networks of several joints are judged on the last half alone.
 
 Functions are linear in their weights, which are found with their scale by maximising the marginal likelihood (MacKay,
 Neural Computation 4:415, 1992); networks are found by L-BFGS from a normal distribution of their weights.
@@ -40,20 +39,20 @@ WIDEST = 0.99 * LARGEST  # weights of friction's logarithm: beyond, the model's 
 @dataclass(frozen=True)
 class SelectedResidual:
     """A part that was selected. gain: the fraction by which the squares of the torque fell that was missed where it
-    acts, in held-out samples. straight: of functions, a straight line alone.
+    acts, in held-out samples.
     """
 
     name: str
     joint: int | None
     gain: float
-    straight: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
     """A function of one joint.
 
-    The model's parameter of that name has a row for it, in units of ``scale``: ``basis`` (W, P) times its weights (P,).
+    The model's parameter of that name has a row (W,) for it, in units of ``scale``. Weights are those of ``lines``,
+    (W, L), which are sums over the row, and then the row's own: P = L + W.
     features: (T, P); in a selection, of torques what bodies and laws cannot take over.
     force: (n,) how its torque acts on the joints.
     groups: (P,) which weights have a scale in common.
@@ -65,34 +64,26 @@ class _Candidate:
     scale: float
     features: torch.Tensor
     force: torch.Tensor
-    basis: torch.Tensor
+    lines: torch.Tensor
     groups: torch.Tensor
     friction: torch.Tensor | None
 
-    @property
-    def straight(self) -> bool:
-        """Return whether it is a straight line alone."""
-        return len(self.groups) == 1
-
-    def contains(self, other: _Candidate) -> bool:
-        """Return whether this can be all that another candidate can be."""
-        alike = (self.parameter, self.joint) == (other.parameter, other.joint)
-        return alike and (other.straight or not self.straight)
-
-    def row(self, functions: Any) -> torch.Tensor:
-        """Return the model's."""
+    def weights(self, functions: Any) -> torch.Tensor:
+        """Return weights (P,) that give the model's."""
         if self.friction is not None:
-            row: torch.Tensor = functions.friction_logarithms()[self.joint]
+            row = functions.friction_logarithms()[self.joint]
         else:
             row = functions.get_parameter(self.parameter)[self.joint] * self.scale
-        return row.detach()
+        return F.pad(row.detach(), (self.lines.shape[1], 0))
 
-    def write(self, functions: Any, row: torch.Tensor) -> None:
-        """Make it the model's."""
+    def write(self, functions: Any, weights: torch.Tensor) -> None:
+        """Make them the model's."""
+        count = self.lines.shape[1]
+        weights = self.lines @ weights[:count] + weights[count:]
         if self.friction is not None:
-            row = LARGEST * (row.clamp(-WIDEST, WIDEST) / LARGEST).atanh()
+            weights = LARGEST * (weights.clamp(-WIDEST, WIDEST) / LARGEST).atanh()
         with torch.no_grad():
-            functions.get_parameter(self.parameter)[self.joint] = row / self.scale
+            functions.get_parameter(self.parameter)[self.joint] = weights / self.scale
 
     def torque(self, weights: torch.Tensor, rows: slice = EVERY) -> torch.Tensor:
         """Return what they add to these samples (T,)."""
@@ -116,21 +107,18 @@ def select_residuals(
     first, last = _halves(len(samples.q), correlation)
     if first.stop < last.start - first.stop:  # the gap leaves next to nothing of so few samples
         return []
-    noise, selected = _noise(samples.missing), dict[tuple[str, int], SelectedResidual]()
+    noise, selected = _noise(samples.missing), []
     missing = missing_early = samples.missing  # the latter by the same parts, fitted to the first half
     candidates = list(_candidates(model, samples, rigid))
     while best := _best(candidates, missing, missing_early, noise, correlation):
         candidate, gain, torque_early = best
         weights = _fit_candidate(candidate, candidate.target(missing, noise), correlation)
-        candidate.write(model.residuals, candidate.row(model.residuals) + candidate.basis @ weights)
+        candidate.write(model.residuals, weights)
         missing = missing - candidate.torque(weights).unsqueeze(-1) * candidate.force
         missing_early = missing_early - torque_early.unsqueeze(-1) * candidate.force
-        candidates = [x for x in candidates if not candidate.contains(x)]
-        key = candidate.parameter, candidate.joint
-        if key in selected:  # a straight line, which splines contain
-            gain = 1 - (1 - gain) * (1 - selected[key].gain)
-        selected[key] = SelectedResidual(*key, gain, candidate.straight)
-    return [*selected.values(), *_select_networks(model, samples._replace(missing=missing), correlation)]
+        candidates.remove(candidate)
+        selected.append(SelectedResidual(candidate.parameter, candidate.joint, gain))
+    return [*selected, *_select_networks(model, samples._replace(missing=missing), correlation)]
 
 
 def refit_residuals(
@@ -145,15 +133,12 @@ def refit_residuals(
     To all that is missed where ``rigid`` is None, else as far as bodies and laws cannot follow.
     """
     noise, missing, functions = _noise(samples.missing), samples.missing, model.residuals
-    chosen = {(residual.name, residual.joint, residual.straight) for residual in selected}
+    chosen = {(residual.name, residual.joint) for residual in selected}
     for candidate in _candidates(model, samples, rigid, chosen):
-        row = candidate.row(functions)
-        present = (candidate.features @ torch.linalg.pinv(candidate.basis) @ row).unsqueeze(
-            -1
-        ) * candidate.force
+        present = (candidate.features @ candidate.weights(functions)).unsqueeze(-1) * candidate.force
         target = candidate.target(missing + present, noise)
         weights = _fit_candidate(candidate, target, correlation)
-        candidate.write(functions, candidate.basis @ weights)
+        candidate.write(functions, weights)
         changed = (candidate.features @ weights).unsqueeze(-1) * candidate.force
         missing = missing + present - changed
 
@@ -174,10 +159,7 @@ def _best(
     for candidate in candidates:
         target, target_early = candidate.target(missing, noise), candidate.target(missing_early, noise)
         gain = _held_out_gain(candidate, target, correlation)
-        if gain is None:
-            continue
-        # where splines gain, too, they explain a spring better than the straight line alone
-        if best is not None and gain <= best[1] and not candidate.contains(best[0]):
+        if gain is None or (best is not None and gain <= best[1]):
             continue
         torque_early = candidate.torque(_fit_candidate(candidate, target_early, correlation, first))
         if (target_early - torque_early)[last].square().sum() < target_early[last].square().sum():
@@ -189,7 +171,7 @@ def _candidates(
     model: Any,
     samples: ResidualSamples,
     rigid: RigidResponse | None,
-    chosen: Collection[tuple[str, int | None, bool]] | None = None,
+    chosen: Collection[tuple[str, int | None]] | None = None,
 ) -> Iterator[_Candidate]:
     """Yield what could be selected: smooth torques, friction that varies, and ripple.
 
@@ -200,36 +182,29 @@ def _candidates(
         splines, ripple = functions.splines(samples.q), functions.revolute * functions.waves(samples.q)
     joints, unit = torch.eye(len(motors)).to(motors), functions.unit.flatten()
     alike, pairs = torch.zeros(SPLINES), torch.arange(ripple.shape[-1] // 2).repeat(2)
+    # a straight line, and what is not straight: a spring is known where no motion has been
+    line = torch.linspace(-1, 1, SPLINES).double().unsqueeze(-1)
     varied = splines * samples.friction.unsqueeze(-1)
-    # a straight line by itself, too: it goes on as it is where splines lead astray, outside of what was seen
-    line, row = torch.linspace(-1, 1, SPLINES).double().unsqueeze(-1), torch.eye(SPLINES).double()
     kinds = (
-        ("raw_torque_splines", splines, unit, joints, line, alike[:1]),
-        (
-            "raw_torque_splines",
-            splines,
-            unit,
-            joints,
-            torch.cat([line, row], dim=1),
-            F.pad(alike + 1, (1, 0)),
-        ),
-        (FRICTION, varied, torch.ones(len(motors)), motors, row, alike),
-        ("raw_torque_ripple", ripple, unit, joints, torch.eye(len(pairs)).double(), pairs),
+        ("raw_torque_splines", splines, unit, joints, line, F.pad(alike + 1, (1, 0))),
+        (FRICTION, varied, torch.ones(len(motors)), motors, line[:, :0], alike),
+        ("raw_torque_ripple", ripple, unit, joints, torch.zeros(len(pairs), 0).double(), pairs),
     )
-    for parameter, features, scale, force, basis, groups in kinds:
+    for parameter, features, scale, force, lines, groups in kinds:
         for joint in range(len(motors)):
-            if chosen is not None and (parameter, joint, len(groups) == 1) not in chosen:
+            if chosen is not None and (parameter, joint) not in chosen:
                 continue
             columns = features[:, joint]
             if not columns.any() or scale[joint] <= 0:
                 continue
-            columns, friction = columns @ basis, None
+            columns = torch.cat([columns @ lines, columns], dim=1)
+            friction = None
             if parameter == FRICTION:
                 friction = samples.friction[:, joint]
             elif rigid is not None:
                 columns = rigid.remaining(joint, columns)
             yield _Candidate(
-                parameter, joint, float(scale[joint]), columns, force[joint], basis, groups, friction
+                parameter, joint, float(scale[joint]), columns, force[joint], lines, groups, friction
             )
 
 
