@@ -145,7 +145,7 @@ class TorqueProblem:
     def around(self, state: State) -> tuple[ResidualSamples, RigidResponse]:
         """Return what bodies and laws miss after a fit, and how they would follow what else explained it."""
         self.normal_equations(state.x, state.residuals)
-        self._find_covariance()  # under the noise of now: what followed too far would show a spring that is none
+        self._set_covariance()  # under the noise of now: what followed too far would show a spring that is none
         response = self.jacobian.response(state.x, self.noise, self.covariance)
         return self.jacobian.residual_samples(state.x), response
 
@@ -171,7 +171,7 @@ class TorqueProblem:
             state = self._steps(state, TUNING.steps)
             previous = self.noise
             self.set_noise(state.residuals)
-            self._find_covariance()
+            self._set_covariance()
             if self.adapt != "load":
                 away = state.x - self.start
                 self.set_prior(most_probable(self.prior, self.guess, self.kinds, away, self.covariance))
@@ -179,7 +179,8 @@ class TorqueProblem:
                 break
         return state
 
-    def _find_covariance(self) -> None:
+    def _set_covariance(self) -> None:
+        """Take the covariance from the curvature of the last normal equations."""
         free = self.free
         self.covariance[free[:, None] & free] = torch.linalg.inv(self.curvature).flatten()
 

@@ -150,7 +150,7 @@ def _best(
     noise: torch.Tensor,
     correlation: float,
 ) -> tuple[_Candidate, float, torch.Tensor] | None:
-    """Return the candidate that gains most where it was not seen; None where none gains.
+    """Return the candidate that gains most where it was not seen, the first of nearly equal ones; None: none gains.
 
     Beside it are its gain and its torque (T,) after a fit to the first half. missing_early: (T, n) after such fits.
     """
@@ -159,7 +159,8 @@ def _best(
     for candidate in candidates:
         target, target_early = candidate.target(missing, noise), candidate.target(missing_early, noise)
         gain = _held_out_gain(candidate, target, correlation)
-        if gain is None or (best is not None and gain <= best[1]):
+        # splines of a straight spring gain nearly what ripple does, and go on as the spring does
+        if gain is None or (best is not None and 1 - gain > TUNING.clearly_less * (1 - best[1])):
             continue
         torque_early = candidate.torque(_fit_candidate(candidate, target_early, correlation, first))
         if (target_early - torque_early)[last].square().sum() < target_early[last].square().sum():

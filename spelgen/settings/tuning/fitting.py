@@ -68,9 +68,10 @@ class TorqueTuning:
     """Fits of rigid bodies to torques (`fitting.torque`)."""
 
     decimation: int = 2  # samples at 100 Hz, filtered at 8 Hz: every second one says all that is to be said
-    # samples at 50 Hz: what is filtered at 8 Hz has 16 numbers a second to say. Estimates from what a fit misses drive
-    # themselves up: a joint that is missed counts less, and is missed more (Panda: torque nMSE 0.0015 -> 0.0030)
-    correlation_length: float = 3.125
+    # samples, 0.1 s: so many in a row err alike and count once. White noise has 3 after the filter, by which short real
+    # logs lose (UR10e, 3 s: nMSE 0.0097 -> 0.0130). Estimates from what a fit misses drive themselves up: a joint that
+    # is missed counts less, and is missed more (Panda: 0.0015 -> 0.0030)
+    correlation_length: float = 5.0
     rounds: int = 5  # after the first ones, of finding noise and prior anew
     # twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773, 1995)
     memory_evidence: float = 6.0
@@ -127,6 +128,9 @@ class ResidualTuning:
         2.82  # of a block's mean gain: 1 % of luck, by Student's t of nine degrees of freedom
     )
     least_gain: float = 1e-3  # [1] of the squares that are missed: what explains less is not worth a function
+    clearly_less: float = (
+        0.9  # [1] of what the best function so far leaves: a later one has to leave less than that
+    )
     rounds: int = 30  # of the marginal likelihood's fixed point, at most
     converged: float = 1e-3  # [1] relative change of the noise
     network_samples: int = 2**12  # that networks are fitted to
