@@ -2,6 +2,7 @@
 
 import functools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from typer.testing import CliRunner
 import spelgen
 from spelgen.cli.main import app
 from spelgen.errors import RunError
+from spelgen.fitting.dataset import digest
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.run_folder import RunFolder
@@ -81,6 +83,8 @@ def test_it_goes_on_with_what_it_was_started_with(start, whole, tmp_path):
     spelgen.write_logs(tmp_path / "train.parquet", servo_logs(2, 1.0, seed=1), ("shoulder", "elbow"))
     with pytest.raises(RunError, match="other logs than the run was started with"):
         train("", [tmp_path / "train.parquet"], whole, options=RunOptions(resume=True))
+    others = [replace(log, u=log.u + 0.01) for log in servo_logs(2, 1.0)]
+    assert digest(others) != digest(servo_logs(2, 1.0))
     checkpoint, run = RunFolder(whole).load_checkpoint(), RunFolder(tmp_path / "run")
     run.start((whole / "module.py").read_text(), start / "servo_arm.urdf", force=False)
     run.config.write_bytes((whole / "config.json").read_bytes())

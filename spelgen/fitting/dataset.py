@@ -145,5 +145,6 @@ def digest(trajectories: Iterable[Trajectory]) -> str:
 
 def numbers_of(trajectory: Trajectory) -> Iterator[memoryview]:
     """Yield what is digested of a trajectory."""
-    for array in (trajectory.t, trajectory.q, trajectory.qd, trajectory.tau):
-        yield np.ascontiguousarray(array).data
+    for array in (trajectory.t, trajectory.q, trajectory.qd, trajectory.tau, trajectory.u):
+        if array is not None:
+            yield np.ascontiguousarray(array).data
