@@ -277,6 +277,15 @@ def test_samples_leave_out_what_a_filter_makes_up_at_both_ends(cutoff):
     assert np.abs(sample.qdd + sample.q).max() < 0.1
 
 
+@pytest.mark.parametrize(("rate", "least"), [(50.0, "50"), (400.0, "200")])
+def test_a_filter_beyond_the_samples_is_refused(rate, least):
+    t = np.arange(0.0, 5.0, 1 / rate)
+    swing = np.sin(t)[:, None]
+    log = Trajectory(t, swing, np.cos(t)[:, None], -swing, "swing")
+    with pytest.raises(LogError, match=f"expected below {least} Hz"):
+        dynamics_samples([log], preprocessing=Preprocessing(cutoff=200.0))
+
+
 def test_panda_gives_the_published_figure(shared):
     arm = load_arm(shared / "arms" / "panda_erd.urdf").arm
     (whole,) = read(shared / "logs" / "panda", ["exciting_traj1"], arm)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from spelgen.dynamics.bristles import BristleReach, bristles_along, direction_along
-from spelgen.logs.filtering import interpolated, low_passed, regular_times, resampled
+from spelgen.logs.filtering import interpolated, low_passed, regular_times, require_cutoff, resampled
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
@@ -89,6 +89,8 @@ def _columns(
 ) -> list[np.ndarray]:
     """Return q, qd, qdd, tau, and z where a reach is given, of the selected samples of a piece."""
     cutoff = preprocessing.acceleration_cutoff
+    if cutoff is not None:
+        require_cutoff(piece, piece.sample_rate if _is_denser(piece) else FREQUENCY, cutoff)
     t = regular_times(piece.t, FREQUENCY)
     q, qd, tau = (_as_sampled(piece, x, t, cutoff) for x in (piece.q, piece.qd, piece.tau))
     qdd = np.gradient(qd, t, axis=0)
@@ -120,12 +122,16 @@ def is_moving(qd: np.ndarray) -> np.ndarray:
     return np.asarray((np.abs(qd) > TUNING.moving).any(axis=1))
 
 
+def _is_denser(piece: Trajectory) -> bool:
+    return piece.sample_rate > 1.5 * FREQUENCY
+
+
 def _as_sampled(piece: Trajectory, signals: np.ndarray, t: np.ndarray, cutoff: float | None) -> np.ndarray:
     """Return signals at a piece's own times at these regular times, through the filter."""
     rate = piece.sample_rate
     if cutoff is None:
         return resampled(piece.t, signals, t, rate)
     # filtered at the higher of the two rates: what the lower one would fold back is gone by then
-    if rate > 1.5 * FREQUENCY:
+    if _is_denser(piece):
         return resampled(piece.t, low_passed(piece.t, signals, cutoff), t, rate)
     return low_passed(t, resampled(piece.t, signals, t, rate), cutoff)

@@ -22,13 +22,17 @@ def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:
     cutoff [Hz]. All three go through the same filter, so that a linear system's filtered input still explains its
     filtered output. Raises LogError where the piece is too slow for this cutoff.
     """
-    mean_rate = _mean_rate(trajectory.t)
-    if cutoff >= mean_rate / 2:
-        got = f"a filter of {cutoff:g} Hz on samples at {mean_rate:.3g} Hz"
-        raise trajectory.error(got, f"below {mean_rate / 2:.3g} Hz", "lower or drop the filter")
+    require_cutoff(trajectory, _mean_rate(trajectory.t), cutoff)
     signals = trajectory.q, trajectory.qd, trajectory.tau
     q, qd, tau = (low_passed(trajectory.t, x, cutoff) for x in signals)
     return replace(trajectory, q=q, qd=qd, tau=tau)
+
+
+def require_cutoff(trajectory: Trajectory, rate: float, cutoff: float) -> None:
+    """Raise LogError where samples at this rate [Hz] are too few for a filter of that cutoff [Hz]."""
+    if cutoff >= rate / 2:
+        got = f"a filter of {cutoff:g} Hz on samples at {rate:.3g} Hz"
+        raise trajectory.error(got, f"below {rate / 2:.3g} Hz", "lower or drop the filter")
 
 
 def low_passed(t: np.ndarray, signals: np.ndarray, cutoff: float) -> np.ndarray:
