@@ -182,7 +182,7 @@ def find_wrong_torques(problem: DriveProblem, joints: Sequence[str]) -> WrongTor
 
 
 def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
-    """Return the coupling between two joints' motors that explains torques best, and what it leaves of the error.
+    """Return the coupling between two neighbours' motors that explains torques best, and what it leaves of the error.
 
     None: none is sure. Joints that known couplings join are left alone.
     """
@@ -190,6 +190,8 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     coarse = problem.in_one_block(TUNING.coarse)
     candidates: list[Coupling] = []
     for joint, moved_by in permutations(problem.free, 2):
+        if abs(joint - moved_by) > 1:
+            continue  # shafts and belts run along the arm; farther pairs explain springs
         for ratio in TUNING.ratios:
             candidates.append(Coupling(joint, moved_by, ratio, "joints"))
             candidates.append(Coupling(joint, moved_by, ratio, "motors"))
@@ -199,7 +201,9 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     best = _with_best_ratio(nearest, problem.in_one_block(1).cost)
     logged = problem.errors[:, best.pair].mean(axis=1)
     coupled = problem.coupled(best).errors[:, best.pair].mean(axis=1)
-    if not _is_sure(logged, coupled, TUNING.coupling_gain, len(candidates)):
+    # torques that are hardly explained in some block may be anything
+    explained = coupled.max() < TUNING.coupling_gain
+    if not (explained and _is_sure(logged, coupled, TUNING.coupling_gain, len(candidates))):
         return None
     return best, float(coupled.mean() / logged.mean())
 
@@ -221,8 +225,9 @@ def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: in
     """Whether errors by block (B,) fell to this part of what they were, and not as the luckiest of some candidates."""
     if mended.mean() >= gain * logged.mean():
         return False
-    ratios = np.log(logged / mended)  # by factors: a block that is hard to tell counts as any other
-    standard_error = ratios.std(ddof=1) / np.sqrt(len(ratios))
+    # between -1 and 1: neither a block that is hard to tell nor one that all but vanishes counts more than others
+    gains = (logged - mended) / (logged + mended)
+    standard_error = gains.std(ddof=1) / np.sqrt(len(gains))
     # of hundreds of couplings one is always better by chance (Bonferroni's bound)
-    needed = -float(stdtrit(len(ratios) - 1, TUNING.chance / candidates))
-    return bool(ratios.mean() > needed * standard_error)
+    needed = -float(stdtrit(len(gains) - 1, TUNING.chance / candidates))
+    return bool(gains.mean() > needed * standard_error)

@@ -37,9 +37,9 @@ class DriveHintTuning:
 
     blocks: int = 10  # of time, each judged by what the others say
     coarse: int = 4  # one of so many samples chooses among candidates
-    coupling_gain: float = (
-        0.5  # of the squared error, what a coupling leaves at most; the TX40's wrist leaves 0.05
-    )
+    # of the squared error, and in each block of the torque's squares, what a coupling leaves at most; the TX40's wrist
+    # leaves 0.05 and 0.03
+    coupling_gain: float = 0.5
     wrong_gain: float = (
         0.25  # likewise of a swapped or negated torque; recorded arms lose a factor of 4 by either
     )
