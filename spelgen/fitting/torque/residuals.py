@@ -263,13 +263,15 @@ def _significant_gain(squares: torch.Tensor, missed: torch.Tensor) -> float | No
     """Return the fraction by which sums of squares of blocks fell; None where luck could do that, or it is next to
     nothing.
     """
-    # by the logarithm, else a block of large torques would make all others luck; one next to nothing counts as nothing
-    negligible = TUNING.least_gain * squares.mean()
-    gains = ((squares + negligible) / (missed + negligible)).log()
+    # between -1 and 1: neither a block of large torques, nor one where joints go farther than in all others, makes all
+    # others luck; one next to nothing counts as nothing
+    negligible = 2 * TUNING.least_gain * squares.mean()
+    gains = (squares - missed) / (squares + missed + negligible)
     error = gains.std() / len(gains) ** 0.5
     if not gains.isfinite().all() or gains.mean() <= TUNING.standard_errors * error:
         return None
-    fraction = 1 - float(missed.sum() / squares.sum())
+    mean = float(gains.mean())
+    fraction = 2 * mean / (1 + mean)  # as if all blocks gained alike
     return fraction if fraction > TUNING.least_gain else None
 
 
