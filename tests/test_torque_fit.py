@@ -30,7 +30,7 @@ from spelgen.fitting.torque.problem import TorqueProblem
 from spelgen.fitting.torque.report import terms_in_use, torque_notes
 from spelgen.fitting.torque.residuals import FRICTION, select_residuals
 from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.fitting.torque.weights import RIGID, RigidWeights
+from spelgen.fitting.torque.weights import NONE, RIGID, RigidWeights
 from spelgen.fitting.train import train
 from spelgen.loaded_arm import load_arm
 from spelgen.logs import chunks
@@ -123,6 +123,14 @@ def test_the_prior_shares_what_joints_share():
     assert found[2, 4] == 9.0  # another effect
     assert found[0, 2] == 0.0
     assert torch.linalg.eigvalsh(found)[0] > 0
+
+
+def test_the_prior_shares_each_element_of_bristles():
+    """Of three elements at two joints: what an element has at one joint it has at the other, and no other element."""
+    prior = GaussianPrior(fractions=0.5, shared_fractions=2.0)
+    found = covariance(prior, {"fractions": torch.zeros(2, 3)}, {"fractions": "fractions"})
+    expected = 0.25 * torch.eye(6) + 4.0 * torch.eye(3).repeat(2, 2)
+    torch.testing.assert_close(found, expected.double())
 
 
 def test_the_prior_knows_every_weight(emitted):
@@ -246,6 +254,20 @@ def test_a_torque_that_falls_with_velocity_by_little_is_no_compensation(emitted)
     falling = 0.03 * plain.tau.std(axis=0) / plain.qd.std(axis=0) * plain.qd
     log = replace(plain, tau=plain.tau - falling)
     assert not fit_torque(module.Model(), [log]).compensated.any()
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_friction_has_the_effects_that_samples_show(emitted, shown):
+    """Stribeck effect, saturation and dependence on load: all of them, or none at all."""
+    module = emitted["six_dof"][0]
+    true, found = drawn(module, seed=2, deviation=0.3), module.Model()
+    effects = ("raw_stribeck", "raw_saturation", "raw_load_dependence")
+    for name in effects:
+        getattr(true.friction, name).data += 1.0 if shown else NONE
+    fit_torque(found, [recorded(true, 20.0, 0.02)])
+    sizes = torch.stack([getattr(found.friction, name).detach().exp() for name in effects])
+    assert (sizes > 0.1).any(dim=0).all() if shown else (sizes < 1e-12).all()
+    assert nmse(found, recorded(true, 10.0, 0.0, seed=9)) < 1e-3
 
 
 def test_compensation_belongs_to_the_input(emitted):

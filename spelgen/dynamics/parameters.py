@@ -11,8 +11,9 @@ from torch import nn
 class ParameterInfo:
     """A parameter by what it stands for, whichever part of a model holds it.
 
-    kind: bodies, armature, gains, offset, friction_compensation, sizes, velocities, load_dependence, fractions (of
-    bristles), torque_splines, torque_ripple, friction_splines, mass_constants, mass_residuals, stiffness, damping,
+    kind: bodies, armature, gains, offset, friction_compensation, sizes (of friction), effects (sizes of what varies it
+    with velocity), velocities, load_dependence, fractions (of bristles), torque_splines, torque_ripple,
+    friction_splines, mass_constants, mass_residuals, stiffness, damping,
     dead_zone, delay, or network. unit: of the quantity that the parameter makes, of revolute and of prismatic joints;
     most parameters are logarithms of it, relative to a nominal value.
     """

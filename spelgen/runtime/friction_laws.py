@@ -53,10 +53,10 @@ class FrictionLaws(nn.Module):
     # weight, kind, unit, and the constant that a zero stands for, by usual friction and velocity
     kinds: tuple[tuple[str, str, str, float], ...] = (
         ("raw_viscous", "sizes", "Nm s/rad, N s/m", 1.0),
-        ("raw_saturation", "sizes", "Nm, N", 1.0),
+        ("raw_saturation", "effects", "Nm, N", 1.0),
         ("raw_saturation_velocity", "velocities", "rad/s, m/s", 0.2),
         ("raw_coulomb", "sizes", "Nm, N", 1.0),
-        ("raw_stribeck", "sizes", "Nm, N", 0.3),
+        ("raw_stribeck", "effects", "Nm, N", 0.3),
         ("raw_stribeck_velocity", "velocities", "rad/s, m/s", 0.03),
         ("raw_load_dependence", "load_dependence", "1", 0.03),
         ("raw_bristle_fractions", "fractions", "1", 1.0),

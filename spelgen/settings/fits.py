@@ -35,8 +35,8 @@ class GaussianPrior(Group):
 
     The weights are logarithms or fractions and so have no unit. bodies: of log-Cholesky parameters, 0.1 is 10 % in
     mass and in the size along each axis. offset: in usual sizes of friction. armature, sizes and velocities of
-    friction: of each joint by itself; shared_*: of all joints together, of one effect (`shared_sizes`) or of all
-    friction (`shared_friction`).
+    friction, fractions of its bristles: of each joint by itself; shared_*: of all joints together, of one effect
+    (`shared_sizes`), of one element of bristles (`shared_fractions`) or of all friction (`shared_friction`).
     friction_compensation: of a drive, in usual sizes of friction at usual speed, where logs show one.
     bodies, armature and offset are first guesses, which count as `degrees_of_freedom` weights: how far those turn out
     to be from where they start is found by the fit (see `most_probable`).
@@ -52,6 +52,7 @@ class GaussianPrior(Group):
     shared_armature: NonNegative = 3.0
     shared_sizes: NonNegative = 1.0
     shared_velocities: NonNegative = 1.0
+    shared_fractions: NonNegative = 3.0
     shared_friction: NonNegative = 3.0
     friction_compensation: Positive = 1000.0
     degrees_of_freedom: Positive = 4.0

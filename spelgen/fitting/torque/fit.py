@@ -69,6 +69,8 @@ def fit_torque(
     state = problem.solve_from_start()
     if select_memory:
         state = problem.select_memory(state)
+    if adapt is None:
+        state = problem.select_effects(state)
     residuals: list[SelectedResidual] = []
     if adapt is None and has_residuals(model):
         state, residuals = _with_residuals(problem, state, samples.thinned(TUNING.residual_samples))
@@ -110,9 +112,9 @@ def _with_residuals(
     model = problem.jacobian.model
     if samples is not problem.jacobian.samples:
         state = problem.refine(state, samples)
-    correlation = problem.correlation
+    lasting = problem.lasting
     problem.jacobian.rigid.write(state.x)
-    residuals = select_residuals(model, *problem.around(state), correlation)
+    residuals = select_residuals(model, *problem.around(state), lasting)
     if not residuals:
         return state, residuals
     follow = True
@@ -123,5 +125,5 @@ def _with_residuals(
         missing, rigid = problem.around(state)
         # masses are positive: bodies that do not follow as their slopes promise would drive functions ever further
         follow = follow and bool(problem.noise.log().sum() <= missed)
-        refit_residuals(model, missing, rigid if follow else None, residuals, correlation)
+        refit_residuals(model, missing, rigid if follow else None, residuals, lasting)
     return problem.set_samples(state, TorqueJacobian(model, samples)), residuals

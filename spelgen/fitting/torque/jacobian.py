@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 TUNING = TorqueTuning()
-LOGARITHMS = ("armature", "sizes", "load_dependence")
+LOGARITHMS = ("armature", "sizes", "effects", "load_dependence")
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,12 @@ Kinds = Mapping[str, str]
 """Of weights by name: what they stand for, as `dynamics.parameters.ParameterInfo` has it."""
 
 ADAPTED = ("armature", "bodies", "offset")  # kinds whose deviations the fit finds
-SHARED = {"armature": "shared_armature", "sizes": "shared_sizes", "velocities": "shared_velocities"}
+SHARED = {
+    "armature": "shared_armature",
+    "sizes": "shared_sizes",
+    "velocities": "shared_velocities",
+    "fractions": "shared_fractions",
+}
 """The options that say how far all joints may be off together, by the option of one joint's own deviation."""
 
 
@@ -33,8 +38,10 @@ def covariance(prior: GaussianPrior, weights: Mapping[str, torch.Tensor], kinds:
     for name, row in rows.items():
         own = prior_field(kinds[name])
         if own in SHARED:
-            matrix[row[:, None], row] += getattr(prior, SHARED[own]) ** 2
-        if kinds[name] == "sizes":
+            # of fractions, each element of the bristles by itself
+            for of_joints in row.view(len(weights[name]), -1).mT:
+                matrix[of_joints[:, None], of_joints] += getattr(prior, SHARED[own]) ** 2
+        if kinds[name] in ("sizes", "effects"):
             friction.append(row)
     if friction:
         together = torch.cat(friction)
@@ -85,4 +92,4 @@ def adapted_kinds(weights: Mapping[str, torch.Tensor], kinds: Kinds) -> torch.Te
 
 def prior_field(kind: str) -> str:
     """Return the option of `GaussianPrior` that is for a kind of weights."""
-    return "sizes" if kind == "load_dependence" else kind
+    return "sizes" if kind in ("effects", "load_dependence") else kind

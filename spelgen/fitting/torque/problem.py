@@ -23,10 +23,17 @@ from spelgen.fitting.levenberg_marquardt import NormalEquations, SolverState, le
 from spelgen.fitting.torque.jacobian import TUNING, ResidualSamples, RigidResponse, TorqueJacobian
 from spelgen.fitting.torque.prior import adapted_kinds, covariance, most_probable
 from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.fitting.torque.weights import NONE
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 State = SolverState[torch.Tensor]
 """Weights (K,); as residuals the sums of squares of the torque that they miss (n,)."""
+
+
+EFFECTS = ("effects", "load_dependence")
+"""Kinds of what varies friction, which not every joint has."""
+
+Found = tuple[torch.Tensor, torch.Tensor, GaussianPrior, torch.Tensor]
 
 
 class TorqueProblem:
@@ -48,6 +55,7 @@ class TorqueProblem:
     def _use(self, jacobian: TorqueJacobian) -> None:
         self.jacobian, self.count = jacobian, jacobian.samples.count
         self.correlation = max(1.0, TUNING.correlation_length / jacobian.samples.step)
+        self.lasting = max(1.0, TUNING.lasting_errors / jacobian.samples.step)
         deviation = jacobian.torque_deviation()
         self.range = torch.maximum(deviation, 1e-3 * deviation.max())
 
@@ -68,9 +76,14 @@ class TorqueProblem:
         rigid = self.jacobian.rigid
         self.precision = torch.linalg.inv(covariance(prior, rigid.start, rigid.kinds))
 
-    def set_noise(self, squares: torch.Tensor) -> None:
-        """Take for noise what is missed: sums of squares (n,). This is the one place of the noise model."""
-        rms = torch.maximum((squares / self.count).sqrt(), TUNING.least_noise * self.range)
+    def set_noise(self, squares: torch.Tensor, determined: torch.Tensor | float = 0.0) -> None:
+        """Take for noise what is missed: sums of squares (n,). This is the one place of the noise model.
+
+        determined: how many weights each torque determines, (n,), of which each takes an independent error.
+        """
+        errors = self.count / self.correlation
+        left = torch.as_tensor(1.0 - determined / errors).clamp(min=TUNING.least_left)
+        rms = torch.maximum((squares / self.count / left).sqrt(), TUNING.least_noise * self.range)
         self.noise = self.correlation**0.5 * rms
 
     def _set_least_squares_noise(self, x: torch.Tensor) -> None:
@@ -78,10 +91,7 @@ class TorqueProblem:
         self.noise = self.correlation**0.5 * self.range
         slopes = list(self.jacobian.slopes(x))
         for _ in range(TUNING.last_rounds):
-            squares, weights = self.jacobian.least_squares(slopes, self.noise, self.free)
-            # each weight takes an independent sample, of which one is left at least
-            independent = self.count / self.correlation
-            self.set_noise(squares * independent / (independent - weights).clamp(min=1.0))
+            self.set_noise(*self.jacobian.least_squares(slopes, self.noise, self.free))
 
     def _first_fit(self, x: torch.Tensor, steps: int) -> State:
         """Return the end of all steps from weights x (K,), under the noise of least squares.
@@ -128,19 +138,64 @@ class TorqueProblem:
         Bristles turn around after a displacement, and so late: where friction turns around at once, they pass for
         inertia. The gears of an arm are mostly alike: weak evidence of a joint yields to that of all.
         """
-        laws = self.jacobian.model.friction
-        fitted = self.noise, self.prior, self.covariance.clone()
+        laws, before = self.jacobian.model.friction, self._found()
         laws.memoryless.fill_(0.0)
         remembering = self.solve(self._first_fit(state.x, state.steps), TUNING.rounds)
-        evidence = self.count / self.correlation * (remembering.residuals / state.residuals).log()
-        laws.memoryless.copy_(evidence > -TUNING.memory_evidence * evidence.sum().sign())
+        evidence = self._evidence(remembering, state) - self._fractions_narrowed()
+        laws.memoryless.copy_(_unlikely(evidence))
         if laws.memoryless.all():
-            self.noise, prior, self.covariance = fitted
-            self.set_prior(prior)
+            self._restore(before)
             return state
         if laws.memoryless.any():
             return self.solve(self.set_samples(remembering, self.jacobian), TUNING.rounds)
         return remembering
+
+    def select_effects(self, state: State) -> State:
+        """Go on without Stribeck effect, saturation and dependence on load of joints whose samples show none of them.
+
+        They are positive, and so none is an error to one side, of all joints together.
+        """
+        rigid = self.jacobian.rigid
+        places = rigid.named(torch.arange(len(self.start)))
+        effects = torch.stack([places[name] for name in rigid.of_kind(*EFFECTS)], dim=-1)
+
+        def without(joints: torch.Tensor) -> State:
+            x, rows = state.x.clone(), effects[joints]
+            self.start = self.start.clone()
+            self.start[rows] = x[rows] = NONE
+            return self.solve(replace(state, x=x, residuals=self.jacobian.squares(x)), TUNING.rounds)
+
+        before = self._found()
+        plain = without(torch.ones(len(effects), dtype=torch.bool))
+        unlikely = _unlikely(self._evidence(state, plain) - TUNING.effects_evidence)
+        if unlikely.all():
+            return plain
+        self._restore(before)
+        return without(unlikely) if unlikely.any() else state
+
+    def _evidence(self, state: State, other: State) -> torch.Tensor:
+        """Return how much more likely the samples of each joint (n,) are after a fit: twice the logarithm."""
+        return self.count / self.lasting * (other.residuals / state.residuals).log()
+
+    def _found(self) -> Found:
+        """Return what rounds have found, to be restored."""
+        return self.start, self.noise, self.prior, self.covariance.clone()
+
+    def _restore(self, found: Found) -> None:
+        self.start, self.noise, prior, self.covariance = found
+        self.set_prior(prior)
+
+    def _fractions_narrowed(self) -> torch.Tensor:
+        """Return, of each joint (n,), by how much samples narrowed its bristles' fractions: logarithms of variances.
+
+        Freedom explains noise, too: evidence is what a fit explains, less what it was narrowed (MacKay, 1992).
+        """
+        rigid = self.jacobian.rigid
+        (fractions,) = rigid.of_kind("fractions")
+        places = rigid.named(torch.arange(len(self.start)))[fractions]
+        block = places.unsqueeze(-1), places.unsqueeze(-2)
+        before: torch.Tensor = torch.linalg.inv(self.precision)[block]
+        return before.logdet() - self.covariance[block].logdet()
 
     def around(self, state: State) -> tuple[ResidualSamples, RigidResponse]:
         """Return what bodies and laws miss after a fit, and how they would follow what else explained it."""
@@ -170,14 +225,19 @@ class TorqueProblem:
         for number in range(TUNING.longer * rounds):
             state = self._steps(state, TUNING.steps)
             previous = self.noise
-            self.set_noise(state.residuals)
             self._set_covariance()
+            self.set_noise(state.residuals, self._determined() / len(state.residuals))
             if self.adapt != "load":
                 away = state.x - self.start
                 self.set_prior(most_probable(self.prior, self.guess, self.kinds, away, self.covariance))
             if number + 1 >= rounds and (self.noise > TUNING.noise_settled * previous).all():
                 break
         return state
+
+    def _determined(self) -> float:
+        """Return how many weights all torques determine: those that move, less what is the prior's (MacKay, 1992)."""
+        free = self.free
+        return float(free.sum() - (self.covariance * self.precision)[free][:, free].sum())
 
     def _set_covariance(self) -> None:
         """Take the covariance from the curvature of the last normal equations."""
@@ -213,3 +273,8 @@ class TorqueProblem:
         change = torch.zeros_like(x).masked_scatter(self.free, step)
         yield x + change
         yield self.jacobian.moved(x, change)
+
+
+def _unlikely(evidence: torch.Tensor) -> torch.Tensor:
+    """Return the joints (n,) whose evidence says no; weak evidence of a joint yields to that of all."""
+    return evidence < -TUNING.strong_evidence * evidence.sum().sign()

@@ -16,12 +16,14 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 RIGID = (
-    "bodies", "friction_compensation", "gains", "armature", "offset", "sizes", "velocities", "load_dependence",
-    "fractions",
+    "bodies", "friction_compensation", "gains", "armature", "offset", "sizes", "effects", "velocities",
+    "load_dependence", "fractions",
 )  # fmt: skip
 """Kinds of parameters of bodies, drives and friction laws: all but what stands beside them."""
 MOVING = IdentificationTuning().moving
-DAILY = ("sizes", "velocities", "load_dependence", "fractions", "offset")  # kinds that change from day to day
+DAILY = ("sizes", "effects", "velocities", "load_dependence", "fractions", "offset")
+"""Kinds that change from day to day."""
+NONE = -30.0  # of a size that is none, the logarithm
 
 
 class RigidWeights:
@@ -97,7 +99,7 @@ def bound_friction(model: EmittedModel, samples: Block) -> None:
         change = largest.clamp(max=1.0)
         model.friction.nominal *= change
     weights = dict(rigid.start)
-    for name in rigid.of_kind("sizes"):
+    for name in rigid.of_kind("sizes", "effects"):
         weights[name] = weights[name].minimum(largest.log()) - change.log()
     for name in rigid.of_kind("offset", "friction_compensation"):
         weights[name] = weights[name] / change

@@ -59,6 +59,7 @@ DAY_TO_DAY = {
     "fractions": 0.1,
     "shared_sizes": 0.1,
     "shared_velocities": 0.1,
+    "shared_fractions": 0.1,
     "shared_friction": 0.3,
 }
 
@@ -68,13 +69,18 @@ class TorqueTuning:
     """Fits of rigid bodies to torques (`fitting.torque`)."""
 
     decimation: int = 2  # samples at 100 Hz, filtered at 8 Hz: every second one says all that is to be said
-    # samples, 0.1 s: so many in a row err alike and count once. White noise has 3 after the filter, by which short real
-    # logs lose (UR10e, 3 s: nMSE 0.0097 -> 0.0130). Estimates from what a fit misses drive themselves up: a joint that
-    # is missed counts less, and is missed more (Panda: 0.0015 -> 0.0030)
-    correlation_length: float = 5.0
+    # samples, 0.06 s: so many in a row err alike and count once, as white noise does after the filter. Of 5, M(q) of
+    # arms whose truth is known is 5 % worse, seconds of real logs do better (UR10e, 3 s: nMSE 0.0080 -> 0.0062).
+    # Estimates from what a fit misses drive themselves up: a joint that is missed counts less, and is missed more
+    # (Panda: 0.0015 -> 0.0030)
+    correlation_length: float = 3.1
+    lasting_errors: float = 5.0  # samples, 0.1 s: likewise where forms of friction and functions are judged
     rounds: int = 5  # after the first ones, of finding noise and prior anew
     # twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773, 1995)
-    memory_evidence: float = 6.0
+    strong_evidence: float = 6.0
+    # likewise, which Stribeck effect, saturation and dependence on load of a joint have to gain (2 for a parameter:
+    # Akaike, IEEE Trans. Autom. Control 19:716, 1974)
+    effects_evidence: float = 2.0
     first_steps: int = 60  # at most, before noise and prior are found
     first_rounds: int = 12  # at most, while noise falls to that of least squares
     first_noise: float = (
@@ -93,6 +99,7 @@ class TorqueTuning:
     least_noise: float = (
         1e-4  # [1] of it: noise-free samples are fitted to four digits of their torque's range
     )
+    least_left: float = 0.1  # [1] of independent errors, however many weights a torque determines
     compensation_explained: float = (
         0.1  # [1] of the missed squares, by a drive that adds torque with velocity
     )
@@ -123,7 +130,7 @@ class ResidualTuning:
     """Selection of what stands beside rigid bodies (`fitting.torque.residuals`)."""
 
     folds: int = 10  # blocks of samples that are held out in turn
-    gap: float = 5.0  # [1] of the samples that err alike, 0.5 s: left out between fitted and held-out samples
+    gap: float = 5.0  # [1] of the samples that err alike, 0.3 s: left out between fitted and held-out samples
     standard_errors: float = (
         2.82  # of a block's mean gain: 1 % of luck, by Student's t of nine degrees of freedom
     )
