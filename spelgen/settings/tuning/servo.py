@@ -91,7 +91,7 @@ class ServoLawTuning:
 class ServoIntervalTuning:
     """Decide what is reported as determined."""
 
-    logs: int = 4  # [1] at least, each left out whole: half of a motion says what its other half does
+    logs: int = 3  # [1] at least, each left out whole: half of a motion says what its other half does
     stretches: int = 6  # [1] into which fewer logs are cut, at least
     variance_inflation: float = (
         50.0  # [1] from which on two effects are one; measured on SO-101s: below 30, above 90
