@@ -49,6 +49,9 @@ SIMULATED = (
 )
 
 
+OWN_BRISTLES = {kind: shared for kind, shared in torque_prior.SHARED.items() if kind != "fractions"}
+
+
 @dataclass(frozen=True)
 class Mechanism:
     """One thing that fits do, and how it is switched off: attributes of modules, replaced for a while."""
@@ -77,6 +80,16 @@ def remember_always(problem: Any, state: Any) -> Any:
     return problem.solve(problem._first_fit(state.x, state.steps), torque_jacobian.TUNING.rounds)
 
 
+def keep_all(problem: Any, state: Any) -> Any:
+    """Stand in for `select_effects`: friction has all effects at every joint."""
+    return state
+
+
+def freedom_is_free(problem: Any) -> float:
+    """Stand in for `_fractions_narrowed`: memory is likely by what it explains alone."""
+    return 0.0
+
+
 def leave(model: Any, samples: Any) -> None:
     """Stand in for `bound_friction`: friction is guessed by efforts alone."""
 
@@ -90,14 +103,23 @@ def mechanisms() -> list[Mechanism]:
     """All that are switched off."""
     return [
         Mechanism("ends of recordings left out", tuned(dynamics_samples, unsettled=0.0)),
-        Mechanism("correlated errors (5 samples)", tuned(torque_jacobian, correlation_length=1.0)),
+        Mechanism("correlated errors (3 samples)", tuned(torque_jacobian, correlation_length=1.0)),
         Mechanism("steps under the noise of least squares", tuned(torque_jacobian, first_steps=0)),
         Mechanism("noise that falls with what is missed", tuned(torque_jacobian, first_rounds=0)),
         Mechanism("more rounds while noise falls", tuned(torque_jacobian, longer=1)),
         Mechanism("priors that yield", ((torque_problem, "most_probable", keep_prior),)),
         Mechanism("that of armatures", ((torque_prior, "ADAPTED", ("bodies", "offset")),)),
         Mechanism("memory by evidence", ((torque_problem.TorqueProblem, "select_memory", remember_always),)),
-        Mechanism("weak evidence yields to all joints'", tuned(torque_jacobian, memory_evidence=0.0)),
+        Mechanism(
+            "less what its freedom explains",
+            ((torque_problem.TorqueProblem, "_fractions_narrowed", freedom_is_free),),
+        ),
+        Mechanism("weak evidence yields to all joints'", tuned(torque_jacobian, strong_evidence=0.0)),
+        Mechanism(
+            "effects of friction by evidence", ((torque_problem.TorqueProblem, "select_effects", keep_all),)
+        ),
+        Mechanism("bristles that joints share", ((torque_prior, "SHARED", OWN_BRISTLES),)),
+        Mechanism("errors that weights take", tuned(torque_jacobian, least_left=1.0)),
         Mechanism("no more friction than torque", ((torque_fit, "bound_friction", leave),)),
         Mechanism("friction compensated unseen", tuned(torque_jacobian, compensation_explained=NEVER)),
         Mechanism("every second sample alone", tuned(torque_jacobian, decimation=1)),

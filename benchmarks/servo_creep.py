@@ -1,0 +1,83 @@
+"""How far joints creep that servos hold, as measured and as the fitted model replays the same commands.
+
+    python benchmarks/servo_creep.py ARM.urdf --train LOGS... --test LOGS... [--preset hybrid]
+
+A joint is held from two seconds after its command became constant, while others may move, if the measured one stays
+within a step of its encoder. It creeps by the farthest that it goes from there within a minute. The model is fitted to
+the training logs and replays all logs whole.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+import spelgen
+from spelgen.evaluation.replay import ServoModel
+from spelgen.logs.trajectory import split_at_gaps
+
+AT_REST, MINUTE = 2.0, 60.0  # s: after which a joint should rest, and for how long it is watched
+SHORTEST = 5.0  # s
+
+
+def holds(t: np.ndarray, command: np.ndarray) -> Iterator[slice]:
+    """Yield the rows in which a joint should rest under a constant command, a minute of them at most."""
+    changes = np.flatnonzero(np.diff(command)) + 1
+    for start, stop in zip([0, *changes], [*changes, len(t)], strict=True):
+        first, last = np.searchsorted(t, (t[start] + AT_REST, t[start] + AT_REST + MINUTE))
+        rows = slice(first, min(last, stop))
+        if rows.start < rows.stop and t[rows][-1] - t[rows][0] >= SHORTEST:
+            yield rows
+
+
+def creep(log: spelgen.Trajectory, q: np.ndarray, step: float) -> list[tuple[int, float, float]]:
+    """Return, of each hold, the joint and the farthest that the measured and the predicted one go [rad]."""
+    assert log.u is not None
+    found = []
+    for joint, command in enumerate(log.u.T):
+        for rows in holds(log.t, command):
+            measured, predicted = (np.abs(x[rows, joint] - x[rows.start, joint]).max() for x in (log.q, q))
+            if measured <= step:
+                found.append((joint, float(measured), float(predicted)))
+    return found
+
+
+def main() -> None:
+    """Fit the model, replay every log, and print creep by joint."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("urdf", type=Path)
+    parser.add_argument("--train", type=Path, nargs="+", required=True)
+    parser.add_argument("--test", type=Path, nargs="+", required=True)
+    parser.add_argument("--preset", default="hybrid")
+    parser.add_argument("--encoder-step", type=float, default=360 / 4096, help="degrees")
+    options = parser.parse_args()
+    arm = spelgen.load_arm(options.urdf)
+    training = spelgen.read_logs(sorted(options.train), arm)
+    tests = spelgen.read_logs(sorted(options.test), arm)
+    model = spelgen.fit(spelgen.build(arm, options.preset), training).model
+    pieces = [piece for log in [*training, *tests] for piece in split_at_gaps(log, shortest=3)]
+    starts = np.stack([piece.q[0] for piece in pieces])
+    parts = [(piece, slice(0, len(piece))) for piece in pieces]
+    replayed = ServoModel(model).positions(parts, starts, np.zeros_like(starts))
+    found, missed = [], []
+    for piece, after in zip(pieces, replayed, strict=True):
+        q = np.concatenate([piece.q[:1], after])
+        found += creep(piece, q, math.radians(options.encoder_step))
+        if any(piece.name == test.name for test in tests):
+            missed.append(np.sqrt(np.square(q - piece.q).mean()))
+    print(f"{'creep [mrad]':20}{'holds':>8}{'measured':>12}{'model':>12}")
+    for joint, name in enumerate(model.joint_names):
+        own = np.array([row[1:] for row in found if row[0] == joint]).reshape(-1, 2)
+        farthest = "".join(f"{1000 * x:12.2f}" for x in own.max(axis=0, initial=0.0))
+        print(f"{name:20}{len(own):8}{farthest}")
+    print(f"root mean square over the tests, whole logs: {1000 * np.mean(missed):.2f} mrad")
+
+
+if __name__ == "__main__":
+    main()
