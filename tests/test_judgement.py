@@ -88,6 +88,23 @@ def test_what_the_first_half_shows_has_to_hold_in_the_last(hybrid):
         assert len(found) == selected
 
 
+def test_the_first_half_is_judged_where_it_has_been(hybrid):
+    """Beyond, splines fitted to it are far off, which says nothing against them."""
+    t = torch.linspace(0, 100, 4000).double()
+    early, late = 1.0 + 0.7 * torch.sin(t[:2000]), -0.7 + 1.2 * torch.sin(t[2000:])
+    q = torch.stack([torch.cat([early, late]), torch.zeros_like(t)], dim=1)
+    torque = torch.stack([q[:, 0].square(), torch.zeros_like(t)], dim=1)
+    noise = 0.02 * torch.randn(4000, 2, generator=torch.Generator().manual_seed(0)).double()
+    missed = samples(torque + noise, q)
+    spline = next(residual_fit._candidates(hybrid, missed, ALONE))
+    first, last = residual_fit._halves(4000, 1.0)
+    weights = residual_fit._fit_candidate(spline, missed.missing[:, 0], 1.0, first)
+    error = missed.missing[last, 0] - spline.torque(weights, last)
+    assert error.square().sum() > missed.missing[last, 0].square().sum()
+    selected = select_residuals(hybrid, missed, ALONE, 1.0)
+    assert [(residual.name, residual.joint) for residual in selected] == [("raw_torque_splines", 0)]
+
+
 def test_a_gain_in_one_of_ten_stretches_is_luck(hybrid):
     t = torch.linspace(0, 200, 4000).double()
     q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)

@@ -6,7 +6,8 @@ therefore compared as far as they cannot: a partial regression (Frisch and Waugh
 A function of one joint is fitted without each tenth of the samples in turn, and without a gap beside it, since errors
 of neighbours are alike. It can be selected where the tenths gain, beyond luck, and where the last half of the samples
 gains by it, too, after a fit of it and of those before it to the first half: one motion often repeats what another does
-not. The function that gains most comes first. Networks of several joints are judged on the last half alone.
+not. Where none does, that is judged between the positions of the first half, for a spring may go on elsewhere. The
+function that gains most comes first. Networks of several joints are judged on the last half alone.
 
 Functions are linear in their weights, which are found with their scale by maximising the marginal likelihood (MacKay,
 Neural Computation 4:415, 1992); networks are found by L-BFGS from a normal distribution of their weights.
@@ -53,6 +54,7 @@ class _Candidate:
 
     The model's parameter of that name has a row (W,) for it, in units of ``scale``. Weights are those of ``lines``,
     (W, L), which are sums over the row, and then the row's own: P = L + W.
+    position: (T,) of the joint.
     features: (T, P); in a selection, of torques what bodies and laws cannot take over.
     force: (n,) how its torque acts on the joints.
     groups: (P,) which weights have a scale in common.
@@ -62,6 +64,7 @@ class _Candidate:
     parameter: str
     joint: int
     scale: float
+    position: torch.Tensor
     features: torch.Tensor
     force: torch.Tensor
     lines: torch.Tensor
@@ -143,29 +146,55 @@ def refit_residuals(
         missing = missing + present - changed
 
 
+class _Gaining(NamedTuple):
+    """A candidate that gains where it was not seen. torque_early: (T,) after a fit to the first half."""
+
+    candidate: _Candidate
+    gain: float
+    torque_early: torch.Tensor
+
+
 def _best(
     candidates: Sequence[_Candidate],
     missing: torch.Tensor,
     missing_early: torch.Tensor,
     noise: torch.Tensor,
     correlation: float,
-) -> tuple[_Candidate, float, torch.Tensor] | None:
+) -> _Gaining | None:
     """Return the candidate that gains most where it was not seen, the first of nearly equal ones; None: none gains.
 
-    Beside it are its gain and its torque (T,) after a fit to the first half. missing_early: (T, n) after such fits.
+    The last half must gain by it, too; if by none, then between the positions of the first half.
+    missing_early: (T, n) after fits to the first half.
     """
     first, last = _halves(len(missing), correlation)
-    best = None
+    best = best_between = None
     for candidate in candidates:
         target, target_early = candidate.target(missing, noise), candidate.target(missing_early, noise)
         gain = _held_out_gain(candidate, target, correlation)
-        # splines of a straight spring gain nearly what ripple does, and go on as the spring does
-        if gain is None or (best is not None and 1 - gain > TUNING.clearly_less * (1 - best[1])):
+        if gain is None:
             continue
         torque_early = candidate.torque(_fit_candidate(candidate, target_early, correlation, first))
-        if (target_early - torque_early)[last].square().sum() < target_early[last].square().sum():
-            best = candidate, gain, torque_early
-    return best
+        before, after = target_early[last].square(), (target_early - torque_early)[last].square()
+        # where the first half has not been it says little of a function
+        between = _between(candidate.position[last], candidate.position[first])
+        if after.sum() < before.sum():
+            best = _better(best, _Gaining(candidate, gain, torque_early))
+        elif after[between].sum() < before[between].sum():
+            best_between = _better(best_between, _Gaining(candidate, gain, torque_early))
+    return best or best_between
+
+
+def _better(first: _Gaining | None, other: _Gaining) -> _Gaining:
+    """Return the one of two that gains more, the first where they are nearly equal."""
+    # splines of a straight spring gain nearly what ripple does, and go on as the spring does
+    if first is None or 1 - other.gain <= TUNING.clearly_less * (1 - first.gain):
+        return other
+    return first
+
+
+def _between(position: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
+    """Return which positions lie between others."""
+    return (position >= others.min()) & (position <= others.max())
 
 
 def _candidates(
@@ -205,7 +234,15 @@ def _candidates(
             elif rigid is not None:
                 columns = rigid.remaining(joint, columns)
             yield _Candidate(
-                parameter, joint, float(scale[joint]), columns, force[joint], lines, groups, friction
+                parameter=parameter,
+                joint=joint,
+                scale=float(scale[joint]),
+                position=samples.q[:, joint],
+                features=columns,
+                force=force[joint],
+                lines=lines,
+                groups=groups,
+                friction=friction,
             )
 
 
