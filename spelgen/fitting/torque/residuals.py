@@ -6,8 +6,8 @@ therefore compared as far as they cannot: a partial regression (Frisch and Waugh
 A function of one joint is fitted without each tenth of the samples in turn, and without a gap beside it, since errors
 of neighbours are alike. It can be selected where the tenths gain, beyond luck, and where the last half of the samples
 gains by it, too, after a fit of it and of those before it to the first half: one motion often repeats what another does
-not. Where none does, that is judged between the positions of the first half, for a spring may go on elsewhere. The
-function that gains most comes first. Networks of several joints are judged on the last half alone.
+not. If none gains so, they are judged between the positions that they were fitted to, since a function is known nowhere
+else. The function that gains most comes first. Networks of several joints are judged on the last half alone.
 
 Functions are linear in their weights, which are found with their scale by maximising the marginal likelihood (MacKay,
 Neural Computation 4:415, 1992); networks are found by L-BFGS from a normal distribution of their weights.
@@ -163,24 +163,25 @@ def _best(
 ) -> _Gaining | None:
     """Return the candidate that gains most where it was not seen, the first of nearly equal ones; None: none gains.
 
-    The last half must gain by it, too; if by none, then between the positions of the first half.
     missing_early: (T, n) after fits to the first half.
     """
     first, last = _halves(len(missing), correlation)
     best = best_between = None
     for candidate in candidates:
         target, target_early = candidate.target(missing, noise), candidate.target(missing_early, noise)
-        gain = _held_out_gain(candidate, target, correlation)
-        if gain is None:
+        error, between = _held_out_errors(candidate, target, correlation)
+        gain = _significant_gain(_by_block(target), _by_block(error))
+        gain_between = _significant_gain(_by_block(target * between), _by_block(error * between))
+        if gain is None and gain_between is None:
             continue
         torque_early = candidate.torque(_fit_candidate(candidate, target_early, correlation, first))
         before, after = target_early[last].square(), (target_early - torque_early)[last].square()
-        # where the first half has not been it says little of a function
-        between = _between(candidate.position[last], candidate.position[first])
-        if after.sum() < before.sum():
+        if gain is not None and after.sum() < before.sum():
             best = _better(best, _Gaining(candidate, gain, torque_early))
-        elif after[between].sum() < before[between].sum():
-            best_between = _better(best_between, _Gaining(candidate, gain, torque_early))
+        between = _between(candidate.position[last], candidate.position[first])
+        if gain_between is not None and after[between].sum() < before[between].sum():
+            best_between = _better(best_between, _Gaining(candidate, gain_between, torque_early))
+    # beyond the positions that it was fitted to a spring may be far off, and what is not one usually is
     return best or best_between
 
 
@@ -275,25 +276,34 @@ def _halves(count: int, correlation: float) -> tuple[slice, slice]:
     return slice(0, max(0, middle - round(TUNING.gap * correlation))), slice(middle, count)
 
 
-def _blocks(rows: slice) -> list[slice]:
+def _blocks(count: int) -> list[slice]:
     """Return as many blocks of these samples as there are folds."""
-    edges = torch.linspace(rows.start, rows.stop, TUNING.folds + 1).long().tolist()
+    edges = torch.linspace(0, count, TUNING.folds + 1).long().tolist()
     return [slice(start, stop) for start, stop in pairwise(edges)]
 
 
-def _held_out_gain(candidate: _Candidate, target: torch.Tensor, correlation: float) -> float | None:
-    """Return the fraction of the target's squares that is explained where it was not seen; None: no more than luck
-    explains.
+def _held_out_errors(
+    candidate: _Candidate, target: torch.Tensor, correlation: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return what is missed (T,) of each block after a fit to the others, and which samples lie between positions of
+    these.
     """
     everything, gap = _Sums.of(candidate.features, target), round(TUNING.gap * correlation)
-    squares, missed = [], []
-    for block in _blocks(slice(0, len(target))):
+    errors, between, position = [], [], candidate.position
+    for block in _blocks(len(target)):
         near = slice(max(0, block.start - gap), block.stop + gap)
         fitted_to = everything.without(_Sums.of(candidate.features[near], target[near]))
         weights = _most_probable(fitted_to, candidate.groups, correlation)
-        squares.append(target[block].square().sum())
-        missed.append((target[block] - candidate.torque(weights, block)).square().sum())
-    return _significant_gain(torch.stack(squares), torch.stack(missed))
+        errors.append(target[block] - candidate.torque(weights, block))
+        others = torch.cat([position[: near.start], position[near.stop :]])
+        between.append(_between(position[block], others))
+    return torch.cat(errors), torch.cat(between)
+
+
+def _by_block(values: torch.Tensor) -> torch.Tensor:
+    """Return the sums of the values' squares (T, ...) over blocks of samples (folds,)."""
+    squares = [values[block].square().sum() for block in _blocks(len(values))]
+    return torch.stack(squares)
 
 
 def _significant_gain(squares: torch.Tensor, missed: torch.Tensor) -> float | None:
@@ -387,12 +397,9 @@ def _fit_network(
     for evaluations in (TUNING.network_first_look, TUNING.network_evaluations):
         fit(first, evaluations)
         error = samples.missing - _present_torque(model, samples) + present
-        squares, missed = [], []
-        for block in _blocks(last):
-            squares.append((samples.missing[block] / noise).square().sum())
-            missed.append((error[block] / noise).square().sum())
-        gain = _significant_gain(torch.stack(squares), torch.stack(missed))
-        if sum(missed) >= sum(squares):
+        squares, missed = _by_block((samples.missing / noise)[last]), _by_block((error / noise)[last])
+        gain = _significant_gain(squares, missed)
+        if missed.sum() >= squares.sum():
             break
     network.load_state_dict(start)
     if gain is not None:
