@@ -4,21 +4,25 @@
 
 Every case is drawn from its number alone: an arm (a real URDF or a random chain), the error of the given URDF,
 friction of one of six kinds, armature, offsets, springs, a motion, a sample rate, noise and a delay of the
-torques. Fitted to the same samples are the default preset, `hybrid`, and least squares without and with friction's
-memory. Results are appended to a file of JSON lines as they come, so that a run goes on where it stopped.
-`--panda` adds a simulated Panda with 40 s of logs at 200 Hz and 3 % noise.
+torques. Fitted to the same samples are the default preset, `hybrid`, least squares without and with friction's
+memory, and figaroh's weighted least squares where it is installed. Results are appended to a file of JSON lines as
+they come, so that a run goes on where it stopped. `--panda` adds a simulated Panda with 40 s of logs at 200 Hz and
+3 % noise.
 
 M error: mean over positions of |M - M*| / |M*| (Frobenius norm), and the largest relative error of a diagonal
-entry; g error: root mean square relative to that of g*; friction error: likewise, along the test motion, without
-offsets; torque nMSE on another motion without noise, raw and after a low-pass of 8 Hz.
+entry; g error: root mean square relative to that of g*; error of the base parameters: likewise, each by the torque
+that it makes along the test motion; friction error: likewise, without offsets; torque nMSE on another motion without
+noise, raw and after a low-pass of 8 Hz.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import multiprocessing
 import os
+import sys
 import tempfile
 import time
 import warnings
@@ -32,12 +36,18 @@ import torch
 from lxml import etree
 from scipy.signal import butter, sosfiltfilt
 
+sys.path.insert(0, str(Path(__file__).parent))
+
+from figaroh_identification import figaroh_dynamics
+
 import spelgen
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import memory_along
+from spelgen.dynamics.regressor import regressor
 from spelgen.errors import SpelgenError
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.objective import torque_delay
+from spelgen.identification.base_parameters import base_parameters
 from spelgen.logs.dynamics_samples import dynamics_samples
 
 FRICTIONS = ("none", "coulomb", "stribeck", "bristles", "load", "asymmetric")
@@ -92,10 +102,11 @@ class Truth:
         self.case = case
         self.bodies = spelgen.build(urdf, "closed-form")
         n = self.bodies.n
-        loaded = spelgen.load_arm(urdf).arm.coordinates
-        self.lower = np.array([_limit(x.lower, -2.0) for x in loaded])
-        self.upper = np.array([_limit(x.upper, 2.0) for x in loaded])
-        self.speed = np.array([min(x.velocity or 1.5, 3.0) for x in loaded])
+        self.arm = spelgen.load_arm(urdf).arm
+        coordinates = self.arm.coordinates
+        self.lower = np.array([_limit(x.lower, -2.0) for x in coordinates])
+        self.upper = np.array([_limit(x.upper, 2.0) for x in coordinates])
+        self.speed = np.array([min(x.velocity or 1.5, 3.0) for x in coordinates])
         middle = torch.from_numpy(rng.uniform(self.lower, self.upper, (200, n)))
         with torch.no_grad():
             self.nominal = self.bodies.armature.numpy()
@@ -136,6 +147,20 @@ class Truth:
             gravity = np.abs(self.gravity(q))
             dry = dry * (0.6 + 0.8 * gravity / (gravity.mean(axis=0) + TINY))
         return self.viscous * qd + dry * (1 + self.asymmetry * sign)
+
+    def base_error(self, fitted: Fitted, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> float:
+        """How far base parameters of bodies and armatures are off, by the torques that they make along a motion."""
+        base = base_parameters(self.arm, spelgen.FrictionModel())
+        count = 10 * len(self.arm.bodies) + len(self.armature)
+        columns = np.concatenate(
+            [regressor(self.arm, q, qd, qdd), qdd[:, None] * np.eye(len(self.armature))], axis=2
+        )
+        inertial = base.columns < count  # those of friction and offsets follow
+        size = np.sqrt(np.square(columns[:, :, base.columns[inertial]]).mean(axis=(0, 1)))
+        combination = size[:, None] * base.combination[inertial, :count]
+        truth = np.concatenate([self.bodies.inertial_parameters.detach().numpy().ravel(), self.armature])
+        error = np.concatenate([fitted.bodies.ravel(), fitted.armature]) - truth
+        return float(np.linalg.norm(combination @ error) / np.linalg.norm(combination @ truth))
 
     def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         """Joint torques along a motion (T, n) on the fine grid."""
@@ -296,24 +321,24 @@ def run_case(case: Case, folder: Path) -> dict[str, Any]:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 try:
-                    dynamics = fit(given, logs)
-                    results[name] = measure(dynamics, truth, test)
+                    results[name] = measure(fit(given, logs), truth, test)
                 except SpelgenError as error:
                     results[name] = {"error": str(error)}
             results[name]["seconds"] = round(time.process_time() - since, 2)
         return asdict(case) | {"n": truth.bodies.n, "results": results}
 
 
-def measure(dynamics: Any, truth: Truth, test: tuple[np.ndarray, ...]) -> dict[str, Any]:
+def measure(fitted: Fitted, truth: Truth, test: tuple[np.ndarray, ...]) -> dict[str, Any]:
     """How far fitted dynamics are from the truth."""
-    every = round(FINE / 100.0)
+    every, dynamics = round(FINE / 100.0), fitted.dynamics
     q, qd, qdd = (x[::every] for x in test)
     states = [torch.from_numpy(np.ascontiguousarray(x)) for x in (q, qd, qdd)]
     with torch.no_grad():
         mass = np.asarray(dynamics.mass_matrix(states[0][::10]))
         gravity = np.asarray(dynamics.gravity(states[0]))
-        z = memory_along(dynamics, states[0][None], states[1][None])[0]
-        past = (z,) if z.shape[-1] else ()
+        past: tuple[torch.Tensor, ...] = ()
+        if getattr(dynamics, "elements", 0):
+            past = (memory_along(dynamics, states[0][None], states[1][None])[0],)
         tau = np.asarray(dynamics.inverse_dynamics(*states, *past))
         friction = np.asarray(dynamics.friction_torque(*states[:2], *past))
     true_mass, true_gravity = truth.mass_matrix(q[::10]), truth.gravity(q)
@@ -328,6 +353,7 @@ def measure(dynamics: Any, truth: Truth, test: tuple[np.ndarray, ...]) -> dict[s
     return {
         "mass": float(norm.mean()),
         "diagonal": [round(float(x), 5) for x in diagonal],
+        "base": truth.base_error(fitted, q, qd, qdd),
         "gravity": float(np.sqrt(((gravity - true_gravity) ** 2).mean() / ((true_gravity**2).mean() + TINY))),
         "friction": float(np.sqrt((varying**2).mean() / (true_friction.var(0).mean() + TINY))),
         "nmse": float(nmse.mean()),
@@ -335,23 +361,46 @@ def measure(dynamics: Any, truth: Truth, test: tuple[np.ndarray, ...]) -> dict[s
     }
 
 
-def fit_hybrid(urdf: Path, logs: list[spelgen.Trajectory]) -> Any:
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """Hold fitted dynamics, and their constants: bodies (B, 10) about the joints' frames, armatures (n,)."""
+
+    dynamics: Any
+    bodies: np.ndarray
+    armature: np.ndarray
+
+
+def fit_hybrid(urdf: Path, logs: list[spelgen.Trajectory]) -> Fitted:
     """The default model, fitted to torques as `spelgen train` does, without its measurement of windows."""
     model = spelgen.build(urdf, "hybrid")
     late = torque_delay(model, logs, spelgen.Preprocessing())
     moved = spelgen.Preprocessing(torque_delay=late.delay)
     fit_torque(model, dynamics_samples(logs, preprocessing=moved, reach=bristle_reach(model)))
-    return model
+    with torch.no_grad():
+        return Fitted(model, model.inertial_parameters.numpy(), model.armature.numpy())
 
 
-def fit_least_squares(memory: bool) -> Callable[[Path, list[spelgen.Trajectory]], Any]:
+def fit_least_squares(memory: bool) -> Callable[[Path, list[spelgen.Trajectory]], Fitted]:
     """A function that identifies the arm by least squares."""
 
-    def fitted(urdf: Path, logs: list[spelgen.Trajectory]) -> Any:
+    def fit(urdf: Path, logs: list[spelgen.Trajectory]) -> Fitted:
         method = spelgen.LeastSquares(friction=spelgen.FrictionModel(memory=memory))
-        return spelgen.identify(urdf, logs, method).dynamics
+        result = spelgen.identify(urdf, logs, method)
+        bodies, armature, _ = np.split(
+            result.parameters, np.cumsum([10 * len(result.arm.bodies), len(result.arm.coordinates)])
+        )
+        return Fitted(result.dynamics, bodies, armature)
 
-    return fitted
+    return fit
+
+
+def fit_figaroh(urdf: Path, logs: list[spelgen.Trajectory]) -> Fitted:
+    """Identify the arm by figaroh, from samples moved by the delay that `identify` finds."""
+    loaded = spelgen.load_arm(urdf)
+    delay = spelgen.identify(loaded, logs).torque_delay.delay
+    samples = dynamics_samples(logs, preprocessing=spelgen.Preprocessing(torque_delay=delay))
+    dynamics = figaroh_dynamics(loaded.arm, loaded.settings, samples)
+    return Fitted(dynamics, dynamics.inertial_parameters, dynamics.armature)
 
 
 METHODS = {
@@ -359,6 +408,9 @@ METHODS = {
     "identify": fit_least_squares(memory=False),
     "identify --memory": fit_least_squares(memory=True),
 }
+OURS = tuple(METHODS)
+if importlib.util.find_spec("figaroh"):
+    METHODS["figaroh"] = fit_figaroh
 
 
 def usable_arms(folder: Path) -> list[str]:
@@ -375,18 +427,19 @@ def usable_arms(folder: Path) -> list[str]:
 def summary(rows: Sequence[dict[str, Any]]) -> str:
     """Medians by method, and how often the default is near the better least squares."""
     lines = [
-        f"{'':20}{'M':>10}{'g':>10}{'friction':>10}{'nMSE':>12}{'filtered':>12}{'worst Mjj':>11}{'s':>7}"
+        f"{'':20}{'M':>10}{'g':>10}{'base':>10}{'friction':>10}"
+        f"{'nMSE':>12}{'filtered':>12}{'worst Mjj':>11}{'s':>7}{'arms':>7}"
     ]
-    good = [row for row in rows if all("error" not in x for x in row["results"].values())]
+    good = [row for row in rows if not any("error" in row["results"][name] for name in OURS)]
     for name in METHODS:
-        each = [row["results"][name] for row in good]
-        columns = [np.median([x[key] for x in each]) for key in ("mass", "gravity", "friction")]
+        each = [row["results"][name] for row in good if "mass" in row["results"].get(name, {})]
+        columns = [np.median([x[key] for x in each]) for key in ("mass", "gravity", "base", "friction")]
         errors = [np.median([x[key] for x in each]) for key in ("nmse", "nmse_filtered")]
         worst = np.median([np.abs(x["diagonal"]).max() for x in each])
         seconds = np.median([x["seconds"] for x in each])
         lines.append(
             f"{name:20}" + "".join(f"{x:10.4f}" for x in columns) + "".join(f"{x:12.2e}" for x in errors)
-            + f"{worst:11.4f}{seconds:7.1f}"
+            + f"{worst:11.4f}{seconds:7.1f}{len(each):7}"
         )  # fmt: skip
     for key in ("mass", "nmse"):
         ratio = np.array([by_better_least_squares(row, key) for row in good])
@@ -408,7 +461,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> str:
 
 def by_better_least_squares(row: dict[str, Any], key: str) -> float:
     """Return an error of the default model, by that of the better of both least squares."""
-    errors = {name: x[key] for name, x in row["results"].items()}
+    errors = {name: row["results"][name][key] for name in OURS}
     return float(errors["hybrid"] / min(errors["identify"], errors["identify --memory"]))
 
 
