@@ -12,7 +12,7 @@ from torch import Tensor
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.pose import Pose
-from spelgen.dynamics.rigid_bodies import body_chain
+from spelgen.dynamics.regressor import body_chain
 from spelgen.runtime.bristles import moved_bristles
 from spelgen.runtime.port_hamiltonian import applied
 from spelgen.runtime.rigid_body import spatial_inertia

@@ -20,9 +20,9 @@ from scipy.special import stdtrit
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.body_regressor import chain_regressor
+from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.identification.drive_samples import DriveSamples
-from spelgen.identification.friction import FrictionModel
-from spelgen.identification.least_squares import block_products
+from spelgen.identification.least_squares import block_products, normal_solution
 from spelgen.runtime.body_chain import BodyChain
 from spelgen.settings.tuning.identification import DriveHintTuning, IdentificationTuning
 
@@ -128,13 +128,8 @@ class DriveProblem:
         fitted = products.sum(axis=0)
         if len(fitted) > 1:
             fitted = fitted.sum(axis=0) - fitted
-        # kilograms and kilogram square metres, in columns of one length: products square the spread
-        length = np.sqrt(np.diagonal(fitted, axis1=1, axis2=2))[..., None]
-        length = np.where(length > 0, length, 1.0)
-        fitted = fitted / (length * length.swapaxes(1, 2)) + NEGLIGIBLE * np.eye(length.shape[1])
-        left = np.full(length.shape, -1.0)
-        left[:, :-1] = np.linalg.solve(fitted[:, :-1, :-1], fitted[:, :-1, -1:])
-        left *= length[:, -1:] / length
+        solution = normal_solution(fitted, 1)
+        left = np.append(solution, np.full_like(solution[:, :1], -1.0), axis=1)
         errors = left.swapaxes(1, 2) @ products @ left
         # of torques that are explained exactly rounding is left
         return np.asarray(np.maximum(errors[..., 0, 0].T, NEGLIGIBLE))

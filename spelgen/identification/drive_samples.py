@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.bristles import reach_of
-from spelgen.identification.friction import FrictionModel
+from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.logs.dynamics_samples import FREQUENCY, TUNING, dynamics_samples, is_moving, long_pieces
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory

@@ -17,7 +17,7 @@ Columns = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """Hold the samples' normal equations by joint, as triangular factors (n, K + 1, K + 1) of [regressor, torque].
+    """Hold the normal equations of samples by joint: triangular factors (n, K + 1, K + 1) of [regressor, torque].
 
     count: samples. deviation: (n,) standard deviation of each joint's torque [Nm, N].
     """
@@ -34,22 +34,16 @@ class Triangles:
 
 def reduce(blocks: Iterable[Columns]) -> Triangles:
     """Return the triangles of all blocks, one in memory at a time."""
-    factors: list[np.ndarray] = []
+    factors: np.ndarray | None = None
     count, total, square = 0, 0.0, 0.0
     for regressor, torque in blocks:
-        joints = list(np.concatenate([regressor, torque[:, :, None]], axis=2).swapaxes(0, 1))
-        if factors:
-            joints = [np.concatenate(pair) for pair in zip(factors, joints, strict=True)]
-        factors = [np.asarray(np.linalg.qr(rows, mode="r")) for rows in joints]
+        rows = np.concatenate([regressor, torque[:, :, None]], axis=2).swapaxes(0, 1)
+        if factors is not None:
+            rows = np.concatenate([factors, rows], axis=1)
+        factors = np.linalg.qr(rows, mode="r")
         count, total, square = count + len(torque), total + torque.sum(0), square + np.square(torque).sum(0)
-    if not count:
-        raise ValueError("no samples")
-    width = factors[0].shape[1]
-    padded = np.zeros((len(factors), width, width))
-    for joint, factor in enumerate(factors):
-        padded[joint, : len(factor)] = factor
     deviation = np.sqrt(np.maximum(square / count - np.square(total / count), 0.0))
-    return Triangles(padded, count, deviation)
+    return Triangles(np.asarray(factors), count, deviation)
 
 
 def block_products(rows: np.ndarray, blocks: int) -> np.ndarray:
@@ -61,6 +55,16 @@ def block_products(rows: np.ndarray, blocks: int) -> np.ndarray:
     by_joint = by_joint.reshape(rows.shape[1], blocks, -1, rows.shape[2])
     products: np.ndarray = by_joint.swapaxes(2, 3) @ by_joint
     return products
+
+
+def normal_solution(products: np.ndarray, targets: int) -> np.ndarray:
+    """Return the parameters (..., K, D) of least squares by products (..., K + D, K + D), for the last D columns."""
+    # kilograms and kilogram square metres, in columns of one length: products square the spread
+    length = np.sqrt(np.diagonal(products, axis1=-2, axis2=-1))[..., :-targets, None]
+    length = np.where(length > 0, length, 1.0)
+    normal = products[..., :-targets, :-targets] / (length * length.swapaxes(-1, -2))
+    normal = normal + TUNING.negligible * np.eye(length.shape[-2])
+    return np.asarray(np.linalg.solve(normal, products[..., :-targets, -targets:] / length) / length)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,11 +13,11 @@ from scipy.special import stdtrit
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.body_regressor import chain_regressor
 from spelgen.dynamics.bristles import reach_of
+from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.errors import Diagnostic
 from spelgen.identification.drive_hints import Coupling, DriveProblem, drive_problem, find_coupling
 from spelgen.identification.drive_samples import SHIFTS, DriveLog, DriveSamples
-from spelgen.identification.friction import FrictionModel
-from spelgen.identification.least_squares import block_products
+from spelgen.identification.least_squares import block_products, normal_solution
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.runtime.body_chain import BodyChain
@@ -164,12 +164,8 @@ def _least(products: np.ndarray) -> tuple[float, np.ndarray]:
     Between shifts a torque is a cubic in the shift: filtered torques are smooth over one step.
     """
     moved = len(SHIFTS)
-    length = np.sqrt(np.diag(products))[:-moved]
-    length = np.where(length > 0, length, 1.0)
-    normal = products[:-moved, :-moved] / np.outer(length, length) + TUNING.negligible * np.eye(len(length))
-    crossed = products[:-moved, -moved:]
-    parameters = np.linalg.solve(normal, crossed / length[:, None]) / length[:, None]
-    left = products[-moved:, -moved:] - crossed.T @ parameters
+    parameters = normal_solution(products, moved)
+    left = products[-moved:, -moved:] - products[-moved:, :-moved] @ parameters
 
     def squares(delay: float) -> float:
         shape = _spline(delay)
