@@ -101,7 +101,7 @@ def _limit(text: str) -> tuple[str, float]:
 
 def report(
     runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN...", help="Run folders; several are compared on one page.")
+        list[Path], typer.Argument(metavar="RUN", help="Run folders; several are compared on one page.")
     ],
     output: Annotated[
         Path | None,

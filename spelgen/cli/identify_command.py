@@ -56,9 +56,7 @@ def identify(
     from spelgen.dynamics.linear_friction import FrictionModel
     from spelgen.identification.identification import LeastSquares
     from spelgen.identification.identify import identify as identify_arm
-    from spelgen.loaded_arm import load_arm
     from spelgen.log_checks.check_logs import require_sound_logs
-    from spelgen.logs.arm_mapping import log_source
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs
 
@@ -68,9 +66,9 @@ def identify(
         if name not in EFFECTS:
             raise typer.BadParameter(f"{name!r} is none of {', '.join(EFFECTS)}", param_hint="'--friction'")
     method = LeastSquares(weights, FrictionModel(**dict.fromkeys(effects, True)))
-    arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
+    arm = options.load(robot, joints, tip, angle_tolerance)
     # codes are accepted for this command alone; the sidecar holds those for always
-    log_mapping = options.accepting(log_source(arm, mapping).mapping, accept)
+    log_mapping = options.log_mapping(arm, mapping, accept)
     logs = read_logs(paths, arm, log_mapping, role="train")
     # least squares would fit wrong units without a word
     for diagnostic in require_sound_logs(logs, arm, log_mapping):

@@ -38,11 +38,10 @@ def inspect(
     ] = False,
 ) -> None:
     """Show the exact structure of an arm's dynamics."""
-    from spelgen.loaded_arm import load_arm
 
     chosen_entry = options.entry(entry)
     chosen = options.choose_format(format, output, Format)
-    arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
+    arm = options.load(robot, joints, tip, angle_tolerance)
     inspection = arm.inspect(assume)
     # other programs, which take seconds
     proof = arm.verify(assume) if verify else None

@@ -16,6 +16,8 @@ from spelgen.settings.log_mapping import Accepted
 from spelgen.spec import Assume
 
 if TYPE_CHECKING:
+    from spelgen.loaded_arm import LoadedArm
+    from spelgen.logs.arm_mapping import LoggedArm
     from spelgen.settings.log_mapping import LogMapping
 
 SUFFIXES = {".json": "json", ".csv": "csv", ".html": "html", ".tex": "latex", ".py": "sympy"}
@@ -167,16 +169,29 @@ def logs(data: list[Path] | None, extra_logs: list[Path] | None) -> list[Path]:
     return [*data, *(extra_logs or [])]
 
 
-def accepting(mapping: LogMapping, codes: Sequence[str] | None) -> LogMapping:
-    """Return the mapping that accepts these errors too. A usage error for an unknown code."""
+def log_mapping(arm: LoggedArm, mapping: Path | LogMapping | None, codes: Sequence[str] | None) -> LogMapping:
+    """Return how the logs of an arm are named, by default as its settings say, with these errors accepted too.
+
+    A usage error for an unknown code.
+    """
+    from spelgen.logs.arm_mapping import log_source
+
     for code in codes or ():
         # a misspelt code would silently accept nothing
         if code not in get_args(Accepted):
             hint = suggestion(code, get_args(Accepted))
             raise typer.BadParameter(f"unknown code {code!r}; {hint}", param_hint="'--accept'")
+    chosen = log_source(arm, mapping).mapping
     # a dict keeps the order, so that the same command writes the same record
-    accepted = dict.fromkeys((*mapping.accept, *(codes or ())))
-    return mapping.model_copy(update={"accept": tuple(accepted)})
+    accepted = dict.fromkeys((*chosen.accept, *(codes or ())))
+    return chosen.model_copy(update={"accept": tuple(accepted)})
+
+
+def load(robot: Path, joints: str | None, tip: str | None, angle_tolerance: float) -> LoadedArm:
+    """Return the arm that a command names."""
+    from spelgen.loaded_arm import load_arm
+
+    return load_arm(robot, names(joints), tip, angle_tolerance)
 
 
 def require_free(path: Path, *, force: bool) -> None:

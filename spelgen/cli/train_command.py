@@ -103,20 +103,23 @@ def train(
         start = new_run(module, urdf, request)
     from spelgen.loaded_arm import arm_of_module
     from spelgen.log_checks.check_logs import require_sound_logs
-    from spelgen.logs.arm_mapping import log_source
 
     facts = read_facts(start.module)
     # the mapping may speak of all joints of a URDF, and logs are checked beside the arm
     arm = None if urdf is None else arm_of_module(facts, urdf)
-    log_mapping = options.accepting(log_source(arm or facts.joints, mapping or start.mapping).mapping, accept)
+    log_mapping = options.log_mapping(arm or facts.joints, mapping or start.mapping, accept)
     # where a fit runs is no part of what is fitted, and not recorded with it
-    machine = Machine.model_validate({name: values[name] for name in Machine.model_fields if name in values})
+    machine = Machine().model_copy(
+        update={name: values[name] for name in Machine.model_fields if name in values}
+    )
     # torch is imported where it is needed: --help and mistakes are answered at once
     from spelgen.fitting.fit import RunOptions
     from spelgen.fitting.train import train as train_files
+    from spelgen.logs.preprocessing import Preprocessing
 
-    where = machine.model_dump()
-    run_options = RunOptions(**where, resume=resume, force=force, mapping=log_mapping, began=start_time)
+    run_options = RunOptions(
+        **machine.model_dump(), resume=resume, force=force, mapping=log_mapping, began=start_time
+    )
     try:
         fit = train_files(
             start.module,
@@ -125,9 +128,9 @@ def train(
             start.config,
             urdf=urdf,
             source=source,
-            preprocessing=start.preprocessing,
-            validation=start.validation,
-            seed=start.seed,
+            preprocessing=Preprocessing(**start.settings.preprocessing),
+            validation=start.settings.validation_fraction,
+            seed=start.settings.seed,
             trust=trust,
             require=lambda logs: [] if arm is None else require_sound_logs(logs, arm, log_mapping),
             options=run_options,

@@ -19,11 +19,10 @@ from spelgen.settings.values import Count, Group
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
-    from spelgen.logs.preprocessing import Preprocessing
     from spelgen.settings.log_mapping import LogMapping
 
 TIME_LIMIT = "max_minutes"
-PREPROCESSING = ("cutoff", "decimation", "gap", "torque_delay")
+OF_LOGS = {"cutoff", "decimation", "gap", "torque_delay", "validation_fraction", "seed"}
 FIELD_SEPARATOR = "."
 
 
@@ -71,10 +70,10 @@ class Request:
         """Return the values that belong to the configuration of an objective."""
         return {name: value for name, value in self.values.items() if issubclass(KEYS[name], FitConfig)}
 
-    @property
-    def preprocessing(self) -> dict[str, object]:
-        """Return the values that say how logs are prepared."""
-        return {name: value for name, value in self.values.items() if name in PREPROCESSING}
+    def settings(self, defaults: TrainingSettings) -> TrainingSettings:
+        """Return how logs are prepared and split: as the command line says, else as these settings do."""
+        changes = {name: value for name, value in self.values.items() if name in OF_LOGS}
+        return defaults.model_copy(update=changes)
 
 
 @dataclass(frozen=True)
@@ -83,10 +82,8 @@ class Start:
 
     module: Path
     config: Callable[[EmittedModel, Sequence[float] | None], FitConfig | None]
-    preprocessing: Preprocessing
-    validation: float
-    seed: int
-    mapping: LogMapping | None
+    settings: TrainingSettings
+    mapping: LogMapping | None = None
 
 
 def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
@@ -110,9 +107,9 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
         if isinstance(fields, dict):
             fields[field] = text
     values = {}
-    for name, given in texts.items():
+    for name, content in texts.items():
         try:
-            values[name] = getattr(KEYS[name].model_validate({name: given}), name)
+            values[name] = getattr(KEYS[name].model_validate({name: content}), name)
         except ValidationError as error:
             wrong = explain(error.errors(include_url=False)[0], None, KEYS[name])
             raise UsageError(f"--set {wrong}") from error
@@ -121,20 +118,12 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
 
 def new_run(module: Path, urdf: Path | None, request: Request) -> Start:
     """Return the start of a new run: what the command line does not say, the robot's settings do."""
-    from spelgen.logs.preprocessing import Preprocessing
     from spelgen.settings.settings import load_settings
 
     # without a URDF there is no sidecar that could hold defaults
-    settings = TrainingSettings()
-    if urdf is not None:
-        settings = load_settings(urdf).training
+    settings = TrainingSettings() if urdf is None else load_settings(urdf).training
     return Start(
-        module,
-        lambda model, rates: _new_config(settings, request, model, rates),
-        Preprocessing(**(settings.preprocessing | request.preprocessing)),
-        request.values.get("validation_fraction", settings.validation_fraction),
-        request.values.get("seed", settings.seed),
-        mapping=None,
+        module, lambda model, rates: _new_config(settings, request, model, rates), request.settings(settings)
     )
 
 
@@ -165,19 +154,22 @@ def resumed_run(folder: Path, request: Request) -> Start:
     from spelgen.dynamics.protocol import has_rigid_bodies
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.fitting.run_record import recorded_config
-    from spelgen.logs.preprocessing import Preprocessing
     from spelgen.settings.fits import fit_config
     from spelgen.settings.log_mapping import LogMapping
 
     run = RunFolder(folder)
     record = run.read_config()
+    fraction = record["validation_fraction"]
     # those logs were in memory of another program
-    if record["validation_fraction"] is None and record["validation"]:
+    if fraction is None and record["validation"]:
         raise RunError(
             "a run whose validation logs were passed from Python",
             file=folder,
             do="resume it by spelgen.fit(..., folder=..., options=spelgen.RunOptions(resume=True))",
         )
+    settings = TrainingSettings(seed=record["seed"], **record["preprocessing"])
+    if fraction is not None:
+        settings = settings.model_copy(update={"validation_fraction": fraction})
 
     def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig:
         rigid_bodies = has_rigid_bodies(model)
@@ -187,11 +179,4 @@ def resumed_run(folder: Path, request: Request) -> Start:
         same.require(rigid_bodies=rigid_bodies)
         return same
 
-    return Start(
-        run.module,
-        config,
-        Preprocessing(**(record["preprocessing"] | request.preprocessing)),
-        request.values.get("validation_fraction", record["validation_fraction"]),
-        request.values.get("seed", record["seed"]),
-        mapping=LogMapping(**record["mapping"]),
-    )
+    return Start(run.module, config, request.settings(settings), LogMapping(**record["mapping"]))
