@@ -30,8 +30,6 @@ TUNING = DriveHintTuning()
 FRICTION = FrictionModel(coulomb_smoothing_velocity=IdentificationTuning().moving)
 NEGLIGIBLE = IdentificationTuning().negligible
 
-LoggedAt = Literal["joints", "motors"]
-
 
 @dataclass(frozen=True)
 class Coupling:
@@ -43,7 +41,7 @@ class Coupling:
     joint: int
     moved_by: int
     ratio: float
-    logged_at: LoggedAt
+    logged_at: Literal["joints", "motors"]
 
     @property
     def pair(self) -> list[int]:
@@ -71,36 +69,45 @@ def drive_rows(
     return np.concatenate([bodies, FRICTION.columns(qd, qdd, None, speeds)], axis=2)
 
 
-def drive_problem(chain: BodyChain, drives: Drives, samples: DriveSamples) -> DriveProblem | None:
-    """Return least squares of the joint torques; None where there are too few samples."""
-    if len(samples.q) < TUNING.fewest_samples:
-        return None
-    speeds, tau = drives.speeds, samples.tau
-    regressors = drive_rows(chain, samples.q, samples.qd, samples.qdd, speeds)
-    rows = np.concatenate([regressors, tau[..., None]], axis=2)
-    is_coupled = ((speeds != 0) | (speeds != 0).T).sum(axis=0) > 1
-    # what is no more than a constant with rounding shows nothing
-    varies = tau.std(axis=0) > NEGLIGIBLE * np.abs(tau).max(axis=0)
-    free = np.flatnonzero(varies & ~is_coupled).tolist()
+def drive_problem(chain: BodyChain, drives: Drives, samples: DriveSamples) -> DriveProblem:
+    """Return least squares of the joint torques."""
+    regressors = drive_rows(chain, samples.q, samples.qd, samples.qdd, drives.speeds)
+    rows = np.concatenate([regressors, samples.tau[..., None]], axis=2)
     products = block_products(rows, TUNING.blocks)
-    motion = np.stack([samples.qd, samples.qdd])
-    return DriveProblem(motion, rows, products, products[..., -1, -1].mean(axis=1), free)
+    return DriveProblem(samples, drives.speeds, rows, products, products[..., -1, -1].mean(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
 class DriveProblem:
     """Hold least squares of the torques of n joints by K parameters, in B blocks of time.
 
-    motion: qd and qdd, (2, S, n). rows: (S, n, K + 1), of each joint the columns of the parameters and the torque.
-    products: (n, B, K + 1, K + 1), of these. size: (n,) of the squares of the torques. free: the joints that no known
-    coupling joins and whose torques vary.
+    speeds: C, (n, n), of the motors, by the couplings that are known. rows: (S, n, K + 1), of each joint the columns of
+    the parameters and the torque. products: (n, B, K + 1, K + 1), of these. size: (n,) of the squares of the torques.
     """
 
-    motion: np.ndarray
+    samples: DriveSamples
+    speeds: np.ndarray
     rows: np.ndarray
     products: np.ndarray
     size: np.ndarray
-    free: list[int]
+
+    @property
+    def bodies(self) -> np.ndarray:
+        """Return the columns of the bodies' parameters, (S, n, 10 bodies)."""
+        return self.rows[..., : -len(FRICTION.effects) * len(self.size) - 1]
+
+    @property
+    def is_short(self) -> bool:
+        """Whether there are too few samples for a hint."""
+        return len(self.rows) < TUNING.fewest_samples
+
+    @property
+    def free(self) -> list[int]:
+        """Return the joints that no known coupling joins and whose torques vary."""
+        joins, tau = self.speeds != 0, self.rows[..., -1]
+        # what is no more than a constant with rounding shows nothing
+        varies = tau.std(axis=0) > NEGLIGIBLE * np.abs(tau).max(axis=0)
+        return np.flatnonzero(varies & ((joins | joins.T).sum(axis=0) == 1)).tolist()
 
     def with_rows(self, joints: list[int], rows: np.ndarray) -> DriveProblem:
         """Return the same with other rows (S, k, K + 1) of k joints."""
@@ -116,7 +123,8 @@ class DriveProblem:
     def in_one_block(self, stride: int) -> DriveProblem:
         """Return the same on one of so many samples, in a single block: it judges by what it was fitted to."""
         rows = self.rows[::stride]
-        return replace(self, motion=self.motion[:, ::stride], rows=rows, products=block_products(rows, 1))
+        samples = self.samples.thinned(stride)
+        return replace(self, samples=samples, rows=rows, products=block_products(rows, 1))
 
     @cached_property
     def errors(self) -> np.ndarray:
@@ -150,7 +158,8 @@ class DriveProblem:
     def coupled(self, coupling: Coupling) -> DriveProblem:
         """Return the problem where a motor turns with another joint, too."""
         joint, moved_by, ratio = coupling.joint, coupling.moved_by, coupling.ratio
-        qd, qdd = self.motion[..., [joint]] + ratio * self.motion[..., [moved_by]]
+        motion = np.stack([self.samples.qd, self.samples.qdd])
+        qd, qdd = motion[..., [joint]] + ratio * motion[..., [moved_by]]
         columns = FRICTION.columns(qd, qdd)[:, 0]  # (S, effects)
         n, effects = self.rows.shape[1], columns.shape[1]
         of_motor = np.arange(effects) * n + joint - effects * n - 1
@@ -164,6 +173,8 @@ class DriveProblem:
 
 def find_wrong_torques(problem: DriveProblem, joints: Sequence[str]) -> WrongTorque | None:
     """Return what is surely wrong with the torques of joints: one of the other sign, or two exchanged."""
+    if problem.is_short:
+        return None
     coarse = problem.in_one_block(TUNING.coarse)
     candidates = list(combinations_with_replacement(range(len(joints)), 2))
     k, other = min(candidates, key=lambda pair: float(coarse.exchanged(*pair).errors.mean()))
@@ -190,7 +201,7 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
         for ratio in TUNING.ratios:
             candidates.append(Coupling(joint, moved_by, ratio, "joints"))
             candidates.append(Coupling(joint, moved_by, ratio, "motors"))
-    if not candidates:
+    if problem.is_short or not candidates:
         return None
     nearest = min(candidates, key=coarse.cost)
     best = _with_best_ratio(nearest, problem.in_one_block(1).cost)
