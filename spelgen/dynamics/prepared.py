@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.pose import poses
+from spelgen.dynamics.equations import poses, runge_kutta
 from spelgen.dynamics.protocol import known_past, sliding_memory
 from spelgen.dynamics.residuals import without_idle_residuals
-from spelgen.dynamics.runge_kutta import runge_kutta
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 if TYPE_CHECKING:

@@ -4,26 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import inf, isfinite
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from scipy.optimize import minimize
 
+from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.errors import SettingsError
 from spelgen.excitation.criterion import Criterion
 from spelgen.excitation.excitation import Excitation
 from spelgen.excitation.trajectory import ExcitationTrajectory, motion_bounds
 from spelgen.settings.tuning.simulation import ExcitationTuning
 
-if TYPE_CHECKING:
-    from spelgen.loaded_arm import LoadedArm
-
 TUNING = ExcitationTuning()
 
 
 def excite(
-    arm: LoadedArm,
+    arm: ConfiguredArm,
     *,
     duration: float = 30.0,
     sample_rate: float = 100.0,

@@ -32,8 +32,8 @@ SHIFTS = np.array(HINTS.shifts) / FREQUENCY  # [s]
 class DriveSamples(NamedTuple):
     """Hold S samples of motion with the torques at n joints.
 
-    q, qd, qdd: (S, n). bent: (S, n, K), of bristles, by their reach. direction: see `DynamicsSamples`. torques: (S, n, D),
-    moved by each of the D `SHIFTS`.
+    q, qd, qdd: (S, n). bent: (S, n, K), of bristles, by their reach. direction: see `DynamicsSamples`.
+    torques: (S, n, D), moved by each of the D `SHIFTS`.
     """
 
     q: np.ndarray

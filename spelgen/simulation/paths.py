@@ -9,7 +9,7 @@ from spelgen.errors import SettingsError, SpelgenError, collect
 from spelgen.excitation.trajectory import SPEEDS, ExcitationTrajectory, Motion, MotionBounds
 from spelgen.settings.settings import Settings
 from spelgen.settings.tuning.simulation import ExcitationTuning, SimulationTuning
-from spelgen.simulation.random_inputs import initial_range
+from spelgen.simulation.protocol import initial_range
 
 TUNING = SimulationTuning()
 HARMONICS = ExcitationTuning().fewest_harmonics

@@ -23,11 +23,9 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
 from spelgen.settings.tuning.simulation import SimulationTuning
-from spelgen.simulation.friction import make_friction
 from spelgen.simulation.integration import rollout
 from spelgen.simulation.paths import paths
-from spelgen.simulation.random_inputs import initial_range
-from spelgen.simulation.simulated_logs import SimulatedLogs
+from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction
 
 TUNING = SimulationTuning()
 
@@ -63,7 +61,7 @@ def track(
     settings: Settings,
     drives: Drives | None = None,
     *,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SimulatedLogs:
     """Return logs of the arm controlled along paths, by `settings.simulation` and `settings.tracking`.
 
@@ -89,8 +87,7 @@ def track(
         train.append(log[:cut])
         if cut < len(log):
             test.append(replace(log[cut:], name=f"{log.name}_end"))
-        if progress is not None:
-            progress(number + 1, protocol.trajectories)
+        progress(number + 1, protocol.trajectories)
     return SimulatedLogs(train, test)
 
 

@@ -1,16 +1,17 @@
-"""Equations of motion at a position, M qdd = force, with all that depends on the position alone worked out once."""
+"""Equations of motion M qdd = force: at a position, with M as a network gives it, and one step of them in time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from spelgen.dynamics.protocol import has_momentum, known_past
+from spelgen.dynamics.protocol import has_momentum, known_past, memory_after
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 
@@ -63,3 +64,50 @@ def _of_any(dynamics: Any, q: Tensor) -> Pose:
         return (mass @ qdd.unsqueeze(-1)).squeeze(-1)
 
     return Pose(mass, force, friction)
+
+
+def runge_kutta(
+    dynamics: object,
+    rhs: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
+    q: Tensor,
+    p: Tensor,
+    z: Tensor,
+    step: Tensor | float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return q, p and z after one `step` [s], and q' at its start (Hairer et al., Solving ODEs I, II.1).
+
+    rhs: q' and p' of these dynamics by q, p and z. p: momenta, or velocities. Friction's memory z, (..., n, K), follows
+    the displacement exactly, so it needs no stages of its own.
+    """
+
+    def slopes(moved: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return rhs(q + moved, p, memory_after(dynamics, z, moved))
+
+    half = step / 2
+    qd1, pd1 = slopes(torch.zeros_like(p), p)
+    qd2, pd2 = slopes(half * qd1, p + half * pd1)
+    qd3, pd3 = slopes(half * qd2, p + half * pd2)
+    qd4, pd4 = slopes(step * qd3, p + step * pd3)
+    sixth = step / 6
+    moved = sixth * (qd1 + 2 * (qd2 + qd3) + qd4)
+    p = p + sixth * (pd1 + 2 * (pd2 + pd3) + pd4)
+    return q + moved, p, memory_after(dynamics, z, moved), qd1
+
+
+def unbounded(mass: Tensor) -> Tensor:
+    """Return one for every matrix: all of M's changes stand, see ``DerivedMass.fraction``."""
+    return mass.new_ones(mass.shape[:-2])
+
+
+@contextmanager
+def mass_as_learned(model: nn.Module) -> Iterator[None]:
+    """Let the model's M be indefinite where its network says so; a model that bounds nothing stays as it is."""
+    mass = getattr(model, "mass", None)
+    if mass is None or not hasattr(mass, "fraction"):
+        yield
+        return
+    mass.fraction = unbounded
+    try:
+        yield
+    finally:
+        del mass.fraction
