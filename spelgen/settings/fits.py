@@ -87,9 +87,7 @@ class FitConfig(Group):
             raise OptionError(
                 "objective", "momentum belongs to models of networks alone, this is one of rigid bodies"
             )
-        kind = "models of rigid bodies"
-        if rigid_bodies:
-            kind = "models of networks alone"
+        kind = "models of networks alone" if rigid_bodies else "models of rigid bodies"
         for name in self.unused(rigid_bodies=rigid_bodies):
             if name in self.model_fields_set:
                 raise OptionError(name, f"with the objective {self.objective} belongs to {kind}")
@@ -102,9 +100,7 @@ class FitConfig(Group):
     @classmethod
     def unused(cls, *, rigid_bodies: bool) -> tuple[str, ...]:
         """Return the options that do not apply to this kind of model."""
-        if rigid_bodies:
-            return cls.of_networks
-        return cls.of_rigid_bodies
+        return cls.of_networks if rigid_bodies else cls.of_rigid_bodies
 
 
 class TorqueFit(FitConfig):
@@ -152,17 +148,15 @@ class OnWindows(FitConfig):
 
     def resolved(self, windows: int) -> Self:
         """Return the same with optimizer, batch, learning rate and weight decay decided for so many windows."""
-        optimizer = self.optimizer
-        if optimizer is None:
-            optimizer = "lbfgs" if windows <= DEFAULTS.few_windows else "adamw"
-        batch, rate, decay = None, None, DEFAULTS.lbfgs_decay
+        optimizer = self.optimizer or ("lbfgs" if windows <= DEFAULTS.few_windows else "adamw")
+        update: dict[str, object] = {"optimizer": optimizer, "batch": None, "learning_rate": None}
+        decay = DEFAULTS.lbfgs_decay
         if optimizer == "adamw":
-            batch = self.batch or DEFAULTS.batch
-            rate = self.learning_rate or DEFAULTS.learning_rate
+            update["batch"] = self.batch or DEFAULTS.batch
+            update["learning_rate"] = self.learning_rate or DEFAULTS.learning_rate
             decay = DEFAULTS.adamw_decay
-        if self.weight_decay is not None:
-            decay = self.weight_decay
-        update = {"optimizer": optimizer, "batch": batch, "learning_rate": rate, "weight_decay": decay}
+        if self.weight_decay is None:
+            update["weight_decay"] = decay
         return self.model_copy(update=update)
 
 
@@ -210,15 +204,10 @@ CONFIGS: dict[str, type[FitConfig]] = {
 }
 
 
-def _owners() -> dict[str, list[str]]:
-    owners: dict[str, list[str]] = {}
-    for objective, config in CONFIGS.items():
-        for name in config.model_fields:
-            owners.setdefault(name, []).append(objective)
-    return owners
-
-
-OWNERS = _owners()
+OWNERS: dict[str, list[str]] = {}
+for _objective, _config in CONFIGS.items():
+    for _name in _config.model_fields:
+        OWNERS.setdefault(_name, []).append(_objective)
 
 
 def fit_config(

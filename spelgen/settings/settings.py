@@ -89,10 +89,8 @@ class Settings(Group):
         diagnostics = []
         for name in OF_A_STEP:
             group = getattr(self, name)
-            if isinstance(group, Unusable):
-                for error in group.errors:
-                    message = str(error)
-                    diagnostics.append(Diagnostic("warning", "unusable-settings", "settings", None, message))
+            for error in group.errors if isinstance(group, Unusable) else ():
+                diagnostics.append(Diagnostic("warning", "unusable-settings", "settings", None, str(error)))
         return tuple(diagnostics)
 
     def joint(self, name: str) -> JointSettings:
