@@ -8,14 +8,14 @@ from typing import Annotated, Literal
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import deliver, note
+from spelgen.cli.console import note
 from spelgen.cli.options import (
     Accept,
     AngleTolerance,
     Data,
     Filter,
     Joints,
-    Mapping,
+    MappingFile,
     MoreData,
     Output,
     Robot,
@@ -30,7 +30,7 @@ def identify(
     robot: Robot,
     extra_logs: MoreData = None,
     data: Data = None,
-    mapping: Mapping = None,
+    mapping: MappingFile = None,
     joints: Joints = None,
     tip: Tip = None,
     angle_tolerance: AngleTolerance = 2e-3,
@@ -76,13 +76,12 @@ def identify(
     result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
     for diagnostic in result.diagnostics:
         note(diagnostic)
-    # pages and charts are imported where they are asked for
-    chosen = options.choose_format(format, output, Format)
-    if chosen == "html":
+
+    def page() -> str:
+        # pages and charts are imported where they are asked for
         from spelgen.render.identification_page import page
 
-        deliver(page(result, arm) + "\n", output)
-    elif chosen == "json":
-        deliver(json.dumps(result.to_dict(), indent=2) + "\n", output)
-    else:
-        deliver(result.text() + "\n", output)
+        return page(result, arm)
+
+    forms = {"text": result.text, "json": lambda: json.dumps(result.to_dict(), indent=2), "html": page}
+    options.write_result(format, output, forms)

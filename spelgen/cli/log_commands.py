@@ -10,7 +10,17 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, answer, note, progress_bar, refuse_warnings, say
-from spelgen.cli.options import Accept, AngleTolerance, Force, Joints, Mapping, Robot, Strict, TextOrJson, Tip
+from spelgen.cli.options import (
+    Accept,
+    AngleTolerance,
+    Force,
+    Joints,
+    MappingFile,
+    Robot,
+    Strict,
+    TextOrJson,
+    Tip,
+)
 from spelgen.errors import SpelgenErrors
 from spelgen.files import write_text
 
@@ -100,7 +110,7 @@ def logs(
     joints: Joints = None,
     tip: Tip = None,
     angle_tolerance: AngleTolerance = 2e-3,
-    mapping: Mapping = None,
+    mapping: MappingFile = None,
     format: TextOrJson = "text",
     html: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Also write an HTML page with plots.")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import typer
 from typer.models import OptionInfo
 
+from spelgen.cli.console import deliver
 from spelgen.errors import SpelgenError, suggestion
 from spelgen.settings.log_mapping import Accepted
 from spelgen.spec import Assume
@@ -73,7 +74,7 @@ MoreData = Annotated[
         metavar="LOGS", help="More log files or folders; several may follow --data.", show_default=False
     ),
 ]
-Mapping = Annotated[
+MappingFile = Annotated[
     Path | None,
     typer.Option(
         "--mapping",
@@ -130,15 +131,16 @@ def result_format() -> OptionInfo:
     return option
 
 
-def choose_format(format: str | None, output: Path | None, formats: object) -> str:
-    """Return the format named, else the one of these (a Literal) that the output's suffix means, else text."""
-    if format is not None:
-        return format
+def choose_format(format: str | None, output: Path | None, formats: Iterable[str]) -> str:
+    """Return the format named, else the one of these that the output's suffix means, else text."""
     # `-o page.html` means HTML: to say so twice would be tedious
     meant = SUFFIXES.get(output.suffix.lower()) if output else None
-    if meant in get_args(formats):
-        return str(meant)
-    return "text"
+    return format or (meant if meant in formats else None) or "text"
+
+
+def write_result(format: str | None, output: Path | None, forms: Mapping[str, Callable[[], str]]) -> None:
+    """Print or write a result by the function of the format that `choose_format` returns."""
+    deliver(forms[choose_format(format, output, forms)]() + "\n", output)
 
 
 def names(text: str | None) -> list[str] | None:

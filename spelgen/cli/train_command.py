@@ -12,7 +12,7 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
-from spelgen.cli.options import Accept, Data, Force, Mapping, MoreData, RobotOption, TextOrJson, Trust
+from spelgen.cli.options import Accept, Data, Force, MappingFile, MoreData, RobotOption, TextOrJson, Trust
 from spelgen.cli.train_settings import (
     TIME_LIMIT,
     Machine,
@@ -65,7 +65,7 @@ def train(
     data: Data = None,
     output: NewRun = None,
     robot: RobotOption = None,
-    mapping: Mapping = None,
+    mapping: MappingFile = None,
     resume: Resume = False,
     force: Force = False,
     trust: Trust = False,
@@ -94,7 +94,8 @@ def train(
     if module is None:
         raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
     paths = options.logs(data, extra_logs)
-    folder = output or _default_folder(module, resume)
+    # `train RUN --resume` names the folder where a module stands otherwise
+    folder = output or (module if resume and module.is_dir() else Path("runs") / module.stem)
     urdf = None
     if resume:
         start = resumed_run(folder, request)
@@ -184,10 +185,8 @@ def _outcome(fit: Fit) -> tuple[str, str]:
         return f"{fit.status}: {config.objective} fitted in {fit.seconds:.0f} s{reason}", loss
     if fit.status == "stopped early":
         reason = f": no better validation loss since epoch {fit.best_epoch}"
-    elif fit.status == "finished" and fit.epochs >= config.epochs:
-        reason = ": all epochs are run"
     elif fit.status == "finished":
-        reason = ": no way further down"
+        reason = ": all epochs are run" if fit.epochs >= config.epochs else ": no way further down"
     end = f"{fit.status} after {counted(fit.epochs, 'epoch')}, {fit.steps} steps, {fit.seconds:.0f} s{reason}"
     return end, f"best {loss}, at epoch {fit.best_epoch}"
 
@@ -200,13 +199,6 @@ def _warm_start(request: Request) -> Request:
     elif "adapt" in values:
         raise UsageError(f"--set adapt: belongs to the objective torque, this fits {objective}")
     return Request(objective, values, warm_start=True)
-
-
-def _default_folder(module: Path, resume: bool) -> Path:
-    # `train RUN --resume` names the folder where a module stands otherwise
-    if resume and module.is_dir():
-        return module
-    return Path("runs") / module.stem
 
 
 def _module_of_run(source: Path, robot: Path | None) -> tuple[Path, Path | None]:
@@ -231,6 +223,5 @@ def _unchanged_urdf(module: Path) -> Path | None:
     except ModuleError:
         return None
     # settings and limits of a changed URDF would belong to another arm
-    if hashlib.sha256(urdf_bytes(path)).hexdigest() != facts.urdf_sha256:
-        return None
-    return path
+    is_same = hashlib.sha256(urdf_bytes(path)).hexdigest() == facts.urdf_sha256
+    return path if is_same else None
