@@ -10,7 +10,7 @@ import os
 import re
 import sys
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
@@ -27,32 +27,29 @@ from spelgen.cli import (
 from spelgen.cli.console import handle_errors, say
 from spelgen.version import __version__
 
-if TYPE_CHECKING:
-    from click import Context
-
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 CONTEXT = {"max_content_width": 80, "help_option_names": ["-h", "--help"]}
 
 
-class Command(TyperCommand):  # type: ignore[misc]  # typer's own types do not agree with click's
+class Command(TyperCommand):
     """A command whose help names arguments and nothing of their types, which their names say."""
 
-    def get_help(self, ctx: Context) -> str:
+    def get_help(self, ctx: Any) -> str:
         """Return the help."""
         for parameter in self.params:
             if isinstance(parameter, TyperArgument):
                 vars(parameter)["display_type"] = lambda ctx: ""
-        return str(super().get_help(ctx))
+        return super().get_help(ctx)
 
-    def collect_usage_pieces(self, ctx: Context) -> list[str]:
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the names as they are, optional ones in brackets."""
         return [re.sub(r"[{}]", "", piece) for piece in super().collect_usage_pieces(ctx)]
 
 
-class Group(TyperGroup):  # type: ignore[misc]
+class Group(TyperGroup):
     """All commands: a mistake in the words of one is answered with what may have been meant."""
 
-    def invoke(self, ctx: Context) -> Any:
+    def invoke(self, ctx: Any) -> Any:
         """Run a command."""
         try:
             return super().invoke(ctx)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
@@ -131,11 +131,11 @@ def result_format() -> OptionInfo:
     return option
 
 
-def choose_format(format: str | None, output: Path | None, formats: Iterable[str]) -> str:
+def choose_format(format: str | None, output: Path | None, formats: Container[str]) -> str:
     """Return the format named, else the one of these that the output's suffix means, else text."""
     # `-o page.html` means HTML: to say so twice would be tedious
-    meant = SUFFIXES.get(output.suffix.lower()) if output else None
-    return format or (meant if meant in formats else None) or "text"
+    meant = SUFFIXES.get(output.suffix.lower(), "text") if output else "text"
+    return format or (meant if meant in formats else "text")
 
 
 def write_result(format: str | None, output: Path | None, forms: Mapping[str, Callable[[], str]]) -> None:

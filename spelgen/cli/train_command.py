@@ -15,7 +15,6 @@ from spelgen.cli.console import INTERRUPTED, answer, note
 from spelgen.cli.options import Accept, Data, Force, MappingFile, MoreData, RobotOption, TextOrJson, Trust
 from spelgen.cli.train_settings import (
     TIME_LIMIT,
-    Machine,
     Request,
     UsageError,
     new_run,
@@ -109,18 +108,14 @@ def train(
     # the mapping may speak of all joints of a URDF, and logs are checked beside the arm
     arm = None if urdf is None else arm_of_module(facts, urdf)
     log_mapping = options.log_mapping(arm or facts.joints, mapping or start.mapping, accept)
-    # where a fit runs is no part of what is fitted, and not recorded with it
-    machine = Machine().model_copy(
-        update={name: values[name] for name in Machine.model_fields if name in values}
-    )
     # torch is imported where it is needed: --help and mistakes are answered at once
     from spelgen.fitting.fit import RunOptions
     from spelgen.fitting.train import train as train_files
     from spelgen.logs.preprocessing import Preprocessing
 
-    run_options = RunOptions(
-        **machine.model_dump(), resume=resume, force=force, mapping=log_mapping, began=start_time
-    )
+    # where a fit runs is no part of what is fitted, and not recorded with it
+    machine = {"progress": True} | request.values_of(("device", "threads", "progress"))
+    run_options = RunOptions(**machine, resume=resume, force=force, mapping=log_mapping, began=start_time)
     try:
         fit = train_files(
             start.module,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,10 +12,10 @@ from pydantic import ValidationError
 
 from spelgen.cli.console import note
 from spelgen.errors import RunError, suggestion
-from spelgen.settings.fits import CONFIGS, FitConfig
+from spelgen.settings.fits import OWNERS, Adaptation, FitConfig
 from spelgen.settings.messages import explain
 from spelgen.settings.training import TrainingSettings
-from spelgen.settings.values import Count, Group
+from spelgen.settings.values import Count
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -34,27 +34,16 @@ class UsageError(typer.BadParameter):
         return self.message
 
 
-class Machine(Group):
-    """Where a fit runs: a device of torch, how many threads it uses, and whether it shows its progress."""
+class Assignments(TrainingSettings):
+    """What `--set` assigns: a robot's settings, what of a fitted model moves, and where and how a fit runs.
 
+    device: of torch. threads: that it uses. progress: whether it is shown.
+    """
+
+    adapt: Adaptation | None = None
     device: str = "cpu"
     threads: Count = 1
     progress: bool = True
-
-
-def _groups_by_key() -> dict[str, type[Group]]:
-    """Return every key of `--set` with the group of settings that checks its value."""
-    keys: dict[str, type[Group]] = {}
-    groups: list[type[Group]] = [*CONFIGS.values(), TrainingSettings, Machine]
-    for group in groups:
-        for name in group.model_fields:
-            # several objectives share options: the first that has one checks its value
-            keys.setdefault(name, group)
-    del keys["objective"]  # an option of its own
-    return keys
-
-
-KEYS = _groups_by_key()
 
 
 @dataclass(frozen=True)
@@ -65,15 +54,13 @@ class Request:
     values: Mapping[str, Any]
     warm_start: bool = False
 
-    @property
-    def options(self) -> dict[str, object]:
-        """Return the values that belong to the configuration of an objective."""
-        return {name: value for name, value in self.values.items() if issubclass(KEYS[name], FitConfig)}
+    def values_of(self, keys: Iterable[str]) -> dict[str, Any]:
+        """Return the values of these keys."""
+        return {name: self.values[name] for name in keys if name in self.values}
 
     def settings(self, defaults: TrainingSettings) -> TrainingSettings:
         """Return how logs are prepared and split: as the command line says, else as these settings do."""
-        changes = {name: value for name, value in self.values.items() if name in OF_LOGS}
-        return defaults.model_copy(update=changes)
+        return defaults.model_copy(update=self.values_of(OF_LOGS))
 
 
 @dataclass(frozen=True)
@@ -91,29 +78,26 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
 
     Raises a usage error for an unknown key, with the nearest known one, and for a value that cannot be.
     """
+    keys = Assignments.model_fields.keys() - {"objective"}  # an option of its own
     # first gathered: fields of one group are checked together
-    texts: dict[str, object] = {}
+    texts: dict[str, Any] = {}
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         name, _, field = key.strip().replace("-", "_").partition(FIELD_SEPARATOR)
         if not equals:
             raise UsageError(f"--set: got {assignment!r}, expected KEY=VALUE")
-        if name not in KEYS:
-            raise UsageError(f"--set: unknown key {name!r}; {suggestion(name, KEYS)}")
+        if name not in keys:
+            raise UsageError(f"--set: unknown key {name!r}; {suggestion(name, sorted(keys))}")
         if not field:
             texts[name] = text
-            continue
-        fields = texts.setdefault(name, {})
-        if isinstance(fields, dict):
-            fields[field] = text
-    values = {}
-    for name, content in texts.items():
-        try:
-            values[name] = getattr(KEYS[name].model_validate({name: content}), name)
-        except ValidationError as error:
-            wrong = explain(error.errors(include_url=False)[0], None, KEYS[name])
-            raise UsageError(f"--set {wrong}") from error
-    return values
+        elif isinstance(texts.setdefault(name, {}), dict):
+            texts[name][field] = text
+    try:
+        checked = Assignments.model_validate(texts)
+    except ValidationError as error:
+        wrong = explain(error.errors(include_url=False)[0], None, Assignments)
+        raise UsageError(f"--set {wrong}") from error
+    return {name: getattr(checked, name) for name in texts}
 
 
 def new_run(module: Path, urdf: Path | None, request: Request) -> Start:
@@ -134,7 +118,7 @@ def _new_config(
     from spelgen.dynamics.protocol import has_rigid_bodies
     from spelgen.fitting.objectives import chosen_config
 
-    options, defaults = request.options, dict(settings.options)
+    options, defaults = request.values_of(OWNERS), dict(settings.options)
     objective = request.objective or settings.objective
     if request.warm_start and objective == "rollout" and has_rigid_bodies(model):
         defaults["torque_first"] = False  # it would start the bodies anew
@@ -174,8 +158,8 @@ def resumed_run(folder: Path, request: Request) -> Start:
     def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig:
         rigid_bodies = has_rigid_bodies(model)
         if request.objective not in (None, record["objective"]):
-            return fit_config(request.objective, rigid_bodies=rigid_bodies, options=request.options)
-        same = recorded_config(record, **request.options)
+            return fit_config(request.objective, rigid_bodies=rigid_bodies, options=request.values_of(OWNERS))
+        same = recorded_config(record, **request.values_of(OWNERS))
         same.require(rigid_bodies=rigid_bodies)
         return same
 

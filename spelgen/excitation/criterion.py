@@ -85,4 +85,5 @@ class Criterion:
         # a parameter that the motion does not show at all
         if not length.all():
             return torch.tensor(torch.inf, dtype=torch.float64)
-        return torch.linalg.cond(columns / length).log()
+        condition: Tensor = torch.linalg.cond(columns / length)
+        return condition.log()

@@ -40,7 +40,7 @@ def reduce(blocks: Iterable[Columns]) -> Triangles:
         rows = np.concatenate([regressor, torque[:, :, None]], axis=2).swapaxes(0, 1)
         if factors is not None:
             rows = np.concatenate([factors, rows], axis=1)
-        factors = np.linalg.qr(rows, mode="r")
+        factors = np.asarray(np.linalg.qr(rows, mode="r"))
         count, total, square = count + len(torque), total + torque.sum(0), square + np.square(torque).sum(0)
     deviation = np.sqrt(np.maximum(square / count - np.square(total / count), 0.0))
     return Triangles(np.asarray(factors), count, deviation)
