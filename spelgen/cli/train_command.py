@@ -14,7 +14,6 @@ from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
 from spelgen.cli.options import Accept, Data, Force, MappingFile, MoreData, RobotOption, TextOrJson, Trust
 from spelgen.cli.train_settings import (
-    TIME_LIMIT,
     Request,
     UsageError,
     new_run,
@@ -81,26 +80,26 @@ def train(
     """
     start_time = time.monotonic()  # max_minutes counts from here, reading of logs included
     # before anything is read: a misspelt key costs no time
-    values = read_assignments(assignments or [])
-    request = Request(objective, values)
+    request = Request(objective, read_assignments(assignments or []))
     if source is not None:
+        from spelgen.fitting.run_folder import RunFolder
+
         if module is not None:
             extra_logs = [module, *(extra_logs or [])]  # with --from, all that stands there is logs
-        module, robot = _module_of_run(source, robot)
+        run = RunFolder(source)
+        run.read_config()  # where there is no run, this says so
+        module = run.module
+        robot = robot or (run.urdf if run.urdf.exists() else None)
         request = _warm_start(request)
-    elif "adapt" in values:
+    elif "adapt" in request.values:
         raise UsageError("--set adapt: belongs to --from")
     if module is None:
         raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
     paths = options.logs(data, extra_logs)
     # `train RUN --resume` names the folder where a module stands otherwise
     folder = output or (module if resume and module.is_dir() else Path("runs") / module.stem)
-    urdf = None
-    if resume:
-        start = resumed_run(folder, request)
-    else:
-        urdf = robot or _unchanged_urdf(module)
-        start = new_run(module, urdf, request)
+    urdf = None if resume else robot or _unchanged_urdf(module)
+    start = resumed_run(folder, request) if resume else new_run(module, urdf, request)
     from spelgen.loaded_arm import arm_of_module
     from spelgen.log_checks.check_logs import require_sound_logs
 
@@ -132,9 +131,7 @@ def train(
             options=run_options,
         )
     except OptionError as error:
-        option = f"--set {error.option}"
-        if error.option in ("objective", TIME_LIMIT):
-            option = f"--{error.option.replace('_', '-')}"
+        option = "--objective" if error.option == "objective" else f"--set {error.option}"
         raise UsageError(f"{option}: {error.got}") from error
     _tell(fit, folder, paths, format, resume=resume)
 
@@ -191,20 +188,9 @@ def _warm_start(request: Request) -> Request:
     objective, values = request.objective or "torque", dict(request.values)
     if objective == "torque":
         values.setdefault("adapt", "load")
-    elif "adapt" in values:
+    elif "adapt" in request.values:
         raise UsageError(f"--set adapt: belongs to the objective torque, this fits {objective}")
     return Request(objective, values, warm_start=True)
-
-
-def _module_of_run(source: Path, robot: Path | None) -> tuple[Path, Path | None]:
-    """Return the module of a run, and its URDF where none is named."""
-    from spelgen.fitting.run_folder import RunFolder
-
-    run = RunFolder(source)
-    run.read_config()  # where there is no run, this says so
-    if robot is None and run.urdf.exists():
-        robot = run.urdf
-    return run.module, robot
 
 
 def _unchanged_urdf(module: Path) -> Path | None:

@@ -80,18 +80,17 @@ def runge_kutta(
     the displacement exactly, so it needs no stages of its own.
     """
 
-    def slopes(moved: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return rhs(q + moved, p, memory_after(dynamics, z, moved))
-
-    half = step / 2
-    qd1, pd1 = slopes(torch.zeros_like(p), p)
-    qd2, pd2 = slopes(half * qd1, p + half * pd1)
-    qd3, pd3 = slopes(half * qd2, p + half * pd2)
-    qd4, pd4 = slopes(step * qd3, p + step * pd3)
-    sixth = step / 6
-    moved = sixth * (qd1 + 2 * (qd2 + qd3) + qd4)
-    p = p + sixth * (pd1 + 2 * (pd2 + pd3) + pd4)
-    return q + moved, p, memory_after(dynamics, z, moved), qd1
+    qd1 = qd = pd = torch.zeros_like(p)
+    moved = pushed = torch.zeros_like(p)
+    # where in the step a stage is, and its weight
+    for fraction, weight in ((0.0, 1), (0.5, 2), (0.5, 2), (1.0, 1)):
+        stage = fraction * step
+        qd, pd = rhs(q + stage * qd, p + stage * pd, memory_after(dynamics, z, stage * qd))
+        if fraction == 0:
+            qd1 = qd
+        moved, pushed = moved + weight * qd, pushed + weight * pd
+    moved = step / 6 * moved
+    return q + moved, p + step / 6 * pushed, memory_after(dynamics, z, moved), qd1
 
 
 def unbounded(mass: Tensor) -> Tensor:

@@ -40,7 +40,12 @@ def excite(
     at, beside 40 at random that it starts from. progress: called with the trials done and all.
     Raises SettingsError for a value that cannot be, ArmError for a joint without room between its limits.
     """
-    _require(duration=duration, sample_rate=sample_rate, reach=reach, speed=speed)
+    positive = {"duration": duration, "sample_rate": sample_rate, "reach": reach, "speed": speed}
+    for name, value in positive.items():
+        is_fraction = name in ("reach", "speed")
+        if not 0 < value < inf or (is_fraction and value > 1):
+            expected = "more than 0, at most 1" if is_fraction else "a positive number"
+            raise SettingsError(repr(value), element=f"excite: {name}", expected=expected)
     if harmonics is None:
         harmonics = max(TUNING.fewest_harmonics, round(TUNING.harmonics_per_second * duration))
     elif harmonics < 2:
@@ -61,15 +66,6 @@ def excite(
         efforts=np.abs(criterion.efforts(states)).max(axis=0),
         first_efforts=np.abs(criterion.efforts(first)).max(axis=0),
     )
-
-
-def _require(**values: float) -> None:
-    """Raise SettingsError for values that are not positive, and parts that are more than the whole."""
-    for name, value in values.items():
-        is_fraction = name in ("reach", "speed")
-        if not 0 < value < inf or (is_fraction and value > 1):
-            expected = "more than 0, at most 1" if is_fraction else "a positive number"
-            raise SettingsError(repr(value), element=f"excite: {name}", expected=expected)
 
 
 def _improved(

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import pinv
 
 from spelgen.settings.tuning.identification import IdentificationTuning
 
@@ -102,14 +103,12 @@ def solve(triangles: Triangles, weights: np.ndarray, columns: np.ndarray) -> Sol
     rows, target = weighted[:, columns], weighted[:, -1]
     length = np.linalg.norm(rows, axis=0)
     length[length == 0] = 1.0
-    u, values, vt = np.linalg.svd(rows / length, full_matrices=False)
-    rank = int((values > TUNING.negligible * values[0]).sum())
-    # numpy's lstsq gives neither the covariance nor the pseudo-inverse that it takes
-    root = vt[:rank].T / values[:rank] / length[:, None]
+    inverse, rank = pinv(rows / length, rtol=TUNING.negligible, return_rank=True)
+    inverse = inverse / length[:, None]
     parameters = np.zeros(weighted.shape[1] - 1)
-    parameters[columns] = root @ (u[:, :rank].T @ target)
-    condition = float(values[0] / values[-1]) if rank == len(values) else float("inf")
-    return Solution(parameters, columns, root @ root.T, condition, rank)
+    parameters[columns] = inverse @ target
+    condition = float(np.linalg.cond(rows / length)) if rank == len(columns) else float("inf")
+    return Solution(parameters, columns, inverse @ inverse.T, condition, int(rank))
 
 
 def deviations(residuals: Sequence[np.ndarray], parameters: int) -> np.ndarray:

@@ -68,10 +68,13 @@ class FitConfig(Group):
     @model_validator(mode="before")
     @classmethod
     def _refuse_foreign(cls, options: object) -> object:
-        if isinstance(options, Mapping):
-            for name in options:
-                if name not in cls.model_fields:
-                    raise _foreign(name, cls)
+        for name in options if isinstance(options, Mapping) else ():
+            if name not in cls.model_fields:
+                owners = OWNERS.get(name)
+                if owners is None:
+                    raise SettingsError(f"unknown option {name!r}", do=suggestion(name, cls.model_fields))
+                objectives = f"objective{'s' * (len(owners) > 1)} {' and '.join(owners)}"
+                raise OptionError(name, f"belongs to the {objectives}, this fits {cls.objective}")
         return options
 
     @model_validator(mode="after")
@@ -232,12 +235,3 @@ def fit_config(
     config = validated(kind, settings | options)
     config.require(rigid_bodies=rigid_bodies)
     return config
-
-
-def _foreign(name: str, config: type[FitConfig]) -> SettingsError:
-    owners = OWNERS.get(name)
-    if owners is None:
-        return SettingsError(f"unknown option {name!r}", do=suggestion(name, config.model_fields))
-    plural = "s" * (len(owners) > 1)
-    objectives = f"objective{plural} {' and '.join(owners)}"
-    return OptionError(name, f"belongs to the {objectives}, this fits {config.objective}")

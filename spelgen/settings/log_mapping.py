@@ -18,12 +18,10 @@ from spelgen.settings.values import Group, Number, Positive
 
 _MILLI = 1e-3
 TIMES = {unit: _MILLI**power for power, unit in enumerate(("s", "ms", "us", "ns"))}
-LENGTHS = {"rad": 1.0, "deg": pi / 180, "turns": 2 * pi, "m": 1.0, "mm": _MILLI}
-SCALES = {
-    **LENGTHS,
-    **{f"{name}/s": scale for name, scale in LENGTHS.items()},
-    "rpm": 2 * pi / 60, "Nm": 1.0, "N": 1.0, "A": 1.0, "mNm": _MILLI, "mA": _MILLI,
-}  # fmt: skip
+# what a value is multiplied with to be in SI units, which are not listed themselves
+LENGTHS = {"deg": pi / 180, "turns": 2 * pi, "mm": _MILLI}
+SPEEDS = {f"{name}/s": scale for name, scale in LENGTHS.items()} | {"rpm": 2 * pi / 60}
+SCALES = {**LENGTHS, **SPEEDS, "mNm": _MILLI, "mA": _MILLI}
 CURRENTS = ("A", "mA")
 COUNTS = ("counts", "counts/s")
 ONLY = {  # units that a joint of this kind cannot have
@@ -188,7 +186,7 @@ class LogMapping(Group):
     def scale(self, quantity: str, joint: str) -> float:
         """Return what a logged value is multiplied with, sign included."""
         logged, unit = self.joint(joint), self.unit(quantity, joint)
-        factor = SCALES.get(unit or "", 1.0)  # counts have no size of their own
+        factor = SCALES.get(unit or "", 1.0)
         if quantity == "tau" and logged.gain is not None:
             factor *= logged.gain
         elif unit in COUNTS:

@@ -25,7 +25,11 @@ def paths(arm: Arm, settings: Settings, t: np.ndarray) -> list[Motion]:
     randoms = [np.random.default_rng(seed) for seed in seeds]
     low, high = initial_range(arm, settings)
     if settings.tracking.paths == "excitation":
-        motions = ExcitationTrajectory(float(t[-1]), HARMONICS, _bounds(arm, low, high))
+        # the middle of the ranges at moderate speeds: a first try at an arm that nobody knows
+        middle, half = (low + high) / 2, TUNING.used_range * (high - low) / 2
+        speeds = [min(TUNING.used_range * (x.velocity or np.inf), SPEEDS[x.kind]) for x in arm.coordinates]
+        bounds = MotionBounds(middle - half, middle + half, np.array(speeds))
+        motions = ExcitationTrajectory(float(t[-1]), HARMONICS, bounds)
         return [motions.motion(random.standard_normal(motions.size), t) for random in randoms]
     middle, amplitude = (low + high) / 2, _amplitude(arm, settings, low, high)
     drawn = [random.uniform(0, 2 * np.pi, len(middle)) for random in randoms]
@@ -42,13 +46,6 @@ def sines(
     angle = omega * t[:, None] + phase
     swing = amplitude * np.sin(angle)
     return Motion(t, middle + swing, amplitude * omega * np.cos(angle), -(omega**2) * swing)
-
-
-def _bounds(arm: Arm, low: np.ndarray, high: np.ndarray) -> MotionBounds:
-    """Return the middle of the ranges at moderate speeds: a first try at an arm that nobody knows."""
-    middle, half = (low + high) / 2, (high - low) / 2
-    speed = [min(TUNING.used_range * (x.velocity or np.inf), SPEEDS[x.kind]) for x in arm.coordinates]
-    return MotionBounds(middle - TUNING.used_range * half, middle + TUNING.used_range * half, np.array(speed))
 
 
 def _amplitude(arm: Arm, settings: Settings, low: np.ndarray, high: np.ndarray) -> np.ndarray:

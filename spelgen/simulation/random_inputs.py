@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from spelgen.arm.actuation import Drives
-from spelgen.arm.arm import Arm, Coordinate
+from spelgen.arm.arm import Arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
@@ -33,7 +33,11 @@ def random_inputs(
     protocol = settings.simulation
     dynamics = arm_dynamics(arm, settings, make_friction(arm, settings, drives and drives.speeds))
     lowest, highest = initial_range(arm, settings)
-    torques = [_torques(coordinate, settings) for coordinate in arm.coordinates]
+    torques = []
+    for coordinate in arm.coordinates:
+        joint = settings.joint(coordinate.name)
+        is_driven = joint.actuated and not coordinate.passive
+        torques.append(np.array(joint.inputs or protocol.inputs) if is_driven else np.zeros(1))
     t = np.arange(round(protocol.duration * protocol.sample_rate) + 1) / protocol.sample_rate
     # a seed for each trajectory: more of them leave the first ones as they were
     split_seed, *seeds = np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories + 1)
@@ -47,18 +51,9 @@ def random_inputs(
         q, qd = np.split(states, 2, axis=1)
         trajectories.append(Trajectory(t, q, qd, tau, f"traj_{number:02d}"))
         progress(number + 1, protocol.trajectories)
-    tested = _tested(protocol.trajectories, protocol.test_fraction, np.random.default_rng(split_seed))
-    train = [log for number, log in enumerate(trajectories) if number not in tested]
-    return SimulatedLogs(train, [trajectories[number] for number in sorted(tested)])
-
-
-def _torques(coordinate: Coordinate, settings: Settings) -> np.ndarray:
-    joint = settings.joint(coordinate.name)
-    if coordinate.passive or not joint.actuated:
-        return np.zeros(1)
-    return np.array(joint.inputs or settings.simulation.inputs)
-
-
-def _tested(count: int, fraction: float, random: np.random.Generator) -> set[int]:
-    """Return the numbers of the trajectories kept for testing; at least one is left to train on."""
-    return set(random.permutation(count)[: min(round(fraction * count), count - 1)].tolist())
+    # at least one is left to train on
+    count = protocol.trajectories
+    order = np.random.default_rng(split_seed).permutation(count).tolist()
+    tests = min(round(protocol.test_fraction * count), count - 1)
+    train, test = ([trajectories[k] for k in sorted(numbers)] for numbers in (order[tests:], order[:tests]))
+    return SimulatedLogs(train, test)
