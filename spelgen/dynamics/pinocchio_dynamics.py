@@ -68,21 +68,18 @@ class PinocchioDynamics:
         """M, (..., n, n) [kg m^2, kg m, kg]."""
         upper = np.triu(self._by_joint(pin.crba, self.configuration(q)))
         joints = upper + np.triu(upper, 1).swapaxes(-1, -2)  # Pinocchio promises the upper triangle only
-        mass: np.ndarray = self.jacobian.T @ joints @ self.jacobian
-        return mass
+        return np.asarray(self.jacobian.T @ joints @ self.jacobian)
 
     @_takes_tensors
     def nonlinear_effects(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
         """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
         effects = self._by_joint(pin.nle, self.configuration(q), qd @ self.jacobian.T)
-        result: np.ndarray = effects @ self.jacobian
-        return result
+        return effects @ self.jacobian
 
     @_takes_tensors
     def gravity(self, q: np.ndarray) -> np.ndarray:
         """dV/dq, (..., n) [Nm, N]."""
-        torque: np.ndarray = self.nonlinear_effects(q, np.zeros_like(q))
-        return torque
+        return np.asarray(self.nonlinear_effects(q, np.zeros_like(q)))
 
     @_takes_tensors
     def friction_torque(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
@@ -96,8 +93,7 @@ class PinocchioDynamics:
         if self._same:  # a copy, for Pinocchio writes over what it gave
             return np.array(self._by_joint(pin.aba, self.configuration(q), qd, force))
         force = force - self.nonlinear_effects(q, qd)
-        qdd: np.ndarray = np.linalg.solve(self.mass_matrix(q), force[..., None])[..., 0]
-        return qdd
+        return np.linalg.solve(self.mass_matrix(q), force[..., None])[..., 0]
 
     @_takes_tensors
     def inverse_dynamics(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
@@ -106,8 +102,7 @@ class PinocchioDynamics:
         torque = self._by_joint(pin.rnea, self.configuration(q), speeds, rates) @ self.jacobian
         torque = torque + self.friction(qd)
         passive = np.diag(~self.inputs.any(axis=1))
-        inputs: np.ndarray = np.linalg.solve(self.inputs + passive, torque[..., None])[..., 0]
-        return inputs
+        return np.linalg.solve(self.inputs + passive, torque[..., None])[..., 0]
 
     def configuration(self, q: np.ndarray) -> np.ndarray:
         """Pinocchio's configuration (..., nq) at q (..., n)."""

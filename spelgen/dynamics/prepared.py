@@ -144,13 +144,11 @@ class PreparedModel:
 
     def pose(self, q: Tensor) -> Tensor:
         """The tip's homogeneous transform in the root link's frame, (..., 4, 4). Raises ValueError without a tip."""
-        result: Tensor = self._kinematics().pose(q)
-        return result
+        return self._kinematics().pose(q)
 
     def jacobian(self, q: Tensor) -> Tensor:
         """The tip's linear, then angular velocity by qd, (..., 6, n). Raises ValueError without a tip."""
-        result: Tensor = self._kinematics().jacobian(q)
-        return result
+        return self._kinematics().jacobian(q)
 
     def compile(self) -> PreparedModel:
         """Itself, its forward and inverse dynamics compiled by ``torch.compile`` at their first calls."""

@@ -29,8 +29,7 @@ class Triangles:
 
     def squares(self, x: np.ndarray) -> np.ndarray:
         """Return sums of squared residuals by joint, (n,), of the parameters x (K,)."""
-        squares: np.ndarray = np.square(self.factors @ np.append(x, -1.0)).sum(axis=1)
-        return squares
+        return np.asarray(np.square(self.factors @ np.append(x, -1.0)).sum(axis=1))
 
 
 def reduce(blocks: Iterable[Columns]) -> Triangles:
@@ -54,8 +53,7 @@ def block_products(rows: np.ndarray, blocks: int) -> np.ndarray:
     """
     by_joint = rows[: len(rows) // blocks * blocks].swapaxes(0, 1)
     by_joint = by_joint.reshape(rows.shape[1], blocks, -1, rows.shape[2])
-    products: np.ndarray = by_joint.swapaxes(2, 3) @ by_joint
-    return products
+    return np.asarray(by_joint.swapaxes(2, 3) @ by_joint)
 
 
 def normal_solution(products: np.ndarray, targets: int) -> np.ndarray:
@@ -120,8 +118,7 @@ def deviations(residuals: Sequence[np.ndarray], parameters: int) -> np.ndarray:
     count = sum(map(len, residuals))
     power = sum(np.square(x).sum(axis=0) for x in residuals)
     variance = power / max(count - parameters / residuals[0].shape[1], 1.0)
-    deviation: np.ndarray = np.sqrt(variance * correlation_time(residuals))
-    return deviation
+    return np.asarray(np.sqrt(variance * correlation_time(residuals)))
 
 
 def correlation_time(residuals: Sequence[np.ndarray]) -> np.ndarray:
