@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from spelgen.design import BRISTLE_REACH
-from spelgen.settings.tuning.identification import IdentificationTuning
+from spelgen.settings.tuning.identification import TUNING
 
 BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BRISTLE_REACH["revolute"])))
-STRIBECK_VELOCITY = IdentificationTuning().stribeck_velocity
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ class FrictionModel:
             dry = [sign] * len(BRISTLES) if bent is None else list(np.moveaxis(bent, -1, 0))
         effects = [rise, speed, *dry, np.ones_like(speed)]
         if self.stribeck:
-            effects.append(sign * np.exp(-((speed / STRIBECK_VELOCITY) ** 2)))
+            effects.append(sign * np.exp(-((speed / TUNING.stribeck_velocity) ** 2)))
         if self.polynomial:
             effects += [speed * np.abs(speed), speed**3]
         return np.stack(effects, axis=-2)

@@ -24,11 +24,9 @@ from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.identification.drive_samples import DriveSamples
 from spelgen.identification.least_squares import block_products, normal_solution
 from spelgen.runtime.body_chain import BodyChain
-from spelgen.settings.tuning.identification import DriveHintTuning, IdentificationTuning
+from spelgen.settings.tuning.identification import HINTS, TUNING
 
-TUNING = DriveHintTuning()
-FRICTION = FrictionModel(coulomb_smoothing_velocity=IdentificationTuning().moving)
-NEGLIGIBLE = IdentificationTuning().negligible
+FRICTION = FrictionModel(coulomb_smoothing_velocity=TUNING.moving)
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ def drive_problem(chain: BodyChain, drives: Drives, samples: DriveSamples) -> Dr
     """Return least squares of the joint torques."""
     regressors = drive_rows(chain, samples.q, samples.qd, samples.qdd, drives.speeds)
     rows = np.concatenate([regressors, samples.tau[..., None]], axis=2)
-    products = block_products(rows, TUNING.blocks)
+    products = block_products(rows, HINTS.blocks)
     return DriveProblem(samples, drives.speeds, rows, products, products[..., -1, -1].mean(axis=1))
 
 
@@ -99,14 +97,14 @@ class DriveProblem:
     @property
     def is_short(self) -> bool:
         """Whether there are too few samples for a hint."""
-        return len(self.rows) < TUNING.fewest_samples
+        return len(self.rows) < HINTS.fewest_samples
 
     @property
     def free(self) -> list[int]:
         """Return the joints that no known coupling joins and whose torques vary."""
         joins, tau = self.speeds != 0, self.rows[..., -1]
         # what is no more than a constant with rounding shows nothing
-        varies = tau.std(axis=0) > NEGLIGIBLE * np.abs(tau).max(axis=0)
+        varies = tau.std(axis=0) > TUNING.negligible * np.abs(tau).max(axis=0)
         return np.flatnonzero(varies & ((joins | joins.T).sum(axis=0) == 1)).tolist()
 
     def with_rows(self, joints: list[int], rows: np.ndarray) -> DriveProblem:
@@ -140,7 +138,7 @@ class DriveProblem:
         left = np.append(solution, np.full_like(solution[:, :1], -1.0), axis=1)
         errors = left.swapaxes(1, 2) @ products @ left
         # of torques that are explained exactly rounding is left
-        return np.asarray(np.maximum(errors[..., 0, 0].T, NEGLIGIBLE))
+        return np.asarray(np.maximum(errors[..., 0, 0].T, TUNING.negligible))
 
     def exchanged(self, joint: int, other: int) -> DriveProblem:
         """Return the problem with the torques of two joints exchanged, of a joint and itself with the opposite sign."""
@@ -175,11 +173,11 @@ def find_wrong_torques(problem: DriveProblem, joints: Sequence[str]) -> WrongTor
     """Return what is surely wrong with the torques of joints: one of the other sign, or two exchanged."""
     if problem.is_short:
         return None
-    coarse = problem.in_one_block(TUNING.coarse)
+    coarse = problem.in_one_block(HINTS.coarse)
     candidates = list(combinations_with_replacement(range(len(joints)), 2))
     k, other = min(candidates, key=lambda pair: float(coarse.exchanged(*pair).errors.mean()))
     logged, changed = problem.errors.mean(axis=1), problem.exchanged(k, other).errors.mean(axis=1)
-    if not _is_sure(logged, changed, TUNING.wrong_gain, len(candidates)):
+    if not _is_sure(logged, changed, HINTS.wrong_gain, len(candidates)):
         return None
     if k == other:
         return WrongTorque(k, "torque-sense", f"torques of the opposite sign (tau of {joints[k]!r})")
@@ -193,12 +191,12 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     None: none is sure. Joints that known couplings join are left alone.
     """
     # all pairs on few samples: the ratio need not be exact to stand out
-    coarse = problem.in_one_block(TUNING.coarse)
+    coarse = problem.in_one_block(HINTS.coarse)
     candidates: list[Coupling] = []
     for joint, moved_by in permutations(problem.free, 2):
         if abs(joint - moved_by) > 1:
             continue  # shafts and belts run along the arm; farther pairs explain springs
-        for ratio in TUNING.ratios:
+        for ratio in HINTS.ratios:
             candidates.append(Coupling(joint, moved_by, ratio, "joints"))
             candidates.append(Coupling(joint, moved_by, ratio, "motors"))
     if problem.is_short or not candidates:
@@ -208,8 +206,8 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     logged = problem.errors[:, best.pair].mean(axis=1)
     coupled = problem.coupled(best).errors[:, best.pair].mean(axis=1)
     # torques that are hardly explained in some block may be anything
-    explained = coupled.max() < TUNING.coupling_gain
-    if not (explained and _is_sure(logged, coupled, TUNING.coupling_gain, len(candidates))):
+    explained = coupled.max() < HINTS.coupling_gain
+    if not (explained and _is_sure(logged, coupled, HINTS.coupling_gain, len(candidates))):
         return None
     return best, float(coupled.mean() / logged.mean())
 
@@ -222,7 +220,7 @@ def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coup
         bounds=bounds, method="bounded", options={"xatol": abs(start.ratio) / 100},
     )  # fmt: skip
     simple = replace(start, ratio=float(Fraction(float(best.x)).limit_denominator(4)))
-    if simple.ratio and cost(simple) <= (1 + TUNING.simple_ratio) * best.fun:
+    if simple.ratio and cost(simple) <= (1 + HINTS.simple_ratio) * best.fun:
         return simple
     return replace(start, ratio=round(float(best.x), 3))
 
@@ -235,5 +233,5 @@ def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: in
     gains = (logged - mended) / (logged + mended)
     standard_error = gains.std(ddof=1) / np.sqrt(len(gains))
     # of hundreds of couplings one is always better by chance (Bonferroni's bound)
-    needed = -float(stdtrit(len(gains) - 1, TUNING.chance / candidates))
+    needed = -float(stdtrit(len(gains) - 1, HINTS.chance / candidates))
     return bool(gains.mean() > needed * standard_error)

@@ -22,9 +22,8 @@ from spelgen.logs.dynamics_samples import (
 )
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
-from spelgen.settings.tuning.identification import DriveHintTuning
+from spelgen.settings.tuning.identification import HINTS
 
-HINTS = DriveHintTuning()
 STEPS = max(HINTS.shifts)
 SHIFTS = np.array(HINTS.shifts) / FREQUENCY  # [s]
 

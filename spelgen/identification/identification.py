@@ -21,9 +21,8 @@ from spelgen.errors import Diagnostic
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay
 from spelgen.labels import UNITS, counted
 from spelgen.listing import WIDTH, Listing
-from spelgen.settings.tuning.identification import IdentificationTuning
+from spelgen.settings.tuning.identification import TUNING
 
-TUNING = IdentificationTuning()
 SCHEMA = 3
 DETERMINED = ("firm", "fair", "weak", "may be zero")
 _WEIGHTED = {

@@ -23,9 +23,7 @@ from spelgen.logs.dynamics_samples import SHORTEST, DynamicsSamples, dynamics_sa
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
-from spelgen.settings.tuning.identification import IdentificationTuning
-
-TUNING = IdentificationTuning()
+from spelgen.settings.tuning.identification import TUNING
 
 
 def identify(

@@ -19,9 +19,8 @@ from spelgen.identification.least_squares import block_products, normal_solution
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.runtime.body_chain import BodyChain
-from spelgen.settings.tuning.identification import DriveHintTuning, IdentificationTuning
+from spelgen.settings.tuning.identification import HINTS, TUNING
 
-HINTS, TUNING = DriveHintTuning(), IdentificationTuning()
 FRICTION = FrictionModel(memory=True)
 
 

@@ -8,11 +8,8 @@ from spelgen.arm.arm import Arm
 from spelgen.errors import SettingsError, SpelgenError, collect
 from spelgen.excitation.trajectory import SPEEDS, ExcitationTrajectory, Motion, MotionBounds
 from spelgen.settings.settings import Settings
-from spelgen.settings.tuning.simulation import ExcitationTuning, SimulationTuning
+from spelgen.settings.tuning.simulation import EXCITATION, SIMULATION
 from spelgen.simulation.protocol import initial_range
-
-TUNING = SimulationTuning()
-HARMONICS = ExcitationTuning().fewest_harmonics
 
 
 def paths(arm: Arm, settings: Settings, t: np.ndarray) -> list[Motion]:
@@ -26,10 +23,12 @@ def paths(arm: Arm, settings: Settings, t: np.ndarray) -> list[Motion]:
     low, high = initial_range(arm, settings)
     if settings.tracking.paths == "excitation":
         # the middle of the ranges at moderate speeds: a first try at an arm that nobody knows
-        middle, half = (low + high) / 2, TUNING.used_range * (high - low) / 2
-        speeds = [min(TUNING.used_range * (x.velocity or np.inf), SPEEDS[x.kind]) for x in arm.coordinates]
+        middle, half = (low + high) / 2, SIMULATION.used_range * (high - low) / 2
+        speeds = [
+            min(SIMULATION.used_range * (x.velocity or np.inf), SPEEDS[x.kind]) for x in arm.coordinates
+        ]
         bounds = MotionBounds(middle - half, middle + half, np.array(speeds))
-        motions = ExcitationTrajectory(float(t[-1]), HARMONICS, bounds)
+        motions = ExcitationTrajectory(float(t[-1]), EXCITATION.fewest_harmonics, bounds)
         return [motions.motion(random.standard_normal(motions.size), t) for random in randoms]
     middle, amplitude = (low + high) / 2, _amplitude(arm, settings, low, high)
     drawn = [random.uniform(0, 2 * np.pi, len(middle)) for random in randoms]
@@ -52,7 +51,7 @@ def _amplitude(arm: Arm, settings: Settings, low: np.ndarray, high: np.ndarray) 
     """Return the amplitude (n,) of each joint's sines, which must fit into its range."""
     amplitude, errors = np.full(len(low), settings.tracking.amplitude), list[SpelgenError]()
     if "amplitude" not in settings.tracking.model_fields_set:
-        amplitude = np.minimum(amplitude, TUNING.used_range * (high - low) / 2)
+        amplitude = np.minimum(amplitude, SIMULATION.used_range * (high - low) / 2)
     for joint, lowest, highest, swing in zip(arm.coordinates, low, high, amplitude, strict=True):
         if highest - lowest < 2 * swing:
             error = SettingsError(

@@ -53,3 +53,7 @@ class DriveHintTuning:
     samples: int = 1500  # that are kept: six joints have some 70 parameters
     fewest_samples: int = 400  # that hints and errors need
     trajectories: int = 8  # of more, whole ones are left out
+
+
+TUNING = IdentificationTuning()
+HINTS = DriveHintTuning()
