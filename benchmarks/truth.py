@@ -349,7 +349,7 @@ def fit_least_squares(memory: bool) -> Callable[[Path, list[spelgen.Trajectory]]
 
     def fitted(urdf: Path, logs: list[spelgen.Trajectory]) -> Any:
         method = spelgen.LeastSquares(friction=spelgen.FrictionModel(memory=memory))
-        return spelgen.identify(urdf, logs, method).dynamics
+        return spelgen.identify(spelgen.load_arm(urdf), logs, method).dynamics
 
     return fitted
 

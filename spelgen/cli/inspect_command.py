@@ -38,7 +38,6 @@ def inspect(
     ] = False,
 ) -> None:
     """Show the exact structure of an arm's dynamics."""
-
     chosen_entry = options.entry(entry)
     chosen = options.choose_format(format, output, get_args(Format))
     arm = options.load(robot, joints, tip, angle_tolerance)

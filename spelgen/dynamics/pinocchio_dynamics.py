@@ -51,10 +51,9 @@ class PinocchioDynamics:
         self.model, self.data = model, model.createData()
         self.friction: Callable[[np.ndarray], np.ndarray] = friction or np.zeros_like
         self.inputs = np.eye(constraint.jacobian.shape[1]) if inputs is None else inputs
-        self.jacobian, self.offset = np.zeros((model.nv, constraint.jacobian.shape[1])), np.zeros(model.nv)
-        for name, row, offset in zip(constraint.names, constraint.jacobian, constraint.offset, strict=True):
-            index = model.joints[model.getJointId(name)].idx_v
-            self.jacobian[index], self.offset[index] = row, offset
+        order = [model.joints[model.getJointId(name)].idx_v for name in constraint.names]
+        self.jacobian, self.offset = np.zeros((model.nv, len(self.inputs))), np.zeros(model.nv)
+        self.jacobian[order], self.offset[order] = constraint.jacobian, constraint.offset
         # coordinates are the model's joints in its order: products with the identity took longer than `aba` itself
         self._same = np.array_equal(self.jacobian, np.eye(self.n)) and not self.offset.any()
 

@@ -31,11 +31,10 @@ class Criterion:
         count = EXCITATION.samples_per_harmonic * trajectory.harmonics + 1
         self.times = torch.linspace(0.0, trajectory.duration, count, dtype=torch.float64)
         self.inertial = torch.from_numpy(urdf_parameters(arm))
-        self.limits = torch.full((len(arm.coordinates),), torch.inf, dtype=torch.float64)
         # without inertials the torque is not known, and no limit can be kept
-        if all(body.inertia for body in arm.bodies):
-            for k, coordinate in enumerate(arm.coordinates):
-                self.limits[k] = coordinate.effort or torch.inf
+        is_known = all(body.inertia for body in arm.bodies)
+        efforts = [(is_known and coordinate.effort) or torch.inf for coordinate in arm.coordinates]
+        self.limits = torch.tensor(efforts, dtype=torch.float64)
 
     def states(self, parameters: np.ndarray) -> Tensor:
         """Return q, qd and qdd at the samples that are judged, (3, T, n)."""

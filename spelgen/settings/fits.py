@@ -224,9 +224,9 @@ def fit_config(
 
     Of ``defaults``, a robot's settings for whatever is fitted, those that do not apply are left out.
     """
-    kind, options = CONFIGS[objective], dict(options or {})
-    applicable = set(kind.model_fields) - set(kind.unused(rigid_bodies=rigid_bodies))
-    settings = {name: value for name, value in (defaults or {}).items() if name in applicable}
+    kind, options, settings = CONFIGS[objective], dict(options or {}), dict(defaults or {})
+    for name in settings.keys() - (kind.model_fields.keys() - kind.unused(rigid_bodies=rigid_bodies)):
+        del settings[name]
     for name, (other, _, against) in UNLESS.items():
         if options.get(other, settings.get(other)) == against:
             settings.pop(name, None)
