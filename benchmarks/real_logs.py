@@ -32,16 +32,15 @@ from spelgen.arm.arm import Arm
 from spelgen.baselines.predictor import Solver
 from spelgen.building import build
 from spelgen.dynamics.bristles import bristle_reach, reach_of
+from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.regressor import regressor
 from spelgen.errors import LogError
 from spelgen.evaluation.horizons import end_errors
 from spelgen.evaluation.torque import mean_nmse, predicted_torques
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.torque.fit import fit_torque
-from spelgen.identification.friction import FrictionModel
-from spelgen.identification.identification import Identification
+from spelgen.identification.identification import Identification, LeastSquares
 from spelgen.identification.identify import least_squares
-from spelgen.identification.method import LeastSquares
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing

@@ -30,7 +30,7 @@ from published_phnode import ByJvp, Published
 
 from spelgen.building import build
 from spelgen.design import Design
-from spelgen.dynamics.unbounded import unbounded
+from spelgen.dynamics.equations import unbounded
 from spelgen.fitting.rollout import position_difference
 
 if TYPE_CHECKING:

@@ -385,7 +385,7 @@ def fit_least_squares(memory: bool) -> Callable[[Path, list[spelgen.Trajectory]]
 
     def fit(urdf: Path, logs: list[spelgen.Trajectory]) -> Fitted:
         method = spelgen.LeastSquares(friction=spelgen.FrictionModel(memory=memory))
-        result = spelgen.identify(urdf, logs, method)
+        result = spelgen.identify(spelgen.load_arm(urdf), logs, method)
         bodies, armature, _ = np.split(
             result.parameters, np.cumsum([10 * len(result.arm.bodies), len(result.arm.coordinates)])
         )

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from spelgen.building import build
     from spelgen.certificate.inspection import Inspection
     from spelgen.design import Design
+    from spelgen.dynamics.linear_friction import FrictionModel
     from spelgen.dynamics.tip import tip_kinematics
     from spelgen.emission.loading import load_module
     from spelgen.errors import SpelgenError
@@ -19,10 +20,8 @@ if TYPE_CHECKING:
     from spelgen.excitation.design import excite
     from spelgen.exporting.export import export
     from spelgen.fitting.fit import Fit, RunOptions, fit, load_run
-    from spelgen.identification.friction import FrictionModel
-    from spelgen.identification.identification import Identification
+    from spelgen.identification.identification import Identification, LeastSquares
     from spelgen.identification.identify import identify
-    from spelgen.identification.method import LeastSquares
     from spelgen.loaded_arm import LoadedArm, load_arm
     from spelgen.log_checks.check_logs import check_logs
     from spelgen.logs.preprocessing import Preprocessing
@@ -51,9 +50,9 @@ _HOME = {
     "simulate": "simulation.simulate",
     "excite": "excitation.design",
     "identify": "identification.identify",
-    "LeastSquares": "identification.method",
+    "LeastSquares": "identification.identification",
     "keep_baseline": "evaluation.keep",
-    "FrictionModel": "identification.friction",
+    "FrictionModel": "dynamics.linear_friction",
     "Identification": "identification.identification",
     "fit": "fitting.fit",
     "Fit": "fitting.fitted",

@@ -8,38 +8,26 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spelgen.arm.actuation import Actuation, derive_actuation
-from spelgen.arm.arm import Arm, make_arm
+from spelgen.arm.actuation import derive_actuation
+from spelgen.arm.arm import make_arm
+from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.certificate.inspection import Inspection
 from spelgen.certificate.verification import Verification
 from spelgen.errors import Diagnostic
 from spelgen.labels import counted
-from spelgen.settings.settings import Settings, load_settings
+from spelgen.settings.settings import load_settings
 from spelgen.spec import Assume, Facts
 from spelgen.structure.base_parameters import BaseParameter, base_parameters
 from spelgen.structure.structure import Structure, derive
 from spelgen.urdf.read import read_urdf
-from spelgen.urdf.robot import Robot
 
 if TYPE_CHECKING:  # SymPy is read in only for formulas
     from spelgen.certificate.formulas import Entry, Formulas
 
 
 @dataclass(frozen=True, repr=False)
-class LoadedArm:
-    """The robot of a URDF as read, its sidecar's settings, the arm taken from them, and its inputs.
-
-    ``joints``, ``tip`` and ``angle_tolerance`` are those that ``load_arm`` was given. What is derived is worked
-    out on first use.
-    """
-
-    robot: Robot
-    settings: Settings
-    arm: Arm
-    actuation: Actuation
-    joints: tuple[str, ...] | None
-    tip: str | None
-    angle_tolerance: float
+class LoadedArm(ConfiguredArm):
+    """An arm with what is derived from it, which is worked out on first use."""
 
     @cached_property
     def structure(self) -> Structure:

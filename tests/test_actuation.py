@@ -18,7 +18,7 @@ from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.windows import Windows
 from spelgen.pipeline import generate, inspect
-from spelgen.simulation.friction import make_friction
+from spelgen.simulation.protocol import make_friction
 from spelgen.simulation.random_inputs import random_inputs
 
 pytest.importorskip("pinocchio")

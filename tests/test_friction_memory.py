@@ -6,11 +6,11 @@ import torch
 from emitted import ROBOTS, built, import_source
 
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, bristles_along, encoder_step, reach_of
+from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.emission.loading import load_module
 from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
-from spelgen.identification.friction import FrictionModel
+from spelgen.identification.identification import LeastSquares
 from spelgen.identification.identify import least_squares
-from spelgen.identification.method import LeastSquares
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory

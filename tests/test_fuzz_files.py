@@ -29,7 +29,7 @@ from spelgen.render.report_page import render_report
 from spelgen.render.scene import scene
 from spelgen.settings.fits import TorqueFit
 from spelgen.settings.settings import OF_A_STEP
-from spelgen.simulation.friction import make_friction
+from spelgen.simulation.protocol import make_friction
 
 JOINTS = ("joint1", "joint2")
 NUMBERS = st.one_of(

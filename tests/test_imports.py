@@ -19,12 +19,11 @@ CARRIED = {"__future__", "collections", "functools", "math", "torch", "typing"}
 # A folder (or a file at the top) may import only from itself and from what stands above it.
 ROWS = """
 version errors files labels listing tasks templates runtime
-settings urdf arm design spec
+urdf settings arm design spec
 structure dynamics
-certificate emission logs
-loaded_arm pipeline building trust
-identification log_checks excitation
-fitting simulation
+certificate emission logs excitation
+identification simulation loaded_arm pipeline building trust
+log_checks fitting
 exporting baselines
 evaluation
 fleet comparison render

@@ -22,7 +22,7 @@ from emitted import (
     randomise,
 )
 
-from spelgen.dynamics.runge_kutta import runge_kutta
+from spelgen.dynamics.equations import runge_kutta
 from spelgen.settings.settings import load_settings
 from tests.lie_group import from_group, to_group
 

@@ -21,8 +21,8 @@ from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.identification import torque_delay
 from spelgen.identification.drive_hints import Coupling
+from spelgen.identification.identification import LeastSquares
 from spelgen.identification.identify import identify, least_squares
-from spelgen.identification.method import LeastSquares
 from spelgen.loaded_arm import load_arm
 from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples

@@ -14,7 +14,7 @@ from spelgen.errors import SettingsError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
 from spelgen.settings.joint import JointSettings
 from spelgen.settings.settings import OF_A_STEP, Settings, load_mapping, load_settings
-from spelgen.simulation.friction import make_friction
+from spelgen.simulation.protocol import make_friction
 
 
 @pytest.fixture

@@ -13,8 +13,8 @@ from spelgen.loaded_arm import load_arm
 from spelgen.settings.joint import JointSettings
 from spelgen.settings.settings import Settings, load_settings
 from spelgen.simulation import integration
-from spelgen.simulation.friction import make_friction
 from spelgen.simulation.integration import rollout
+from spelgen.simulation.protocol import make_friction
 from spelgen.simulation.random_inputs import random_inputs
 from spelgen.simulation.simulate import simulate
 from spelgen.urdf.read import read_urdf

@@ -13,9 +13,8 @@ from spelgen.loaded_arm import load_arm
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
 from spelgen.simulation import tracking
-from spelgen.simulation.friction import make_friction
 from spelgen.simulation.paths import paths, sines
-from spelgen.simulation.random_inputs import initial_range
+from spelgen.simulation.protocol import initial_range, make_friction
 from spelgen.simulation.simulate import simulate
 from spelgen.simulation.tracking import measured, record, track, tuned_gains
 from tests.hand_built import arm, body, coordinate, point, slider

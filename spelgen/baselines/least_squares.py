@@ -10,12 +10,11 @@ from spelgen.baselines.baseline import Baseline, JudgedArm
 from spelgen.baselines.names import LEAST_SQUARES, LEAST_SQUARES_WITH_MEMORY
 from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.baselines.run_arm import run_arm
+from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.errors import LogError
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.identification.friction import FrictionModel
-from spelgen.identification.identification import identified_dynamics
+from spelgen.identification.identification import LeastSquares, identified_dynamics
 from spelgen.identification.identify import identify_by
-from spelgen.identification.method import LeastSquares
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, require_torques
 

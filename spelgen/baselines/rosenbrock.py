@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.pose import Pose, PoseAt, poses
+from spelgen.dynamics.equations import Pose, PoseAt, poses
 from spelgen.dynamics.protocol import has_friction_state, has_momentum, memory_after, sliding_memory
 from spelgen.logs.windows import Windows
 from spelgen.settings.tuning.evaluation import EvaluationTuning

@@ -11,15 +11,17 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, NoReturn
+from types import NoneType
+from typing import Annotated, NoReturn, get_args
 
 import typer
+from typer.models import OptionInfo
 
-from spelgen.cli.command import name_values
 from spelgen.errors import SpelgenError, in_one_line
 from spelgen.files import local, with_addresses, write_text
 from spelgen.labels import counted, printable
 
+METAVARS: dict[object, str] = {int: "N", float: "X", str: "TEXT", Path: "FILE"}
 FAILED = 1
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
 BROKEN_PIPE = 141  # 128 + SIGPIPE
@@ -57,13 +59,23 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
     # annotations are strings, as files begin with `from __future__ import annotations`
     signature = inspect.signature(command, eval_str=True)
     for parameter in signature.parameters.values():
-        name_values(parameter.annotation)
+        _name_values(*get_args(parameter.annotation))
     option = inspect.Parameter("debug", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Debug)
     parameters = [*signature.parameters.values(), option]
     # typer reads the options from these two
     vars(run)["__signature__"] = signature.replace(parameters=parameters)
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return run
+
+
+def _name_values(kind: object, *metadata: object) -> None:
+    """Give an annotated option the name of its values that people read: N, X, FILE, or the choices."""
+    kinds = [kind]
+    if NoneType in get_args(kind):
+        kinds = list(get_args(kind))
+    for info in metadata:
+        if isinstance(info, OptionInfo) and info.metavar is None and kind is not bool:
+            info.metavar = METAVARS.get(kinds[0]) or "|".join(map(str, get_args(kinds[0])))
 
 
 def _local(value: object) -> object:

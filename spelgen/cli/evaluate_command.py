@@ -10,8 +10,8 @@ import typer
 
 from spelgen.baselines.names import MODEL
 from spelgen.cli import options
-from spelgen.cli.console import deliver, note, progress_bar, say
-from spelgen.cli.options import Data, Filter, Mapping, MoreData, Output, Run, Trust
+from spelgen.cli.console import note, progress_bar, say
+from spelgen.cli.options import Data, Filter, MappingFile, MoreData, Output, Run, Trust
 from spelgen.evaluation.tables import LIMITS, csv_text, figures
 
 Format = Literal["text", "json", "csv"]
@@ -22,7 +22,7 @@ def evaluate(
     run: Run,
     extra_logs: MoreData = None,
     data: Data = None,
-    mapping: Mapping = None,
+    mapping: MappingFile = None,
     filter: Filter = None,
     format: Annotated[Format | None, options.result_format()] = None,
     output: Output = None,
@@ -51,9 +51,7 @@ def evaluate(
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.logs.preprocessing import Preprocessing
 
-    preprocessing = None
-    if filter is not None:
-        preprocessing = Preprocessing(cutoff=filter)
+    preprocessing = None if filter is None else Preprocessing(cutoff=filter)
     logs = read_test_logs(run, paths, mapping)
     model = load_run(run, trust=trust)
     steps, seconds = ((), ()) if quick else (STEPS, SECONDS)
@@ -66,23 +64,18 @@ def evaluate(
     write_json(RunFolder(run).evaluation, record)
     for diagnostic in results.diagnostics:
         note(diagnostic)
-    chosen = options.choose_format(format, output, Format)
-    if chosen == "csv":
-        deliver(csv_text(results), output)
-    elif chosen == "json":
-        deliver(json.dumps(record) + "\n", output)
-    else:
-        deliver(results.text() + "\n", output)
+    forms = {"text": results.text, "csv": lambda: csv_text(results).removesuffix("\n")}
+    options.write_result(format, output, forms | {"json": lambda: json.dumps(record)})
     # after the result, so that a script that failed still has the figures
-    exceeded = False
     values = {figure.name: figure.values[MODEL] for figure in figures(results)}
+    exceeded = []
     for name, largest in limits:
         value = values.get(name)
         if value is None or value > largest:
-            exceeded = True
-            shown = "not known" if value is None else f"{value:.4g}"
-            note(f"limit exceeded: {name} is {shown}, expected at most {largest:g}")
+            size = "not known" if value is None else f"{value:.4g}"
+            exceeded.append(f"limit exceeded: {name} is {size}, expected at most {largest:g}")
     if exceeded:
+        note("\n".join(exceeded))
         raise typer.Exit(MISSED)
 
 
@@ -101,7 +94,7 @@ def _limit(text: str) -> tuple[str, float]:
 
 def report(
     runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN...", help="Run folders; several are compared on one page.")
+        list[Path], typer.Argument(metavar="RUN", help="Run folders; several are compared on one page.")
     ],
     output: Annotated[
         Path | None,

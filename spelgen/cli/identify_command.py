@@ -8,14 +8,14 @@ from typing import Annotated, Literal
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import deliver, note
+from spelgen.cli.console import note
 from spelgen.cli.options import (
     Accept,
     AngleTolerance,
     Data,
     Filter,
     Joints,
-    Mapping,
+    MappingFile,
     MoreData,
     Output,
     Robot,
@@ -30,7 +30,7 @@ def identify(
     robot: Robot,
     extra_logs: MoreData = None,
     data: Data = None,
-    mapping: Mapping = None,
+    mapping: MappingFile = None,
     joints: Joints = None,
     tip: Tip = None,
     angle_tolerance: AngleTolerance = 2e-3,
@@ -53,12 +53,10 @@ def identify(
 ) -> None:
     """Identify base parameters and friction by least squares."""
     paths = options.logs(data, extra_logs)
-    from spelgen.identification.friction import FrictionModel
+    from spelgen.dynamics.linear_friction import FrictionModel
+    from spelgen.identification.identification import LeastSquares
     from spelgen.identification.identify import identify as identify_arm
-    from spelgen.identification.method import LeastSquares
-    from spelgen.loaded_arm import load_arm
     from spelgen.log_checks.check_logs import require_sound_logs
-    from spelgen.logs.arm_mapping import log_source
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs
 
@@ -68,9 +66,9 @@ def identify(
         if name not in EFFECTS:
             raise typer.BadParameter(f"{name!r} is none of {', '.join(EFFECTS)}", param_hint="'--friction'")
     method = LeastSquares(weights, FrictionModel(**dict.fromkeys(effects, True)))
-    arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
+    arm = options.load(robot, joints, tip, angle_tolerance)
     # codes are accepted for this command alone; the sidecar holds those for always
-    log_mapping = options.accepting(log_source(arm, mapping).mapping, accept)
+    log_mapping = options.log_mapping(arm, mapping, accept)
     logs = read_logs(paths, arm, log_mapping, role="train")
     # least squares would fit wrong units without a word
     for diagnostic in require_sound_logs(logs, arm, log_mapping):
@@ -78,13 +76,12 @@ def identify(
     result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
     for diagnostic in result.diagnostics:
         note(diagnostic)
-    # pages and charts are imported where they are asked for
-    chosen = options.choose_format(format, output, Format)
-    if chosen == "html":
+
+    def page() -> str:
+        # pages and charts are imported where they are asked for
         from spelgen.render.identification_page import page
 
-        deliver(page(result, arm) + "\n", output)
-    elif chosen == "json":
-        deliver(json.dumps(result.to_dict(), indent=2) + "\n", output)
-    else:
-        deliver(result.text() + "\n", output)
+        return page(result, arm)
+
+    forms = {"text": result.text, "json": lambda: json.dumps(result.to_dict(), indent=2), "html": page}
+    options.write_result(format, output, forms)

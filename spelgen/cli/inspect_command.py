@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import typer
 
@@ -38,11 +38,9 @@ def inspect(
     ] = False,
 ) -> None:
     """Show the exact structure of an arm's dynamics."""
-    from spelgen.loaded_arm import load_arm
-
     chosen_entry = options.entry(entry)
-    chosen = options.choose_format(format, output, Format)
-    arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
+    chosen = options.choose_format(format, output, get_args(Format))
+    arm = options.load(robot, joints, tip, angle_tolerance)
     inspection = arm.inspect(assume)
     # other programs, which take seconds
     proof = arm.verify(assume) if verify else None
@@ -55,8 +53,7 @@ def inspect(
     # the result comes first; --strict and a failed proof only decide the exit code
     deliver(_text(chosen, inspection, closed, proof, arm.robot.path), output)
     if strict:
-        warnings = [x for x in inspection.diagnostics if x.severity == "warning"]
-        refuse_warnings(f"{robot}: ", len(warnings))
+        refuse_warnings(f"{robot}: ", [x.severity for x in inspection.diagnostics].count("warning"))
     if proof and not proof.agrees:
         note(f"{robot}: the proof contradicts the derivation; please report this file")
         raise typer.Exit(FAILED)

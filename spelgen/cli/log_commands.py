@@ -4,13 +4,23 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, answer, note, progress_bar, refuse_warnings, say
-from spelgen.cli.options import Accept, AngleTolerance, Force, Joints, Mapping, Robot, Strict, TextOrJson, Tip
+from spelgen.cli.options import (
+    Accept,
+    AngleTolerance,
+    Force,
+    Joints,
+    MappingFile,
+    Robot,
+    Strict,
+    TextOrJson,
+    Tip,
+)
 from spelgen.errors import SpelgenErrors
 from spelgen.files import write_text
 
@@ -46,10 +56,9 @@ def excite(
     Collisions are not checked.
     """
     from spelgen.excitation.design import excite as design_motion
-    from spelgen.loaded_arm import load_arm
 
     options.require_free(output, force=force)  # before minutes of search
-    arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
+    arm = options.load(robot, joints, tip, angle_tolerance)
     with progress_bar("searching") as progress:
         motion = design_motion(
             arm,
@@ -78,11 +87,10 @@ def simulate(
     force: Force = False,
 ) -> None:
     """Simulate training and test logs with Pinocchio."""
-    from spelgen.loaded_arm import load_arm
     from spelgen.logs.read import write_logs
     from spelgen.simulation.simulate import simulate as simulate_arm
 
-    arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
+    arm = options.load(robot, joints, tip, angle_tolerance)
     paths = {role: output / f"{role}.parquet" for role in ("train", "test")}
     for path in paths.values():
         options.require_free(path, force=force)
@@ -97,13 +105,13 @@ def simulate(
 
 
 def logs(
-    paths: Annotated[list[Path], typer.Argument(metavar="LOGS...", help="Log files or folders.")],
+    paths: Annotated[list[Path], typer.Argument(metavar="LOGS", help="Log files or folders.")],
     robot: Annotated[Path, typer.Option(metavar="ROBOT.urdf", help="URDF of the logged arm.")],
     joints: Joints = None,
     tip: Tip = None,
     angle_tolerance: AngleTolerance = 2e-3,
-    mapping: Mapping = None,
-    format: Annotated[Literal["text", "json"], typer.Option(help="Format of the result.")] = "text",
+    mapping: MappingFile = None,
+    format: TextOrJson = "text",
     html: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Also write an HTML page with plots.")
     ] = None,
@@ -119,18 +127,16 @@ def logs(
 
     The logs are not changed. The exit code is 1 if they cannot be used for training.
     """
-    from spelgen.loaded_arm import load_arm
     from spelgen.log_checks.check_logs import check_logs
-    from spelgen.logs.arm_mapping import log_source
     from spelgen.logs.chunks import stream_logs
     from spelgen.render.logs_page import page
 
     # the URDF says which joints a mapping must name
-    arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
+    arm = options.load(robot, joints, tip, angle_tolerance)
     if suggest is not None:
         options.require_free(suggest, force=force)
         mapping = _suggested(paths, arm, suggest)
-    log_mapping = options.accepting(log_source(arm, mapping).mapping, accept)
+    log_mapping = options.log_mapping(arm, mapping, accept)
     result = check_logs(stream_logs(paths, arm, log_mapping), arm, log_mapping)
     if format == "text":
         say(result.text())

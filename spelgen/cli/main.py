@@ -7,10 +7,13 @@ never loads torch.
 from __future__ import annotations
 
 import os
+import re
 import sys
-from typing import Annotated
+from difflib import get_close_matches
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperArgument, TyperCommand, TyperGroup
 
 from spelgen.cli import (
     evaluate_command,
@@ -21,11 +24,55 @@ from spelgen.cli import (
     study_commands,
     train_command,
 )
-from spelgen.cli.command import Command, Group
 from spelgen.cli.console import handle_errors, say
 from spelgen.version import __version__
 
+UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 CONTEXT = {"max_content_width": 80, "help_option_names": ["-h", "--help"]}
+
+
+class Command(TyperCommand):
+    """A command whose help names arguments and nothing of their types, which their names say."""
+
+    def get_help(self, ctx: Any) -> str:
+        """Return the help."""
+        for parameter in self.params:
+            if isinstance(parameter, TyperArgument):
+                vars(parameter)["display_type"] = lambda ctx: ""
+        return super().get_help(ctx)
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """Return the names as they are, optional ones in brackets."""
+        return [re.sub(r"[{}]", "", piece) for piece in super().collect_usage_pieces(ctx)]
+
+
+class Group(TyperGroup):
+    """All commands: a mistake in the words of one is answered with what may have been meant."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command."""
+        try:
+            return super().invoke(ctx)
+        except UsageError as error:
+            _suggest(error)
+            raise
+
+
+def _suggest(error: Any) -> None:
+    """Add to the message of a usage error the option or the choice that may have been meant."""
+    # click lists all that is similar: one suggestion is enough
+    nearest = list(getattr(error, "possibilities", None) or [])[:1]
+    if nearest:
+        error.possibilities = []
+    # click has no suggestion for values of a choice, which are misspelt as often as options
+    choice = re.fullmatch(r"'(.*)' is not one of (.*)\.", error.message, re.DOTALL)
+    if choice:
+        choices = re.findall(r"'([^']*)'", choice[2])
+        nearest = [repr(name) for name in get_close_matches(choice[1], choices, n=1)]
+        error.message = f"{choice[1]!r} is none of {', '.join(choices)}."
+    if nearest:
+        error.message = f"{error.message.rstrip('.')}. Did you mean {nearest[0]}?"
+
 
 app = typer.Typer(
     name="spelgen",

@@ -81,10 +81,9 @@ def build(
     # an option without effect would pass for one that was applied
     if net is not None and preset == "closed-form":
         raise typer.BadParameter("closed-form has no networks", param_hint="'--net'")
-    from spelgen.loaded_arm import load_arm
     from spelgen.pipeline import generate
 
-    arm = load_arm(robot, options.names(joints), tip, angle_tolerance)
+    arm = options.load(robot, joints, tip, angle_tolerance)
     path = output or Path(f"{robot.stem}_spel.py")
     source = generate(arm, preset, net=net, width=width, depth=depth, assume=assume, module=path)
     # the same text: nothing is replaced, and its date stays

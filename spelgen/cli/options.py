@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import typer
 from typer.models import OptionInfo
 
+from spelgen.cli.console import deliver
 from spelgen.errors import SpelgenError, suggestion
 from spelgen.settings.log_mapping import Accepted
 from spelgen.spec import Assume
 
 if TYPE_CHECKING:
+    from spelgen.loaded_arm import LoadedArm
+    from spelgen.logs.arm_mapping import LoggedArm
     from spelgen.settings.log_mapping import LogMapping
 
 SUFFIXES = {".json": "json", ".csv": "csv", ".html": "html", ".tex": "latex", ".py": "sympy"}
@@ -71,7 +74,7 @@ MoreData = Annotated[
         metavar="LOGS", help="More log files or folders; several may follow --data.", show_default=False
     ),
 ]
-Mapping = Annotated[
+MappingFile = Annotated[
     Path | None,
     typer.Option(
         "--mapping",
@@ -128,15 +131,16 @@ def result_format() -> OptionInfo:
     return option
 
 
-def choose_format(format: str | None, output: Path | None, formats: object) -> str:
-    """Return the format named, else the one of these (a Literal) that the output's suffix means, else text."""
-    if format is not None:
-        return format
+def choose_format(format: str | None, output: Path | None, formats: Container[str]) -> str:
+    """Return the format named, else the one of these that the output's suffix means, else text."""
     # `-o page.html` means HTML: to say so twice would be tedious
-    meant = SUFFIXES.get(output.suffix.lower()) if output else None
-    if meant in get_args(formats):
-        return str(meant)
-    return "text"
+    meant = SUFFIXES.get(output.suffix.lower(), "text") if output else "text"
+    return format or (meant if meant in formats else "text")
+
+
+def write_result(format: str | None, output: Path | None, forms: Mapping[str, Callable[[], str]]) -> None:
+    """Print or write a result by the function of the format that `choose_format` returns."""
+    deliver(forms[choose_format(format, output, forms)]() + "\n", output)
 
 
 def names(text: str | None) -> list[str] | None:
@@ -167,16 +171,29 @@ def logs(data: list[Path] | None, extra_logs: list[Path] | None) -> list[Path]:
     return [*data, *(extra_logs or [])]
 
 
-def accepting(mapping: LogMapping, codes: Sequence[str] | None) -> LogMapping:
-    """Return the mapping that accepts these errors too. A usage error for an unknown code."""
+def log_mapping(arm: LoggedArm, mapping: Path | LogMapping | None, codes: Sequence[str] | None) -> LogMapping:
+    """Return how the logs of an arm are named, by default as its settings say, with these errors accepted too.
+
+    A usage error for an unknown code.
+    """
+    from spelgen.logs.arm_mapping import log_source
+
     for code in codes or ():
         # a misspelt code would silently accept nothing
         if code not in get_args(Accepted):
             hint = suggestion(code, get_args(Accepted))
             raise typer.BadParameter(f"unknown code {code!r}; {hint}", param_hint="'--accept'")
+    chosen = log_source(arm, mapping).mapping
     # a dict keeps the order, so that the same command writes the same record
-    accepted = dict.fromkeys((*mapping.accept, *(codes or ())))
-    return mapping.model_copy(update={"accept": tuple(accepted)})
+    accepted = dict.fromkeys((*chosen.accept, *(codes or ())))
+    return chosen.model_copy(update={"accept": tuple(accepted)})
+
+
+def load(robot: Path, joints: str | None, tip: str | None, angle_tolerance: float) -> LoadedArm:
+    """Return the arm that a command names."""
+    from spelgen.loaded_arm import load_arm
+
+    return load_arm(robot, names(joints), tip, angle_tolerance)
 
 
 def require_free(path: Path, *, force: bool) -> None:

@@ -62,17 +62,19 @@ def compare(
         raise UsageError("--steps: does not apply with --urdf-error, which uses the training defaults")
     variants = {variant.name: variant for variant in (ablation_variants() if ablation else VARIANTS)}
     chosen = options.names(presets) or list(variants)
-    for name in chosen:
-        if name not in variants:
-            raise SpelgenError(
-                f"unknown preset {name!r}", expected=", ".join(variants), do=suggestion(name, variants)
-            )
-    folder = output or _default_folder(robot, ablation, urdf_error)
+    for preset in chosen:
+        if preset not in variants:
+            hint = suggestion(preset, variants)
+            raise SpelgenError(f"unknown preset {preset!r}", expected=", ".join(variants), do=hint)
+    name = robot.stem + ("-ablation" if ablation else "")
+    if urdf_error is not None:
+        name += f"-urdf-{urdf_error:g}"
+    folder = output or Path("comparisons") / name
     with progress_bar("simulating") as progress:
         study = prepare_study(
             robot,
             folder,
-            variants=[variants[name] for name in chosen],
+            variants=[variants[preset] for preset in chosen],
             seeds=seeds,
             steps=steps,
             urdf_error=urdf_error,
@@ -86,15 +88,6 @@ def compare(
     for table in tables:
         say(table.text() + "\n")
     say(f"wrote {write_comparison(study, tables)}")
-
-
-def _default_folder(robot: Path, ablation: bool, urdf_error: float | None) -> Path:
-    name = robot.stem
-    if ablation:
-        name += "-ablation"
-    if urdf_error is not None:
-        name += f"-urdf-{urdf_error:g}"
-    return Path("comparisons") / name
 
 
 def fleet(

@@ -12,10 +12,8 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
-from spelgen.cli.options import Accept, Data, Force, Mapping, MoreData, RobotOption, TextOrJson, Trust
+from spelgen.cli.options import Accept, Data, Force, MappingFile, MoreData, RobotOption, TextOrJson, Trust
 from spelgen.cli.train_settings import (
-    TIME_LIMIT,
-    Machine,
     Request,
     UsageError,
     new_run,
@@ -65,7 +63,7 @@ def train(
     data: Data = None,
     output: NewRun = None,
     robot: RobotOption = None,
-    mapping: Mapping = None,
+    mapping: MappingFile = None,
     resume: Resume = False,
     force: Force = False,
     trust: Trust = False,
@@ -82,41 +80,41 @@ def train(
     """
     start_time = time.monotonic()  # max_minutes counts from here, reading of logs included
     # before anything is read: a misspelt key costs no time
-    values = read_assignments(assignments or [])
-    request = Request(objective, values)
+    request = Request(objective, read_assignments(assignments or []))
     if source is not None:
+        from spelgen.fitting.run_folder import RunFolder
+
         if module is not None:
             extra_logs = [module, *(extra_logs or [])]  # with --from, all that stands there is logs
-        module, robot = _module_of_run(source, robot)
+        run = RunFolder(source)
+        run.read_config()  # where there is no run, this says so
+        module = run.module
+        robot = robot or (run.urdf if run.urdf.exists() else None)
         request = _warm_start(request)
-    elif "adapt" in values:
+    elif "adapt" in request.values:
         raise UsageError("--set adapt: belongs to --from")
     if module is None:
         raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
     paths = options.logs(data, extra_logs)
-    folder = output or _default_folder(module, resume)
-    urdf = None
-    if resume:
-        start = resumed_run(folder, request)
-    else:
-        urdf = robot or _unchanged_urdf(module)
-        start = new_run(module, urdf, request)
+    # `train RUN --resume` names the folder where a module stands otherwise
+    folder = output or (module if resume and module.is_dir() else Path("runs") / module.stem)
+    urdf = None if resume else robot or _unchanged_urdf(module)
+    start = resumed_run(folder, request) if resume else new_run(module, urdf, request)
     from spelgen.loaded_arm import arm_of_module
     from spelgen.log_checks.check_logs import require_sound_logs
-    from spelgen.logs.arm_mapping import log_source
 
     facts = read_facts(start.module)
     # the mapping may speak of all joints of a URDF, and logs are checked beside the arm
     arm = None if urdf is None else arm_of_module(facts, urdf)
-    log_mapping = options.accepting(log_source(arm or facts.joints, mapping or start.mapping).mapping, accept)
-    # where a fit runs is no part of what is fitted, and not recorded with it
-    machine = Machine.model_validate({name: values[name] for name in Machine.model_fields if name in values})
+    log_mapping = options.log_mapping(arm or facts.joints, mapping or start.mapping, accept)
     # torch is imported where it is needed: --help and mistakes are answered at once
     from spelgen.fitting.fit import RunOptions
     from spelgen.fitting.train import train as train_files
+    from spelgen.logs.preprocessing import Preprocessing
 
-    where = machine.model_dump()
-    run_options = RunOptions(**where, resume=resume, force=force, mapping=log_mapping, began=start_time)
+    # where a fit runs is no part of what is fitted, and not recorded with it
+    machine = {"progress": True} | request.values_of(("device", "threads", "progress"))
+    run_options = RunOptions(**machine, resume=resume, force=force, mapping=log_mapping, began=start_time)
     try:
         fit = train_files(
             start.module,
@@ -125,17 +123,15 @@ def train(
             start.config,
             urdf=urdf,
             source=source,
-            preprocessing=start.preprocessing,
-            validation=start.validation,
-            seed=start.seed,
+            preprocessing=Preprocessing(**start.settings.preprocessing),
+            validation=start.settings.validation_fraction,
+            seed=start.settings.seed,
             trust=trust,
             require=lambda logs: [] if arm is None else require_sound_logs(logs, arm, log_mapping),
             options=run_options,
         )
     except OptionError as error:
-        option = f"--set {error.option}"
-        if error.option in ("objective", TIME_LIMIT):
-            option = f"--{error.option.replace('_', '-')}"
+        option = "--objective" if error.option == "objective" else f"--set {error.option}"
         raise UsageError(f"{option}: {error.got}") from error
     _tell(fit, folder, paths, format, resume=resume)
 
@@ -181,10 +177,8 @@ def _outcome(fit: Fit) -> tuple[str, str]:
         return f"{fit.status}: {config.objective} fitted in {fit.seconds:.0f} s{reason}", loss
     if fit.status == "stopped early":
         reason = f": no better validation loss since epoch {fit.best_epoch}"
-    elif fit.status == "finished" and fit.epochs >= config.epochs:
-        reason = ": all epochs are run"
     elif fit.status == "finished":
-        reason = ": no way further down"
+        reason = ": all epochs are run" if fit.epochs >= config.epochs else ": no way further down"
     end = f"{fit.status} after {counted(fit.epochs, 'epoch')}, {fit.steps} steps, {fit.seconds:.0f} s{reason}"
     return end, f"best {loss}, at epoch {fit.best_epoch}"
 
@@ -194,27 +188,9 @@ def _warm_start(request: Request) -> Request:
     objective, values = request.objective or "torque", dict(request.values)
     if objective == "torque":
         values.setdefault("adapt", "load")
-    elif "adapt" in values:
+    elif "adapt" in request.values:
         raise UsageError(f"--set adapt: belongs to the objective torque, this fits {objective}")
     return Request(objective, values, warm_start=True)
-
-
-def _default_folder(module: Path, resume: bool) -> Path:
-    # `train RUN --resume` names the folder where a module stands otherwise
-    if resume and module.is_dir():
-        return module
-    return Path("runs") / module.stem
-
-
-def _module_of_run(source: Path, robot: Path | None) -> tuple[Path, Path | None]:
-    """Return the module of a run, and its URDF where none is named."""
-    from spelgen.fitting.run_folder import RunFolder
-
-    run = RunFolder(source)
-    run.read_config()  # where there is no run, this says so
-    if robot is None and run.urdf.exists():
-        robot = run.urdf
-    return run.module, robot
 
 
 def _unchanged_urdf(module: Path) -> Path | None:
@@ -228,6 +204,5 @@ def _unchanged_urdf(module: Path) -> Path | None:
     except ModuleError:
         return None
     # settings and limits of a changed URDF would belong to another arm
-    if hashlib.sha256(urdf_bytes(path)).hexdigest() != facts.urdf_sha256:
-        return None
-    return path
+    is_same = hashlib.sha256(urdf_bytes(path)).hexdigest() == facts.urdf_sha256
+    return path if is_same else None

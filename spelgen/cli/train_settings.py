@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,18 +12,17 @@ from pydantic import ValidationError
 
 from spelgen.cli.console import note
 from spelgen.errors import RunError, suggestion
-from spelgen.settings.fits import CONFIGS, FitConfig
+from spelgen.settings.fits import OWNERS, Adaptation, FitConfig
 from spelgen.settings.messages import explain
 from spelgen.settings.training import TrainingSettings
-from spelgen.settings.values import Count, Group
+from spelgen.settings.values import Count
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
-    from spelgen.logs.preprocessing import Preprocessing
     from spelgen.settings.log_mapping import LogMapping
 
 TIME_LIMIT = "max_minutes"
-PREPROCESSING = ("cutoff", "decimation", "gap", "torque_delay")
+OF_LOGS = {"cutoff", "decimation", "gap", "torque_delay", "validation_fraction", "seed"}
 FIELD_SEPARATOR = "."
 
 
@@ -35,27 +34,16 @@ class UsageError(typer.BadParameter):
         return self.message
 
 
-class Machine(Group):
-    """Where a fit runs: a device of torch, how many threads it uses, and whether it shows its progress."""
+class Assignments(TrainingSettings):
+    """What `--set` assigns: a robot's settings, what of a fitted model moves, and where and how a fit runs.
 
+    device: of torch. threads: that it uses. progress: whether it is shown.
+    """
+
+    adapt: Adaptation | None = None
     device: str = "cpu"
     threads: Count = 1
     progress: bool = True
-
-
-def _groups_by_key() -> dict[str, type[Group]]:
-    """Return every key of `--set` with the group of settings that checks its value."""
-    keys: dict[str, type[Group]] = {}
-    groups: list[type[Group]] = [*CONFIGS.values(), TrainingSettings, Machine]
-    for group in groups:
-        for name in group.model_fields:
-            # several objectives share options: the first that has one checks its value
-            keys.setdefault(name, group)
-    del keys["objective"]  # an option of its own
-    return keys
-
-
-KEYS = _groups_by_key()
 
 
 @dataclass(frozen=True)
@@ -66,15 +54,13 @@ class Request:
     values: Mapping[str, Any]
     warm_start: bool = False
 
-    @property
-    def options(self) -> dict[str, object]:
-        """Return the values that belong to the configuration of an objective."""
-        return {name: value for name, value in self.values.items() if issubclass(KEYS[name], FitConfig)}
+    def values_of(self, keys: Iterable[str]) -> dict[str, Any]:
+        """Return the values of these keys."""
+        return {name: self.values[name] for name in keys if name in self.values}
 
-    @property
-    def preprocessing(self) -> dict[str, object]:
-        """Return the values that say how logs are prepared."""
-        return {name: value for name, value in self.values.items() if name in PREPROCESSING}
+    def settings(self, defaults: TrainingSettings) -> TrainingSettings:
+        """Return how logs are prepared and split: as the command line says, else as these settings do."""
+        return defaults.model_copy(update=self.values_of(OF_LOGS))
 
 
 @dataclass(frozen=True)
@@ -83,10 +69,8 @@ class Start:
 
     module: Path
     config: Callable[[EmittedModel, Sequence[float] | None], FitConfig | None]
-    preprocessing: Preprocessing
-    validation: float
-    seed: int
-    mapping: LogMapping | None
+    settings: TrainingSettings
+    mapping: LogMapping | None = None
 
 
 def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
@@ -94,47 +78,36 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
 
     Raises a usage error for an unknown key, with the nearest known one, and for a value that cannot be.
     """
+    keys = Assignments.model_fields.keys() - {"objective"}  # an option of its own
     # first gathered: fields of one group are checked together
-    texts: dict[str, object] = {}
+    texts: dict[str, Any] = {}
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         name, _, field = key.strip().replace("-", "_").partition(FIELD_SEPARATOR)
         if not equals:
             raise UsageError(f"--set: got {assignment!r}, expected KEY=VALUE")
-        if name not in KEYS:
-            raise UsageError(f"--set: unknown key {name!r}; {suggestion(name, KEYS)}")
+        if name not in keys:
+            raise UsageError(f"--set: unknown key {name!r}; {suggestion(name, sorted(keys))}")
         if not field:
             texts[name] = text
-            continue
-        fields = texts.setdefault(name, {})
-        if isinstance(fields, dict):
-            fields[field] = text
-    values = {}
-    for name, given in texts.items():
-        try:
-            values[name] = getattr(KEYS[name].model_validate({name: given}), name)
-        except ValidationError as error:
-            wrong = explain(error.errors(include_url=False)[0], None, KEYS[name])
-            raise UsageError(f"--set {wrong}") from error
-    return values
+        elif isinstance(texts.setdefault(name, {}), dict):
+            texts[name][field] = text
+    try:
+        checked = Assignments.model_validate(texts)
+    except ValidationError as error:
+        wrong = explain(error.errors(include_url=False)[0], None, Assignments)
+        raise UsageError(f"--set {wrong}") from error
+    return {name: getattr(checked, name) for name in texts}
 
 
 def new_run(module: Path, urdf: Path | None, request: Request) -> Start:
     """Return the start of a new run: what the command line does not say, the robot's settings do."""
-    from spelgen.logs.preprocessing import Preprocessing
     from spelgen.settings.settings import load_settings
 
     # without a URDF there is no sidecar that could hold defaults
-    settings = TrainingSettings()
-    if urdf is not None:
-        settings = load_settings(urdf).training
+    settings = TrainingSettings() if urdf is None else load_settings(urdf).training
     return Start(
-        module,
-        lambda model, rates: _new_config(settings, request, model, rates),
-        Preprocessing(**(settings.preprocessing | request.preprocessing)),
-        request.values.get("validation_fraction", settings.validation_fraction),
-        request.values.get("seed", settings.seed),
-        mapping=None,
+        module, lambda model, rates: _new_config(settings, request, model, rates), request.settings(settings)
     )
 
 
@@ -145,7 +118,7 @@ def _new_config(
     from spelgen.dynamics.protocol import has_rigid_bodies
     from spelgen.fitting.objectives import chosen_config
 
-    options, defaults = request.options, dict(settings.options)
+    options, defaults = request.values_of(OWNERS), dict(settings.options)
     objective = request.objective or settings.objective
     if request.warm_start and objective == "rollout" and has_rigid_bodies(model):
         defaults["torque_first"] = False  # it would start the bodies anew
@@ -165,33 +138,29 @@ def resumed_run(folder: Path, request: Request) -> Start:
     from spelgen.dynamics.protocol import has_rigid_bodies
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.fitting.run_record import recorded_config
-    from spelgen.logs.preprocessing import Preprocessing
     from spelgen.settings.fits import fit_config
     from spelgen.settings.log_mapping import LogMapping
 
     run = RunFolder(folder)
     record = run.read_config()
+    fraction = record["validation_fraction"]
     # those logs were in memory of another program
-    if record["validation_fraction"] is None and record["validation"]:
+    if fraction is None and record["validation"]:
         raise RunError(
             "a run whose validation logs were passed from Python",
             file=folder,
             do="resume it by spelgen.fit(..., folder=..., options=spelgen.RunOptions(resume=True))",
         )
+    settings = TrainingSettings(seed=record["seed"], **record["preprocessing"])
+    if fraction is not None:
+        settings = settings.model_copy(update={"validation_fraction": fraction})
 
     def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig:
         rigid_bodies = has_rigid_bodies(model)
         if request.objective not in (None, record["objective"]):
-            return fit_config(request.objective, rigid_bodies=rigid_bodies, options=request.options)
-        same = recorded_config(record, **request.options)
+            return fit_config(request.objective, rigid_bodies=rigid_bodies, options=request.values_of(OWNERS))
+        same = recorded_config(record, **request.values_of(OWNERS))
         same.require(rigid_bodies=rigid_bodies)
         return same
 
-    return Start(
-        run.module,
-        config,
-        Preprocessing(**(record["preprocessing"] | request.preprocessing)),
-        request.values.get("validation_fraction", record["validation_fraction"]),
-        request.values.get("seed", record["seed"]),
-        mapping=LogMapping(**record["mapping"]),
-    )
+    return Start(run.module, config, request.settings(settings), LogMapping(**record["mapping"]))

@@ -98,8 +98,7 @@ def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None
     if bristles.smoothing_velocity is None:
         return None
     speed = qd if bristles.motors is None else qd @ bristles.motors.T
-    direction: np.ndarray = speed / np.hypot(speed, bristles.smoothing_velocity)
-    return direction
+    return np.asarray(speed / np.hypot(speed, bristles.smoothing_velocity))
 
 
 def encoded(q: np.ndarray) -> np.ndarray:
@@ -114,8 +113,7 @@ def encoded(q: np.ndarray) -> np.ndarray:
         clamped = [np.clip(x[earlier], low[later], high[later]) for x in (low, high)]
         low[later], high[later] = clamped
         shift *= 2
-    result: np.ndarray = np.clip(np.broadcast_to(q[:1], q.shape), low, high)
-    return result
+    return np.asarray(np.clip(np.broadcast_to(q[:1], q.shape), low, high))
 
 
 def encoder_step(q: np.ndarray) -> np.ndarray:

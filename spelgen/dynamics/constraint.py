@@ -28,20 +28,12 @@ def mimic_constraint(robot: Robot, coordinates: Sequence[str]) -> Constraint:
     moving = [joint.name for joint in robot.joints if joint.moves]
     jacobian, offset = np.zeros((len(moving), len(columns))), np.zeros(len(moving))
     for row, name in enumerate(moving):
-        leader, multiplier, shift = _followed(robot, name)
-        offset[row] = shift
+        # what a joint follows in the end
+        multiplier, leader = 1.0, name
+        while (mimic := robot.joint[leader].mimic) is not None:
+            offset[row] += multiplier * mimic.offset
+            multiplier *= mimic.multiplier
+            leader = mimic.joint
         if leader in columns:
             jacobian[row, columns[leader]] = multiplier
     return Constraint(tuple(moving), jacobian, offset)
-
-
-def _followed(robot: Robot, name: str) -> tuple[str, float, float]:
-    """What a joint follows in the end: leader, multiplier and offset."""
-    multiplier, offset = 1.0, 0.0
-    while (mimic := robot.joint[name].mimic) is not None:
-        name, multiplier, offset = (
-            mimic.joint,
-            multiplier * mimic.multiplier,
-            offset + multiplier * mimic.offset,
-        )
-    return name, multiplier, offset

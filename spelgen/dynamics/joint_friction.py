@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -37,16 +36,9 @@ class Friction:
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
         s = np.tanh(v / self.smoothing_velocity)
-        torque: np.ndarray = self.viscous * v + s * (self._odd + s * self._even)
+        odd, even = self.forward - self.backward, self.forward + self.backward
+        torque: np.ndarray = self.viscous * v + 0.5 * s * (odd + s * even)
         return torque if self.speeds is None else torque @ self.speeds
-
-    @cached_property
-    def _odd(self) -> np.ndarray:
-        return np.asarray(0.5 * (self.forward - self.backward))
-
-    @cached_property
-    def _even(self) -> np.ndarray:
-        return np.asarray(0.5 * (self.forward + self.backward))
 
 
 def joint_friction(

@@ -31,8 +31,16 @@ def pinocchio_model(arm: Arm, settings: Settings) -> pin.Model:
 
     Reflected rotor inertia is the model's armature. Raises ArmError when a body has no inertial.
     """
-    bare = [body.name for body in arm.bodies if body.inertia is None]
-    collect(list(map(_without_inertial, bare)))
+    errors = []
+    for body in arm.bodies:
+        if body.inertia is None:
+            what, do = (
+                "a link without <inertial>",
+                "write estimates into the URDF; a model that is trained on logs needs none",
+            )
+            expected = "mass, centre of mass and inertia of all that moves"
+            errors.append(ArmError(what, element=f"joint {body.name!r}", expected=expected, do=do))
+    collect(errors)
     model = pin.Model()
     model.name = arm.name
     model.gravity.linear = np.array(arm.gravity, dtype=float)
@@ -41,20 +49,10 @@ def pinocchio_model(arm: Arm, settings: Settings) -> pin.Model:
         placement = pin.SE3(np.array(body.rotation, dtype=float), np.array(body.translation, dtype=float))
         index = model.addJoint(body.parent + 1, joint, placement, body.name)
         model.appendBodyToJoint(index, _inertia(np.array(body.inertia, dtype=float)), pin.SE3.Identity())
-    model.armature = np.array([_armature(arm, settings, body.name) for body in arm.bodies])
+    # a mimic joint has no motor of its own
+    rotors = {name: settings.joint(name).armature for name in arm.joint_names}
+    model.armature = np.array([rotors.get(body.name, 0.0) for body in arm.bodies])
     return model
-
-
-def _without_inertial(name: str) -> ArmError:
-    what, expected = "a link without <inertial>", "mass, centre of mass and inertia of all that moves"
-    do = "write estimates into the URDF; a model that is trained on logs needs none"
-    return ArmError(what, element=f"joint {name!r}", expected=expected, do=do)
-
-
-def _armature(arm: Arm, settings: Settings, joint_name: str) -> float:
-    if joint_name not in arm.joint_names:
-        return 0.0  # a mimic joint has no motor of its own
-    return settings.joint(joint_name).armature
 
 
 def _inertia(parameters: np.ndarray) -> pin.Inertia:

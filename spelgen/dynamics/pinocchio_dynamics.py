@@ -37,7 +37,7 @@ def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
 class PinocchioDynamics:
     """An arm of n coordinates (see ``RigidDynamics``); the model has b joints, the reflected rotors as armature.
 
-    constraint: what its names leave out stands still. friction: torque (..., n) by velocity (..., n).
+    constraint: what its names leave out stands still. friction: torque (..., n) by velocity (..., n); without, none.
     inputs: G, (n, n); without, each input is its own joint's torque.
     """
 
@@ -49,11 +49,11 @@ class PinocchioDynamics:
         inputs: np.ndarray | None = None,
     ) -> None:
         self.model, self.data = model, model.createData()
-        self.friction, self.inputs = friction, inputs
-        self.jacobian, self.offset = np.zeros((model.nv, constraint.jacobian.shape[1])), np.zeros(model.nv)
-        for name, row, offset in zip(constraint.names, constraint.jacobian, constraint.offset, strict=True):
-            index = model.joints[model.getJointId(name)].idx_v
-            self.jacobian[index], self.offset[index] = row, offset
+        self.friction: Callable[[np.ndarray], np.ndarray] = friction or np.zeros_like
+        self.inputs = np.eye(constraint.jacobian.shape[1]) if inputs is None else inputs
+        order = [model.joints[model.getJointId(name)].idx_v for name in constraint.names]
+        self.jacobian, self.offset = np.zeros((model.nv, len(self.inputs))), np.zeros(model.nv)
+        self.jacobian[order], self.offset[order] = constraint.jacobian, constraint.offset
         # coordinates are the model's joints in its order: products with the identity took longer than `aba` itself
         self._same = np.array_equal(self.jacobian, np.eye(self.n)) and not self.offset.any()
 
@@ -67,53 +67,41 @@ class PinocchioDynamics:
         """M, (..., n, n) [kg m^2, kg m, kg]."""
         upper = np.triu(self._by_joint(pin.crba, self.configuration(q)))
         joints = upper + np.triu(upper, 1).swapaxes(-1, -2)  # Pinocchio promises the upper triangle only
-        mass: np.ndarray = self.jacobian.T @ joints @ self.jacobian
-        return mass
+        return np.asarray(self.jacobian.T @ joints @ self.jacobian)
 
     @_takes_tensors
     def nonlinear_effects(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
         """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
         effects = self._by_joint(pin.nle, self.configuration(q), qd @ self.jacobian.T)
-        result: np.ndarray = effects @ self.jacobian
-        return result
+        return effects @ self.jacobian
 
     @_takes_tensors
     def gravity(self, q: np.ndarray) -> np.ndarray:
         """dV/dq, (..., n) [Nm, N]."""
-        torque: np.ndarray = self.nonlinear_effects(q, np.zeros_like(q))
-        return torque
+        return np.asarray(self.nonlinear_effects(q, np.zeros_like(q)))
 
     @_takes_tensors
     def friction_torque(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
         """What friction takes, (..., n) [Nm, N]."""
-        if self.friction is None:
-            return np.zeros_like(qd)
         return self.friction(qd)
 
     @_takes_tensors
     def forward_dynamics(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
         """qdd, (..., n), under the inputs tau."""
-        force = tau if self.inputs is None else tau @ self.inputs.T
-        if self.friction is not None:
-            force = force - self.friction(qd)
+        force = tau @ self.inputs.T - self.friction(qd)
         if self._same:  # a copy, for Pinocchio writes over what it gave
             return np.array(self._by_joint(pin.aba, self.configuration(q), qd, force))
         force = force - self.nonlinear_effects(q, qd)
-        qdd: np.ndarray = np.linalg.solve(self.mass_matrix(q), force[..., None])[..., 0]
-        return qdd
+        return np.linalg.solve(self.mass_matrix(q), force[..., None])[..., 0]
 
     @_takes_tensors
     def inverse_dynamics(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
         speeds, rates = qd @ self.jacobian.T, qdd @ self.jacobian.T
         torque = self._by_joint(pin.rnea, self.configuration(q), speeds, rates) @ self.jacobian
-        if self.friction is not None:
-            torque = torque + self.friction(qd)
-        if self.inputs is None:
-            return np.asarray(torque)
+        torque = torque + self.friction(qd)
         passive = np.diag(~self.inputs.any(axis=1))
-        inputs: np.ndarray = np.linalg.solve(self.inputs + passive, torque[..., None])[..., 0]
-        return inputs
+        return np.linalg.solve(self.inputs + passive, torque[..., None])[..., 0]
 
     def configuration(self, q: np.ndarray) -> np.ndarray:
         """Pinocchio's configuration (..., nq) at q (..., n)."""
@@ -121,15 +109,9 @@ class PinocchioDynamics:
             q = q @ self.jacobian.T + self.offset
         if self.model.nq == self.model.nv:
             return q
-        configuration: np.ndarray = np.tile(pin.neutral(self.model), (*q.shape[:-1], 1))
-        for joint in self.model.joints[1:]:
-            position = q[..., joint.idx_v]
-            if joint.nq == 1:
-                configuration[..., joint.idx_q] = position
-            elif joint.nq == 2:  # a continuous joint is (cos, sin) in Pinocchio
-                configuration[..., joint.idx_q] = np.cos(position)
-                configuration[..., joint.idx_q + 1] = np.sin(position)
-        return configuration
+        # a continuous joint is (cos, sin) in Pinocchio
+        neutral = pin.neutral(self.model)
+        return np.apply_along_axis(lambda moved: pin.integrate(self.model, neutral, moved), -1, q)
 
     def _by_joint(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
         """What the algorithm gives of states (..., nq), (..., nv), ...; it takes one at a time."""

@@ -16,9 +16,8 @@ from spelgen.settings.settings import load_settings
 from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.read import read_urdf
 
-COULOMB_SMOOTHING_VELOCITY = (
-    0.05  # [rad/s, m/s] width of the tanh in place of the jump of a URDF's Coulomb friction
-)
+# [rad/s, m/s] width of the tanh in place of the jump of a URDF's Coulomb friction
+COULOMB_SMOOTHING_VELOCITY = 0.05
 
 
 def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) -> PinocchioDynamics:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.pose import poses
+from spelgen.dynamics.equations import runge_kutta
 from spelgen.dynamics.protocol import known_past, sliding_memory
 from spelgen.dynamics.residuals import without_idle_residuals
-from spelgen.dynamics.runge_kutta import runge_kutta
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 if TYPE_CHECKING:
@@ -96,7 +94,13 @@ class PreparedModel:
         z follows the displacements exactly; by default it starts as ``memory`` says.
         """
         z = self.memory(qd) if z is None else z
-        return self._stepped(self.forward_dynamics, State(q, qd, z), tau, dt, substeps)
+
+        def rhs(q: Tensor, speed: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+            return speed, self.forward_dynamics(q, speed, tau, z)
+
+        for _ in range(substeps):
+            q, qd, z, _ = runge_kutta(self._model, rhs, q, qd, z, dt / substeps)
+        return State(q, qd, z)
 
     def rollout(
         self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, z: Tensor | None = None, *, substeps: int = 1
@@ -128,26 +132,23 @@ class PreparedModel:
         def function(state: Tensor, tau: Tensor, z: Tensor) -> Tensor:
             position, speed = state.split(n)
             if dt is None:
-                return torch.cat([speed, self._differentiable(position, speed, tau, z)])
-            end = self._stepped(self._differentiable, State(position, speed, z), tau, dt, substeps)
-            return torch.cat([end.q, end.qd])
+                return torch.cat([speed, self.forward_dynamics(position, speed, tau, z)])
+            return torch.cat(self.step(position, speed, tau, dt, z, substeps=substeps)[:2])
 
         batch, elements = q.shape[:-1], z.shape[-1]
         states = torch.cat([q, qd], dim=-1).reshape(-1, 2 * n)
         rows = states, tau.reshape(-1, n), z.reshape(len(states), n, elements)
-        jacobian = torch.func.vmap(torch.func.jacfwd(function, argnums=(0, 1)))
-        by_state, by_input = jacobian(*rows)
+        # backwards: vmap of a forward derivative of linalg.solve is wrong in torch 2.13
+        by_state, by_input = torch.func.vmap(torch.func.jacrev(function, argnums=(0, 1)))(*rows)
         return by_state.reshape(*batch, 2 * n, 2 * n), by_input.reshape(*batch, 2 * n, n)
 
     def pose(self, q: Tensor) -> Tensor:
         """The tip's homogeneous transform in the root link's frame, (..., 4, 4). Raises ValueError without a tip."""
-        result: Tensor = self._kinematics().pose(q)
-        return result
+        return self._kinematics().pose(q)
 
     def jacobian(self, q: Tensor) -> Tensor:
         """The tip's linear, then angular velocity by qd, (..., 6, n). Raises ValueError without a tip."""
-        result: Tensor = self._kinematics().jacobian(q)
-        return result
+        return self._kinematics().jacobian(q)
 
     def compile(self) -> PreparedModel:
         """Itself, its forward and inverse dynamics compiled by ``torch.compile`` at their first calls."""
@@ -166,20 +167,3 @@ class PreparedModel:
         if self._tip is None:
             raise ValueError("no tip: give model.prepared(tip=spelgen.tip_kinematics(arm))")
         return self._tip
-
-    def _differentiable(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-        """``forward_dynamics`` by the inverse: vmap of a forward derivative of linalg.solve is wrong in torch 2.13."""
-        pose = poses(self._model)(q)
-        inverse: Tensor = torch.linalg.inv(pose.mass)
-        return inverse @ pose.force(qd, tau, z)
-
-    def _stepped(
-        self, accelerations: Callable[..., Tensor], start: State, tau: Tensor, dt: float, substeps: int
-    ) -> State:
-        def rhs(q: Tensor, speed: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-            return speed, accelerations(q, speed, tau, z)
-
-        q, qd, z = start
-        for _ in range(substeps):
-            q, qd, z, _ = runge_kutta(self._model, rhs, q, qd, z, dt / substeps)
-        return State(q, qd, z)

@@ -129,16 +129,8 @@ class VelocityState:
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
         self.elements = getattr(dynamics, "elements", 0)
-
-    def memory(self, qd: Tensor) -> Tensor:
-        """z, (..., n, K), of joints that have long gone the way of qd."""
-        z: Tensor = self.dynamics.memory(qd)
-        return z
-
-    def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """z after joints went one way by (..., n)."""
-        z = self.dynamics.memory_after(z, displacement)
-        return z
+        if has_friction_state(dynamics):
+            self.memory, self.memory_after = dynamics.memory, dynamics.memory_after
 
     def prepare(self) -> None:
         """Nothing."""

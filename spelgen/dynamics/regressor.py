@@ -1,12 +1,25 @@
-"""The rigid-body regressor Y(q, qd, qdd) of an arm: the joint torques are Y times the bodies' inertial parameters."""
+"""The bodies of an arm as the runtime's own chain, and their regressor: joint torques are Y times their parameters."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.body_regressor import chain_regressor
-from spelgen.dynamics.rigid_bodies import body_chain
+from spelgen.runtime.body_chain import BodyChain
+from spelgen.runtime.parts import Row
+
+
+def body_chain(arm: Arm) -> BodyChain:
+    """Return how the arm's bodies may move, for q (..., n) [rad; m]."""
+    rows: list[tuple[Any, ...]] = []
+    for body in arm.bodies:
+        geometry = tuple(map(_row, body.rotation)), _row(body.translation)
+        is_revolute, ratio = body.kind == "revolute", float(body.multiplier)
+        rows.append((body.parent, body.coordinate, is_revolute, ratio, body.offset, *geometry))
+    return BodyChain(len(arm.coordinates), _row(arm.gravity), *zip(*rows, strict=True))
 
 
 def regressor(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
@@ -20,3 +33,7 @@ def regressor(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.nd
 def urdf_parameters(arm: Arm) -> np.ndarray:
     """The URDF's own inertial parameters, (10 B,); zero for a body without."""
     return np.array([body.inertia or (0,) * 10 for body in arm.bodies], dtype=float).ravel()
+
+
+def _row(values: tuple[object, object, object]) -> Row:
+    return tuple(map(float, values))  # type: ignore[arg-type]

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.pose import Pose
-from spelgen.dynamics.rigid_bodies import body_chain
+from spelgen.dynamics.equations import Pose
+from spelgen.dynamics.regressor import body_chain
 from spelgen.runtime.bristles import moved_bristles
 from spelgen.runtime.port_hamiltonian import applied
 from spelgen.runtime.rigid_body import spatial_inertia
@@ -39,8 +39,9 @@ class RegressorDynamics:
         by_body = torch.from_numpy(parameters).double().reshape(-1, 10)
         self.inertia = torch.block_diag(*spatial_inertia(by_body))
         self.armature = torch.tensor(armature, dtype=torch.float64)
-        self.bristle_reach = None if bristle_reach is None else torch.from_numpy(bristle_reach)
         alone = np.eye(len(armature))
+        reach = alone[:, :0] if bristle_reach is None else bristle_reach
+        self.bristle_reach = torch.from_numpy(reach)
         inputs, motors = drives or Drives(alone, alone)
         self.inputs, self.motors = torch.from_numpy(inputs), torch.from_numpy(motors)
 
@@ -52,7 +53,7 @@ class RegressorDynamics:
     @property
     def elements(self) -> int:
         """K, of friction's memory at a joint."""
-        return 0 if self.bristle_reach is None else self.bristle_reach.shape[1]
+        return self.bristle_reach.shape[1]
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """M, (..., n, n) [kg m^2, kg m, kg]."""
@@ -69,9 +70,7 @@ class RegressorDynamics:
 
     def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
         """What friction takes, and what the measured torque shows without any, (..., n) [Nm, N]."""
-        past = None
-        if z is not None and self.elements:
-            past = z.numpy()
+        past = z.numpy() if z is not None and self.elements else None
         return torch.from_numpy(self.friction(qd.numpy(), past))
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
@@ -93,7 +92,7 @@ class RegressorDynamics:
         return applied(pose.mass, qdd) - pose.force(qd, torch.zeros_like(qdd), z)
 
     def pose_at(self, q: Tensor) -> Pose:
-        """Return the equations of motion at q, (T, n), see `pose.poses`."""
+        """Return the equations of motion at q, (T, n), see `equations.poses`."""
         chain = self.chain.forward(q)
         momenta = chain.twists @ self.inertia
 
@@ -106,11 +105,9 @@ class RegressorDynamics:
 
     def memory(self, qd: Tensor) -> Tensor:
         """z, (..., n, K), of drives that have long gone this way."""
-        assert self.bristle_reach is not None
         return (qd @ self.motors.mT.to(qd)).sign().unsqueeze(-1) * self.bristle_reach
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
         """z after joints went one way by (..., n)."""
-        assert self.bristle_reach is not None
         moved = displacement @ self.motors.mT.to(displacement)
         return moved_bristles(z, moved.unsqueeze(-1), self.bristle_reach)

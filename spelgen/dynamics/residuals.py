@@ -40,19 +40,14 @@ def without_residuals(model: Model) -> Model:
 def without_idle_residuals(model: Model) -> Model:
     """Return a copy of the model without residuals that give nothing, for weights that change no more."""
     reduced = copy.deepcopy(model)
-    _remove_idle(reduced)
+    if has_residuals(reduced):
+        terms = reduced.residuals
+        for part in NETWORKS:
+            if _is_idle(getattr(terms, part)):
+                setattr(terms, part, None)
+        if not any(bool(weights.any()) for weights in terms.parameters()):
+            reduced.residuals = None
     return reduced
-
-
-def _remove_idle(model: object) -> None:
-    if not has_residuals(model):
-        return
-    terms = model.residuals
-    for part in NETWORKS:
-        if _is_idle(getattr(terms, part)):
-            setattr(terms, part, None)
-    if not any(bool(weights.any()) for weights in terms.parameters()):
-        model.residuals = None
 
 
 def _is_idle(network: MaskedMLP | MaskedKAN | None) -> bool:

@@ -12,15 +12,13 @@ import torch
 from torch import Tensor
 
 from spelgen.arm.arm import Arm
+from spelgen.dynamics.base_parameters import base_parameters
 from spelgen.dynamics.body_regressor import regressor_of
-from spelgen.dynamics.regressor import urdf_parameters
-from spelgen.dynamics.rigid_bodies import body_chain
+from spelgen.dynamics.linear_friction import FrictionModel
+from spelgen.dynamics.regressor import body_chain, urdf_parameters
 from spelgen.excitation.trajectory import ExcitationTrajectory
-from spelgen.identification.base_parameters import base_parameters
-from spelgen.identification.friction import FrictionModel
-from spelgen.settings.tuning.simulation import ExcitationTuning
+from spelgen.settings.tuning.simulation import EXCITATION
 
-TUNING = ExcitationTuning()
 FRICTION = FrictionModel()
 
 
@@ -30,14 +28,13 @@ class Criterion:
     def __init__(self, arm: Arm, trajectory: ExcitationTrajectory) -> None:
         self.trajectory, self.chain = trajectory, body_chain(arm)
         self.columns = torch.from_numpy(base_parameters(arm, FRICTION).columns)
-        count = TUNING.samples_per_harmonic * trajectory.harmonics + 1
+        count = EXCITATION.samples_per_harmonic * trajectory.harmonics + 1
         self.times = torch.linspace(0.0, trajectory.duration, count, dtype=torch.float64)
         self.inertial = torch.from_numpy(urdf_parameters(arm))
-        self.limits = torch.full((len(arm.coordinates),), torch.inf, dtype=torch.float64)
         # without inertials the torque is not known, and no limit can be kept
-        if all(body.inertia for body in arm.bodies):
-            for k, coordinate in enumerate(arm.coordinates):
-                self.limits[k] = coordinate.effort or torch.inf
+        is_known = all(body.inertia for body in arm.bodies)
+        efforts = [(is_known and coordinate.effort) or torch.inf for coordinate in arm.coordinates]
+        self.limits = torch.tensor(efforts, dtype=torch.float64)
 
     def states(self, parameters: np.ndarray) -> Tensor:
         """Return q, qd and qdd at the samples that are judged, (3, T, n)."""
@@ -65,8 +62,8 @@ class Criterion:
 
     def _value(self, parameters: Tensor) -> Tensor:
         rows = self._rows(self.trajectory.states(parameters, self.times))
-        overrun = (self._efforts(rows).abs() - TUNING.effort).clamp(min=0.0)
-        penalties = TUNING.penalty * overrun.square().sum() + self.trajectory.given_away(parameters).sum()
+        overrun = (self._efforts(rows).abs() - EXCITATION.effort).clamp(min=0.0)
+        penalties = EXCITATION.penalty * overrun.square().sum() + self.trajectory.given_away(parameters).sum()
         return self._log_condition(rows) + penalties
 
     def _rows(self, states: Tensor) -> Tensor:
@@ -86,5 +83,5 @@ class Criterion:
         # a parameter that the motion does not show at all
         if not length.all():
             return torch.tensor(torch.inf, dtype=torch.float64)
-        values: Tensor = torch.linalg.svdvals(columns / length)
-        return (values[0] / values[-1]).log()
+        condition: Tensor = torch.linalg.cond(columns / length)
+        return condition.log()

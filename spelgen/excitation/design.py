@@ -4,26 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import inf, isfinite
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from scipy.optimize import minimize
 
+from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.errors import SettingsError
 from spelgen.excitation.criterion import Criterion
 from spelgen.excitation.excitation import Excitation
 from spelgen.excitation.trajectory import ExcitationTrajectory, motion_bounds
-from spelgen.settings.tuning.simulation import ExcitationTuning
-
-if TYPE_CHECKING:
-    from spelgen.loaded_arm import LoadedArm
-
-TUNING = ExcitationTuning()
+from spelgen.settings.tuning.simulation import EXCITATION
 
 
 def excite(
-    arm: LoadedArm,
+    arm: ConfiguredArm,
     *,
     duration: float = 30.0,
     sample_rate: float = 100.0,
@@ -43,15 +38,20 @@ def excite(
     at, beside 40 at random that it starts from. progress: called with the trials done and all.
     Raises SettingsError for a value that cannot be, ArmError for a joint without room between its limits.
     """
-    _require(duration=duration, sample_rate=sample_rate, reach=reach, speed=speed)
+    positive = {"duration": duration, "sample_rate": sample_rate, "reach": reach, "speed": speed}
+    for name, value in positive.items():
+        is_fraction = name in ("reach", "speed")
+        if not 0 < value < inf or (is_fraction and value > 1):
+            expected = "more than 0, at most 1" if is_fraction else "a positive number"
+            raise SettingsError(repr(value), element=f"excite: {name}", expected=expected)
     if harmonics is None:
-        harmonics = max(TUNING.fewest_harmonics, round(TUNING.harmonics_per_second * duration))
+        harmonics = max(EXCITATION.fewest_harmonics, round(EXCITATION.harmonics_per_second * duration))
     elif harmonics < 2:
         raise SettingsError(repr(harmonics), element="excite: harmonics", expected="2 or more")
     bounds = motion_bounds(arm.arm, reach, speed, arm.robot.joint)
     trajectory = ExcitationTrajectory(duration, harmonics, bounds)
     criterion = Criterion(arm.arm, trajectory)
-    starts = np.random.default_rng(seed).standard_normal((TUNING.starts, trajectory.size))
+    starts = np.random.default_rng(seed).standard_normal((EXCITATION.starts, trajectory.size))
     best = _improved(criterion, min(starts, key=criterion.value), trials, progress)
     motion = trajectory.motion(best, np.linspace(0.0, duration, round(duration * sample_rate) + 1))
     first, states = criterion.states(starts[0]), torch.from_numpy(np.stack([motion.q, motion.qd, motion.qdd]))
@@ -64,15 +64,6 @@ def excite(
         efforts=np.abs(criterion.efforts(states)).max(axis=0),
         first_efforts=np.abs(criterion.efforts(first)).max(axis=0),
     )
-
-
-def _require(**values: float) -> None:
-    """Raise SettingsError for values that are not positive, and parts that are more than the whole."""
-    for name, value in values.items():
-        is_fraction = name in ("reach", "speed")
-        if not 0 < value < inf or (is_fraction and value > 1):
-            expected = "more than 0, at most 1" if is_fraction else "a positive number"
-            raise SettingsError(repr(value), element=f"excite: {name}", expected=expected)
 
 
 def _improved(
@@ -96,6 +87,6 @@ def _improved(
         progress(min(done, trials), trials)
         return value, gradient
 
-    options = {"maxfun": trials, "maxiter": trials, "maxcor": TUNING.memory, "ftol": 0.0}
+    options = {"maxfun": trials, "maxiter": trials, "maxcor": EXCITATION.memory, "ftol": 0.0}
     minimize(evaluate, start, jac=True, method="L-BFGS-B", options=options)
     return best

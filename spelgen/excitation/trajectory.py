@@ -13,16 +13,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spelgen.arm.arm import Arm, Coordinate
+from spelgen.arm.arm import Arm
 from spelgen.errors import ArmError, SpelgenError, collect
-from spelgen.settings.tuning.simulation import ExcitationTuning
+from spelgen.settings.tuning.simulation import EXCITATION
 from spelgen.urdf.robot import Joint
 
-BETWEEN = cos(pi / ExcitationTuning().grid)  # of a series' largest value, what a grid shows at least
-TUNING = ExcitationTuning()
+BETWEEN = cos(pi / EXCITATION.grid)  # of a series' largest value, what a grid shows at least
 # where the URDF names no limit, and for endless joints: [rad/s, m/s], and [rad, m] to both sides of 0
-SPEEDS = {"revolute": TUNING.usual_speed, "prismatic": TUNING.sliding_speed}
-REACHES = {"revolute": pi, "prismatic": TUNING.sliding_reach}
+SPEEDS = {"revolute": EXCITATION.usual_speed, "prismatic": EXCITATION.sliding_speed}
+REACHES = {"revolute": pi, "prismatic": EXCITATION.sliding_reach}
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,46 +41,31 @@ def motion_bounds(
     joints: of the URDF, by name; then joints that follow others by <mimic> keep their limits too.
     Raises ArmError where a joint has no room between its limits.
     """
-    limits: list[tuple[float, float, float]] = []
+    limits, speeds = np.zeros((len(arm.coordinates), 2)), np.zeros(len(arm.coordinates))
+    for k, coordinate in enumerate(arm.coordinates):
+        half = REACHES[coordinate.kind]
+        limits[k] = sorted(coordinate.limits or (-half, half))
+        speeds[k] = coordinate.velocity or SPEEDS[coordinate.kind]
+    for body in arm.bodies:
+        k, factor = body.coordinate, float(body.multiplier)
+        follower = (joints or {}).get(body.name)
+        if follower is None or body.name == arm.coordinates[k].name or not factor:
+            continue
+        if follower.type != "continuous" and follower.lower is not None and follower.upper is not None:
+            low, high = sorted((end - body.offset) / factor for end in (follower.lower, follower.upper))
+            limits[k] = max(low, limits[k, 0]), min(high, limits[k, 1])
+        if follower.velocity:
+            speeds[k] = min(speeds[k], follower.velocity / abs(factor))
     errors: list[SpelgenError] = []
-    for index, coordinate in enumerate(arm.coordinates):
-        lowest, highest, fastest = _limits(index, arm, joints or {})
-        limits.append((lowest, highest, fastest))
-        if not lowest < highest:
+    for coordinate, (low, high) in zip(arm.coordinates, limits, strict=True):
+        if not low < high:
             errors.append(ArmError(
-                f"the limits {lowest:g} .. {highest:g}", element=f"joint {coordinate.name!r}",
+                f"the limits {low:g} .. {high:g}", element=f"joint {coordinate.name!r}",
                 expected="room to move", do="correct them, or omit the joint by --joints",
             ))  # fmt: skip
     collect(errors)
-    low, high, speeds = np.array(limits).T
-    middle, half = (low + high) / 2, (high - low) / 2
-    return MotionBounds(middle - reach * half, middle + reach * half, speed * speeds)
-
-
-def _limits(index: int, arm: Arm, joints: Mapping[str, Joint]) -> tuple[float, float, float]:
-    """Return lowest and highest position and largest speed of a coordinate."""
-    coordinate = arm.coordinates[index]
-    low, high = _range(coordinate)
-    speed = coordinate.velocity or SPEEDS[coordinate.kind]
-    for body in arm.bodies:
-        if body.coordinate != index or body.name == coordinate.name or body.name not in joints:
-            continue
-        follower, factor = joints[body.name], float(body.multiplier)
-        if not factor:
-            continue
-        if follower.type != "continuous" and follower.lower is not None and follower.upper is not None:
-            ends = sorted((end - body.offset) / factor for end in (follower.lower, follower.upper))
-            low, high = max(low, ends[0]), min(high, ends[1])
-        if follower.velocity:
-            speed = min(speed, follower.velocity / abs(factor))
-    return low, high, speed
-
-
-def _range(coordinate: Coordinate) -> tuple[float, float]:
-    reach = REACHES[coordinate.kind]
-    if coordinate.limits is None:
-        return -reach, reach
-    return min(coordinate.limits), max(coordinate.limits)
+    middle, half_range = limits.mean(axis=1), np.diff(limits)[:, 0] / 2
+    return MotionBounds(middle - reach * half_range, middle + reach * half_range, speed * speeds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +114,7 @@ class ExcitationTrajectory:
         exceeds them by less than 1 / cos(pi / density) (Ehlich and Zeller, Math. Z. 86:41, 1964).
         """
         coefficients, offsets = self._coefficients(parameters)
-        points = torch.linspace(0.0, self.duration, TUNING.grid * self.harmonics + 1, dtype=torch.float64)
+        points = torch.linspace(0.0, self.duration, EXCITATION.grid * self.harmonics + 1, dtype=torch.float64)
         positions, velocities, _ = self._signals(coefficients, points)
         highest, lowest = positions.amax(dim=0), positions.amin(dim=0)
         middle, half = (highest + lowest) / 2, (highest - lowest) / 2 / BETWEEN

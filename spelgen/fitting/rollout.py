@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 
+from spelgen.dynamics.equations import mass_as_learned, runge_kutta
 from spelgen.dynamics.protocol import (
     known_past,
     memory_along,
     sliding_memory,
 )
-from spelgen.dynamics.runge_kutta import runge_kutta
-from spelgen.dynamics.unbounded import mass_as_learned
 from spelgen.errors import LogError
 from spelgen.fitting.adaptive import roll_out_adaptive
 from spelgen.logs.windows import Windows

@@ -20,17 +20,13 @@ from scipy.special import stdtrit
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.body_regressor import chain_regressor
+from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.identification.drive_samples import DriveSamples
-from spelgen.identification.friction import FrictionModel
-from spelgen.identification.least_squares import block_products
+from spelgen.identification.least_squares import block_products, normal_solution
 from spelgen.runtime.body_chain import BodyChain
-from spelgen.settings.tuning.identification import DriveHintTuning, IdentificationTuning
+from spelgen.settings.tuning.identification import HINTS, TUNING
 
-TUNING = DriveHintTuning()
-FRICTION = FrictionModel(coulomb_smoothing_velocity=IdentificationTuning().moving)
-NEGLIGIBLE = IdentificationTuning().negligible
-
-LoggedAt = Literal["joints", "motors"]
+FRICTION = FrictionModel(coulomb_smoothing_velocity=TUNING.moving)
 
 
 @dataclass(frozen=True)
@@ -43,7 +39,7 @@ class Coupling:
     joint: int
     moved_by: int
     ratio: float
-    logged_at: LoggedAt
+    logged_at: Literal["joints", "motors"]
 
     @property
     def pair(self) -> list[int]:
@@ -71,36 +67,45 @@ def drive_rows(
     return np.concatenate([bodies, FRICTION.columns(qd, qdd, None, speeds)], axis=2)
 
 
-def drive_problem(chain: BodyChain, drives: Drives, samples: DriveSamples) -> DriveProblem | None:
-    """Return least squares of the joint torques; None where there are too few samples."""
-    if len(samples.q) < TUNING.fewest_samples:
-        return None
-    speeds, tau = drives.speeds, samples.tau
-    regressors = drive_rows(chain, samples.q, samples.qd, samples.qdd, speeds)
-    rows = np.concatenate([regressors, tau[..., None]], axis=2)
-    is_coupled = ((speeds != 0) | (speeds != 0).T).sum(axis=0) > 1
-    # what is no more than a constant with rounding shows nothing
-    varies = tau.std(axis=0) > NEGLIGIBLE * np.abs(tau).max(axis=0)
-    free = np.flatnonzero(varies & ~is_coupled).tolist()
-    products = block_products(rows, TUNING.blocks)
-    motion = np.stack([samples.qd, samples.qdd])
-    return DriveProblem(motion, rows, products, products[..., -1, -1].mean(axis=1), free)
+def drive_problem(chain: BodyChain, drives: Drives, samples: DriveSamples) -> DriveProblem:
+    """Return least squares of the joint torques."""
+    regressors = drive_rows(chain, samples.q, samples.qd, samples.qdd, drives.speeds)
+    rows = np.concatenate([regressors, samples.tau[..., None]], axis=2)
+    products = block_products(rows, HINTS.blocks)
+    return DriveProblem(samples, drives.speeds, rows, products, products[..., -1, -1].mean(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
 class DriveProblem:
     """Hold least squares of the torques of n joints by K parameters, in B blocks of time.
 
-    motion: qd and qdd, (2, S, n). rows: (S, n, K + 1), of each joint the columns of the parameters and the torque.
-    products: (n, B, K + 1, K + 1), of these. size: (n,) of the squares of the torques. free: the joints that no known
-    coupling joins and whose torques vary.
+    speeds: C, (n, n), of the motors, by the couplings that are known. rows: (S, n, K + 1), of each joint the columns of
+    the parameters and the torque. products: (n, B, K + 1, K + 1), of these. size: (n,) of the squares of the torques.
     """
 
-    motion: np.ndarray
+    samples: DriveSamples
+    speeds: np.ndarray
     rows: np.ndarray
     products: np.ndarray
     size: np.ndarray
-    free: list[int]
+
+    @property
+    def bodies(self) -> np.ndarray:
+        """Return the columns of the bodies' parameters, (S, n, 10 bodies)."""
+        return self.rows[..., : -len(FRICTION.effects) * len(self.size) - 1]
+
+    @property
+    def is_short(self) -> bool:
+        """Whether there are too few samples for a hint."""
+        return len(self.rows) < HINTS.fewest_samples
+
+    @property
+    def free(self) -> list[int]:
+        """Return the joints that no known coupling joins and whose torques vary."""
+        joins, tau = self.speeds != 0, self.rows[..., -1]
+        # what is no more than a constant with rounding shows nothing
+        varies = tau.std(axis=0) > TUNING.negligible * np.abs(tau).max(axis=0)
+        return np.flatnonzero(varies & ((joins | joins.T).sum(axis=0) == 1)).tolist()
 
     def with_rows(self, joints: list[int], rows: np.ndarray) -> DriveProblem:
         """Return the same with other rows (S, k, K + 1) of k joints."""
@@ -116,7 +121,8 @@ class DriveProblem:
     def in_one_block(self, stride: int) -> DriveProblem:
         """Return the same on one of so many samples, in a single block: it judges by what it was fitted to."""
         rows = self.rows[::stride]
-        return replace(self, motion=self.motion[:, ::stride], rows=rows, products=block_products(rows, 1))
+        samples = self.samples.thinned(stride)
+        return replace(self, samples=samples, rows=rows, products=block_products(rows, 1))
 
     @cached_property
     def errors(self) -> np.ndarray:
@@ -128,16 +134,11 @@ class DriveProblem:
         fitted = products.sum(axis=0)
         if len(fitted) > 1:
             fitted = fitted.sum(axis=0) - fitted
-        # kilograms and kilogram square metres, in columns of one length: products square the spread
-        length = np.sqrt(np.diagonal(fitted, axis1=1, axis2=2))[..., None]
-        length = np.where(length > 0, length, 1.0)
-        fitted = fitted / (length * length.swapaxes(1, 2)) + NEGLIGIBLE * np.eye(length.shape[1])
-        left = np.full(length.shape, -1.0)
-        left[:, :-1] = np.linalg.solve(fitted[:, :-1, :-1], fitted[:, :-1, -1:])
-        left *= length[:, -1:] / length
+        solution = normal_solution(fitted, 1)
+        left = np.append(solution, np.full_like(solution[:, :1], -1.0), axis=1)
         errors = left.swapaxes(1, 2) @ products @ left
         # of torques that are explained exactly rounding is left
-        return np.asarray(np.maximum(errors[..., 0, 0].T, NEGLIGIBLE))
+        return np.asarray(np.maximum(errors[..., 0, 0].T, TUNING.negligible))
 
     def exchanged(self, joint: int, other: int) -> DriveProblem:
         """Return the problem with the torques of two joints exchanged, of a joint and itself with the opposite sign."""
@@ -155,7 +156,8 @@ class DriveProblem:
     def coupled(self, coupling: Coupling) -> DriveProblem:
         """Return the problem where a motor turns with another joint, too."""
         joint, moved_by, ratio = coupling.joint, coupling.moved_by, coupling.ratio
-        qd, qdd = self.motion[..., [joint]] + ratio * self.motion[..., [moved_by]]
+        motion = np.stack([self.samples.qd, self.samples.qdd])
+        qd, qdd = motion[..., [joint]] + ratio * motion[..., [moved_by]]
         columns = FRICTION.columns(qd, qdd)[:, 0]  # (S, effects)
         n, effects = self.rows.shape[1], columns.shape[1]
         of_motor = np.arange(effects) * n + joint - effects * n - 1
@@ -169,11 +171,13 @@ class DriveProblem:
 
 def find_wrong_torques(problem: DriveProblem, joints: Sequence[str]) -> WrongTorque | None:
     """Return what is surely wrong with the torques of joints: one of the other sign, or two exchanged."""
-    coarse = problem.in_one_block(TUNING.coarse)
+    if problem.is_short:
+        return None
+    coarse = problem.in_one_block(HINTS.coarse)
     candidates = list(combinations_with_replacement(range(len(joints)), 2))
     k, other = min(candidates, key=lambda pair: float(coarse.exchanged(*pair).errors.mean()))
     logged, changed = problem.errors.mean(axis=1), problem.exchanged(k, other).errors.mean(axis=1)
-    if not _is_sure(logged, changed, TUNING.wrong_gain, len(candidates)):
+    if not _is_sure(logged, changed, HINTS.wrong_gain, len(candidates)):
         return None
     if k == other:
         return WrongTorque(k, "torque-sense", f"torques of the opposite sign (tau of {joints[k]!r})")
@@ -187,23 +191,23 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     None: none is sure. Joints that known couplings join are left alone.
     """
     # all pairs on few samples: the ratio need not be exact to stand out
-    coarse = problem.in_one_block(TUNING.coarse)
+    coarse = problem.in_one_block(HINTS.coarse)
     candidates: list[Coupling] = []
     for joint, moved_by in permutations(problem.free, 2):
         if abs(joint - moved_by) > 1:
             continue  # shafts and belts run along the arm; farther pairs explain springs
-        for ratio in TUNING.ratios:
+        for ratio in HINTS.ratios:
             candidates.append(Coupling(joint, moved_by, ratio, "joints"))
             candidates.append(Coupling(joint, moved_by, ratio, "motors"))
-    if not candidates:
+    if problem.is_short or not candidates:
         return None
     nearest = min(candidates, key=coarse.cost)
     best = _with_best_ratio(nearest, problem.in_one_block(1).cost)
     logged = problem.errors[:, best.pair].mean(axis=1)
     coupled = problem.coupled(best).errors[:, best.pair].mean(axis=1)
     # torques that are hardly explained in some block may be anything
-    explained = coupled.max() < TUNING.coupling_gain
-    if not (explained and _is_sure(logged, coupled, TUNING.coupling_gain, len(candidates))):
+    explained = coupled.max() < HINTS.coupling_gain
+    if not (explained and _is_sure(logged, coupled, HINTS.coupling_gain, len(candidates))):
         return None
     return best, float(coupled.mean() / logged.mean())
 
@@ -216,7 +220,7 @@ def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coup
         bounds=bounds, method="bounded", options={"xatol": abs(start.ratio) / 100},
     )  # fmt: skip
     simple = replace(start, ratio=float(Fraction(float(best.x)).limit_denominator(4)))
-    if simple.ratio and cost(simple) <= (1 + TUNING.simple_ratio) * best.fun:
+    if simple.ratio and cost(simple) <= (1 + HINTS.simple_ratio) * best.fun:
         return simple
     return replace(start, ratio=round(float(best.x), 3))
 
@@ -229,5 +233,5 @@ def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: in
     gains = (logged - mended) / (logged + mended)
     standard_error = gains.std(ddof=1) / np.sqrt(len(gains))
     # of hundreds of couplings one is always better by chance (Bonferroni's bound)
-    needed = -float(stdtrit(len(gains) - 1, TUNING.chance / candidates))
+    needed = -float(stdtrit(len(gains) - 1, HINTS.chance / candidates))
     return bool(gains.mean() > needed * standard_error)

@@ -11,13 +11,19 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.bristles import reach_of
-from spelgen.identification.friction import FrictionModel
-from spelgen.logs.dynamics_samples import FREQUENCY, TUNING, dynamics_samples, is_moving, long_pieces
+from spelgen.dynamics.linear_friction import FrictionModel
+from spelgen.logs.dynamics_samples import (
+    FREQUENCY,
+    TUNING,
+    DynamicsSamples,
+    dynamics_samples,
+    is_moving,
+    long_pieces,
+)
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
-from spelgen.settings.tuning.identification import DriveHintTuning
+from spelgen.settings.tuning.identification import HINTS
 
-HINTS = DriveHintTuning()
 STEPS = max(HINTS.shifts)
 SHIFTS = np.array(HINTS.shifts) / FREQUENCY  # [s]
 
@@ -25,13 +31,14 @@ SHIFTS = np.array(HINTS.shifts) / FREQUENCY  # [s]
 class DriveSamples(NamedTuple):
     """Hold S samples of motion with the torques at n joints.
 
-    q, qd, qdd: (S, n). z, direction: see `DynamicsSamples`. torques: (S, n, D), moved by each of the D `SHIFTS`.
+    q, qd, qdd: (S, n). bent: (S, n, K), of bristles, by their reach. direction: see `DynamicsSamples`.
+    torques: (S, n, D), moved by each of the D `SHIFTS`.
     """
 
     q: np.ndarray
     qd: np.ndarray
     qdd: np.ndarray
-    z: np.ndarray
+    bent: np.ndarray
     direction: np.ndarray
     torques: np.ndarray
 
@@ -67,18 +74,12 @@ class DriveLog:
         self._number += 1
         if self._number % self._step:
             return
-        middle = slice(STEPS, -STEPS)
         for piece in long_pieces(trajectory, self._preprocessing.gap):
             # without a hole and pauses included, a filtered torque is moved by whole samples
-            for x in dynamics_samples(
+            samples = dynamics_samples(
                 [piece], pauses=True, preprocessing=self._preprocessing, reach=self._reach
-            ):
-                if len(x.q) > 2 * STEPS:
-                    torques = sliding_window_view(x.tau @ self._inputs.T, len(SHIFTS), axis=0)
-                    moving = is_moving(x.qd[middle])
-                    columns = [getattr(x, name)[middle][moving] for name in DriveSamples._fields[:-1]]
-                    columns.append(torques[moving])
-                    self._samples.append(DriveSamples(*columns).thinned(self._every))
+            )
+            self._samples += [self._moved(x).thinned(self._every) for x in samples if len(x.q) > 2 * STEPS]
         while self._count > 2 * HINTS.samples:
             if len(self._samples) > HINTS.trajectories:
                 self._samples = self._samples[1::2]
@@ -86,6 +87,15 @@ class DriveLog:
             else:
                 self._samples = [x.thinned(2) for x in self._samples]
                 self._every *= 2
+
+    def _moved(self, samples: DynamicsSamples) -> DriveSamples:
+        """Return what moves of samples at a steady rate, but for the ends that torques are moved from."""
+        inner = samples[STEPS:-STEPS]
+        assert inner.z is not None and inner.direction is not None
+        torques = sliding_window_view(samples.tau @ self._inputs.T, len(SHIFTS), axis=0)
+        columns = (inner.q, inner.qd, inner.qdd, inner.z / self._reach.values, inner.direction, torques)
+        moving = is_moving(inner.qd)
+        return DriveSamples(*(column[moving] for column in columns))
 
     @property
     def _count(self) -> int:

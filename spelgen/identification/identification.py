@@ -1,37 +1,47 @@
-"""Tell what an identification found: base parameters with how sure they are, for people, programs and notebooks."""
+"""Tell how parameters are identified, and what was found: base parameters with how sure they are."""
 
 from __future__ import annotations
 
 import textwrap
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import torch
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
+from spelgen.dynamics.base_parameters import BaseParameters
 from spelgen.dynamics.bristles import reach_of
+from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.errors import Diagnostic
-from spelgen.identification.base_parameters import BaseParameters
-from spelgen.identification.friction import FrictionModel
-from spelgen.identification.method import LeastSquares
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay
-from spelgen.labels import counted
+from spelgen.labels import UNITS, counted
 from spelgen.listing import WIDTH, Listing
-from spelgen.settings.tuning.identification import IdentificationTuning
+from spelgen.settings.tuning.identification import TUNING
 
-TUNING = IdentificationTuning()
 SCHEMA = 3
 DETERMINED = ("firm", "fair", "weak", "may be zero")
-_UNIT = {"revolute": "Nm", "prismatic": "N"}
 _WEIGHTED = {
     "equal": "joints weighted equally",
     "range": "each joint weighted by its torque's range",
     "noise": "each joint weighted by the noise left",
 }
+
+
+@dataclass(frozen=True)
+class LeastSquares:
+    """Say how parameters are fitted.
+
+    weights: of the joints' squared errors: ``equal`` (a Nm is a Nm), by the ``range`` of each joint's torque, or
+    by the ``noise`` that is left, found in a few rounds.
+    """
+
+    weights: Literal["equal", "range", "noise"] = "noise"
+    friction: FrictionModel = field(default_factory=FrictionModel)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -41,7 +51,7 @@ class Identification:
     parameters: (K,), whose torque is the fit's; those outside the base are zero. values, deviations:
     (r,) of the base parameters. condition: of the regressor (columns of length one, joints weighted). unseen:
     directions of the base parameters that these logs do not excite. residual: (n,) root mean square [Nm, N];
-    nmse: (n,) its square by the torque's variance. drives: between logged torques and joints; None: nothing is.
+    nmse: (n,) its square by the torque's variance. drives: between logged torques and joints.
     torque_delay: by which logged torques were moved.
     """
 
@@ -57,7 +67,7 @@ class Identification:
     nmse: np.ndarray
     trajectories: tuple[str, ...]
     samples: int
-    drives: Drives | None = None
+    drives: Drives
     diagnostics: tuple[Diagnostic, ...] = ()
     torque_delay: TorqueDelay = NO_DELAY
 
@@ -83,6 +93,11 @@ class Identification:
         """Return the JSON form, a public contract."""
         joints = list(self.arm.joint_names)
         friction = self.method.friction
+        records: list[dict[str, object]] = []
+        formulas, determined = self.base.formulas(), self.determined
+        for k, name in enumerate(self.base.names):
+            record = {"name": name, "formula": formulas[k], "value": float(self.values[k])}
+            records.append(record | {"deviation": _finite(self.deviations[k]), "determined": determined[k]})
         return {
             "schema": SCHEMA,
             "robot": self.arm.name,
@@ -98,26 +113,12 @@ class Identification:
             "torque_delay": {"delay": self.torque_delay.delay, "interval": self.torque_delay.interval},
             "condition": _finite(self.condition),
             "unseen_directions": self.unseen,
-            "base_parameters": self._records(),
+            "base_parameters": records,
             "identifiability": self.base.identifiability(),
             "residual": dict(zip(joints, map(float, self.residual), strict=True)),
             "nmse": dict(zip(joints, map(_finite, self.nmse), strict=True)),
             "diagnostics": list(map(Diagnostic.to_dict, self.diagnostics)),
         }
-
-    def _records(self) -> list[dict[str, object]]:
-        """Return the base parameters as JSON."""
-        records: list[dict[str, object]] = []
-        formulas, determined = self.base.formulas(), self.determined
-        for k, name in enumerate(self.base.names):
-            records.append({
-                "name": name,
-                "formula": formulas[k],
-                "value": float(self.values[k]),
-                "deviation": _finite(self.deviations[k]),
-                "determined": determined[k],
-            })  # fmt: skip
-        return records
 
     def text(self) -> str:
         """Return all of it for a terminal, in 80 columns."""
@@ -136,24 +137,19 @@ class Identification:
 
     def listings(self) -> tuple[Listing, Listing]:
         """Return tables: the torque that is not explained, by joint, and the base parameters."""
-        joints = zip(self.arm.coordinates, self.residual, self.nmse, strict=True)
+        joints: list[tuple[str, ...]] = []
+        for x, rms, nmse in zip(self.arm.coordinates, self.residual, self.nmse, strict=True):
+            joints.append((x.name, f"{rms:.4g}", UNITS[x.kind].torque, f"{nmse:.3g}"))
+        parameters: list[tuple[str, ...]] = []
         values = zip(self.base.names, self.values, self.deviations, self.determined, strict=True)
+        for name, value, deviation, word in values:
+            parameters.append((name, f"{value:.5g}", f"{deviation:.2g}", word))
+        title = "Base parameters [kg, m, s], with standard deviation; numbers after names: joint"
+        columns = ("parameter", "value", "+-", "determined")
+        head = ("joint", "RMS", "", "nMSE")
         return (
-            Listing(
-                "Torque residual: RMSE and nMSE",
-                ("joint", "RMS", "", "nMSE"),
-                tuple((x.name, f"{rms:.4g}", _UNIT[x.kind], f"{nmse:.3g}") for x, rms, nmse in joints),
-                left=(0, 2),
-            ),
-            Listing(
-                "Base parameters [kg, m, s], with standard deviation; numbers after names: joint",
-                ("parameter", "value", "+-", "determined"),
-                tuple(
-                    (name, f"{value:.5g}", f"{deviation:.2g}", word)
-                    for name, value, deviation, word in values
-                ),
-                left=(0, 3),
-            ),
+            Listing("Torque residual: RMSE and nMSE", head, tuple(joints), left=(0, 2)),
+            Listing(title, columns, tuple(parameters), left=(0, 3)),
         )
 
     def __repr__(self) -> str:
@@ -173,31 +169,34 @@ class Identification:
 
     def quality(self) -> str:
         """Return how well posed the fit is, and how many parameters are how sure."""
+        conditioned = f"Condition number {self.condition:.3g} (columns of length one): "
         if self.unseen:
             conditioned = (
                 f"The logs do not excite {counted(self.unseen, 'direction')} of the base parameters: those values are "
                 "arbitrary; excite the arm more, or train the preset closed-form, which has a prior at the URDF."
             )
+        elif self.condition < TUNING.well_posed:
+            conditioned += "well posed."
+        elif self.condition < TUNING.acceptable:
+            conditioned += "acceptable."
         else:
-            verdict = _conditioned(self.condition)
-            conditioned = f"Condition number {self.condition:.3g} (columns of length one): {verdict}."
+            conditioned += "poor: some parameters trade against each other; excite the arm more."
         counts = Counter(self.determined)
         sure = ", ".join(f"{counts[word]} {word}" for word in DETERMINED if word in counts)
         return textwrap.fill(conditioned, WIDTH) + f"\nParameters: {sure}."
 
 
 def identified_dynamics(
-    arm: Arm, friction: FrictionModel, parameters: np.ndarray, drives: Drives | None
+    arm: Arm, friction: FrictionModel, parameters: np.ndarray, drives: Drives
 ) -> RegressorDynamics:
     """Return the arm with these parameters, (K,), the bodies' first."""
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     constants = parameters[inertial:].reshape(-1, n)
-    motors = None if drives is None else drives.speeds
     reach = reach_of(arm.joint_types).values if friction.memory else None
 
     def torque(qd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
         bent = None if z is None or reach is None else z / reach
-        return friction.torque(constants, qd, bent, motors)
+        return friction.torque(constants, qd, bent, drives.speeds)
 
     return RegressorDynamics(arm, parameters[:inertial], constants[0], torque, drives, reach)
 
@@ -208,14 +207,6 @@ def _determined(value: float, deviation: float) -> str:
         if deviation <= limit * abs(value):
             return word
     return DETERMINED[-1]
-
-
-def _conditioned(condition: float) -> str:
-    if condition < TUNING.well_posed:
-        return "well posed"
-    if condition < TUNING.acceptable:
-        return "acceptable"
-    return "poor: some parameters trade against each other; excite the arm more"
 
 
 def _finite(value: float) -> float | None:

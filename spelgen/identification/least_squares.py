@@ -6,10 +6,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import pinv
 
-from spelgen.settings.tuning.identification import IdentificationTuning
-
-TUNING = IdentificationTuning()
+from spelgen.settings.tuning.identification import TUNING
 
 Columns = tuple[np.ndarray, np.ndarray]
 """Of some samples: the regressor (T, n, K) and the torque (T, n)."""
@@ -17,7 +16,7 @@ Columns = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """Hold the samples' normal equations by joint, as triangular factors (n, K + 1, K + 1) of [regressor, torque].
+    """Hold the normal equations of samples by joint: triangular factors (n, K + 1, K + 1) of [regressor, torque].
 
     count: samples. deviation: (n,) standard deviation of each joint's torque [Nm, N].
     """
@@ -28,28 +27,21 @@ class Triangles:
 
     def squares(self, x: np.ndarray) -> np.ndarray:
         """Return sums of squared residuals by joint, (n,), of the parameters x (K,)."""
-        squares: np.ndarray = np.square(self.factors @ np.append(x, -1.0)).sum(axis=1)
-        return squares
+        return np.asarray(np.square(self.factors @ np.append(x, -1.0)).sum(axis=1))
 
 
 def reduce(blocks: Iterable[Columns]) -> Triangles:
     """Return the triangles of all blocks, one in memory at a time."""
-    factors: list[np.ndarray] = []
+    factors: np.ndarray | None = None
     count, total, square = 0, 0.0, 0.0
     for regressor, torque in blocks:
-        joints = list(np.concatenate([regressor, torque[:, :, None]], axis=2).swapaxes(0, 1))
-        if factors:
-            joints = [np.concatenate(pair) for pair in zip(factors, joints, strict=True)]
-        factors = [np.asarray(np.linalg.qr(rows, mode="r")) for rows in joints]
+        rows = np.concatenate([regressor, torque[:, :, None]], axis=2).swapaxes(0, 1)
+        if factors is not None:
+            rows = np.concatenate([factors, rows], axis=1)
+        factors = np.asarray(np.linalg.qr(rows, mode="r"))
         count, total, square = count + len(torque), total + torque.sum(0), square + np.square(torque).sum(0)
-    if not count:
-        raise ValueError("no samples")
-    width = factors[0].shape[1]
-    padded = np.zeros((len(factors), width, width))
-    for joint, factor in enumerate(factors):
-        padded[joint, : len(factor)] = factor
     deviation = np.sqrt(np.maximum(square / count - np.square(total / count), 0.0))
-    return Triangles(padded, count, deviation)
+    return Triangles(np.asarray(factors), count, deviation)
 
 
 def block_products(rows: np.ndarray, blocks: int) -> np.ndarray:
@@ -59,8 +51,17 @@ def block_products(rows: np.ndarray, blocks: int) -> np.ndarray:
     """
     by_joint = rows[: len(rows) // blocks * blocks].swapaxes(0, 1)
     by_joint = by_joint.reshape(rows.shape[1], blocks, -1, rows.shape[2])
-    products: np.ndarray = by_joint.swapaxes(2, 3) @ by_joint
-    return products
+    return np.asarray(by_joint.swapaxes(2, 3) @ by_joint)
+
+
+def normal_solution(products: np.ndarray, targets: int) -> np.ndarray:
+    """Return the parameters (..., K, D) of least squares by products (..., K + D, K + D), for the last D columns."""
+    # kilograms and kilogram square metres, in columns of one length: products square the spread
+    length = np.sqrt(np.diagonal(products, axis1=-2, axis2=-1))[..., :-targets, None]
+    length = np.where(length > 0, length, 1.0)
+    normal = products[..., :-targets, :-targets] / (length * length.swapaxes(-1, -2))
+    normal = normal + TUNING.negligible * np.eye(length.shape[-2])
+    return np.asarray(np.linalg.solve(normal, products[..., :-targets, -targets:] / length) / length)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,14 +99,12 @@ def solve(triangles: Triangles, weights: np.ndarray, columns: np.ndarray) -> Sol
     rows, target = weighted[:, columns], weighted[:, -1]
     length = np.linalg.norm(rows, axis=0)
     length[length == 0] = 1.0
-    u, values, vt = np.linalg.svd(rows / length, full_matrices=False)
-    rank = int((values > TUNING.negligible * values[0]).sum())
-    # numpy's lstsq gives neither the covariance nor the pseudo-inverse that it takes
-    root = vt[:rank].T / values[:rank] / length[:, None]
+    inverse, rank = pinv(rows / length, rtol=TUNING.negligible, return_rank=True)
+    inverse = inverse / length[:, None]
     parameters = np.zeros(weighted.shape[1] - 1)
-    parameters[columns] = root @ (u[:, :rank].T @ target)
-    condition = float(values[0] / values[-1]) if rank == len(values) else float("inf")
-    return Solution(parameters, columns, root @ root.T, condition, rank)
+    parameters[columns] = inverse @ target
+    condition = float(np.linalg.cond(rows / length)) if rank == len(columns) else float("inf")
+    return Solution(parameters, columns, inverse @ inverse.T, condition, int(rank))
 
 
 def deviations(residuals: Sequence[np.ndarray], parameters: int) -> np.ndarray:
@@ -117,8 +116,7 @@ def deviations(residuals: Sequence[np.ndarray], parameters: int) -> np.ndarray:
     count = sum(map(len, residuals))
     power = sum(np.square(x).sum(axis=0) for x in residuals)
     variance = power / max(count - parameters / residuals[0].shape[1], 1.0)
-    deviation: np.ndarray = np.sqrt(variance * correlation_time(residuals))
-    return deviation
+    return np.asarray(np.sqrt(variance * correlation_time(residuals)))
 
 
 def correlation_time(residuals: Sequence[np.ndarray]) -> np.ndarray:

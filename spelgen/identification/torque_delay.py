@@ -11,19 +11,16 @@ from scipy.optimize import minimize_scalar
 from scipy.special import stdtrit
 
 from spelgen.arm.actuation import Drives
-from spelgen.dynamics.body_regressor import chain_regressor
-from spelgen.dynamics.bristles import reach_of
+from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.errors import Diagnostic
 from spelgen.identification.drive_hints import Coupling, DriveProblem, drive_problem, find_coupling
-from spelgen.identification.drive_samples import SHIFTS, DriveLog, DriveSamples
-from spelgen.identification.friction import FrictionModel
-from spelgen.identification.least_squares import block_products
+from spelgen.identification.drive_samples import SHIFTS, DriveLog
+from spelgen.identification.least_squares import block_products, normal_solution
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.runtime.body_chain import BodyChain
-from spelgen.settings.tuning.identification import DriveHintTuning, IdentificationTuning
+from spelgen.settings.tuning.identification import HINTS, TUNING
 
-HINTS, TUNING = DriveHintTuning(), IdentificationTuning()
 FRICTION = FrictionModel(memory=True)
 
 
@@ -80,69 +77,56 @@ def find_torque_delay(
     for log in logs[:: -(-len(logs) // HINTS.trajectories)]:
         collected.add(log)
     samples = collected.samples()
-    if samples is None:
-        return NO_DELAY
-    return delay_of(samples, drive_problem(chain, drives, samples), kinds, drives, chain)
+    return NO_DELAY if samples is None else delay_of(drive_problem(chain, drives, samples))
 
 
-def delay_of(
-    samples: DriveSamples,
-    problem: DriveProblem | None,
-    kinds: Sequence[str],
-    drives: Drives,
-    chain: BodyChain,
-) -> TorqueDelay:
-    """Return the delay that these samples show, or a coupling of motors instead.
-
-    problem: of these samples, which shows couplings; None: they are too few.
-    """
-    late = _likely_delay(samples, kinds, drives, chain)
-    coupling = None if problem is None else find_coupling(problem)
-    if problem is None or coupling is None:
+def delay_of(problem: DriveProblem) -> TorqueDelay:
+    """Return the delay that samples show, or a coupling of motors instead."""
+    late, coupling = _likely_delay(problem), find_coupling(problem)
+    if coupling is None:
         return late
     # torques that are late pass for a coupling, too, and no longer once they are moved
-    if late.delay and find_coupling(problem.of_torques(samples.torques @ _spline(late.delay))) is None:
+    moved = problem.of_torques(problem.samples.torques @ _spline(late.delay))
+    if late.delay and find_coupling(moved) is None:
         return late
     return TorqueDelay(coupling=coupling)
 
 
-def _likely_delay(
-    samples: DriveSamples, kinds: Sequence[str], drives: Drives, chain: BodyChain
-) -> TorqueDelay:
+def _likely_delay(problem: DriveProblem) -> TorqueDelay:
     """Return the delay that least squares with and without friction's memory both show, where both fit.
 
     The value is that of the form of friction that leaves less of the torque.
     """
-    q, qd, qdd, z, direction, tau = samples
+    samples = problem.samples
+    tau = samples.torques
     if tau.std(axis=0).max() <= TUNING.negligible * np.abs(tau).max():  # a constant, with rounding
         return NO_DELAY
-    bodies = chain_regressor(chain, q, qd, qdd)
     estimates = []
     # dry friction with and without memory, through the filter of the torques: a delay that only one form shows is its
     # error
-    for dry in (z / reach_of(kinds).values, direction[..., None]):
-        friction = FRICTION.columns(qd, qdd, dry, drives.speeds)
-        estimates.append(_estimate(np.concatenate([bodies, friction], axis=2), tau))
-    quantile = -stdtrit(HINTS.blocks - 1, HINTS.delay_chance / 2)
+    for dry in (samples.bent, samples.direction[..., None]):
+        friction = FRICTION.columns(samples.qd, samples.qdd, dry, problem.speeds)
+        estimates.append(_estimate(np.concatenate([problem.bodies, friction, tau], axis=2)))
     # a lag of friction passes for one of torques with memory, not without: its errors are alike to both sides
     memory, direct = estimates
     likely = [direct]
     if memory.squares <= HINTS.unlikely_form * direct.squares:
         likely.append(memory)
     best = min(likely, key=lambda x: x.squares)
+    quantile = -stdtrit(HINTS.blocks - 1, HINTS.delay_chance / 2)
     deviations = np.array([x.delay / x.standard_error for x in likely])
     if not ((deviations > quantile).all() or (deviations < -quantile).all()):
         return NO_DELAY
     return TorqueDelay(round(best.delay, 6), float(quantile * best.standard_error))
 
 
-def _estimate(rows: np.ndarray, tau: np.ndarray) -> _Estimate:
-    """Return the delay of the least squares that rows (S, n, K) leave of torques moved by `SHIFTS`, (S, n, D).
+def _estimate(rows: np.ndarray) -> _Estimate:
+    """Return the delay of least squares by rows (S, n, K + D), the last of which are torques moved by `SHIFTS`.
 
     The standard error is that of a jackknife over blocks of time, for what a model misses errs alike for long.
     """
-    products = block_products(np.concatenate([rows, tau], axis=2), HINTS.blocks)
-    deviation = tau.std(axis=(0, 2))
+    products = block_products(rows, HINTS.blocks)
+    deviation = rows[..., -len(SHIFTS) :].std(axis=(0, 2))
     least = np.maximum(deviation, 1e-3 * deviation.max())
     noise = least
     for _ in range(TUNING.rounds):
@@ -164,12 +148,8 @@ def _least(products: np.ndarray) -> tuple[float, np.ndarray]:
     Between shifts a torque is a cubic in the shift: filtered torques are smooth over one step.
     """
     moved = len(SHIFTS)
-    length = np.sqrt(np.diag(products))[:-moved]
-    length = np.where(length > 0, length, 1.0)
-    normal = products[:-moved, :-moved] / np.outer(length, length) + TUNING.negligible * np.eye(len(length))
-    crossed = products[:-moved, -moved:]
-    parameters = np.linalg.solve(normal, crossed / length[:, None]) / length[:, None]
-    left = products[-moved:, -moved:] - crossed.T @ parameters
+    parameters = normal_solution(products, moved)
+    left = products[-moved:, -moved:] - products[-moved:, :-moved] @ parameters
 
     def squares(delay: float) -> float:
         shape = _spline(delay)

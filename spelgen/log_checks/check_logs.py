@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spelgen.dynamics.rigid_bodies import body_chain
+from spelgen.dynamics.regressor import body_chain
 from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.identification.drive_hints import Coupling, drive_problem, find_wrong_torques
 from spelgen.identification.drive_samples import DriveLog
@@ -142,14 +142,12 @@ class TorqueLogs:
         moving = self._moving.samples()
         if moving is None or summary.errors:
             return
-        chain = body_chain(arm)
-        problem = drive_problem(chain, drives, moving)
-        if problem is not None:
-            wrong = find_wrong_torques(problem, joints)
-            if wrong is not None and wrong.code not in accepted:
-                summary.add(WRONG_TORQUES[wrong.code], wrong.got, f"joint {joints[wrong.joint]!r}, tau")
-                return
-        late = delay_of(moving, problem, arm.joint_types, drives, chain)
+        problem = drive_problem(body_chain(arm), drives, moving)
+        wrong = find_wrong_torques(problem, joints)
+        if wrong is not None and wrong.code not in accepted:
+            summary.add(WRONG_TORQUES[wrong.code], wrong.got, f"joint {joints[wrong.joint]!r}, tau")
+            return
+        late = delay_of(problem)
         if late.coupling is not None:
             summary.notes.append(_coupling_hint(self._arm, *late.coupling))
         else:

@@ -9,8 +9,7 @@ import numpy as np
 from scipy.linalg import orth
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.regressor import regressor, urdf_parameters
-from spelgen.dynamics.rigid_bodies import body_chain
+from spelgen.dynamics.regressor import body_chain, regressor, urdf_parameters
 from spelgen.identification.drive_hints import drive_rows
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.settings.tuning.identification import IdentificationTuning

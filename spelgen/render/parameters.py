@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from spelgen.dynamics.base_parameters import base_parameters
+from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.parameters import parameters_of_kind
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
 from spelgen.exporting.urdf_file import about_center
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.identification.base_parameters import base_parameters
-from spelgen.identification.friction import FrictionModel
 from spelgen.labels import UNITS, entry_name
 from spelgen.listing import Listing
 from spelgen.loaded_arm import LoadedArm

@@ -68,10 +68,13 @@ class FitConfig(Group):
     @model_validator(mode="before")
     @classmethod
     def _refuse_foreign(cls, options: object) -> object:
-        if isinstance(options, Mapping):
-            for name in options:
-                if name not in cls.model_fields:
-                    raise _foreign(name, cls)
+        for name in options if isinstance(options, Mapping) else ():
+            if name not in cls.model_fields:
+                owners = OWNERS.get(name)
+                if owners is None:
+                    raise SettingsError(f"unknown option {name!r}", do=suggestion(name, cls.model_fields))
+                objectives = f"objective{'s' * (len(owners) > 1)} {' and '.join(owners)}"
+                raise OptionError(name, f"belongs to the {objectives}, this fits {cls.objective}")
         return options
 
     @model_validator(mode="after")
@@ -87,9 +90,7 @@ class FitConfig(Group):
             raise OptionError(
                 "objective", "momentum belongs to models of networks alone, this is one of rigid bodies"
             )
-        kind = "models of rigid bodies"
-        if rigid_bodies:
-            kind = "models of networks alone"
+        kind = "models of networks alone" if rigid_bodies else "models of rigid bodies"
         for name in self.unused(rigid_bodies=rigid_bodies):
             if name in self.model_fields_set:
                 raise OptionError(name, f"with the objective {self.objective} belongs to {kind}")
@@ -102,9 +103,7 @@ class FitConfig(Group):
     @classmethod
     def unused(cls, *, rigid_bodies: bool) -> tuple[str, ...]:
         """Return the options that do not apply to this kind of model."""
-        if rigid_bodies:
-            return cls.of_networks
-        return cls.of_rigid_bodies
+        return cls.of_networks if rigid_bodies else cls.of_rigid_bodies
 
 
 class TorqueFit(FitConfig):
@@ -152,17 +151,15 @@ class OnWindows(FitConfig):
 
     def resolved(self, windows: int) -> Self:
         """Return the same with optimizer, batch, learning rate and weight decay decided for so many windows."""
-        optimizer = self.optimizer
-        if optimizer is None:
-            optimizer = "lbfgs" if windows <= DEFAULTS.few_windows else "adamw"
-        batch, rate, decay = None, None, DEFAULTS.lbfgs_decay
+        optimizer = self.optimizer or ("lbfgs" if windows <= DEFAULTS.few_windows else "adamw")
+        update: dict[str, object] = {"optimizer": optimizer, "batch": None, "learning_rate": None}
+        decay = DEFAULTS.lbfgs_decay
         if optimizer == "adamw":
-            batch = self.batch or DEFAULTS.batch
-            rate = self.learning_rate or DEFAULTS.learning_rate
+            update["batch"] = self.batch or DEFAULTS.batch
+            update["learning_rate"] = self.learning_rate or DEFAULTS.learning_rate
             decay = DEFAULTS.adamw_decay
-        if self.weight_decay is not None:
-            decay = self.weight_decay
-        update = {"optimizer": optimizer, "batch": batch, "learning_rate": rate, "weight_decay": decay}
+        if self.weight_decay is None:
+            update["weight_decay"] = decay
         return self.model_copy(update=update)
 
 
@@ -210,15 +207,10 @@ CONFIGS: dict[str, type[FitConfig]] = {
 }
 
 
-def _owners() -> dict[str, list[str]]:
-    owners: dict[str, list[str]] = {}
-    for objective, config in CONFIGS.items():
-        for name in config.model_fields:
-            owners.setdefault(name, []).append(objective)
-    return owners
-
-
-OWNERS = _owners()
+OWNERS: dict[str, list[str]] = {}
+for _objective, _config in CONFIGS.items():
+    for _name in _config.model_fields:
+        OWNERS.setdefault(_name, []).append(_objective)
 
 
 def fit_config(
@@ -232,9 +224,9 @@ def fit_config(
 
     Of ``defaults``, a robot's settings for whatever is fitted, those that do not apply are left out.
     """
-    kind, options = CONFIGS[objective], dict(options or {})
-    applicable = set(kind.model_fields) - set(kind.unused(rigid_bodies=rigid_bodies))
-    settings = {name: value for name, value in (defaults or {}).items() if name in applicable}
+    kind, options, settings = CONFIGS[objective], dict(options or {}), dict(defaults or {})
+    for name in settings.keys() - (kind.model_fields.keys() - kind.unused(rigid_bodies=rigid_bodies)):
+        del settings[name]
     for name, (other, _, against) in UNLESS.items():
         if options.get(other, settings.get(other)) == against:
             settings.pop(name, None)
@@ -243,12 +235,3 @@ def fit_config(
     config = validated(kind, settings | options)
     config.require(rigid_bodies=rigid_bodies)
     return config
-
-
-def _foreign(name: str, config: type[FitConfig]) -> SettingsError:
-    owners = OWNERS.get(name)
-    if owners is None:
-        return SettingsError(f"unknown option {name!r}", do=suggestion(name, config.model_fields))
-    plural = "s" * (len(owners) > 1)
-    objectives = f"objective{plural} {' and '.join(owners)}"
-    return OptionError(name, f"belongs to the {objectives}, this fits {config.objective}")

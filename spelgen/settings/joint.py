@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from spelgen.settings.values import Group, Inputs, NonNegative, Number, Positive
@@ -55,18 +55,6 @@ class Coupling(Group):
     def _invertible(self) -> Coupling:
         if {len(self.matrix), *map(len, self.matrix)} != {len(self.joints)}:
             raise ValueError("as many rows, and as many numbers in each, as joints")
-        if not _independent([[Fraction(x) for x in row] for row in self.matrix]):
+        if np.linalg.matrix_rank(np.array(self.matrix)) < len(self.joints):
             raise ValueError("a matrix with an inverse: as many independent motors as joints")
         return self
-
-
-def _independent(rows: list[list[Fraction]]) -> bool:
-    """Whether a square matrix has an inverse, by elimination, exactly."""
-    # exact: a floating determinant of a gear matrix may be 1e-17 where it is 0
-    while rows:
-        pivot = next((row for row in rows if row[0]), None)
-        if pivot is None:
-            return False
-        rows.remove(pivot)
-        rows = [[b - row[0] / pivot[0] * a for a, b in zip(pivot[1:], row[1:], strict=True)] for row in rows]
-    return True

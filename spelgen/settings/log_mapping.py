@@ -18,10 +18,10 @@ from spelgen.settings.values import Group, Number, Positive
 
 _MILLI = 1e-3
 TIMES = {unit: _MILLI**power for power, unit in enumerate(("s", "ms", "us", "ns"))}
-ANGLES = {"rad": 1.0, "deg": pi / 180, "turns": 2 * pi}
-LENGTHS = {"m": 1.0, "mm": _MILLI}
-RATES = {"rpm": 2 * pi / 60, **{f"{name}/s": value for name, value in {**ANGLES, **LENGTHS}.items()}}
-EFFORTS = dict.fromkeys(("Nm", "N", "A"), 1.0) | dict.fromkeys(("mNm", "mA"), _MILLI)
+# what a value is multiplied with to be in SI units, which are not listed themselves
+LENGTHS = {"deg": pi / 180, "turns": 2 * pi, "mm": _MILLI}
+SPEEDS = {f"{name}/s": scale for name, scale in LENGTHS.items()} | {"rpm": 2 * pi / 60}
+SCALES = {**LENGTHS, **SPEEDS, "mNm": _MILLI, "mA": _MILLI}
 CURRENTS = ("A", "mA")
 COUNTS = ("counts", "counts/s")
 ONLY = {  # units that a joint of this kind cannot have
@@ -186,17 +186,20 @@ class LogMapping(Group):
     def scale(self, quantity: str, joint: str) -> float:
         """Return what a logged value is multiplied with, sign included."""
         logged, unit = self.joint(joint), self.unit(quantity, joint)
-        if quantity == "tau":
-            return logged.sign * (1.0 if logged.gain is None else logged.gain) * EFFORTS[unit or "Nm"]
-        if unit in COUNTS:
+        factor = SCALES.get(unit or "", 1.0)
+        if quantity == "tau" and logged.gain is not None:
+            factor *= logged.gain
+        elif unit in COUNTS:
             turn = logged.counts_per_turn
-            return logged.sign * (2 * pi / turn if turn else 1.0 / (logged.counts_per_metre or 1.0))
-        return logged.sign * {**ANGLES, **LENGTHS, **RATES}[unit or "rad"]
+            factor = 2 * pi / turn if turn else 1.0 / (logged.counts_per_metre or 1.0)
+        return logged.sign * factor
 
     def offset(self, quantity: str, joint: str) -> float:
         """Return what is added after that."""
         logged = self.joint(joint)
-        return {"q": logged.offset, "u": logged.offset, "tau": logged.torque_offset}.get(quantity, 0.0)
+        if quantity == "tau":
+            return logged.torque_offset
+        return logged.offset if quantity in ("q", "u") else 0.0
 
     def misfits(self, joints: Sequence[str], joint_types: Sequence[str] | None = None) -> list[SettingsError]:
         """Return what the mapping lacks for these joints, or says of them that cannot be; empty where it fits."""

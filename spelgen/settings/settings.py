@@ -89,10 +89,8 @@ class Settings(Group):
         diagnostics = []
         for name in OF_A_STEP:
             group = getattr(self, name)
-            if isinstance(group, Unusable):
-                for error in group.errors:
-                    message = str(error)
-                    diagnostics.append(Diagnostic("warning", "unusable-settings", "settings", None, message))
+            for error in group.errors if isinstance(group, Unusable) else ():
+                diagnostics.append(Diagnostic("warning", "unusable-settings", "settings", None, str(error)))
         return tuple(diagnostics)
 
     def joint(self, name: str) -> JointSettings:
@@ -116,19 +114,21 @@ def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) ->
     document = read_document(path)
     content = document.value()
     joint_names = None if joints is None else list(joints)
-    # a group that one step reads must not stop the others: it is taken out and read by itself
-    groups: dict[str, object] = {}
-    step_errors: list[SpelgenError] = []
-    for name in OF_A_STEP:
-        if isinstance(content, dict) and name in content:
-            settings, errors = _read(document, {name: content.pop(name)}, joint_names)
-            groups[name] = Unusable(errors) if errors else getattr(settings, name)
-            step_errors += errors
-    settings, errors = _read(document, content, joint_names)
-    # what is wrong with the arm is told with all else that is wrong
-    if errors:
-        collect([*errors, *step_errors])
-    settings = settings.model_copy(update=groups)
+    unusable: dict[str, Unusable] = {}
+    while True:
+        try:
+            settings = _read(document, content, joint_names).model_copy(update=unusable)
+            break
+        except SpelgenError as error:
+            errors = error.errors if isinstance(error, SpelgenErrors) else (error,)
+        # a group that one step reads must not stop the others: it is taken out, and told when it is read
+        for wrong in errors:
+            group = (wrong.element or "").partition(".")[0]
+            if group not in OF_A_STEP:
+                collect(errors)
+            earlier = unusable.get(group, Unusable(()))
+            unusable[group] = Unusable((*earlier.errors, wrong))
+            content.pop(group, None)
     # the arm says once what it is commanded by; its logs follow
     if settings.input == "position" and not isinstance(settings.logs, Unusable):
         logs = settings.logs.model_copy(update={"input": "position"})
@@ -148,22 +148,13 @@ def load_mapping(path: Path | str, joints: Iterable[str]) -> LogMapping:
     return mapping
 
 
-def _read(
-    document: Document, content: object, joint_names: list[str] | None
-) -> tuple[Settings, list[SpelgenError]]:
-    """Return the settings in ``content``, the defaults where they cannot be read, and what is wrong with them."""
-    try:
-        settings = validated(Settings, content, document)
-    except SpelgenErrors as several:
-        return Settings(), list(several.errors)
-    except SettingsError as error:
-        return Settings(), [error]
-    errors: list[SpelgenError] = []
+def _read(document: Document, content: object, joint_names: list[str] | None) -> Settings:
+    """Return the settings in ``content``. Raises what `validated` raises, and SettingsError for unknown joints."""
+    settings = validated(Settings, content, document)
     if joint_names is not None:
-        for location, name in _joint_names(settings):
-            if name not in joint_names:
-                errors.append(unknown_name(location, "joint", name, joint_names, document))
-    return settings, errors
+        unknown = [(place, name) for place, name in _joint_names(settings) if name not in joint_names]
+        collect([unknown_name(place, "joint", name, joint_names, document) for place, name in unknown])
+    return settings
 
 
 def _joint_names(settings: Settings) -> Iterator[tuple[Location, str]]:

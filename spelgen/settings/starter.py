@@ -6,6 +6,50 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+ARM = """\
+## Settings of the arm {urdf}. Each line that begins with one # and a space is a default:
+## delete these two characters (also in the line above, where it is indented) and change the value.
+
+## Description of the arm and sources of the values.
+# about: ""
+
+## Gravity in the frame of the root link [m/s^2]: turn it for an arm on a wall or under a ceiling.
+# gravity: [0.0, 0.0, -9.81]
+
+## Commanded and logged input: torque, or position (u) of position servos, as
+## of hobby arms. A servo whose kp [Nm/rad] is known: kp, among the drives below.
+# input: torque
+
+## Whether the logs' tau are those of the joints, or of the motors, before the gears: joint or motor.
+# torque: joint
+
+## Drives. rotor_inertia [kg m^2] before the gear; gear: motor turns per joint turn; viscous [Nm s/rad] and
+## coulomb [Nm], for qd > 0 and for qd < 0, after the gear; actuated: false for a passive joint; gain:
+## trained where the gear between logged motor torques and the joint is to be learned.
+# joints:
+{drives}
+## How this arm's logs are named and measured: docs/logs.md; `spelgen logs LOG --robot ROBOT --suggest FILE`
+## drafts the same keys from a log. velocity: differentiated where none is logged; sign: -1 where the log's
+## sense is the opposite of the URDF's axis; offset: the position where the log says 0 [rad, m].
+# logs:
+#   velocity: logged
+#   columns: {{t: t, trajectory: trajectory, q: "q_{{joint}}", qd: "qd_{{joint}}", tau: "tau_{{joint}}"}}
+#   units: {{t: s}}
+#   joints:
+{logs}
+## How `spelgen simulate` drives the arm: tracking, or random-inputs: torques drawn from `inputs` [Nm].
+# simulation:
+#   {{protocol: tracking, trajectories: 4, duration: 8.0, sample_rate: 125.0, test_fraction: 0.25, seed: 0}}
+# tracking: {{control: computed-torque, paths: own, frequency: 0.125, control_rate: 125.0}}
+
+## Defaults of `spelgen train`: its options, with _ in place of -.
+# training: {{validation_fraction: 0.25, seed: 0}}
+"""
+UNITS = {
+    "revolute": {"q": "rad", "qd": "rad/s", "tau": "Nm"},
+    "prismatic": {"q": "m", "qd": "m/s", "tau": "N"},
+}
+
 
 class StarterJoint(NamedTuple):
     """What a URDF says of a joint. kind: "revolute" or "prismatic"; damping, friction: its <dynamics>."""
@@ -18,67 +62,19 @@ class StarterJoint(NamedTuple):
 
 def starter(urdf: str, joints: Sequence[StarterJoint]) -> str:
     """YAML for the URDF of this file name: prose after ``##``, settings after ``# ``; without that they are said."""
-    lines = [
-        f"## Settings of the arm {json.dumps(urdf)}. Each line that begins with one # and a space is a default:",
-        "## delete these two characters (also in the line above, where it is indented) and change the value.",
-        "",
-        "## Description of the arm and sources of the values.",
-        '# about: ""',
-        "",
-        "## Gravity in the frame of the root link [m/s^2]: turn it for an arm on a wall or under a ceiling.",
-        "# gravity: [0.0, 0.0, -9.81]",
-        "",
-        "## Commanded and logged input: torque, or position (u) of position servos, as",
-        "## of hobby arms. A servo whose kp [Nm/rad] is known: kp, among the drives below.",
-        "# input: torque",
-        "",
-        "## Whether the logs' tau are those of the joints, or of the motors, before the gears: joint or motor.",
-        "# torque: joint",
-        "",
-        "## Drives. rotor_inertia [kg m^2] before the gear; gear: motor turns per joint turn; viscous [Nm s/rad] and",
-        "## coulomb [Nm], for qd > 0 and for qd < 0, after the gear; actuated: false for a passive joint; gain:",
-        "## trained where the gear between logged motor torques and the joint is to be learned.",
-        "# joints:",
-    ]
+    drives, logs = "", ""
     for joint in joints:
         drive = {
             "rotor_inertia": 0.0, "gear": 1.0, "viscous": joint.damping,
             "coulomb": [joint.friction, -joint.friction], "actuated": True, "gain": "known",
         }  # fmt: skip
-        lines.append(f"#   {json.dumps(joint.name)}: {_flow(drive)}")
-    lines += [
-        "",
-        "## How this arm's logs are named and measured: docs/logs.md; `spelgen logs LOG --robot ROBOT --suggest FILE`",
-        "## drafts the same keys from a log. velocity: differentiated where none is logged; sign: -1 where the log's",
-        "## sense is the opposite of the URDF's axis; offset: the position where the log says 0 [rad, m].",
-        "# logs:",
-        "#   velocity: logged",
-        '#   columns: {t: t, trajectory: trajectory, q: "q_{joint}", qd: "qd_{joint}", tau: "tau_{joint}"}',
-        "#   units: {t: s}",
-        "#   joints:",
-    ]
-    for joint in joints:
-        turns = joint.kind == "revolute"
-        units = {"q": "rad", "qd": "rad/s", "tau": "Nm"} if turns else {"q": "m", "qd": "m/s", "tau": "N"}
-        log = {"name": joint.name, "sign": 1, "offset": 0.0, "torque_offset": 0.0, "units": units}
-        lines.append(f"#     {json.dumps(joint.name)}: {_flow(log)}")
-    lines += [
-        "",
-        "## How `spelgen simulate` drives the arm: tracking, or random-inputs: torques drawn from `inputs` [Nm].",
-        "# simulation:",
-        "#   {protocol: tracking, trajectories: 4, duration: 8.0, sample_rate: 125.0, test_fraction: 0.25, seed: 0}",
-        "# tracking: {control: computed-torque, paths: own, frequency: 0.125, control_rate: 125.0}",
-        "",
-        "## Defaults of `spelgen train`: its options, with _ in place of -.",
-        "# training: {validation_fraction: 0.25, seed: 0}",
-    ]
-    return "\n".join(lines) + "\n"
+        log = {"name": joint.name, "sign": 1, "offset": 0.0, "torque_offset": 0.0, "units": UNITS[joint.kind]}
+        drives += f"#   {json.dumps(joint.name)}: {_flow(drive)}\n"
+        logs += f"#     {json.dumps(joint.name)}: {_flow(log)}\n"
+    return ARM.format(urdf=json.dumps(urdf), drives=drives, logs=logs)
 
 
 def _flow(keys: Mapping[str, object]) -> str:
     """Keys and values on one line of YAML."""
-    return (
-        "{"
-        + ", ".join(f"{key}: {_flow(x) if isinstance(x, dict) else json.dumps(x)}" for key, x in keys.items())
-        + "}"
-    )
+    pairs = [f"{key}: {_flow(x) if isinstance(x, dict) else json.dumps(x)}" for key, x in keys.items()]
+    return f"{{{', '.join(pairs)}}}"

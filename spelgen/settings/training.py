@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Annotated, Any
 
 from pydantic import Field, ValidationInfo, field_validator
@@ -57,17 +56,9 @@ class TrainingSettings(Group):
     @property
     def options(self) -> dict[str, Any]:
         """Options of any objective that are set."""
-        return self._set(OWNERS)
+        return self.model_dump(include=set(OWNERS), exclude_none=True)
 
     @property
     def preprocessing(self) -> dict[str, Any]:
         """Options of `Preprocessing` that are set."""
-        return self._set(("cutoff", "decimation", "gap", "torque_delay"))
-
-    def _set(self, names: Iterable[str]) -> dict[str, Any]:
-        values = {}
-        for name in names:
-            value = getattr(self, name, None)
-            if value is not None:
-                values[name] = value
-        return values
+        return self.model_dump(include={"cutoff", "decimation", "gap", "torque_delay"}, exclude_none=True)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-MAX_MAGNITUDE = 1e12  # of a number in settings and in a URDF: products of a few are still numbers
+MAX_MAGNITUDE = 1e12  # of a number in settings: products of a few are still numbers
 
 
 def no_bool(value: object) -> object:

@@ -15,9 +15,7 @@ from scipy.integrate import ODEintWarning, odeint
 
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import RunError
-from spelgen.settings.tuning.simulation import SimulationTuning
-
-TUNING = SimulationTuning()
+from spelgen.settings.tuning.simulation import SIMULATION
 
 
 def rollout(
@@ -34,7 +32,7 @@ def rollout(
     on.
     """
     n = tau.shape[1]
-    tolerances = {"rtol": TUNING.rtol * looser, "atol": TUNING.atol * looser}
+    tolerances = {"rtol": SIMULATION.rtol * looser, "atol": SIMULATION.atol * looser}
     states = np.empty((t.size, 2 * n))
     states[0] = start
     changes = np.flatnonzero((tau[1:-1] != tau[:-2]).any(axis=1)) + 1
@@ -52,7 +50,12 @@ def rollout(
             warnings.simplefilter("error", ODEintWarning)
             try:
                 states[span] = odeint(
-                    derivative, states[first], t[span], tfirst=True, mxstep=TUNING.most_steps, **tolerances
+                    derivative,
+                    states[first],
+                    t[span],
+                    tfirst=True,
+                    mxstep=SIMULATION.most_steps,
+                    **tolerances,
                 )
             except ODEintWarning as warning:
                 raise _stuck(t[first], str(warning).split(" (")[0].lower()) from warning

@@ -8,11 +8,8 @@ from spelgen.arm.arm import Arm
 from spelgen.errors import SettingsError, SpelgenError, collect
 from spelgen.excitation.trajectory import SPEEDS, ExcitationTrajectory, Motion, MotionBounds
 from spelgen.settings.settings import Settings
-from spelgen.settings.tuning.simulation import ExcitationTuning, SimulationTuning
-from spelgen.simulation.random_inputs import initial_range
-
-TUNING = SimulationTuning()
-HARMONICS = ExcitationTuning().fewest_harmonics
+from spelgen.settings.tuning.simulation import EXCITATION, SIMULATION
+from spelgen.simulation.protocol import initial_range
 
 
 def paths(arm: Arm, settings: Settings, t: np.ndarray) -> list[Motion]:
@@ -25,7 +22,13 @@ def paths(arm: Arm, settings: Settings, t: np.ndarray) -> list[Motion]:
     randoms = [np.random.default_rng(seed) for seed in seeds]
     low, high = initial_range(arm, settings)
     if settings.tracking.paths == "excitation":
-        motions = ExcitationTrajectory(float(t[-1]), HARMONICS, _bounds(arm, low, high))
+        # the middle of the ranges at moderate speeds: a first try at an arm that nobody knows
+        middle, half = (low + high) / 2, SIMULATION.used_range * (high - low) / 2
+        speeds = [
+            min(SIMULATION.used_range * (x.velocity or np.inf), SPEEDS[x.kind]) for x in arm.coordinates
+        ]
+        bounds = MotionBounds(middle - half, middle + half, np.array(speeds))
+        motions = ExcitationTrajectory(float(t[-1]), EXCITATION.fewest_harmonics, bounds)
         return [motions.motion(random.standard_normal(motions.size), t) for random in randoms]
     middle, amplitude = (low + high) / 2, _amplitude(arm, settings, low, high)
     drawn = [random.uniform(0, 2 * np.pi, len(middle)) for random in randoms]
@@ -44,18 +47,11 @@ def sines(
     return Motion(t, middle + swing, amplitude * omega * np.cos(angle), -(omega**2) * swing)
 
 
-def _bounds(arm: Arm, low: np.ndarray, high: np.ndarray) -> MotionBounds:
-    """Return the middle of the ranges at moderate speeds: a first try at an arm that nobody knows."""
-    middle, half = (low + high) / 2, (high - low) / 2
-    speed = [min(TUNING.used_range * (x.velocity or np.inf), SPEEDS[x.kind]) for x in arm.coordinates]
-    return MotionBounds(middle - TUNING.used_range * half, middle + TUNING.used_range * half, np.array(speed))
-
-
 def _amplitude(arm: Arm, settings: Settings, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return the amplitude (n,) of each joint's sines, which must fit into its range."""
     amplitude, errors = np.full(len(low), settings.tracking.amplitude), list[SpelgenError]()
     if "amplitude" not in settings.tracking.model_fields_set:
-        amplitude = np.minimum(amplitude, TUNING.used_range * (high - low) / 2)
+        amplitude = np.minimum(amplitude, SIMULATION.used_range * (high - low) / 2)
     for joint, lowest, highest, swing in zip(arm.coordinates, low, high, amplitude, strict=True):
         if highest - lowest < 2 * swing:
             error = SettingsError(

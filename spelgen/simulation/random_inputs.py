@@ -7,14 +7,12 @@ from collections.abc import Callable
 import numpy as np
 
 from spelgen.arm.actuation import Drives
-from spelgen.arm.arm import Arm, Coordinate
+from spelgen.arm.arm import Arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
-from spelgen.errors import SettingsError, collect
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
-from spelgen.simulation.friction import make_friction
 from spelgen.simulation.integration import rollout
-from spelgen.simulation.simulated_logs import SimulatedLogs
+from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction
 
 
 def random_inputs(
@@ -22,7 +20,7 @@ def random_inputs(
     settings: Settings,
     drives: Drives | None = None,
     *,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SimulatedLogs:
     """Return random-input trajectories of the arm by `settings.simulation`; same settings, same logs.
 
@@ -35,7 +33,11 @@ def random_inputs(
     protocol = settings.simulation
     dynamics = arm_dynamics(arm, settings, make_friction(arm, settings, drives and drives.speeds))
     lowest, highest = initial_range(arm, settings)
-    torques = [_torques(coordinate, settings) for coordinate in arm.coordinates]
+    torques = []
+    for coordinate in arm.coordinates:
+        joint = settings.joint(coordinate.name)
+        is_driven = joint.actuated and not coordinate.passive
+        torques.append(np.array(joint.inputs or protocol.inputs) if is_driven else np.zeros(1))
     t = np.arange(round(protocol.duration * protocol.sample_rate) + 1) / protocol.sample_rate
     # a seed for each trajectory: more of them leave the first ones as they were
     split_seed, *seeds = np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories + 1)
@@ -48,40 +50,10 @@ def random_inputs(
         states = rollout(dynamics, start, t, effect)
         q, qd = np.split(states, 2, axis=1)
         trajectories.append(Trajectory(t, q, qd, tau, f"traj_{number:02d}"))
-        if progress is not None:
-            progress(number + 1, protocol.trajectories)
-    tested = _tested(protocol.trajectories, protocol.test_fraction, np.random.default_rng(split_seed))
-    train = [log for number, log in enumerate(trajectories) if number not in tested]
-    return SimulatedLogs(train, [trajectories[number] for number in sorted(tested)])
-
-
-def _torques(coordinate: Coordinate, settings: Settings) -> np.ndarray:
-    joint = settings.joint(coordinate.name)
-    if coordinate.passive or not joint.actuated:
-        return np.zeros(1)
-    return np.array(joint.inputs or settings.simulation.inputs)
-
-
-def initial_range(arm: Arm, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest positions (n,) [rad; m] to start from; SettingsError where a joint has none."""
-    positions = settings.simulation.positions or {}
-    ranges, errors = [], []
-    for joint in arm.coordinates:
-        if joint.name in positions:
-            ranges.append(positions[joint.name])
-        elif joint.continuous:
-            ranges.append((-np.pi, np.pi))
-        elif joint.lower is not None and joint.upper is not None and joint.lower < joint.upper:
-            ranges.append((joint.lower, joint.upper))
-        else:
-            # 0 to 0 is what exporters write where nobody said a range
-            message = "the joint has no range: give its lowest and highest initial position"
-            errors.append(SettingsError(message, element=f"simulation.positions.{joint.name}"))
-    collect(errors)
-    lowest, highest = np.array(ranges, dtype=float).T
-    return lowest, highest
-
-
-def _tested(count: int, fraction: float, random: np.random.Generator) -> set[int]:
-    """Return the numbers of the trajectories kept for testing; at least one is left to train on."""
-    return set(random.permutation(count)[: min(round(fraction * count), count - 1)].tolist())
+        progress(number + 1, protocol.trajectories)
+    # at least one is left to train on
+    count = protocol.trajectories
+    order = np.random.default_rng(split_seed).permutation(count).tolist()
+    tests = min(round(protocol.test_fraction * count), count - 1)
+    train, test = ([trajectories[k] for k in sorted(numbers)] for numbers in (order[tests:], order[:tests]))
+    return SimulatedLogs(train, test)

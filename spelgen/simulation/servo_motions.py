@@ -12,9 +12,7 @@ from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
 from spelgen.settings.tuning.servo import ServoSimulationTuning
-from spelgen.simulation.friction import make_friction
-from spelgen.simulation.random_inputs import initial_range
-from spelgen.simulation.simulated_logs import SimulatedLogs
+from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction
 
 TUNING = ServoSimulationTuning()
 SWEEPS = 4  # over the joints, of dry friction
@@ -27,7 +25,7 @@ def servo_motions(
     settings: Settings,
     drives: Drives | None = None,
     *,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SimulatedLogs:
     """Return trajectories by `settings.simulation`; same settings, same logs.
 
@@ -45,8 +43,7 @@ def servo_motions(
         q = np.round(q / encoder) * encoder
         qd, tau = np.gradient(q, t, axis=0), np.zeros((len(t), 0))
         logs.append(Trajectory(t, q, qd, tau, f"traj_{number:02d}", u=u))
-        if progress is not None:
-            progress(number + 1, protocol.trajectories)
+        progress(number + 1, protocol.trajectories)
     trained = len(logs) - min(round(protocol.test_fraction * len(logs)), len(logs) - 1)
     return SimulatedLogs(logs[:trained], logs[trained:])
 

@@ -4,27 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.settings.messages import validated
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import ControlledSimulation, ServoSimulation, SimulationSettings
-from spelgen.settings.tuning.simulation import SimulationTuning
+from spelgen.settings.tuning.simulation import SIMULATION
 from spelgen.settings.yaml_document import Document
+from spelgen.simulation.protocol import SimulatedLogs
 from spelgen.simulation.random_inputs import random_inputs
 from spelgen.simulation.servo_motions import servo_motions
-from spelgen.simulation.simulated_logs import SimulatedLogs
 from spelgen.simulation.tracking import track
 
-if TYPE_CHECKING:
-    from spelgen.loaded_arm import LoadedArm
-
-CONTROL_RATE = SimulationTuning().control_rate
 PROTOCOLS = {"random-inputs": random_inputs, "tracking": track}
 
 
 def simulate(
-    arm: LoadedArm,
+    arm: ConfiguredArm,
     *,
     trajectories: int | None = None,
     duration: float | None = None,
@@ -50,7 +46,7 @@ def simulate(
     changed = validated(SimulationSettings, values, Document(Path("simulate"), None))
     settings = _controlled(arm.settings.model_copy(update={"simulation": changed}))
     run = servo_motions if settings.input == "position" else PROTOCOLS[settings.simulation.protocol]
-    return run(arm.arm, settings, arm.actuation.drives(), progress=progress)
+    return run(arm.arm, settings, arm.actuation.drives(), progress=progress or (lambda done, total: None))
 
 
 def _controlled(settings: Settings) -> Settings:
@@ -64,13 +60,11 @@ def _controlled(settings: Settings) -> Settings:
         return settings
     simulation = ControlledSimulation(**simulation.model_dump(exclude_unset=True))
     rate = simulation.sample_rate
-    changes: dict[str, object] = {
+    usual_tracking: dict[str, object] = {
         "control": "computed-torque",
         "paths": "own" if {"amplitude", "frequency"} & tracking.model_fields_set else "excitation",
-        "control_rate": rate / max(1, round(rate / CONTROL_RATE)),
+        "control_rate": rate / max(1, round(rate / SIMULATION.control_rate)),
         "cutoff": min(tracking.cutoff, rate / 4),
     }
-    for name in tracking.model_fields_set:
-        changes.pop(name, None)
-    tracking = tracking.model_copy(update=changes)
+    tracking = tracking.model_copy(update=usual_tracking | tracking.model_dump(exclude_unset=True))
     return settings.model_copy(update={"simulation": simulation, "tracking": tracking})

@@ -22,17 +22,10 @@ from spelgen.logs.filtering import low_pass_regular
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
-from spelgen.settings.tuning.simulation import SimulationTuning
-from spelgen.simulation.friction import make_friction
+from spelgen.settings.tuning.simulation import SIMULATION
 from spelgen.simulation.integration import rollout
 from spelgen.simulation.paths import paths
-from spelgen.simulation.random_inputs import initial_range
-from spelgen.simulation.simulated_logs import SimulatedLogs
-
-TUNING = SimulationTuning()
-
-Target = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""q, qd and qdd (n,)."""
+from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +56,7 @@ def track(
     settings: Settings,
     drives: Drives | None = None,
     *,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SimulatedLogs:
     """Return logs of the arm controlled along paths, by `settings.simulation` and `settings.tracking`.
 
@@ -76,7 +69,9 @@ def track(
     dynamics = arm_dynamics(arm, settings, friction)
     inputs = np.eye(len(arm.coordinates)) if drives is None else drives.inputs
     middle = np.mean(initial_range(arm, settings), axis=0)
-    ticks = np.arange(_ticks(settings)) * (1.0 / settings.tracking.control_rate)
+    samples = round(protocol.duration * protocol.sample_rate)
+    count = -(-samples // _samples_of_a_tick(settings))
+    ticks = np.arange(count) * (1.0 / settings.tracking.control_rate)
     train, test = [], []
     for number, path in enumerate(paths(arm, settings, ticks)):
         bandwidth = settings.tracking.bandwidths[number % len(settings.tracking.bandwidths)]
@@ -89,22 +84,21 @@ def track(
         train.append(log[:cut])
         if cut < len(log):
             test.append(replace(log[cut:], name=f"{log.name}_end"))
-        if progress is not None:
-            progress(number + 1, protocol.trajectories)
+        progress(number + 1, protocol.trajectories)
     return SimulatedLogs(train, test)
 
 
 def tuned_gains(inertia: np.ndarray, bandwidth: float) -> Gains:
     """Return gains for joints of inertia (n,) [kg m^2; kg]; both poles of the position loop are at the bandwidth."""
     omega = 2 * np.pi * bandwidth
-    return Gains(inertia * omega**2, TUNING.integral_gain * inertia * omega**3, 2 * inertia * omega)
+    return Gains(inertia * omega**2, SIMULATION.integral_gain * inertia * omega**3, 2 * inertia * omega)
 
 
 def computed_torque(
     dynamics: PinocchioDynamics,
     friction: Friction,
-    target: Target,
-    seen: np.ndarray,
+    motion: tuple[np.ndarray, np.ndarray, np.ndarray],
+    error: np.ndarray,
     lag: np.ndarray,
     omega: float,
 ) -> np.ndarray:
@@ -112,16 +106,14 @@ def computed_torque(
 
     They are M (qdd* + 2 omega e' + omega^2 e) + what motion, gravity and friction take.
 
-    target: q*, qd*, qdd* (n,). seen: positions (n,); lag: e', the error of velocity. Where viscous friction alone makes
-    a joint slower than omega, a stiffness of viscous * omega beside it.
+    motion: q as it is seen, qd* and qdd* (n,). error, lag: e and e', those of position and velocity. Where viscous
+    friction alone makes a joint slower than omega, a stiffness of viscous * omega beside it.
     """
-    q, qd, qdd = target
-    error = q - seen
-    mass = dynamics.mass_matrix(seen)
+    q, qd, qdd = motion
+    mass = dynamics.mass_matrix(q)
     slow = np.where(friction.viscous > np.diag(mass) * omega, friction.viscous * omega, 0.0)
-    accelerated = mass @ (qdd + 2 * omega * lag + omega**2 * error)
-    holding: np.ndarray = dynamics.nonlinear_effects(seen, qd) + friction(qd) + slow * error
-    return np.asarray(accelerated + holding)
+    torque = mass @ (qdd + 2 * omega * lag + omega**2 * error) + slow * error
+    return np.asarray(torque + dynamics.nonlinear_effects(q, qd) + friction(qd))
 
 
 def record(
@@ -147,24 +139,22 @@ def record(
     integral = dynamics.nonlinear_effects(*np.split(state, 2))
     previous = seen = _seen(state[:n], tracking)
     states, torques = [], []
-    for k, target in enumerate(zip(path.q, path.qd, path.qdd, strict=True)):
+    within = np.arange(samples + 1) / settings.simulation.sample_rate
+    for k, (q, qd, qdd) in enumerate(zip(path.q, path.qd, path.qdd, strict=True)):
         previous, seen = seen, _seen(state[:n], tracking)
-        error = target[0] - seen
-        lag = target[1] - (seen - previous) / tick
+        error, lag = q - seen, qd - (seen - previous) / tick
         integral = integral + tick * gains.integral * error
         effort = gains.proportional * error + gains.derivative * lag + integral
         if tracking.control == "computed-torque":
-            effort = computed_torque(dynamics, friction, target, seen, lag, omega)
-        tau = to_motors @ effort
-        t = k * tick + np.arange(samples + 1) / settings.simulation.sample_rate
-        torque = np.tile(inputs @ tau, (samples + 1, 1))
-        passed = rollout(dynamics, state, t, torque, TUNING.seen_loosening)
+            effort = computed_torque(dynamics, friction, (seen, qd, qdd), error, lag, omega)
+        torques.append(to_motors @ effort)
+        torque = np.tile(inputs @ torques[-1], (samples + 1, 1))
+        passed = rollout(dynamics, state, k * tick + within, torque, SIMULATION.seen_loosening)
         states.append(passed[:-1])
-        torques.append(np.tile(tau, (samples, 1)))
         state = passed[-1]
     true = np.concatenate(states)
     t = np.arange(len(true)) / settings.simulation.sample_rate
-    return Recording(t, true, _seen(true[:, :n], tracking), np.concatenate(torques))
+    return Recording(t, true, _seen(true[:, :n], tracking), np.repeat(torques, samples, axis=0))
 
 
 def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Trajectory:
@@ -177,12 +167,6 @@ def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Tra
 def _seen(q: np.ndarray, tracking: TrackingSettings) -> np.ndarray:
     """Return the nearest whole steps of the encoders."""
     return np.round(q / tracking.resolution) * tracking.resolution
-
-
-def _ticks(settings: Settings) -> int:
-    """Return how many there are in a trajectory."""
-    simulation = settings.simulation
-    return -(-round(simulation.duration * simulation.sample_rate) // _samples_of_a_tick(settings))
 
 
 def _samples_of_a_tick(settings: Settings) -> int:

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from lxml import etree
 
 from spelgen.errors import suggestion
-from spelgen.settings.values import MAX_MAGNITUDE
 from spelgen.urdf.robot import MOVING, Inertial, Joint, Link, Mimic, Tensor, Transmission, Vector
 from spelgen.urdf.values import (
+    MAX_MAGNITUDE,
     Notes,
     first_child,
     note_unexpanded,

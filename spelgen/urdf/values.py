@@ -15,9 +15,9 @@ from pathlib import Path
 from lxml import etree
 
 from spelgen.errors import Diagnostic, UrdfError
-from spelgen.settings.values import MAX_MAGNITUDE
 from spelgen.urdf.robot import Vector
 
+MAX_MAGNITUDE = 1e12  # of a number that becomes exact geometry: products of a few are still floats
 MAX_NUMBER_TEXT = 64
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _COUNTS = {1: "one number", 3: "three numbers"}

@@ -26,11 +26,12 @@ from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque_logs import TorqueLogObjective
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.fitting.validation import Validation, measure
-from spelgen.identification.torque_delay import HINTS, NO_DELAY, TorqueDelay, find_torque_delay
+from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay, find_torque_delay
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
 from spelgen.settings.fits import TorqueFit
+from spelgen.settings.tuning.identification import HINTS
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

@@ -10,17 +10,15 @@ class ExportTuning:
     """How an export is held against the model, and how the nearest rigid bodies are found."""
 
     states: int = 200  # [1] random states of a parity check
-    tolerance: float = (
-        1e-12  # [1] of C, CasADi and torch, relative to the largest value; docs/deploy.md: 4e-14
-    )
+    # [1] of C, CasADi and torch, relative to the largest value; docs/deploy.md: 4e-14
+    tolerance: float = 1e-12
     onnx_tolerance: float = 1e-10  # [1] of ONNX, likewise; looser where M is ill-conditioned
     mujoco_tolerance: float = 1e-9  # [1] of MuJoCo, likewise; docs/deploy.md: 9e-15
     tip_tolerance: float = 3e-6  # [1] of the tip, likewise: pytorch-kinematics rounds offsets to float32
     positions: int = 512  # [1] random positions at which a model and the nearest bodies are compared
     steps: int = 400  # [1] of the optimiser towards the nearest bodies
-    ridge: float = (
-        1e-8  # [1] weight of the difference to the URDF's bodies, where M and gravity leave it open
-    )
+    # [1] weight of the difference to the URDF's bodies, where M and gravity leave it open
+    ridge: float = 1e-8
     friction_positions: int = 32  # [1] of these positions, for the nearest viscous and Coulomb friction
     friction_speeds: int = 25  # [1] speeds each way, from 2 % to all of a joint's usual speed
 

@@ -23,9 +23,8 @@ class IdentificationTuning:
     acceptable: float = 300.0  # condition number up to which parameters can be told apart
     firm: float = 0.05  # of a value, the deviation up to which it is firm
     fair: float = 0.2  # likewise fair; above, up to the value itself, weak
-    stribeck_velocity: float = (
-        0.1  # [rad/s, m/s] at which the extra dry friction of slow motion has fallen to 1/e
-    )
+    # [rad/s, m/s] at which the extra dry friction of slow motion has fallen to 1/e
+    stribeck_velocity: float = 0.1
     block: int = 2000  # samples in memory at a time
     dependent: float = 1e-9  # of its own length: what is left of a column that others span
     rounding: float = 1e-8  # of the largest coefficient of a base parameter: smaller ones are none
@@ -40,9 +39,8 @@ class DriveHintTuning:
     # of the squared error, and in each block of the torque's squares, what a coupling leaves at most; the TX40's wrist
     # leaves 0.05 and 0.03
     coupling_gain: float = 0.5
-    wrong_gain: float = (
-        0.25  # likewise of a swapped or negated torque; recorded arms lose a factor of 4 by either
-    )
+    # likewise of a swapped or negated torque; recorded arms lose a factor of 4 by either
+    wrong_gain: float = 0.25
     chance: float = 1 / 400  # that any candidate is taken by luck, as of what enters a fit
     simple_ratio: float = 0.02  # of the squared error, what a ratio of small numbers may cost
     # that begin the search for couplings: each covers half of it to twice
@@ -55,3 +53,7 @@ class DriveHintTuning:
     samples: int = 1500  # that are kept: six joints have some 70 parameters
     fewest_samples: int = 400  # that hints and errors need
     trajectories: int = 8  # of more, whole ones are left out
+
+
+TUNING = IdentificationTuning()
+HINTS = DriveHintTuning()

@@ -13,14 +13,12 @@ class LogTuning:
     chunk_samples: int = 2**16  # of a streamed log held at once: of 7 joints 12 MB, as windows 53 MB
     npz_bytes: int = 2**30  # unpacked at most from one NPZ archive, which zeros pack a thousandfold
     largest_value: float = 1e9  # [rad, rad/s, Nm; m, m/s, N] no arm has more: what is beyond is a wrong unit
-    dropout: float = (
-        20.0  # [usual steps] next to which a signal's 0 is no value: smooth signals come nearer first
-    )
+    # [usual steps] next to which a signal's 0 is no value: smooth signals come nearer first
+    dropout: float = 20.0
     gap: float = 4.0  # [median steps] a longer step is a hole; jitter of USB loggers stays below 3
     automatic_cutoff: float = 8.0  # [Hz] rigid-body motion lies below, ripple and quantisation above (UR10e)
-    dense_rate: float = (
-        50.0  # [Hz] slower logs are interpolated by cubics, and windows of them are not filtered
-    )
+    # [Hz] slower logs are interpolated by cubics, and windows of them are not filtered
+    dense_rate: float = 50.0
     clock_error: float = 0.002  # of a rate: nominal 50 Hz are 49.95 Hz of one logger, 50.1 Hz of another
     filter_order: int = 4  # of the Butterworth low-pass, run both ways: as in the logs' published protocols
     samples_per_period: int = 3  # of the cutoff's period that windows keep; two are Nyquist's bound

@@ -11,9 +11,8 @@ class RenderTuning:
 
     points: int = 300  # of a line: more cannot be seen at 400 pixels and only make the page heavy
     decades: float = 8.0  # of a logarithmic axis, counted from the largest value
-    outlier: float = (
-        100.0  # times the model's error: baselines beyond it are cut off, else all others were flat
-    )
+    # times the model's error: baselines beyond it are cut off, else all others were flat
+    outlier: float = 100.0
     bulk: float = 0.995  # quantile of measured friction that sets the axis: its outliers are cut off
     zero: float = 1e-9  # of the largest entry of M: a smaller one is what rounding leaves of zero
     faces: int = 4000  # of all links together, so that a page stays below 1 MB

@@ -33,3 +33,7 @@ class SimulationTuning:
     used_range: float = 0.7  # of a joint's range and of its speed limit, where nothing is said
     integral_gain: float = 0.2  # of the PID: a tenth of what makes a joint without friction unstable
     control_rate: float = 125.0  # [Hz] about, where nothing is said of the controllers
+
+
+EXCITATION = ExcitationTuning()
+SIMULATION = SimulationTuning()

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from spelgen.design import BRISTLE_REACH
-from spelgen.settings.tuning.identification import IdentificationTuning
+from spelgen.settings.tuning.identification import TUNING
 
 BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BRISTLE_REACH["revolute"])))
-STRIBECK_VELOCITY = IdentificationTuning().stribeck_velocity
 
 
 @dataclass(frozen=True)
@@ -49,35 +48,31 @@ class FrictionModel:
         bent: (T, n, K), how far the bristles are bent, relative to their reach; None: not known. motors: (n, n), takes
         joints' velocities to the drives' (see ``motor_speeds``); None: each drive moves its own joint alone.
         """
-        motors = np.eye(qd.shape[1]) if motors is None else motors
-        qd, qdd = qd @ motors.T, qdd @ motors.T
-        effects = np.stack([qdd, *self._velocity_effects(qd, bent)], axis=-2)  # (T, effects, n)
-        columns: np.ndarray = effects[:, None] * motors.T[:, None]
+        motors = np.eye(qd.shape[-1]) if motors is None else motors
+        effects = self._effects(qd @ motors.T, qdd @ motors.T, bent)
+        columns: np.ndarray = effects[..., None, :, :] * motors.T[:, None]
         return columns.reshape(*qd.shape, -1)
 
     def torque(
-        self,
-        constants: np.ndarray,
-        qd: np.ndarray,
-        bent: np.ndarray | None = None,
-        motors: np.ndarray | None = None,
+        self, constants: np.ndarray, qd: np.ndarray, bent: np.ndarray | None, motors: np.ndarray
     ) -> np.ndarray:
-        """Return all but the armature's part, (T, n), of ``constants`` by effect and drive, (effects, n)."""
-        motors = np.eye(qd.shape[1]) if motors is None else motors
-        effects = np.stack(self._velocity_effects(qd @ motors.T, bent))
-        torque: np.ndarray = np.einsum("en,e...n->...n", constants[1:], effects) @ motors
+        """Return all but the armature's part, (..., n), of ``constants`` by effect and drive, (effects, n)."""
+        speed = qd @ motors.T
+        torque: np.ndarray = (self._effects(speed, np.zeros_like(speed), bent) * constants).sum(
+            axis=-2
+        ) @ motors
         return torque
 
-    def _velocity_effects(self, qd: np.ndarray, bent: np.ndarray | None) -> list[np.ndarray]:
-        """Return what each constant but the armature is multiplied with, each (T, n)."""
-        sign = np.tanh(qd / self.coulomb_smoothing_velocity)
+    def _effects(self, speed: np.ndarray, rise: np.ndarray, bent: np.ndarray | None) -> np.ndarray:
+        """Return what each constant is multiplied with, (..., effects, n), by the drives' motion."""
+        sign = np.tanh(speed / self.coulomb_smoothing_velocity)
         dry = [sign]
         if self.memory:
             # where the motion before is not known: as of a joint that has long moved the way it does
             dry = [sign] * len(BRISTLES) if bent is None else list(np.moveaxis(bent, -1, 0))
-        effects = [qd, *dry, np.ones_like(qd)]
+        effects = [rise, speed, *dry, np.ones_like(speed)]
         if self.stribeck:
-            effects.append(sign * np.exp(-((qd / STRIBECK_VELOCITY) ** 2)))
+            effects.append(sign * np.exp(-((speed / TUNING.stribeck_velocity) ** 2)))
         if self.polynomial:
-            effects += [qd * np.abs(qd), qd**3]
-        return effects
+            effects += [speed * np.abs(speed), speed**3]
+        return np.stack(effects, axis=-2)

@@ -1,16 +1,17 @@
-"""Equations of motion at a position, M qdd = force, with all that depends on the position alone worked out once."""
+"""Equations of motion M qdd = force: at a position, with M as a network gives it, and one step of them in time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from spelgen.dynamics.protocol import has_momentum, known_past
+from spelgen.dynamics.protocol import has_momentum, known_past, memory_after
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 
@@ -63,3 +64,49 @@ def _of_any(dynamics: Any, q: Tensor) -> Pose:
         return (mass @ qdd.unsqueeze(-1)).squeeze(-1)
 
     return Pose(mass, force, friction)
+
+
+def runge_kutta(
+    dynamics: object,
+    rhs: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
+    q: Tensor,
+    p: Tensor,
+    z: Tensor,
+    step: Tensor | float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return q, p and z after one `step` [s], and q' at its start (Hairer et al., Solving ODEs I, II.1).
+
+    rhs: q' and p' of these dynamics by q, p and z. p: momenta, or velocities. Friction's memory z, (..., n, K), follows
+    the displacement exactly, so it needs no stages of its own.
+    """
+
+    qd1 = qd = pd = torch.zeros_like(p)
+    moved = pushed = torch.zeros_like(p)
+    # where in the step a stage is, and its weight
+    for fraction, weight in ((0.0, 1), (0.5, 2), (0.5, 2), (1.0, 1)):
+        stage = fraction * step
+        qd, pd = rhs(q + stage * qd, p + stage * pd, memory_after(dynamics, z, stage * qd))
+        if fraction == 0:
+            qd1 = qd
+        moved, pushed = moved + weight * qd, pushed + weight * pd
+    moved = step / 6 * moved
+    return q + moved, p + step / 6 * pushed, memory_after(dynamics, z, moved), qd1
+
+
+def unbounded(mass: Tensor) -> Tensor:
+    """Return one for every matrix: all of M's changes stand, see ``DerivedMass.fraction``."""
+    return mass.new_ones(mass.shape[:-2])
+
+
+@contextmanager
+def mass_as_learned(model: nn.Module) -> Iterator[None]:
+    """Let the model's M be indefinite where its network says so; a model that bounds nothing stays as it is."""
+    mass = getattr(model, "mass", None)
+    if mass is None or not hasattr(mass, "fraction"):
+        yield
+        return
+    mass.fraction = unbounded
+    try:
+        yield
+    finally:
+        del mass.fraction
