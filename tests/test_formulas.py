@@ -97,7 +97,7 @@ def test_sympy_proves_each_expression(robot):
     """Exactly, and not by numbers: by sines and cosines of single angles each is its unshortened expansion."""
     arm, _, found = written(robot)
     expansion = Expansion(arm)
-    generators = [function for q in found.q for function in (sympy.cos(q), sympy.sin(q), q)]
+    generators = [function for q in found.q for function in (sympy.sin(q), sympy.cos(q), q)]
     circles = [sympy.cos(q) ** 2 + sympy.sin(q) ** 2 - 1 for q in found.q]
     for row in found.rows:
         element = expansion.written.potential if row.place is None else expansion.written.mass[row.place]

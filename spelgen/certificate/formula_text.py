@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import textwrap
 
+from spelgen.certificate import printing
 from spelgen.certificate.formulas import WRITABLE, Formula, Formulas
-from spelgen.certificate.printing import Text
 from spelgen.labels import printable, short_name
 
 
@@ -17,7 +17,7 @@ def text(formulas: Formulas, width: int = 80) -> str:
         if row.expression is None:
             lines.append(f"{row.name}: {row.omission}")
         else:
-            lines += Text().lines(row.expression, f"{row.name} = ", width)
+            lines += printing.lines(printing.text(row.expression), f"{row.name} = ", width)
     for note in _notes(formulas):
         lines += ["", *textwrap.wrap(note, width)]
     if formulas.base:
@@ -27,14 +27,13 @@ def text(formulas: Formulas, width: int = 80) -> str:
 
 def to_dict(formulas: Formulas) -> dict[str, object]:
     """Return every expression as one line of text, null where it is too long; rows and columns count from 1."""
-    printer = Text()
     base = []
     for symbol, definition in formulas.base_parameters.items():
         # JSON has no fractions: programs get the nearest double
         value = formulas.values.get(symbol)
         if value is not None:
             value = float(value)
-        base.append({"name": symbol.name, "definition": printer.whole(definition), "value": value})
+        base.append({"name": symbol.name, "definition": printing.text(definition), "value": value})
     return {"entries": list(map(_entry, formulas.rows)), "base_parameters": base}
 
 
@@ -43,7 +42,7 @@ def _entry(formula: Formula) -> dict[str, object]:
     if formula.place is not None:
         row, column = formula.place[0] + 1, formula.place[1] + 1
     if formula.expression is not None:
-        text = Text().whole(formula.expression)
+        text = printing.text(formula.expression)
     return {"name": formula.name, "row": row, "col": column, "terms": formula.terms, "expression": text}
 
 
@@ -77,7 +76,7 @@ def _parameters(formulas: Formulas, width: int) -> list[str]:
         if definition.is_Symbol:
             lines.append(f"  {symbol.name}{value}")
         else:
-            lines += Text().lines(definition, f"  {symbol.name} = ", width, end=value)
+            lines += printing.lines(printing.text(definition), f"  {symbol.name} = ", width, value)
     return lines
 
 

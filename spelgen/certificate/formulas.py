@@ -1,12 +1,11 @@
 """Derive closed forms of M(q) and V(q), linear in the base inertial parameters, as SymPy expressions.
 
 Each entry is expanded exactly (``expansion``), its terms are collected by base parameter (``base_parameters``) and
-written the shortest of several ways (``shortening``). What is too long is counted, not written.
+written with multiple angles (``expressions``). What is too long is counted, not written.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
@@ -16,9 +15,14 @@ from flint import fmpq_mpoly
 from sympy import Expr, Matrix, Rational, Symbol
 
 from spelgen.arm.arm import Arm
-from spelgen.certificate.printing import Latex
-from spelgen.certificate.shortening import Shortener
-from spelgen.certificate.terms import coordinate, expression, grouped, parameter
+from spelgen.certificate.expressions import (
+    PolynomialWriter,
+    coordinate,
+    grouped,
+    parameter,
+    weighted_sum,
+)
+from spelgen.certificate.printing import latex
 from spelgen.errors import SpelgenError
 from spelgen.labels import entry_name
 from spelgen.listing import Listing
@@ -65,13 +69,19 @@ class Formula:
             return "too many terms to be expanded"
         return f"{self.terms} terms, not written out"
 
+    @property
+    def symbols(self) -> set[Symbol]:
+        """Everything that stands in it."""
+        if self.expression is None:
+            return set()
+        return set(self.expression.free_symbols)
+
 
 @dataclass(frozen=True, repr=False)
 class Formulas:
     """Hold closed forms of ``arm`` in the base parameters ``base``; V up to a constant.
 
-    Sums and products stand as they were chosen: SymPy did not evaluate them, and what it makes of them (a
-    derivative, a substitution) it does. Under ``inertials`` terms that vanish for the URDF's values are left out.
+    Under ``inertials`` terms that vanish for the URDF's values are left out.
     """
 
     arm: Arm
@@ -117,8 +127,8 @@ class Formulas:
         for base in self.base:
             terms = {}
             for index, coefficient in base.weights:
-                terms[parameter(parameter_name(index)),] = rational(coefficient)
-            definitions[parameter(base.name)] = expression(terms)
+                terms[parameter(parameter_name(index))] = rational(coefficient)
+            definitions[parameter(base.name)] = weighted_sum(terms)
         return definitions
 
     @property
@@ -148,7 +158,7 @@ class Formulas:
         for row in self.rows:
             text = row.omission
             if row.expression is not None:
-                text = f"${Latex().whole(row.expression)}$"
+                text = f"${latex(row.expression)}$"
             rows.append((row.name, text))
         return Listing(f"{self.arm.name}: closed forms", ("", ""), tuple(rows), left=(0, 1)).html()
 
@@ -163,30 +173,20 @@ def formulas(
     """
     n = len(arm.coordinates)
     places: list[Place] = [*triangle(n), None]
-    budget = TUNING.entry_budget
     if entry is not None:
         places = [_place(n, entry)]
-        budget = TUNING.budget
     if longest is None:
         longest = READABLE if entry is None else WRITABLE
     # recursion and base parameters serve all entries: they are worked out once
     writer = _Writer(arm, structure)
-    total = TUNING.budget
-    rows: list[Formula] = []
-    for place in reversed(places):  # from the tip on, so that what is cheap is not left out for what is dear
-        allowance = Budget(min(total, budget))
-        total -= allowance.left
-        rows.insert(0, writer.formula(place, longest, allowance))
-        total += allowance.left
+    budget = Budget(TUNING.budget)
+    # from the tip on, so that what is cheap is not left out for what is dear
+    rows = [writer.formula(place, longest, budget) for place in reversed(places)]
     # of one entry, parameters that it does not contain would only puzzle a reader
     base = writer.base
     if entry is not None:
-        names: set[str] = set()
-        for row in rows:
-            if row.expression is not None:
-                names.update(symbol.name for symbol in row.expression.free_symbols)
-        base = tuple(parameter for parameter in base if parameter.name in names)
-    return Formulas(arm, structure.assume, base, tuple(rows))
+        base = tuple(x for x in base if parameter(x.name) in rows[0].symbols)
+    return Formulas(arm, structure.assume, base, tuple(reversed(rows)))
 
 
 def _place(n: int, entry: Entry) -> Place:
@@ -208,7 +208,7 @@ class _Writer:
         if self._at_urdf_values:
             self.base = tuple(base for base in self.base if base.value)
         self._expansion = Expansion(arm)
-        self._shortener = Shortener(arm, self._expansion.context)
+        self._writer = PolynomialWriter(arm, self._expansion.context)
 
     def formula(self, place: Place, longest: int, budget: Budget) -> Formula:
         """Return one entry, counted only where it has more than ``longest`` terms or needs more than ``budget``."""
@@ -216,16 +216,13 @@ class _Writer:
             polynomials = self._polynomials(place, budget)
         except TooLarge:
             return Formula(place, None, None)
-        if self._at_urdf_values:
-            polynomials = self._without_vanishing(polynomials)
-        # counted before shortening: how short a sum gets depends on the heuristics
         terms = sum(map(len, polynomials))
         if terms > longest:
             return Formula(place, terms, None)
         functions = []
         for base, polynomial in zip(self.base, polynomials, strict=True):
             if polynomial:
-                functions.append((parameter(base.name), self._shortener.shortest(polynomial)))
+                functions.append((parameter(base.name), self._writer.terms(polynomial)))
         return Formula(place, terms, grouped(functions))
 
     def _polynomials(self, place: Place, budget: Budget) -> list[fmpq_mpoly]:
@@ -234,23 +231,19 @@ class _Writer:
         if place is not None:
             element = self._expansion.written.mass[place]
         polynomials = []
+        total = self._expansion.context.from_dict({})
         for base in self.base:
             # the parameters regrouped into this one have their part in its first one's polynomial
-            polynomial = self._shortener.reduced(self._expansion.polynomial(element, base.index, budget))
+            polynomial = self._writer.reduced(self._expansion.polynomial(element, base.index, budget))
             if place is None:
                 polynomial -= polynomial[(0,) * self._expansion.context.nvars()]
             polynomials.append(polynomial)
-        return polynomials
-
-    def _without_vanishing(self, polynomials: Sequence[fmpq_mpoly]) -> list[fmpq_mpoly]:
-        """Leave out the monomials whose coefficient is zero for the URDF's values."""
-        context = self._expansion.context
-        # under `inertials` the parameters have values, and a monomial may cancel between them
-        total = context.from_dict({})
-        for base, polynomial in zip(self.base, polynomials, strict=True):
             total += rational(base.value or Fraction(0)) * polynomial
-        result = []
-        for polynomial in polynomials:
-            terms = {monomial: value for monomial, value in polynomial.terms() if total[monomial] != 0}
-            result.append(context.from_dict(terms))
-        return result
+        if not self._at_urdf_values:
+            return polynomials
+        # with the URDF's values a monomial may cancel between parameters
+        remaining = set(total.monoms())
+        for index, polynomial in enumerate(polynomials):
+            terms = {monomial: value for monomial, value in polynomial.terms() if monomial in remaining}
+            polynomials[index] = self._expansion.context.from_dict(terms)
+        return polynomials
