@@ -71,7 +71,7 @@ class LoadedArm:
         )
 
     def verify(self, assume: Assume = "kinematics") -> Verification:
-        """The structure once more, by numbers and by other programs. Raises SpelgenError without Pinocchio."""
+        """The structure once more, by numbers and by other programs, Pinocchio among them."""
         from spelgen.certificate.verify import verify
 
         return verify(self.robot, self.arm, self.structure_for(assume))

@@ -45,11 +45,11 @@ def draw(arm: Arm, count: int, rng: np.random.Generator, *, random_inertials: bo
     rows, columns = np.tril_indices(n)
     mass = np.zeros((1 + n, count, n, n))
     potential = np.zeros((1 + n, count))
-    if not random_inertials:
-        dynamics = arm_dynamics(arm, Settings())
     for sample in range(count):
+        drawn = arm
         if random_inertials:
-            dynamics = arm_dynamics(with_random_inertias(arm, rng), Settings())
+            drawn = with_random_inertias(arm, rng)
+        dynamics = arm_dynamics(drawn, Settings())
         base, moved = _positions(arm, rng), _positions(arm, rng)
         q = np.where(np.eye(1 + n, n, -1) == 1, moved, base)  # (1 + n, n)
         mass[:, sample] = dynamics.mass_matrix(q)
