@@ -51,7 +51,7 @@ position [rad, m]."""
 # What a roboticist would write on a board.
 ON_A_BOARD = {
     "rpr": {
-        "M11": "0.5*Ixx3R*(cos(2*q3) + 1) - Ixy3*sin(2*q3) + Izz1R + 2*hz2R*q2 + m2R*q2**2",
+        "M11": "Ixx3R*(0.5*cos(2*q3) + 0.5) - Ixy3*sin(2*q3) + Izz1R + 2*hz2R*q2 + m2R*q2**2",
         "M32": "0",
         "V": "9.81*(-hx3*cos(q3) + hy3*sin(q3))",
     },

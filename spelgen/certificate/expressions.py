@@ -8,11 +8,10 @@ those that a person reads no shorter.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache
-from itertools import product
+from functools import cache, lru_cache
 
 from flint import fmpq, fmpq_mpoly, fmpq_mpoly_ctx
-from sympy import Add, Expr, Mul, Rational, Symbol, cos, sin
+from sympy import Add, Expr, Integer, Mul, Rational, Symbol, cos, sin
 from sympy.core.parameters import distribute
 
 from spelgen.arm.arm import Arm
@@ -65,18 +64,18 @@ class PolynomialWriter:
         """Return a polynomial with its products of cosines and sines as multiple angles."""
         result: Terms = {}
         for exponents, coefficient in polynomial.terms():
-            distances = Mul(*(coordinate(k) ** power for k, power in enumerate(exponents[2::3])))
-            sums = []
+            products = {
+                Mul(*(coordinate(k) ** power for k, power in enumerate(exponents[2::3]))): coefficient
+            }
             for run in self._runs:
-                powers = [(exponents[3 * joint], exponents[3 * joint + 1]) for joint in run]
-                sums.append(multiple_angles([self._angles[joint] for joint in run], powers))
-            for waves in product(*sums):
-                value = coefficient
-                for _, number in waves:
-                    value *= number
-                key = Mul(distances, *(wave for wave, _ in waves))
-                result[key] = result.get(key, fmpq(0)) + value
-        return {key: value for key, value in result.items() if value != 0}
+                powers = tuple((self._angles[k], exponents[3 * k], exponents[3 * k + 1]) for k in run)
+                waves = multiple_angles(powers)
+                products = {
+                    x * wave: y * number for x, y in products.items() for wave, number in waves.items()
+                }
+            for factors, value in products.items():
+                result[factors] = result.get(factors, fmpq(0)) + value
+        return {factors: value for factors, value in result.items() if value != 0}
 
 
 def parallel_runs(arm: Arm) -> list[list[int]]:
@@ -97,58 +96,54 @@ def parallel_runs(arm: Arm) -> list[list[int]]:
     return runs
 
 
-def multiple_angles(angles: Sequence[Expr], powers: Sequence[tuple[int, int]]) -> list[tuple[Expr, fmpq]]:
-    """Return a product of powers of the angles' sines and cosines as a sum of cosines and sines of their sums."""
-    # a wave is cos(m . angles - quarters pi/2), in which sin(x) is cos(x - pi/2)
-    waves = {((0,) * len(angles), 0): fmpq(1)}
-    for joint, (sines, cosines) in enumerate(powers):
+@lru_cache(4096)
+def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
+    """Return a product of powers, given as (angle, power of sin, power of cos), as a sum.
+
+    Each term is a multiple of one or of a cosine or sine of a sum of the angles.
+    """
+    # a wave is cos(sum of angles - quarters pi/2), in which sin(x) is cos(x - pi/2)
+    waves: dict[tuple[Expr, int], fmpq] = {(Integer(0), 0): fmpq(1)}
+    for angle, sines, cosines in powers:
         for quarter in [1] * sines + [0] * cosines:
-            products: dict[tuple[tuple[int, ...], int], fmpq] = {}
-            for (multiples, quarters), value in waves.items():
+            products: dict[tuple[Expr, int], fmpq] = {}
+            for (total, quarters), value in waves.items():
                 # cos a cos b = (cos(a + b) + cos(a - b)) / 2
                 for sign in (1, -1):
-                    moved = (*multiples[:joint], multiples[joint] + sign, *multiples[joint + 1 :])
-                    key = (moved, (quarters + sign * quarter) % 4)
-                    products[key] = products.get(key, fmpq(0)) + value / 2
+                    wave = (total + sign * angle, (quarters + sign * quarter) % 4)
+                    products[wave] = products.get(wave, fmpq(0)) + value / 2
             waves = products
-    result = []
-    for (multiples, quarters), value in waves.items():
-        angle = Add(*(multiple * angle for multiple, angle in zip(multiples, angles, strict=True)))
+    result: Terms = {}
+    for (total, quarters), value in waves.items():
+        function = cos(total)
+        if quarters % 2:
+            function = sin(total)
         # SymPy writes cos(-a) as cos(a) and sin(-a) as -sin(a)
-        wave = sin(angle) if quarters % 2 else cos(angle)
-        sign, function = wave.as_coeff_Mul()
-        if sign != 0:
-            result.append((function, value * int(sign) * (1 - 2 * (quarters // 2))))
+        sign, function = function.as_coeff_Mul()
+        if quarters > 1:
+            sign = -sign
+        result[function] = result.get(function, fmpq(0)) + value * int(sign)
     return result
 
 
 def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
     """Return the sum of parameters times functions; parameters with one function, up to a factor, together."""
+    # a common factor before the sum: 2*(a + b) is shorter than 2*a + 2*b
+    sizes = {abs(value) for _, terms in functions for value in terms.values()}
+    size = fmpq(1)
+    if len(sizes) == 1:
+        (size,) = sizes
     groups: dict[tuple[tuple[Expr, fmpq], ...], dict[Expr, fmpq]] = {}
     for symbol, terms in functions:
         leading = next(iter(terms.values()))
         unit = tuple((function, value / leading) for function, value in terms.items())
-        groups.setdefault(unit, {})[symbol] = leading
-    total: dict[Expr, fmpq] = {}
+        groups.setdefault(unit, {})[symbol] = leading / size
+    total = []
     for unit, parameters in groups.items():
-        first = next(iter(parameters.values()))
-        # a size stands before the brackets only where it leaves none inside
-        size = fmpq(1)
-        if any(abs(value) != 1 for _, value in unit):
-            size = abs(first)
-        function = weighted_sum({term: value * size for term, value in unit})
-        if function == 1 or len(parameters) == 1:
-            for symbol, value in parameters.items():
-                total[Mul(symbol, function)] = value / size
-        else:
-            # the sign of the first goes outside, so that no bracket begins with a minus
-            outside = size * first / abs(first)
-            symbols = weighted_sum({symbol: value / outside for symbol, value in parameters.items()})
-            total[Mul(symbols, function)] = outside / size
-    # a common factor before the sum: 2*(a + b) is shorter than 2*a + 2*b
-    sizes = {abs(value) for value in total.values()}
-    if len(sizes) != 1:
-        return weighted_sum(total)
-    (size,) = sizes
-    inside = weighted_sum({term: value / size for term, value in total.items()})
-    return weighted_sum({inside: size})
+        factor = fmpq(1)
+        # the numbers of a function that stands alone are those of the arm
+        if len(parameters) == 1:
+            factor = abs(next(iter(parameters.values())))
+        symbols = weighted_sum({symbol: value / factor for symbol, value in parameters.items()})
+        total.append(symbols * weighted_sum({function: value * factor for function, value in unit}))
+    return weighted_sum({Add(*total): size})

@@ -33,7 +33,7 @@ values: what the URDF gives them, where it has inertials.
 
 def latex(formulas: Formulas) -> str:
     """Return the formulas and the definitions of their parameters in two ``align*`` environments."""
-    rows = {Symbol(row.name): row.expression for row in formulas.rows if row.expression is not None}
+    rows = {Symbol(row.name): row.expression for row in formulas.written}
     definitions = {
         name: definition for name, definition in formulas.base_parameters.items() if not definition.is_Symbol
     }

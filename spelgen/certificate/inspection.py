@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Literal
 from spelgen.arm.actuation import Actuation, InputEntry
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.certificate.facts import Fact, facts
-from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.errors import Diagnostic
 from spelgen.labels import counted, joint_ranges, joints_in_ranges, printable, short_name
 from spelgen.listing import WIDTH, Listing
+from spelgen.structure.servo_rank import servo_rank
 from spelgen.structure.structure import Entry, Structure
 
 if TYPE_CHECKING:  # SymPy is read in only for formulas

@@ -7,14 +7,11 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Callable
 
 from sympy import Add, Expr, Float, Rational
 from sympy.core.parameters import distribute
 from sympy.printing.latex import LatexPrinter
 from sympy.printing.str import StrPrinter
-
-Print = Callable[[Expr], str]
 
 # textwrap breaks lines at blanks alone, so a no-break space holds a line together
 _FIXED = "\N{NO-BREAK SPACE}"
@@ -46,9 +43,12 @@ def python(expression: Expr) -> str:
 def lines(formula: str, start: str, width: int, end: str = "") -> list[str]:
     """Return a formula between ``start`` and ``end``, broken where lines get longer than ``width``."""
     indent = " " * (len(start) - len(start.lstrip()) + 4)
-    # a sign stays with what follows it, and angles stay in one line
-    formula = re.sub(r" ([+-]) ", rf" \1{_FIXED}", formula)
-    formula = re.sub(r"(cos|sin)\b.*?\)", lambda match: match[0].replace(" ", _FIXED), formula)
+    # a sign stays with what follows it; angles, and short brackets, stay in one line
+    formula = re.sub(r"([+-]) ", rf"\1{_FIXED}", formula)
+    unbroken = [x for x in re.findall(r"\((?:[^()]|\([^()]*\))+\)", formula) if len(x) < width // 2]
+    unbroken += re.findall(r"(?:cos|sin)\b.*?\)", formula)
+    for text in dict.fromkeys([*unbroken, r" \, "]):
+        formula = formula.replace(text, text.replace(" ", _FIXED))
     wrapped = textwrap.wrap(
         start + formula + end, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
     )
