@@ -22,7 +22,7 @@ version errors files labels listing tasks templates runtime
 settings urdf arm design spec
 structure dynamics
 certificate emission logs
-loaded_arm pipeline building trust
+loaded_arm pipeline building
 identification log_checks excitation
 fitting simulation
 exporting baselines

@@ -26,12 +26,11 @@ from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline import generate
+from spelgen.pipeline import generate, require_own_module
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.fits import Rollout, fit_config
 from spelgen.settings.settings import Settings
 from spelgen.spec import read_facts
-from spelgen.trust import require_own_module
 
 SCHEMA = 5
 
