@@ -41,7 +41,7 @@ class LoadedArm:
     tip: str | None
     angle_tolerance: float
 
-    @cached_property
+    @property
     def structure(self) -> Structure:
         """What holds for any inertial values: the kinematics alone are trusted."""
         return derive(self.arm)
@@ -62,7 +62,7 @@ class LoadedArm:
 
         Raises ArmError where these are required and absent.
         """
-        return self.structure if assume == "kinematics" else derive(self.arm, assume)
+        return derive(self.arm, assume)
 
     def inspect(self, assume: Assume = "kinematics") -> Inspection:
         """The structure as people and programs read it. Raises ArmError as ``structure_for`` does."""
@@ -84,9 +84,7 @@ class LoadedArm:
         They are ``.entries``, ``.mass_matrix`` and ``.potential``, in ``.q`` and ``.base_parameters``. ``longest``:
         terms of what is still written out; None: as many as a person reads.
         """
-        from spelgen.certificate.formulas import formulas
-
-        return formulas(self.arm, self.structure_for(assume), entry=entry, longest=longest)
+        return self.inspect(assume).closed_forms(entry, longest=longest)
 
     def __repr__(self) -> str:
         joints = counted(len(self.arm.coordinates), "joint")

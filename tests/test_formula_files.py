@@ -31,7 +31,8 @@ two_link: closed forms for any inertial values
 M11 = Izz1R + Izz2 + 2*hx2*cos(q2) - 2*hy2*sin(q2)
 M21 = Izz2 + hx2*cos(q2) - hy2*sin(q2)
 M22 = Izz2
-V = 9.81*(hx1R*sin(q1) + hx2*sin(q1 + q2) + hy1*cos(q1) + hy2*cos(q1 + q2))
+V = 9.81*hx1R*sin(q1) + 9.81*hx2*sin(q1 + q2) + 9.81*hy1*cos(q1)
+    + 9.81*hy2*cos(q1 + q2)
 
 V is determined up to a constant.
 
@@ -53,7 +54,7 @@ ON_A_BOARD = {
     "rpr": {
         "M11": "Ixx3R*(0.5*cos(2*q3) + 0.5) - Ixy3*sin(2*q3) + Izz1R + 2*hz2R*q2 + m2R*q2**2",
         "M32": "0",
-        "V": "9.81*(-hx3*cos(q3) + hy3*sin(q3))",
+        "V": "-9.81*hx3*cos(q3) + 9.81*hy3*sin(q3)",
     },
     "scara": {
         "M22": "Izz2R + Izz4 + 0.55*hx4*cos(q4) - 0.55*hy4*sin(q4) + 0.075625*m3R",

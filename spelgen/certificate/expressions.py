@@ -128,16 +128,11 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
 
 def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
     """Return the sum of parameters times functions; parameters with one function, up to a factor, together."""
-    # a common factor before the sum: 2*(a + b) is shorter than 2*a + 2*b
-    sizes = {abs(value) for _, terms in functions for value in terms.values()}
-    size = fmpq(1)
-    if len(sizes) == 1:
-        (size,) = sizes
     groups: dict[tuple[tuple[Expr, fmpq], ...], dict[Expr, fmpq]] = {}
     for symbol, terms in functions:
         leading = next(iter(terms.values()))
         unit = tuple((function, value / leading) for function, value in terms.items())
-        groups.setdefault(unit, {})[symbol] = leading / size
+        groups.setdefault(unit, {})[symbol] = leading
     total = []
     for unit, parameters in groups.items():
         factor = fmpq(1)
@@ -146,4 +141,4 @@ def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
             factor = abs(next(iter(parameters.values())))
         symbols = weighted_sum({symbol: value / factor for symbol, value in parameters.items()})
         total.append(symbols * weighted_sum({function: value * factor for function, value in unit}))
-    return weighted_sum({Add(*total): size})
+    return Add(*total)

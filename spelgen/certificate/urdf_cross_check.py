@@ -25,7 +25,6 @@ from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.robot import Robot
 
 TUNING = CertificateTuning()
-QUANTITIES = ("axes of the joints", "masses and inertias")
 TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
@@ -45,15 +44,14 @@ def urdf_cross_check(robot: Robot, arm: Arm, seed: int) -> tuple[Check, ...]:
         note = ", without the reported roundings"
     theirs, ours = _reading(dynamics, arm, q), _reading(_arm_dynamics(arm), arm, q)
     checks = []
-    for what, (their_values, our_values) in zip(QUANTITIES, zip(theirs, ours, strict=True), strict=True):
-        # numbers are compared with the largest of their kind at each joint
-        scale = np.abs(our_values).max(axis=0) + np.abs(our_values).max() * 1e-3
-        difference = float((np.abs(their_values - our_values) / np.where(scale == 0, 1.0, scale)).max())
+    for quantity, values in ours.items():
+        scale = np.abs(values).max() or 1.0
+        difference = float(np.abs(theirs[quantity] - values).max() / scale)
         verdict: Verdict = "agrees"
         if difference > TUNING.frame_rounding * len(robot.joints):
             verdict = "differs"
-        result = f"at most {size_text(difference)} of their size apart{note}"
-        checks.append(Check(f"{what} in the file", "as Pinocchio reads them", result, verdict))
+        result = f"at most {size_text(difference)} of the largest apart{note}"
+        checks.append(Check(f"{quantity} in the file", "as Pinocchio reads them", result, verdict))
     return tuple(checks)
 
 
@@ -84,7 +82,7 @@ def _arm_dynamics(arm: Arm) -> PinocchioDynamics:
     return arm_dynamics(replace(arm, bodies=tuple(bodies)), Settings())
 
 
-def _reading(dynamics: PinocchioDynamics, arm: Arm, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _reading(dynamics: PinocchioDynamics, arm: Arm, q: np.ndarray) -> dict[str, np.ndarray]:
     """Return what one program makes of a file at some configurations, by the joint of each moving body.
 
     Twists of unit rates in the root's frame, (samples, 6, bodies), and M of these joints with twice its diagonal,
@@ -101,4 +99,4 @@ def _reading(dynamics: PinocchioDynamics, arm: Arm, q: np.ndarray) -> tuple[np.n
         mass = upper + upper.T
         gravity = pin.computeGeneralizedGravity(model, data, configuration)
         loads.append(np.column_stack([mass, gravity])[columns][:, [*columns, -1]])
-    return np.array(axes), np.array(loads)
+    return {"axes of the joints": np.array(axes), "masses and inertias": np.array(loads)}

@@ -154,8 +154,8 @@ def _ranks(structure: Structure, samples: NumericSamples) -> Iterator[_Fact]:
 def _potential(structure: Structure, samples: NumericSamples) -> _Fact:
     """Return that V depends on the joints it should, and on no others."""
     sizes = []
-    for joint, change in enumerate(np.abs(samples.potential[1:] - samples.potential[0]).max(axis=1).tolist()):
-        sizes.append(_Size(f"change with joint {joint + 1}", change, joint in structure.potential))
+    for joint, size in enumerate(np.abs(samples.gravity).max(axis=0).tolist()):
+        sizes.append(_Size(f"torque of gravity at joint {joint + 1}", size, joint in structure.potential))
     derived = "no joint"
     if structure.potential:
         derived = joints_in_ranges(structure.potential)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
 from spelgen.comparison.metrics import RunResult
 from spelgen.evaluation.tables import Row, Table, table
@@ -24,7 +23,7 @@ LOSSES: dict[str, Quantity] = {
     "prediction loss, 1 s": lambda run: run.prediction.loss,
     "velocity, 1 s": lambda run: run.prediction.velocity,
     "position, 1 s": lambda run: run.prediction.position,
-    "M, relative error": lambda run: run.mass.error,
+    "M, relative error": lambda run: run.mass_error,
 }
 RATIOS = {"prediction loss, 1 s": "prediction loss", "velocity, 1 s": "velocity"}
 """Of these the baseline's is told by that of each variant."""
@@ -44,23 +43,21 @@ def comparison_tables(
     """Return the tables of a comparison: sizes and speed, losses, those of each seed, invariants."""
     runs: dict[str, list[RunResult]] = {}
     losses: dict[str, dict[str, float | None]] = {}
-    for result in sorted(results, key=lambda result: result.seed):
-        losses.setdefault(f"seed {result.seed}", {})[result.variant] = result.prediction.loss
     for result in results:
         runs.setdefault(result.variant, []).append(result)
-    invariants = (
-        Row("least eigenvalue of M / mean", _summary(runs, lambda x: x.invariants.least_eigenvalue, min)),
-        Row("rise of energy, no input", _summary(runs, lambda x: x.invariants.energy_rise, max)),
-        Row("energy drift, no friction", _summary(runs, lambda x: x.invariants.energy_drift, max)),
-    )
+    for result in sorted(results, key=lambda result: result.seed):
+        losses.setdefault(f"seed {result.seed}", {})[result.variant] = result.prediction.loss
+    invariants = {
+        "least eigenvalue of M / mean": _summary(runs, lambda x: x.invariants.least_eigenvalue, min),
+        "rise of energy, no input": _summary(runs, lambda x: x.invariants.energy_rise, max),
+        "energy drift, no friction": _summary(runs, lambda x: x.invariants.energy_drift, max),
+    }
+    worst = tuple(Row(label, values, ranked=False) for label, values in invariants.items())
     return [
         _sizes(runs, step_seconds, published),
         _losses(runs, published),
         table("Prediction loss over 1 s of every run", list(losses), losses.values()),
-        Table(
-            "Invariants, worst over seeds; a negative rise is a fall",
-            tuple(replace(row, ranked=False) for row in invariants),
-        ),
+        Table("Invariants, worst over seeds; a negative rise is a fall", worst),
     ]
 
 
@@ -86,11 +83,8 @@ def _losses(runs: Runs, published: Published) -> Table:
         medians = _summary(runs, quantity, statistics.median)
         rows.append(Row(label, medians))
         baseline = medians.get(BASELINE)
-        if BASELINE in runs and label in RATIOS:
-            ratios: dict[str, float | None] = dict.fromkeys(medians)
-            for name, median in medians.items():
-                if baseline is not None and median:
-                    ratios[name] = baseline / median
+        if baseline is not None and label in RATIOS:
+            ratios = {name: baseline / median if median else None for name, median in medians.items()}
             rows.append(Row(f"{BASELINE}'s {RATIOS[label]} / this", ratios, ranked=False))
     for label, field in PUBLISHED.items():
         rows += _published(runs, published, label, field)
@@ -121,6 +115,9 @@ def _published(
     runs: Runs, published: Published, label: str, field: str, form: Callable[[float | None], str] = number
 ) -> list[Row]:
     """Return a row of published figures, or none where there are none for this robot."""
-    figures = {name: getattr(published[name], field) for name in runs if name in published}
-    figures = {name: figure for name, figure in figures.items() if figure is not None}
+    figures = {}
+    for name in runs:
+        figure = getattr(published.get(name), field, None)
+        if figure is not None:
+            figures[name] = figure
     return [Row(f"published: {label}", figures, form, ranked=False)] if figures else []

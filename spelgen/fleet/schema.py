@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -31,6 +30,19 @@ class FleetRobot(Group):
     joints: tuple[str, ...] | None = None
     tip: str | None = None
 
+    def paths(self) -> list[tuple[str, Path]]:
+        """Return its files, each with its key."""
+        paths = [("urdf", self.urdf), *(("data", path) for path in self.data)]
+        if self.mapping is not None:
+            paths.append(("mapping", self.mapping))
+        return paths
+
+    def in_folder(self, folder: Path) -> FleetRobot:
+        """Return it with paths that are relative to the folder."""
+        mapping = self.mapping and folder / self.mapping
+        data = tuple(folder / path for path in self.data)
+        return self.model_copy(update={"urdf": folder / self.urdf, "data": data, "mapping": mapping})
+
 
 class Fleet(Group):
     """Every arm with every preset, seed and split.
@@ -56,39 +68,21 @@ def load_fleet(path: Path) -> Fleet:
     # YAML that knows its lines, for messages
     document = read_document(path)
     fleet = validated(Fleet, document.value(), document)
-    collect([*_preset_errors(fleet, document), *_path_errors(fleet, document)])
-    folder = path.parent
-    presets = tuple(name if name in PRESET_NAMES else str(folder / name) for name in fleet.presets)
-    robots = {name: _resolved(robot, folder) for name, robot in fleet.robots.items()}
-    return fleet.model_copy(update={"robots": robots, "presets": presets})
-
-
-def _resolved(robot: FleetRobot, folder: Path) -> FleetRobot:
-    paths: dict[str, object] = {
-        "urdf": folder / robot.urdf,
-        "data": tuple(folder / path for path in robot.data),
-    }
-    if robot.mapping is not None:
-        paths["mapping"] = folder / robot.mapping
-    return robot.model_copy(update=paths)
-
-
-def _preset_errors(fleet: Fleet, document: Document) -> Iterator[SettingsError]:
+    errors = []
     for number, preset in enumerate(fleet.presets):
         if preset not in PRESET_NAMES and Path(preset).suffix not in (".yaml", ".yml"):
-            yield _error(
-                document, ("presets", number), f"unknown preset {preset!r}", suggestion(preset, PRESET_NAMES)
-            )
-
-
-def _path_errors(fleet: Fleet, document: Document) -> Iterator[SettingsError]:
+            hint = suggestion(preset, PRESET_NAMES)
+            errors.append(_error(document, ("presets", number), f"unknown preset {preset!r}", hint))
     for name, robot in fleet.robots.items():
-        paths = [("urdf", robot.urdf), *(("data", path) for path in robot.data)]
-        if robot.mapping is not None:
-            paths.append(("mapping", robot.mapping))
-        for key, path in paths:
-            if not (document.path.parent / path).exists():
-                yield _error(document, ("robots", name, key), f"no such file: {path}", "check the path")
+        for key, file in robot.paths():
+            if not (path.parent / file).exists():
+                errors.append(
+                    _error(document, ("robots", name, key), f"no such file: {file}", "check the path")
+                )
+    collect(errors)
+    presets = tuple(name if name in PRESET_NAMES else str(path.parent / name) for name in fleet.presets)
+    robots = {name: robot.in_folder(path.parent) for name, robot in fleet.robots.items()}
+    return fleet.model_copy(update={"robots": robots, "presets": presets})
 
 
 def _error(document: Document, location: Location, got: str, do: str) -> SettingsError:
