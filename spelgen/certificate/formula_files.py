@@ -75,17 +75,14 @@ def _table(name: str, rows: Mapping[tuple[int, int], Expr] | Mapping[Symbol, Exp
 
 def _beginning(formulas: Formulas, body: str) -> list[str]:
     """Return comments, imports of what ``body`` uses, and the symbols."""
-    imported = ["Symbol"]
     # an import that is not used would fail the linters of whoever takes the file
-    for name in ("Add", "Matrix", "S", "cos", "sin"):
-        if f"{name}(" in body:
-            imported.append(name)
+    imported = sorted({"Symbol", *re.findall(r"\b(Add|Matrix|S|cos|sin)\(", body)})
     inertial: set[str] = set()
     for definition in formulas.base_parameters.values():
         inertial.update(symbol.name for symbol in definition.free_symbols)
     positions = [symbol.name for symbol in formulas.q]
     bases = [base.name for base in formulas.base]
-    lines = [*_comments(formulas, "#"), "", f"from sympy import {', '.join(sorted(imported))}", ""]
+    lines = [*_comments(formulas, "#"), "", f"from sympy import {', '.join(imported)}", ""]
     for name in dict.fromkeys([*positions, *sorted(inertial), *bases]):
         lines.append(f'{name} = Symbol("{name}", real=True)')
     # the last comma makes a tuple of one position too

@@ -17,14 +17,10 @@ MEASURE = "relative RMS after each time (0: no error, 1: as if the arm had stood
 
 def fleet_listings(fleet: FleetResults) -> list[Listing]:
     """Return all tables of a fleet's report."""
-    tables = []
-    for robot, runs in _by_robot(fleet).items():
-        tables.append(ranking(robot, runs))
-    if fleet.failures:
-        rows = []
-        for name, reason in fleet.failures.items():
-            rows.append((f"{name}: {reason}",))
-        tables.append(Listing("Failed runs; the same command runs them again", ("",), tuple(rows)))
+    tables = [ranking(robot, runs) for robot, runs in _by_robot(fleet).items()]
+    failures = tuple((f"{name}: {reason}",) for name, reason in fleet.failures.items())
+    if failures:
+        tables.append(Listing("Failed runs; the same command runs them again", ("",), failures))
     return tables
 
 

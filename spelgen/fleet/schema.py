@@ -12,7 +12,7 @@ from spelgen.errors import SettingsError, collect, suggestion
 from spelgen.settings.messages import dotted, validated
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Count, Group
-from spelgen.settings.yaml_document import Document, Location, read_document
+from spelgen.settings.yaml_document import Location, read_document
 
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,60}$")]
 
@@ -68,24 +68,20 @@ def load_fleet(path: Path) -> Fleet:
     # YAML that knows its lines, for messages
     document = read_document(path)
     fleet = validated(Fleet, document.value(), document)
-    errors = []
+    problems: list[tuple[Location, str, str]] = []
     for number, preset in enumerate(fleet.presets):
         if preset not in PRESET_NAMES and Path(preset).suffix not in (".yaml", ".yml"):
             hint = suggestion(preset, PRESET_NAMES)
-            errors.append(_error(document, ("presets", number), f"unknown preset {preset!r}", hint))
+            problems.append((("presets", number), f"unknown preset {preset!r}", hint))
     for name, robot in fleet.robots.items():
         for key, file in robot.paths():
             if not (path.parent / file).exists():
-                errors.append(
-                    _error(document, ("robots", name, key), f"no such file: {file}", "check the path")
-                )
+                problems.append((("robots", name, key), f"no such file: {file}", "check the path"))
+    errors = []
+    for place, got, do in problems:
+        line = document.line(place)
+        errors.append(SettingsError(got, file=path, line=line, element=dotted(place), do=do))
     collect(errors)
     presets = tuple(name if name in PRESET_NAMES else str(path.parent / name) for name in fleet.presets)
     robots = {name: robot.in_folder(path.parent) for name, robot in fleet.robots.items()}
     return fleet.model_copy(update={"robots": robots, "presets": presets})
-
-
-def _error(document: Document, location: Location, got: str, do: str) -> SettingsError:
-    return SettingsError(
-        got, file=document.path, line=document.line(location), element=dotted(location), do=do
-    )
