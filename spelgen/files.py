@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from spelgen.errors import SpelgenError
 
@@ -149,18 +149,6 @@ ADDRESS = re.compile(r"^([a-z][a-z0-9+.-]+):/+(?=[^/])")
 _copies: dict[str, Path] = {}  # address -> its local copy
 
 
-class FileSystem(Protocol):
-    """What is used of a file system of fsspec, which has no types."""
-
-    def isdir(self, path: str) -> bool: ...
-    def exists(self, path: str) -> bool: ...
-    def find(self, path: str) -> list[str]: ...
-    def get_file(self, remote: str, local: str) -> None: ...
-    def put_file(self, local: str, remote: str) -> None: ...
-    def rm_file(self, path: str) -> None: ...
-    def makedirs(self, path: str, exist_ok: bool) -> None: ...
-
-
 def local(path: Path | str) -> Path:
     """Return a local path as it is, and of an address the copy of the file or folder there.
 
@@ -209,8 +197,8 @@ def with_addresses(text: str) -> str:
 
 
 @contextmanager
-def reached(address: str) -> Iterator[tuple[FileSystem, str]]:
-    """Yield the file system of an address, and the path there.
+def reached(address: str) -> Iterator[tuple[Any, str]]:
+    """Yield the file system of an address, fsspec's, and the path there.
 
     Within it every exception becomes a SpelgenError that names the address: each file system raises kinds of its own.
     """
@@ -220,10 +208,6 @@ def reached(address: str) -> Iterator[tuple[FileSystem, str]]:
         yield fsspec.core.url_to_fs(address)
     except SpelgenError:
         raise
-    except ImportError as error:
-        raise SpelgenError(
-            f"an address that needs a package ({error})", file=address, do="install it"
-        ) from error
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise SpelgenError(f"cannot be reached ({reason})", file=address) from error

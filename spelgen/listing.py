@@ -1,17 +1,14 @@
-"""Lay out tables as text and as HTML: the same rows for a terminal, a file, a page and a notebook.
-
-Rich lays them out. Its console is told all that it would else ask the terminal and the environment for (width,
-colours, notebook), so that the same rows give the same text wherever they go.
-"""
+"""Lay out tables as text and as HTML: the same rows for a terminal, a file, a page and a notebook."""
 
 from __future__ import annotations
 
-import io
 import math
 import re
 import textwrap
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from html import escape
+from itertools import zip_longest
 from typing import Literal
 
 WIDTH = 80
@@ -39,7 +36,8 @@ class Listing:
 
     def text(self) -> str:
         """Return the table for a terminal or a file, without a line end."""
-        tables = "\n\n".join(table._layout() for table in self._cut())
+        columns = self._columns()
+        tables = "\n\n".join(self._layout(columns, group) for group in _groups(columns))
         note = textwrap.wrap(self.note, WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
         return "\n".join([*textwrap.wrap(self.title, WIDTH), tables, *note])
 
@@ -67,90 +65,52 @@ class Listing:
             return "left"
         return "right"
 
-    def _head(self) -> list[str]:
-        """Return the head, its names folded where the table would be too wide."""
-        widths = [0] * len(self.head)
-        for row in self.rows:
-            widths = [max(width, _wide(cell)) for width, cell in zip(widths, row, strict=True)]
-        total = 0
-        folded = [self.head[0]]
-        for name, width in zip(self.head, widths, strict=True):
-            total += 2 + max(_wide(name), width)
-        if total <= WIDTH:
-            return list(self.head)
-        for name, width in zip(self.head[1:], widths[1:], strict=True):
-            folded.append(_folded(name, max(HEAD, width)))
-        return folded
+    def _columns(self) -> list[list[str]]:
+        """Return the columns, the names above them folded where the table would be too wide."""
+        columns = list(map(list, zip(self.head, *self.rows, strict=True)))
+        if sum(2 + _width(column) for column in columns) > WIDTH:
+            for column in columns[1:]:
+                column[0] = _folded(column[0], max(HEAD, _width(column[1:])))
+        return columns
 
-    def _widths(self) -> list[int]:
-        """Return the widths of the columns under that head."""
-        widths = []
-        for column in zip(self._head(), *self.rows, strict=True):
-            lines = "\n".join(column).split("\n")
-            widths.append(max(map(_wide, lines)))
-        return widths
-
-    def _cut(self) -> list[Listing]:
-        """Return the same columns in as many tables as leave room for the words in the names of rows."""
-        longest_word = SHORTEST
-        for row in self.rows:
-            longest_word = max(longest_word, *map(_wide, SEPARATOR.split(row[0])))
-        room = WIDTH - 2 - longest_word
-        groups: list[list[int]] = [[]]
-        used = 0
-        for column, width in enumerate(self._widths()):
-            if column == 0:
-                continue
-            if groups[-1] and used + 2 + width > room:
-                groups.append([])
-                used = 0
-            groups[-1].append(column)
-            used += 2 + width
-        return [self._columns([0, *group]) for group in groups]
-
-    def _columns(self, columns: list[int]) -> Listing:
-        """Return the table of these columns alone."""
-        rows = []
-        for row in self.rows:
-            rows.append(tuple(row[column] for column in columns))
-        head = tuple(self.head[column] for column in columns)
-        left = tuple(columns.index(column) for column in self.left if column in columns)
-        return replace(self, head=head, rows=tuple(rows), left=left)
-
-    def _layout(self) -> str:
-        from rich.console import Console  # here: `--help` and `import spelgen` stay fast
-        from rich.table import Table
-        from rich.text import Text
-
-        widths = self._widths()
-        room = max(SHORTEST, WIDTH - 2 * len(widths) - sum(widths[1:]))
-        widths[0] = min(widths[0], SHORTEST)  # names may be folded, numbers never are
-        table = Table(box=None, show_header=False, padding=(0, 0, 0, 2))
-        for column, width in enumerate(widths):
-            table.add_column(justify=self._side(column), overflow="fold", min_width=width, no_wrap=column > 0)
-        for name, *cells in (self._head(), *self.rows):
-            table.add_row(Text(_folded(name, room)), *map(Text, cells))
-        file = io.StringIO()
-        width = max(WIDTH, sum(widths) + 2 * len(widths))
-        console = Console(
-            file=file,
-            width=width,
-            color_system=None,
-            force_terminal=False,
-            force_jupyter=False,
-            legacy_windows=False,
-            _environ={},
-        )
-        console.print(table, crop=False)
-        lines = [line.rstrip() for line in file.getvalue().rstrip("\n").split("\n")]
+    def _layout(self, columns: Sequence[Sequence[str]], group: Sequence[int]) -> str:
+        """Return the table of the names of rows, and these columns."""
+        chosen = [columns[column] for column in group]
+        # names may be folded, numbers never are
+        room = WIDTH - 2 * (1 + len(group)) - sum(map(_width, chosen))
+        chosen.insert(0, [_folded(name, max(SHORTEST, room)) for name in columns[0]])
+        lines = []
+        for row in zip(*chosen, strict=True):
+            for cells in zip_longest(*(cell.split("\n") for cell in row), fillvalue=""):
+                line = ""
+                for side, column, cell in zip(map(self._side, (0, *group)), chosen, cells, strict=True):
+                    blanks = " " * (_width(column) - _width([cell]))
+                    line += f"  {cell}{blanks}" if side == "left" else f"  {blanks}{cell}"
+                lines.append(line.rstrip())
         return "\n".join(lines)
 
 
-def _wide(text: str) -> int:
-    """Return the characters of a terminal that a text takes."""
-    from rich.cells import cell_len
+def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
+    """Return the columns in as many groups as leave room for the words in the names of rows."""
+    words = [word for name in columns[0][1:] for word in SEPARATOR.split(name)]
+    room = WIDTH - 2 - max(SHORTEST, _width(words))
+    groups: list[list[int]] = [[]]
+    used = 0
+    for column in range(1, len(columns)):
+        width = 2 + _width(columns[column])
+        if used and used + width > room:
+            groups.append([])
+            used = 0
+        groups[-1].append(column)
+        used += width
+    return groups
 
-    return cell_len(text)
+
+def _width(texts: Iterable[str]) -> int:
+    """Return the characters of a terminal that the widest line takes."""
+    from rich.cells import cell_len  # here: `--help` and `import spelgen` stay fast
+
+    return max((cell_len(line) for text in texts for line in text.split("\n")), default=0)
 
 
 def _folded(name: str, width: int) -> str:

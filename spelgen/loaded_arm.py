@@ -29,7 +29,7 @@ if TYPE_CHECKING:  # SymPy is read in only for formulas
 class LoadedArm(ConfiguredArm):
     """An arm with what is derived from it, which is worked out on first use."""
 
-    @cached_property
+    @property
     def structure(self) -> Structure:
         """What holds for any inertial values: the kinematics alone are trusted."""
         return derive(self.arm)
@@ -50,7 +50,7 @@ class LoadedArm(ConfiguredArm):
 
         Raises ArmError where these are required and absent.
         """
-        return self.structure if assume == "kinematics" else derive(self.arm, assume)
+        return derive(self.arm, assume)
 
     def inspect(self, assume: Assume = "kinematics") -> Inspection:
         """The structure as people and programs read it. Raises ArmError as ``structure_for`` does."""
@@ -59,7 +59,7 @@ class LoadedArm(ConfiguredArm):
         )
 
     def verify(self, assume: Assume = "kinematics") -> Verification:
-        """The structure once more, by numbers and by other programs. Raises SpelgenError without Pinocchio."""
+        """The structure once more, by numbers and by other programs, Pinocchio among them."""
         from spelgen.certificate.verify import verify
 
         return verify(self.robot, self.arm, self.structure_for(assume))
@@ -72,9 +72,7 @@ class LoadedArm(ConfiguredArm):
         They are ``.entries``, ``.mass_matrix`` and ``.potential``, in ``.q`` and ``.base_parameters``. ``longest``:
         terms of what is still written out; None: as many as a person reads.
         """
-        from spelgen.certificate.formulas import formulas
-
-        return formulas(self.arm, self.structure_for(assume), entry=entry, longest=longest)
+        return self.inspect(assume).closed_forms(entry, longest=longest)
 
     def __repr__(self) -> str:
         joints = counted(len(self.arm.coordinates), "joint")

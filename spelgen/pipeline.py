@@ -12,9 +12,9 @@ from spelgen.certificate.verification import Verification
 from spelgen.design import PRESET_NAMES, Design, Net, load_design
 from spelgen.emission.emit import emit
 from spelgen.emission.plan import plan_model
-from spelgen.errors import ModuleError
+from spelgen.errors import ModuleError, RunError, SpelgenError
 from spelgen.loaded_arm import LoadedArm, arm_of_module, load_arm
-from spelgen.spec import Assume, Facts, ModelSpec, Options, read_facts, read_source
+from spelgen.spec import Assume, Facts, ModelSpec, Options, parse_facts, read_facts, read_source
 
 
 def inspect(
@@ -48,10 +48,13 @@ def generate(
     no model.
     """
     loaded = arm if isinstance(arm, LoadedArm) else load_arm(arm)
-    shipped = preset in PRESET_NAMES
+    name, design = str(preset), None
+    if preset not in PRESET_NAMES:
+        name = "own" if isinstance(preset, Design) else Path(preset).stem
+        design = load_design(preset)
     options = Options(
-        preset=str(preset) if shipped else "own" if isinstance(preset, Design) else Path(preset).stem,
-        design=None if shipped else load_design(preset),
+        preset=name,
+        design=design,
         net=net,
         assume=assume,
         joints=loaded.joints,
@@ -84,6 +87,30 @@ def make_spec(loaded: LoadedArm, options: Options) -> ModelSpec:
         drives={item.name: loaded.settings.joint(item.name) for item in loaded.arm.coordinates},
         servos=loaded.settings.input == "position",
     )
+
+
+def require_own_module(module: Path, urdf: Path) -> None:
+    """Raise RunError unless a run folder's module is what its facts and the URDF beside it give.
+
+    A module is a program: it is run only where it is the very text that this version of spelgen writes.
+    """
+    source = read_source(module)
+    facts = parse_facts(source, module)
+    hint = ""
+    try:
+        if not urdf.is_file():
+            hint = "; fit(arm=...) and train --robot keep one"
+            reason = "there is no URDF beside it to write it anew from"
+        elif rebuilt(facts, urdf) == source:
+            return
+        else:
+            reason = "it is not what spelgen writes for the URDF beside it"
+    except SpelgenError as error:
+        reason = f"it cannot be written anew ({error})"
+    raise RunError(
+        f"a module that spelgen cannot verify: {reason}", file=module,
+        do="read it, then pass --trust (in Python: trust=True), or build it again and start a new run" + hint,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -107,7 +107,7 @@ def _work_or_die(work: Callable[[Task], Result], task: Task) -> Result:
 def _outcome(reference: Any) -> Any:
     """Return the result of a task, or its own exception."""
     import ray
-    from ray.exceptions import LocalRayletDiedError, RayError, RayTaskError
+    from ray.exceptions import RayError, RayTaskError
 
     try:
         return ray.get(reference)
@@ -115,7 +115,8 @@ def _outcome(reference: Any) -> Any:
         if isinstance(error.cause, Exception):
             return error.cause
         return error
-    except LocalRayletDiedError:
-        return RunError("Ray's own processes on a machine died", do="the same command does what is left")
-    except RayError as error:  # its workers died, each time
-        return RunError(f"a worker that died {RETRIES + 1} times ({type(error).__name__})")
+    except RayError as error:  # its workers died each time, or Ray's own processes did
+        return RunError(
+            f"a worker that died {RETRIES + 1} times ({type(error).__name__})",
+            do="the same command does what is left",
+        )

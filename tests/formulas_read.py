@@ -63,13 +63,12 @@ def without_latex(told: str) -> dict[str, str]:
     body = told.partition(r"\begin{align*}")[2].partition(r"\end{align*}")[0]
     for pattern, plain in (
         (r"\\\\\n\s*&\\quad", " "),
-        (r"\\tfrac\{(\d+)\}\{(\d+)\}", r"(\1/\2)"),
         (r" \\cdot 10\^\{(-?\d+)\}", r"e\1"),
         (r"\\[,]|\\\\", lambda match: "*" if match[0] == r"\," else ""),
+        (r"\\(cos|sin)(?:\^\{(\d)\})?\{\\bigl(\([^()]*)\\bigr\)\}", lambda m: f"{m[1]}{m[3]})**{m[2] or 1}"),
         (r"\\(?:bigl|bigr)", ""),
         (r"([mhI])_\{(?:([xyz]+),)?(\w+)\}", r"\1\2\3"),
         (r"([Mq])_\{(\d+)\}", r"\1\2"),
-        (r"\\(cos|sin)(?:\^\{(\d)\})?\{\\left(\([^()]*)\\right\)\}", lambda m: f"{m[1]}{m[3]})**{m[2] or 1}"),
         (r"\^\{(\d)\}", r"**\1"),
     ):
         body = re.sub(pattern, plain, body)

@@ -130,7 +130,7 @@ def test_build_and_check(spelgen, robots, tmp_path):
     assert spelgen("build", "arm.urdf").stdout == "wrote arm_spel.py\n"
     assert spelgen("build", "arm.urdf").stdout == "arm_spel.py is up to date\n"
     assert spelgen("check", "arm_spel.py").stdout.startswith(
-        "arm_spel.py is up to date with arm.urdf; 11 facts"
+        "arm_spel.py is up to date with arm.urdf; 10 facts"
     )
     text = (tmp_path / "arm.urdf").read_text(encoding="utf-8")
     (tmp_path / "arm.urdf").write_text(text + "<!-- changed -->\n", encoding="utf-8")

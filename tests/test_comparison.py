@@ -16,7 +16,7 @@ from spelgen.baselines.constant_velocity import hold_velocity
 from spelgen.baselines.predictor import Predictor
 from spelgen.comparison import metrics, runs
 from spelgen.comparison.formatting import comparison_tables
-from spelgen.comparison.known_urdf import with_wrong_inertials
+from spelgen.comparison.known_urdf import known_urdf
 from spelgen.comparison.metrics import mass_error, true_mass
 from spelgen.comparison.runs import predict_example, run_study, time_steps
 from spelgen.comparison.study import VARIANTS, ablation_variants, prepare_study
@@ -80,7 +80,7 @@ def test_inertials_that_are_wrong_are_possible_ones(robot, tmp_path):
     true = {x.name: x.inertial for x in read_urdf(robot).links if x.inertial}
     for error in (0.0, 0.3, 1.0):
         path = tmp_path / f"wrong_{error}.urdf"
-        path.write_bytes(with_wrong_inertials(robot, error))
+        path.write_bytes(known_urdf(robot, error))
         found = {x.name: x.inertial for x in read_urdf(path).links if x.inertial}
         away = [abs(np.log(float(found[x].mass) / float(true[x].mass))) for x in true]
         assert found.keys() == true.keys()
@@ -94,7 +94,7 @@ def test_inertials_that_are_wrong_are_possible_ones(robot, tmp_path):
 
 def test_with_a_wrong_urdf_models_are_trained_by_defaults(robot, quick, tmp_path):
     found = prepare_study(robot, tmp_path, variants=CHOSEN[1:], urdf_error=0.3)
-    assert found.urdf.read_bytes() == with_wrong_inertials(robot, 0.3)
+    assert found.urdf.read_bytes() == known_urdf(robot, 0.3)
     with pytest.MonkeyPatch.context() as patch:
         seen = []
 
@@ -245,7 +245,7 @@ def test_the_page_shows_predictions_and_m_beside_the_truth(study):
     q = torch.tensor(result.example.q, dtype=torch.float64)
     model = load_module(study.module(CHOSEN[1]))
     model.load_state_dict(torch.load(study.run(CHOSEN[1], 0) / "model.pt"))
-    np.testing.assert_allclose(result.mass.along, model.mass_matrix(q).detach(), rtol=1e-12)
+    np.testing.assert_allclose(result.mass, model.mass_matrix(q).detach(), rtol=1e-12)
 
 
 def test_a_run_that_is_not_finite_counts_as_worst(study):

@@ -132,9 +132,10 @@ def test_folds_test_every_trajectory_once(logs, robots, tmp_path):
     robot = FleetRobot(urdf=robots / "two_link.urdf", data=(logs,))
     found = prepare(Preparation("a", robot, 4, tmp_path))
     tested = []
-    for training, testing in found.data:
+    for split in found:
         parts = [
-            {x.q.tobytes() for x in read_logs(paths, ["joint1", "joint2"])} for paths in (training, testing)
+            {x.q.tobytes() for x in read_logs(paths, ["joint1", "joint2"])}
+            for paths in (split.train, split.test)
         ]
         assert len(parts[0]) == 6 and len(parts[1]) == 2 and not parts[0] & parts[1]
         tested += parts[1]

@@ -31,7 +31,8 @@ two_link: closed forms for any inertial values
 M11 = Izz1R + Izz2 + 2*hx2*cos(q2) - 2*hy2*sin(q2)
 M21 = Izz2 + hx2*cos(q2) - hy2*sin(q2)
 M22 = Izz2
-V = 9.81*(hx1R*sin(q1) + hy1*cos(q1) + hx2*sin(q1 + q2) + hy2*cos(q1 + q2))
+V = 9.81*hx1R*sin(q1) + 9.81*hx2*sin(q1 + q2) + 9.81*hy1*cos(q1)
+    + 9.81*hy2*cos(q1 + q2)
 
 V is determined up to a constant.
 
@@ -51,19 +52,19 @@ position [rad, m]."""
 # What a roboticist would write on a board.
 ON_A_BOARD = {
     "rpr": {
-        "M11": "Izz1R + m2R*q2**2 + 2*hz2R*q2 + Ixx3R*cos(q3)**2 - Ixy3*sin(2*q3)",
+        "M11": "Ixx3R*(0.5*cos(2*q3) + 0.5) - Ixy3*sin(2*q3) + Izz1R + 2*hz2R*q2 + m2R*q2**2",
         "M32": "0",
-        "V": "9.81*(-hx3*cos(q3) + hy3*sin(q3))",
+        "V": "-9.81*hx3*cos(q3) + 9.81*hy3*sin(q3)",
     },
     "scara": {
-        "M22": "Izz2R + 0.075625*m3R + Izz4 + 0.55*hx4*cos(q4) - 0.55*hy4*sin(q4)",
-        "M41": "-Izz4 - hx4*(0.325*cos(q2 - q4) + 0.275*cos(q4)) - hy4*(0.325*sin(q2 - q4) - 0.275*sin(q4))",
+        "M22": "Izz2R + Izz4 + 0.55*hx4*cos(q4) - 0.55*hy4*sin(q4) + 0.075625*m3R",
+        "M41": "-Izz4 - hx4*(0.275*cos(q4) + 0.325*cos(q2 - q4)) - hy4*(-0.275*sin(q4) + 0.325*sin(q2 - q4))",
     },
     "ur10e": {
-        "M54": "(Ixz5 - 0.11985*hx5)*sin(q5) + (Iyz5 - 0.11985*hy5R)*cos(q5) - 0.5*Ixx6R*sin(q5)*sin(2*q6) "
-        "- Ixy6*sin(q5)*cos(2*q6) - Ixz6*cos(q5)*sin(q6) - Iyz6*cos(q5)*cos(q6) "
-        "+ hx6*(0.11655*cos(q5)*sin(q6) - 0.11985*sin(q5)*cos(q6)) "
-        "+ hy6*(0.11655*cos(q5)*cos(q6) + 0.11985*sin(q5)*sin(q6))",
+        "M54": "-0.5*Ixx6R*sin(q5)*sin(2*q6) - Ixy6*sin(q5)*cos(2*q6) - Ixz6*sin(q6)*cos(q5) "
+        "- Iyz6*cos(q5)*cos(q6) - hx6*(0.11985*sin(q5)*cos(q6) - 0.11655*sin(q6)*cos(q5)) "
+        "+ hy6*(0.11985*sin(q5)*sin(q6) + 0.11655*cos(q5)*cos(q6)) + (Ixz5 - 0.11985*hx5)*sin(q5) "
+        "+ (Iyz5 - 0.11985*hy5R)*cos(q5)",
     },
 }
 
@@ -121,7 +122,7 @@ def test_json_has_the_same_expressions(robots, spelgen):
         "terms": 5,
         "expression": ON_A_BOARD["rpr"]["M11"],
     }
-    assert data["formulas"]["base_parameters"][0]["definition"] == "Izz1 + Iyy2 + Iyy3"
+    assert data["formulas"]["base_parameters"][0]["definition"] == "Iyy2 + Iyy3 + Izz1"
     assert "formulas" not in json.loads(spelgen("inspect", robots / "rpr.urdf", "--format", "json").stdout)
 
 
@@ -129,7 +130,7 @@ def test_without_inertials_there_are_no_values(robots, spelgen, tmp_path):
     bare = re.sub(r"<inertial>.*?</inertial>", "", (robots / "rpr.urdf").read_text(), flags=re.DOTALL)
     (tmp_path / "bare.urdf").write_text(bare)
     told = spelgen("inspect", "bare.urdf", "--formulas").stdout
-    assert "Base parameters\n  Izz1R = Izz1 + Iyy2 + Iyy3\n" in told
+    assert "Base parameters\n  Izz1R = Iyy2 + Iyy3 + Izz1\n" in told
 
 
 def test_lines_keep_the_width(shared):

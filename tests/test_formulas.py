@@ -97,15 +97,17 @@ def test_sympy_proves_each_expression(robot):
     """Exactly, and not by numbers: by sines and cosines of single angles each is its unshortened expansion."""
     arm, _, found = written(robot)
     expansion = Expansion(arm)
-    generators = [function for q in found.q for function in (sympy.cos(q), sympy.sin(q), q)]
+    generators = [function for q in found.q for function in (sympy.sin(q), sympy.cos(q), q)]
     circles = [sympy.cos(q) ** 2 + sympy.sin(q) ** 2 - 1 for q in found.q]
     for row in found.rows:
-        element = expansion.written.potential if row.place is None else expansion.written.mass[row.place]
+        element = expansion.written.potential
+        if row.entry != "V":
+            element = expansion.written.mass[row.entry[0] - 1, row.entry[1] - 1]
         expanded = sympy.Integer(0)
         for each in found.base:
             polynomial = expansion.polynomial(element, each.index, Budget(10**6))
             for powers, share in polynomial.terms():
-                if row.place is not None or any(powers):  # V is known up to a constant
+                if row.entry != "V" or any(powers):  # V is known up to a constant
                     monomial = sympy.prod(x**power for x, power in zip(generators, powers, strict=True))
                     expanded += (
                         sympy.Rational(int(share.p), int(share.q))

@@ -22,7 +22,7 @@ version errors files labels listing tasks templates runtime
 urdf settings arm design spec
 structure dynamics
 certificate emission logs excitation
-identification simulation loaded_arm pipeline building trust
+identification simulation loaded_arm pipeline building
 log_checks fitting
 exporting baselines
 evaluation

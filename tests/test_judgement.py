@@ -267,8 +267,8 @@ def test_each_job_of_a_fleet_trains_with_its_own_seed(robots, tmp_path, monkeypa
     monkeypatch.setattr(jobs, "train", train)
     for seed in (0, 1, 5):
         job = jobs.Job(
-            robot="a", preset="spel", seed=seed, split=0, folder=tmp_path / str(seed), urdf=robots / "two_link.urdf",
-            train=(), test=(), data="x", design="spel", width=4, depth=1,
+            fleet={"robots": {"a": {"urdf": robots / "two_link.urdf"}}, "width": 4, "depth": 1}, robot="a",
+            design="spel", seed=seed, split=0, logs={"digest": "x"}, folder=tmp_path / str(seed),
         )  # fmt: skip
         with pytest.raises(KeyboardInterrupt):
             jobs.run_job(job)

@@ -130,7 +130,7 @@ def assert_statements_hold(arm: Arm, structure: Structure, told: tuple[Fact, ...
     samples = draw(arm, 4 if free else 6, np.random.default_rng(0), random_inertials=free)
     names = {_entry(row, column): k for k, (row, column) in enumerate(keys)}
     mass, changes = samples.mass * samples.scale, np.abs(samples.changes)
-    lifted = np.abs(samples.potential[1:] - samples.potential[0])
+    lifted = np.abs(samples.gravity.T)
     of_kind: dict[str, set[str]] = {"zero": set(), "constant": set()}
     idle = set()
     for fact in told:

@@ -31,11 +31,10 @@ from spelgen.fitting.window import objective as window_objective
 from spelgen.logs import chunks
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline import generate
+from spelgen.pipeline import generate, require_own_module
 from spelgen.render.report_page import render_report
 from spelgen.settings.fits import Rollout
 from spelgen.settings.tuning.fitting import WindowTuning
-from spelgen.trust import require_own_module
 
 JOINTS = ("joint1", "joint2")
 QUICK = Rollout(epochs=3, momentum_steps=0, optimizer="adamw", batch=32, urdf_weight=0.0, stride=3)

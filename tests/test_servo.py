@@ -21,7 +21,6 @@ from spelgen.baselines import mujoco_actuators
 from spelgen.baselines.mujoco_actuators import kept_actuators
 from spelgen.baselines.names import DELAYED_COMMAND, LINEAR_SERVOS, POSITION_ACTUATORS
 from spelgen.cli.main import app
-from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import LogError, OptionError, RunError, SettingsError
 from spelgen.files import write_json
@@ -38,6 +37,7 @@ from spelgen.logs.commands import delayed_commands
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.render.report_page import render_report
+from spelgen.structure.servo_rank import servo_rank
 
 TRUTH = Servos(stribeck=(0.0, 0.08), dead_zone=(0.006, 0.0))
 SLIDER = """<joint name="{0}" type="prismatic"><parent link="{1}"/><child link="{2}"/><axis xyz="{3}"/>

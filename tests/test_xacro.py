@@ -13,9 +13,8 @@ from spelgen.fitting.train import train
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline import check, generate
+from spelgen.pipeline import check, generate, require_own_module
 from spelgen.settings.fits import Rollout
-from spelgen.trust import require_own_module
 from spelgen.urdf import xacro_input
 from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.read import read_urdf

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 
@@ -29,17 +28,6 @@ def is_plain(arm: Arm) -> bool:
     return True
 
 
-@dataclass(frozen=True)
-class _Configuration:
-    """Hold the axes and the twists of all joints, in the root's frame, at one configuration.
-
-    A twist is how a unit rate moves a body: the velocity of its point at the root's origin, then its angular velocity.
-    """
-
-    axes: list[np.ndarray]
-    twists: list[np.ndarray]
-
-
 class Axes:
     """Answer whether something holds of the axes of a plain arm's joints at every configuration."""
 
@@ -48,10 +36,11 @@ class Axes:
         self.slides = [kind == "prismatic" for kind in arm.joint_types]
         # fixed, so that a report is the same every time
         generator = random.Random(0)
+        # directions and twists of the axes, (joints, 3) and (joints, 6), by configuration
         self._configurations = [_configuration(arm, generator) for _ in range(_CONFIGURATIONS)]
 
     def parallel(self, a: int, b: int) -> bool:
-        return all(_are_parallel(pose.axes[a], pose.axes[b]) for pose in self._configurations)
+        return all(_are_parallel(axes[a], axes[b]) for axes, _ in self._configurations)
 
     def perpendicular(self, a: int, b: int) -> bool:
         return self._cosines(a, b) == {0}
@@ -60,7 +49,7 @@ class Axes:
         return len(self._cosines(a, b)) == 1
 
     def _cosines(self, a: int, b: int) -> set[Fraction]:
-        return {pose.axes[a] @ pose.axes[b] for pose in self._configurations}
+        return {axes[a] @ axes[b] for axes, _ in self._configurations}
 
     def opposed(self, a: int, b: int) -> bool:
         """Whether the two point against each other, for axes that are always parallel."""
@@ -69,12 +58,12 @@ class Axes:
 
     def move_alike(self, a: int, b: int) -> bool:
         """Whether unit rates of the two joints give the same velocity field, or opposite ones."""
-        return all(_are_parallel(pose.twists[a], pose.twists[b]) for pose in self._configurations)
+        return all(_are_parallel(twists[a], twists[b]) for _, twists in self._configurations)
 
     def commute(self, a: int, b: int) -> bool:
         """Whether moving one joint leaves the other's axis where it was: the twists' Lie bracket is zero."""
-        for pose in self._configurations:
-            (v, w), (v_b, w_b) = np.split(pose.twists[a], 2), np.split(pose.twists[b], 2)
+        for _, twists in self._configurations:
+            (v, w), (v_b, w_b) = np.split(twists[a], 2), np.split(twists[b], 2)
             if np.cross(w, w_b).any() or (np.cross(w, v_b) - np.cross(w_b, v)).any():
                 return False
         return True
@@ -83,10 +72,10 @@ class Axes:
         """Whether no joint moves the mass behind ``slider`` across the plane of the two directions."""
         if not all(self.slides[turner + 1 : slider]):
             return False  # a turn between the two may turn the plane
-        for pose in self._configurations:
-            normal = np.cross(pose.axes[slider], pose.axes[turner])
-            others = [joint for joint in range(turner + 1, len(self.slides)) if joint != slider]
-            if not all(_moves_nothing(pose.twists[joint], normal) for joint in others):
+        later = [joint for joint in range(turner + 1, len(self.slides)) if joint != slider]
+        for axes, twists in self._configurations:
+            normal = np.cross(axes[slider], axes[turner])
+            if not all(_moves_nothing(twists[joint], normal) for joint in later):
                 return False
         return True
 
@@ -123,11 +112,14 @@ class Axes:
     def lifts_nothing(self, joint: int) -> bool:
         """Whether the joint slides level, or turns about the vertical."""
         gravity = np.array(self.arm.gravity)
-        return all(_moves_nothing(pose.twists[joint], gravity) for pose in self._configurations)
+        return all(_moves_nothing(twists[joint], gravity) for _, twists in self._configurations)
 
 
-def _configuration(arm: Arm, generator: random.Random) -> _Configuration:
-    """Place a plain arm's joints at a random rational configuration."""
+def _configuration(arm: Arm, generator: random.Random) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return axes and twists of a plain arm's joints, in the root's frame, at a random rational configuration.
+
+    A twist is how a unit rate moves a body: the velocity of its point at the root's origin, then its angular velocity.
+    """
     axes, twists = [], []
     rotation, origin = IDENTITY, ZERO
     for body in arm.bodies:
@@ -135,18 +127,16 @@ def _configuration(arm: Arm, generator: random.Random) -> _Configuration:
         rotation = rotation @ np.array(body.rotation)
         axis = rotation[:, 2]
         axes.append(axis)
-        twist = [axis, ZERO]
-        if body.kind == "revolute":
-            twist = [np.cross(origin, axis), axis]
-        twists.append(np.concatenate(twist))
         t = Fraction(generator.randrange(1, _GRID), generator.randrange(1, _GRID))
         if body.kind == "prismatic":
+            twists.append(np.concatenate([axis, ZERO]))
             origin = origin + t * axis
         else:
+            twists.append(np.concatenate([np.cross(origin, axis), axis]))
             # t is the tangent of half the angle: so cosine and sine are rational too
             norm = 1 + t * t
             rotation = rotation @ turn_about(2, (1 - t * t) / norm, 2 * t / norm)
-    return _Configuration(axes, twists)
+    return axes, twists
 
 
 def _are_parallel(a: np.ndarray, b: np.ndarray) -> bool:

@@ -5,7 +5,7 @@ A reason is given only where the arm's exact geometry proves it (``reasons``).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -16,6 +16,7 @@ from spelgen.labels import axes_told, entry_name, joints_told, listed
 from spelgen.structure.structure import Entry, Structure
 
 Reason = str | None
+EntryReason = Callable[[Axes, Structure, Entry], Reason]
 
 
 @dataclass(frozen=True)
@@ -43,9 +44,11 @@ def facts(arm: Arm, structure: Structure) -> tuple[Fact, ...]:
     if is_plain(arm):
         axes = Axes(arm)
     words = _Words(structure, axes)
+    zero = ("always zero", "Nothing is learned for it", "Nothing is learned for them")
+    constant = ("constant", "It needs a number, no network", "They need numbers, no network")
     return (
-        *words.zeros(),
-        *words.constants(),
+        *words.entries("zero", reasons.zero_reason, *zero),
+        *words.entries("constant", reasons.constant_reason, *constant),
         *words.equalities(),
         *words.idle_joints(),
         *words.potential(),
@@ -64,34 +67,26 @@ class _Words:
             return None
         return why(self.axes, self.structure, *subject)
 
-    def zeros(self) -> Iterator[Fact]:
-        zeros = [entry for entry in self.structure.entries if entry.kind == "zero"]
-        for reason, group in self._by_reason(zeros, reasons.zero_reason):
-            means = f"Nothing is learned for {_pronoun(group)}"
-            yield Fact(f"{_names_are(group)} always zero", means, reason)
-
-    def constants(self) -> Iterator[Fact]:
-        constant = [entry for entry in self.structure.entries if entry.kind == "constant"]
-        for reason, group in self._by_reason(constant, reasons.constant_reason):
-            means = "They need numbers, no network"
-            if len(group) == 1:
-                means = "It needs a number, no network"
-            yield Fact(f"{_names_are(group)} constant", means, reason)
-
-    def _by_reason(
-        self, entries: Sequence[Entry], why: Callable[[Axes, Structure, Entry], Reason]
-    ) -> Iterator[tuple[Reason, list[Entry]]]:
-        """Yield the entries grouped by their reasons, those without one last."""
+    def entries(
+        self, kind: str, why: EntryReason, statement: str, means_one: str, means_several: str
+    ) -> Iterator[Fact]:
+        """Yield what holds of the entries of this kind; those with one reason make one sentence."""
         groups: dict[Reason, list[Entry]] = {}
-        for entry in entries:
-            groups.setdefault(self._reason(why, entry), []).append(entry)
+        for entry in self.structure.entries:
+            if entry.kind == kind:
+                groups.setdefault(self._reason(why, entry), []).append(entry)
+        # those without a reason come last
         for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
             if reason is not None and self.axes is not None:
                 # the joint that a reason is about comes second only where it slides, and is nearer to the root
                 slides = self.axes.slides
                 others = sorted({entry.row if slides[entry.column] else entry.column for entry in group})
                 reason = reason.format(axes=axes_told(others), joints=joints_told(others))
-            yield reason, group
+            names = listed([entry_name(entry.row, entry.column) for entry in group])
+            if len(group) == 1:
+                yield Fact(f"{names} is {statement}", means_one, reason)
+            else:
+                yield Fact(f"{names} are {statement}", means_several, reason)
 
     def equalities(self) -> Iterator[Fact]:
         """Yield entries that are equal, or opposite, at every configuration: the smallest form writes them alike."""
@@ -102,32 +97,26 @@ class _Words:
         groups: dict[tuple[tuple[int, Fraction], ...], dict[tuple[int, int], bool]] = {}
         for entry, factors in sorted(terms.items()):
             # entries are opposite where all factors are: so the first one's sign is taken out
-            positive = factors[min(factors)] > 0
+            positive = next(iter(factors.values())) > 0
             if not positive:
                 factors = {number: -factor for number, factor in factors.items()}
-            groups.setdefault(tuple(sorted(factors.items())), {})[entry] = positive
-        for group in groups.values():
-            if len(group) > 1:
-                entries = list(group)
-                names = []
-                for entry in entries:
-                    sign = "" if group[entry] == group[entries[0]] else "-"
-                    names.append(sign + entry_name(*entry))
+            groups.setdefault(tuple(factors.items()), {})[entry] = positive
+        for signs in groups.values():
+            if len(signs) > 1:
+                entries = list(signs)
+                names = ["-" * (signs[x] != signs[entries[0]]) + entry_name(*x) for x in entries]
                 reason = self._reason(reasons.equality_reason, entries)
                 yield Fact(f"{' = '.join(names)} always", "One of them is learned", reason)
 
     def idle_joints(self) -> Iterator[Fact]:
         """Yield joints that no entry of M depends on."""
         # what no network reads is the most useful fact: an input less
-        read: set[int] = set()
-        for entry in self.structure.entries:
-            read.update(entry.joints)
+        read = {joint for entry in self.structure.entries for joint in entry.joints}
         if not read:
             return  # every entry is zero or constant, which has been said
-        for joint in range(len(self.structure.joints)):
-            if joint not in read:
-                reason = self._reason(reasons.idle_reason, joint)
-                yield Fact(f"M does not depend on joint {joint + 1}", "No network of M reads it", reason)
+        for joint in sorted(set(range(len(self.structure.joints))) - read):
+            reason = self._reason(reasons.idle_reason, joint)
+            yield Fact(f"M does not depend on joint {joint + 1}", "No network of M reads it", reason)
 
     def potential(self) -> Iterator[Fact]:
         if not self.structure.potential:
@@ -139,18 +128,6 @@ class _Words:
             if joint not in self.structure.potential:
                 groups.setdefault(self._reason(reasons.weightless_reason, joint), []).append(joint)
         for reason, group in groups.items():
-            means = f"The network of V does not read {_pronoun(group)}"
+            pronoun = "it" if len(group) == 1 else "them"
+            means = f"The network of V does not read {pronoun}"
             yield Fact(f"V does not depend on {joints_told(group)}", means, reason)
-
-
-def _names_are(entries: Sequence[Entry]) -> str:
-    names = [entry_name(entry.row, entry.column) for entry in entries]
-    if len(names) == 1:
-        return f"{names[0]} is"
-    return f"{listed(names)} are"
-
-
-def _pronoun(things: Sequence[object]) -> str:
-    if len(things) == 1:
-        return "it"
-    return "them"

@@ -7,12 +7,14 @@ have neither line ends nor control characters.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Mapping
 
 from sympy import Expr, Symbol
 
+from spelgen.certificate import printing
 from spelgen.certificate.formulas import Formulas
-from spelgen.certificate.printing import Latex, Python
+from spelgen.certificate.printing import lines, python
 
 _LATEX_WIDTH = 140
 _PYTHON_WIDTH = 100
@@ -31,29 +33,22 @@ values: what the URDF gives them, where it has inertials.
 
 def latex(formulas: Formulas) -> str:
     """Return the formulas and the definitions of their parameters in two ``align*`` environments."""
-    rows = []
-    for row in formulas.rows:
-        if row.expression is not None:
-            rows.append((Symbol(row.name), row.expression))
-    definitions = []
-    for name, definition in formulas.base_parameters.items():
-        if not definition.is_Symbol:
-            definitions.append((name, definition))
-    lines = ["% Closed forms of a serial arm's mass matrix and potential energy, by spelgen; needs amsmath."]
-    lines += _comments(formulas, "%")
+    rows = {Symbol(row.name): row.expression for row in formulas.written}
+    definitions = {
+        name: definition for name, definition in formulas.base_parameters.items() if not definition.is_Symbol
+    }
+    result = ["% Closed forms of a serial arm's mass matrix and potential energy, by spelgen; needs amsmath."]
+    result += _comments(formulas, "%")
     for equations in (rows, definitions):
-        if equations:
-            lines += [r"\begin{align*}", " \\\\\n".join(_aligned(equations)), r"\end{align*}"]
-    return "\n".join(lines) + "\n"
-
-
-def _aligned(rows: Iterable[tuple[Symbol, Expr]]) -> Iterable[str]:
-    printer = Latex()
-    for name, expression in rows:
-        first, *following = printer.lines(expression, f"{printer.whole(name)} &= ", _LATEX_WIDTH)
-        yield first
-        for line in following:
-            yield rf"    &\quad {line.strip()}"
+        aligned = []
+        for name, expression in equations.items():
+            start = f"{printing.latex(name)} &= "
+            aligned += lines(printing.latex(expression), start, _LATEX_WIDTH)
+        if aligned:
+            # what goes on in another line is indented
+            body = " \\\\\n".join(re.sub("^ +", r"    &\\quad ", line) for line in aligned)
+            result += [r"\begin{align*}", body, r"\end{align*}"]
+    return "\n".join(result) + "\n"
 
 
 def sympy_source(formulas: Formulas) -> str:
@@ -65,32 +60,29 @@ def sympy_source(formulas: Formulas) -> str:
         body.append(f"M = Matrix({n}, {n}, lambda i, j: entries[max(i, j) + 1, min(i, j) + 1])")
     body.append("")
     if formulas.potential is not None:
-        body += ["V = (", *Python().lines(formulas.potential, "    ", _PYTHON_WIDTH), ")", ""]
+        body += lines(python(formulas.potential), "V = (", _PYTHON_WIDTH, end=")")
     body += _table("base_parameters", formulas.base_parameters)
     body += _table("values", formulas.values)
     return "\n".join([_HEAD, *_beginning(formulas, "\n".join(body)), *body]) + "\n"
 
 
 def _table(name: str, rows: Mapping[tuple[int, int], Expr] | Mapping[Symbol, Expr]) -> list[str]:
-    lines = [f"{name} = {{"]
+    result = [f"{name} = {{"]
     for key, expression in rows.items():
-        lines += Python().lines(expression, f"    {key}: ", _PYTHON_WIDTH, end=",")
-    return [*lines, "}"]
+        result += lines(python(expression), f"    {key}: ", _PYTHON_WIDTH, end=",")
+    return [*result, "}"]
 
 
 def _beginning(formulas: Formulas, body: str) -> list[str]:
     """Return comments, imports of what ``body`` uses, and the symbols."""
-    imported = ["Symbol"]
     # an import that is not used would fail the linters of whoever takes the file
-    for name in ("Add", "Float", "Matrix", "Rational", "cos", "sin"):
-        if f"{name}(" in body:
-            imported.append(name)
+    imported = sorted({"Symbol", *re.findall(r"\b(Add|Matrix|S|cos|sin)\(", body)})
     inertial: set[str] = set()
     for definition in formulas.base_parameters.values():
         inertial.update(symbol.name for symbol in definition.free_symbols)
     positions = [symbol.name for symbol in formulas.q]
     bases = [base.name for base in formulas.base]
-    lines = [*_comments(formulas, "#"), "", f"from sympy import {', '.join(sorted(imported))}", ""]
+    lines = [*_comments(formulas, "#"), "", f"from sympy import {', '.join(imported)}", ""]
     for name in dict.fromkeys([*positions, *sorted(inertial), *bases]):
         lines.append(f'{name} = Symbol("{name}", real=True)')
     # the last comma makes a tuple of one position too

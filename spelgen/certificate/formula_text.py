@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import textwrap
 
+from spelgen.certificate import printing
 from spelgen.certificate.formulas import WRITABLE, Formula, Formulas
-from spelgen.certificate.printing import Text
 from spelgen.labels import printable, short_name
 
 
@@ -17,7 +17,7 @@ def text(formulas: Formulas, width: int = 80) -> str:
         if row.expression is None:
             lines.append(f"{row.name}: {row.omission}")
         else:
-            lines += Text().lines(row.expression, f"{row.name} = ", width)
+            lines += printing.lines(printing.text(row.expression), f"{row.name} = ", width)
     for note in _notes(formulas):
         lines += ["", *textwrap.wrap(note, width)]
     if formulas.base:
@@ -27,40 +27,34 @@ def text(formulas: Formulas, width: int = 80) -> str:
 
 def to_dict(formulas: Formulas) -> dict[str, object]:
     """Return every expression as one line of text, null where it is too long; rows and columns count from 1."""
-    printer = Text()
-    base = []
+    base, values = [], formulas.values
     for symbol, definition in formulas.base_parameters.items():
         # JSON has no fractions: programs get the nearest double
-        value = formulas.values.get(symbol)
-        if value is not None:
-            value = float(value)
-        base.append({"name": symbol.name, "definition": printer.whole(definition), "value": value})
+        value = float(values[symbol]) if symbol in values else None
+        base.append({"name": symbol.name, "definition": printing.text(definition), "value": value})
     return {"entries": list(map(_entry, formulas.rows)), "base_parameters": base}
 
 
 def _entry(formula: Formula) -> dict[str, object]:
     row = column = text = None
-    if formula.place is not None:
-        row, column = formula.place[0] + 1, formula.place[1] + 1
+    if formula.entry != "V":
+        row, column = formula.entry
     if formula.expression is not None:
-        text = Text().whole(formula.expression)
+        text = printing.text(formula.expression)
     return {"name": formula.name, "row": row, "col": column, "terms": formula.terms, "expression": text}
 
 
 def _notes(formulas: Formulas) -> list[str]:
     notes = []
-    if any(row.place is None for row in formulas.rows):
+    if formulas.rows[-1].entry == "V":
         notes.append("V is determined up to a constant.")
-    for row in formulas.unwritten:
-        # one example does: the first that can be had at all
-        if row.terms is not None and row.terms <= WRITABLE:
-            option = "V"
-            if row.place is not None:
-                option = f"{row.place[0] + 1},{row.place[1] + 1}"
-            notes.append(
-                f"Omitted here: --entry {option} shows {row.name} alone, and -o FILE.py writes all entries for SymPy."
-            )
-            break
+    # one example does: the first that can be had at all
+    obtainable = [row for row in formulas.unwritten if row.terms is not None and row.terms <= WRITABLE]
+    for row in obtainable[:1]:
+        option = ",".join(map(str, row.entry))
+        notes.append(
+            f"Omitted here: --entry {option} shows {row.name} alone, and -o FILE.py writes all entries for SymPy."
+        )
     return notes
 
 
@@ -70,14 +64,10 @@ def _parameters(formulas: Formulas, width: int) -> list[str]:
     if values:
         lines = ["Base parameters, and the URDF's values"]
     for symbol, definition in formulas.base_parameters.items():
-        value = ""
-        if symbol in values:
-            value = f" [{float(values[symbol]):.6g}]"
+        value = f" [{float(values[symbol]):.6g}]" if symbol in values else ""
         # a parameter that stands for itself alone needs no equation
-        if definition.is_Symbol:
-            lines.append(f"  {symbol.name}{value}")
-        else:
-            lines += Text().lines(definition, f"  {symbol.name} = ", width, end=value)
+        name = "" if definition.is_Symbol else f"{symbol.name} = "
+        lines += printing.lines(printing.text(definition), f"  {name}", width, value)
     return lines
 
 

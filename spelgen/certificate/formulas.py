@@ -1,24 +1,28 @@
 """Derive closed forms of M(q) and V(q), linear in the base inertial parameters, as SymPy expressions.
 
 Each entry is expanded exactly (``expansion``), its terms are collected by base parameter (``base_parameters``) and
-written the shortest of several ways (``shortening``). What is too long is counted, not written.
+written with multiple angles (``expressions``). What is too long is counted, not written.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from typing import Literal
 
 from flint import fmpq_mpoly
-from sympy import Expr, Matrix, Rational, Symbol
+from sympy import Expr, Integer, Matrix, Rational, Symbol
 
 from spelgen.arm.arm import Arm
-from spelgen.certificate.printing import Latex
-from spelgen.certificate.shortening import Shortener
-from spelgen.certificate.terms import coordinate, expression, grouped, parameter
+from spelgen.certificate.expressions import (
+    PolynomialWriter,
+    coordinate,
+    grouped,
+    parameter,
+    weighted_sum,
+)
+from spelgen.certificate.printing import latex
 from spelgen.errors import SpelgenError
 from spelgen.labels import entry_name
 from spelgen.listing import Listing
@@ -32,31 +36,29 @@ TUNING = CertificateTuning()
 READABLE = TUNING.readable_terms
 WRITABLE = TUNING.writable_terms
 
-Place = tuple[int, int] | None
-"""An entry of M, 0-based with row >= column; None stands for V."""
 Entry = tuple[int, int] | Literal["V"]
-"""An entry as users name it: (row, column) from 1, or V."""
+"""An entry of M as users name it, (row, column) from 1, or V."""
 
 
 @dataclass(frozen=True)
 class Formula:
-    """Hold one entry of M, or V: its number of terms, and how it is written.
+    """Hold one entry of M's lower triangle, or V: its number of terms, and how it is written.
 
     ``terms`` counts products of a base parameter and a monomial in cosines, sines and distances, before
-    they are shortened; None where they were too many to be expanded. ``expression`` is None where it is too
+    they become multiple angles; None where they were too many to be expanded. ``expression`` is None where it is too
     long.
     """
 
-    place: Place
+    entry: Entry
     terms: int | None
     expression: Expr | None
 
     @property
     def name(self) -> str:
         """``M21`` or ``V``."""
-        if self.place is None:
+        if self.entry == "V":
             return "V"
-        return entry_name(*self.place)
+        return entry_name(self.entry[0] - 1, self.entry[1] - 1)
 
     @property
     def omission(self) -> str:
@@ -70,8 +72,7 @@ class Formula:
 class Formulas:
     """Hold closed forms of ``arm`` in the base parameters ``base``; V up to a constant.
 
-    Sums and products stand as they were chosen: SymPy did not evaluate them, and what it makes of them (a
-    derivative, a substitution) it does. Under ``inertials`` terms that vanish for the URDF's values are left out.
+    Under ``inertials`` terms that vanish for the URDF's values are left out.
     """
 
     arm: Arm
@@ -87,11 +88,7 @@ class Formulas:
     @cached_property
     def entries(self) -> dict[tuple[int, int], Expr]:
         """(row, column) -> entry of M that is not too long; the lower triangle, counted from 1."""
-        entries = {}
-        for row in self.rows:
-            if row.place is not None and row.expression is not None:
-                entries[row.place[0] + 1, row.place[1] + 1] = row.expression
-        return entries
+        return {row.entry: row.expression for row in self.written if row.entry != "V"}
 
     @property
     def mass_matrix(self) -> Matrix | None:
@@ -104,7 +101,7 @@ class Formulas:
     @property
     def potential(self) -> Expr | None:
         """V(q) [J], None where it is missing."""
-        return next((row.expression for row in self.rows if row.place is None), None)
+        return next((row.expression for row in self.written if row.entry == "V"), None)
 
     @property
     def base_parameters(self) -> dict[Symbol, Expr]:
@@ -117,8 +114,8 @@ class Formulas:
         for base in self.base:
             terms = {}
             for index, coefficient in base.weights:
-                terms[parameter(parameter_name(index)),] = rational(coefficient)
-            definitions[parameter(base.name)] = expression(terms)
+                terms[parameter(parameter_name(index))] = rational(coefficient)
+            definitions[parameter(base.name)] = weighted_sum(terms)
         return definitions
 
     @property
@@ -134,13 +131,18 @@ class Formulas:
         return "any inertial values"
 
     @property
+    def written(self) -> tuple[Formula, ...]:
+        """The entries that are not too long."""
+        return tuple(row for row in self.rows if row.expression is not None)
+
+    @property
     def unwritten(self) -> tuple[Formula, ...]:
         """The entries that were too long."""
         return tuple(row for row in self.rows if row.expression is None)
 
     def __repr__(self) -> str:
-        written = len(self.rows) - len(self.unwritten)
-        return f"<Formulas of {self.arm.name!r}: {written} written, in {len(self.base)} base parameters>"
+        counts = f"{len(self.written)} written, in {len(self.base)} base parameters"
+        return f"<Formulas of {self.arm.name!r}: {counts}>"
 
     def _repr_html_(self) -> str:
         """A table of LaTeX, for a notebook."""
@@ -148,7 +150,7 @@ class Formulas:
         for row in self.rows:
             text = row.omission
             if row.expression is not None:
-                text = f"${Latex().whole(row.expression)}$"
+                text = f"${latex(row.expression)}$"
             rows.append((row.name, text))
         return Listing(f"{self.arm.name}: closed forms", ("", ""), tuple(rows), left=(0, 1)).html()
 
@@ -162,41 +164,28 @@ def formulas(
     written. Raises SpelgenError for an entry that M does not have.
     """
     n = len(arm.coordinates)
-    places: list[Place] = [*triangle(n), None]
-    budget = TUNING.entry_budget
+    entries: list[Entry] = [*((row + 1, column + 1) for row, column in triangle(n)), "V"]
     if entry is not None:
-        places = [_place(n, entry)]
-        budget = TUNING.budget
+        lower: Entry = entry
+        if entry != "V":
+            lower = (max(entry), min(entry))
+        if lower not in entries:
+            expected = f"a row and a column from 1 to {n}, or V"
+            raise SpelgenError(f"the entry {entry[0]},{entry[1]} of M", expected=expected)
+        entries = [lower]
     if longest is None:
         longest = READABLE if entry is None else WRITABLE
     # recursion and base parameters serve all entries: they are worked out once
     writer = _Writer(arm, structure)
-    total = TUNING.budget
-    rows: list[Formula] = []
-    for place in reversed(places):  # from the tip on, so that what is cheap is not left out for what is dear
-        allowance = Budget(min(total, budget))
-        total -= allowance.left
-        rows.insert(0, writer.formula(place, longest, allowance))
-        total += allowance.left
+    budget = Budget(TUNING.budget)
+    # from the tip on, so that what is cheap is not left out for what is dear
+    rows = [writer.formula(x, longest, budget) for x in reversed(entries)]
     # of one entry, parameters that it does not contain would only puzzle a reader
     base = writer.base
     if entry is not None:
-        names: set[str] = set()
-        for row in rows:
-            if row.expression is not None:
-                names.update(symbol.name for symbol in row.expression.free_symbols)
-        base = tuple(parameter for parameter in base if parameter.name in names)
-    return Formulas(arm, structure.assume, base, tuple(rows))
-
-
-def _place(n: int, entry: Entry) -> Place:
-    if entry == "V":
-        return None
-    row, column = max(entry), min(entry)
-    if column < 1 or row > n:
-        expected = f"a row and a column from 1 to {n}, or V"
-        raise SpelgenError(f"the entry {entry[0]},{entry[1]} of M", expected=expected)
-    return row - 1, column - 1
+        symbols = (rows[0].expression or Integer(0)).free_symbols
+        base = tuple(x for x in base if parameter(x.name) in symbols)
+    return Formulas(arm, structure.assume, base, tuple(reversed(rows)))
 
 
 class _Writer:
@@ -208,49 +197,42 @@ class _Writer:
         if self._at_urdf_values:
             self.base = tuple(base for base in self.base if base.value)
         self._expansion = Expansion(arm)
-        self._shortener = Shortener(arm, self._expansion.context)
+        self._writer = PolynomialWriter(arm, self._expansion.context)
 
-    def formula(self, place: Place, longest: int, budget: Budget) -> Formula:
+    def formula(self, entry: Entry, longest: int, budget: Budget) -> Formula:
         """Return one entry, counted only where it has more than ``longest`` terms or needs more than ``budget``."""
         try:
-            polynomials = self._polynomials(place, budget)
+            polynomials = self._polynomials(entry, budget)
         except TooLarge:
-            return Formula(place, None, None)
-        if self._at_urdf_values:
-            polynomials = self._without_vanishing(polynomials)
-        # counted before shortening: how short a sum gets depends on the heuristics
-        terms = sum(map(len, polynomials))
+            return Formula(entry, None, None)
+        terms = sum(map(len, polynomials.values()))
         if terms > longest:
-            return Formula(place, terms, None)
+            return Formula(entry, terms, None)
         functions = []
-        for base, polynomial in zip(self.base, polynomials, strict=True):
+        for name, polynomial in polynomials.items():
             if polynomial:
-                functions.append((parameter(base.name), self._shortener.shortest(polynomial)))
-        return Formula(place, terms, grouped(functions))
+                functions.append((parameter(name), self._writer.terms(polynomial)))
+        return Formula(entry, terms, grouped(functions))
 
-    def _polynomials(self, place: Place, budget: Budget) -> list[fmpq_mpoly]:
-        """Return what each base parameter is multiplied by, without the constant part of V. Raises TooLarge."""
+    def _polynomials(self, entry: Entry, budget: Budget) -> dict[str, fmpq_mpoly]:
+        """Return by what each base parameter is multiplied, without the constant part of V. Raises TooLarge."""
         element = self._expansion.written.potential
-        if place is not None:
-            element = self._expansion.written.mass[place]
-        polynomials = []
+        if entry != "V":
+            element = self._expansion.written.mass[entry[0] - 1, entry[1] - 1]
+        polynomials = {}
+        total = self._expansion.context.from_dict({})
         for base in self.base:
             # the parameters regrouped into this one have their part in its first one's polynomial
-            polynomial = self._shortener.reduced(self._expansion.polynomial(element, base.index, budget))
-            if place is None:
+            polynomial = self._writer.reduced(self._expansion.polynomial(element, base.index, budget))
+            if entry == "V":
                 polynomial -= polynomial[(0,) * self._expansion.context.nvars()]
-            polynomials.append(polynomial)
-        return polynomials
-
-    def _without_vanishing(self, polynomials: Sequence[fmpq_mpoly]) -> list[fmpq_mpoly]:
-        """Leave out the monomials whose coefficient is zero for the URDF's values."""
-        context = self._expansion.context
-        # under `inertials` the parameters have values, and a monomial may cancel between them
-        total = context.from_dict({})
-        for base, polynomial in zip(self.base, polynomials, strict=True):
+            polynomials[base.name] = polynomial
             total += rational(base.value or Fraction(0)) * polynomial
-        result = []
-        for polynomial in polynomials:
-            terms = {monomial: value for monomial, value in polynomial.terms() if total[monomial] != 0}
-            result.append(context.from_dict(terms))
-        return result
+        if not self._at_urdf_values:
+            return polynomials
+        # with the URDF's values a monomial may cancel between parameters
+        remaining = set(total.monoms())
+        for name, polynomial in polynomials.items():
+            terms = {monomial: value for monomial, value in polynomial.terms() if monomial in remaining}
+            polynomials[name] = self._expansion.context.from_dict(terms)
+        return polynomials

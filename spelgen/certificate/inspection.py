@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from itertools import product
@@ -11,10 +12,10 @@ from typing import TYPE_CHECKING, Literal
 from spelgen.arm.actuation import Actuation, InputEntry
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.certificate.facts import Fact, facts
-from spelgen.dynamics.servo_rank import servo_rank
 from spelgen.errors import Diagnostic
 from spelgen.labels import counted, joint_ranges, joints_in_ranges, printable, short_name
 from spelgen.listing import WIDTH, Listing
+from spelgen.structure.servo_rank import servo_rank
 from spelgen.structure.structure import Entry, Structure
 
 if TYPE_CHECKING:  # SymPy is read in only for formulas
@@ -91,15 +92,12 @@ class Inspection:
 
     def _repr_html_(self) -> str:
         """Return the whole matrix, for a notebook."""
-        n = len(self.structure.joints)
-        cells = self._cells()
+        cells, n = self._cells(), len(self.structure.joints)
         rows = []
         for row, name in enumerate(self.structure.joints):
-            line = [f"{row + 1} {name}"]
-            for column in range(n):
-                # M is symmetric: above the diagonal stand the entries below it
-                line.append(cells[max(row, column), min(row, column)])
-            rows.append(tuple(line))
+            # M is symmetric: above the diagonal stand the entries below it
+            line = [cells[max(row, column), min(row, column)] for column in range(n)]
+            rows.append((f"{row + 1} {name}", *line))
         title = f"{self.arm.name}: mass matrix; joints each entry depends on, C constant, 0 always zero"
         head = ("", *map(str, range(1, n + 1)))
         note = "; ".join(f"{name}: {need}" for name, need in self.needs().items())
@@ -124,15 +122,13 @@ class Inspection:
         for row, column in product(range(n), repeat=2):
             kind, value = values.get((row, column), ("zero", 0.0))
             entries.append({"row": row + 1, "col": column + 1, "kind": kind, "value": value})
-        if self.input == "torque":
-            return {"entries": entries}
-        rank = servo_rank(self.arm)
-        return {
-            "input": "position",
-            "kp_in_ratio": list(map(self._names, rank.groups)),
-            "with_inertia_only": [f"{name} of {self.structure.joints[joint]}" for name, joint in rank.open],
-            "entries": entries,
-        }
+        content: dict[str, object] = {}
+        if self.input == "position":
+            rank = servo_rank(self.arm)
+            undetermined = [f"{name} of {self.structure.joints[joint]}" for name, joint in rank.open]
+            content = {"input": "position", "kp_in_ratio": list(map(self._names, rank.groups))}
+            content["with_inertia_only"] = undetermined
+        return {**content, "entries": entries}
 
     def _servo_needs(self) -> str:
         """Return what logs of positions determine, by the rank of their equations."""
@@ -191,25 +187,28 @@ class Inspection:
     def _cells(self) -> dict[tuple[int, int], str]:
         cells = {}
         for entry in self.structure.entries:
-            letter = LETTERS.get(entry.kind)
-            cells[entry.row, entry.column] = joint_ranges(entry.joints) if letter is None else letter
+            cells[entry.row, entry.column] = LETTERS.get(entry.kind, joint_ranges(entry.joints))
         return cells
 
     def _matrix(self) -> str:
-        """Return the lower triangle of M with each entry's joints."""
-        lines = _triangle(self._cells(), len(self.structure.joints))
-        return "\n".join(["Mass matrix: joints each entry depends on; C constant, 0 always zero", *lines])
+        """Return the lower triangle of M with each entry's joints, its columns aligned."""
+        cells, n = self._cells(), len(self.structure.joints)
+        lines = ["Mass matrix: joints each entry depends on; C constant, 0 always zero"]
+        widths = [max(len(cells[row, column]) for row in range(column, n)) for column in range(n)]
+        for row in range(n):
+            line = f"  {row + 1:>2}"
+            for column in range(row + 1):
+                line += f"  {cells[row, column]:<{widths[column]}}"
+            lines.append(line.rstrip())
+        return "\n".join(lines)
 
     def needs(self) -> dict[str, str]:
         """Return what a model of M(q), V(q) and G needs, in words, and the number of base parameters."""
         structure = self.structure
         # outputs that read the same joints are one network: said together
-        counts: dict[tuple[int, ...], int] = {}
-        for output in structure.outputs:
-            counts[output.joints] = counts.get(output.joints, 0) + 1
-        mass = (
-            f"{counted(len(structure.outputs), 'output')} and {counted(len(structure.constants), 'constant')}"
-        )
+        counts = Counter(output.joints for output in structure.outputs)
+        outputs = counted(len(structure.outputs), "output")
+        mass = f"{outputs} and {counted(len(structure.constants), 'constant')}"
         mass += f" make all {len(structure.entries)} entries"
         if counts:
             groups = [f"{count} of {joints_in_ranges(joints)}" for joints, count in counts.items()]
@@ -234,20 +233,6 @@ class Inspection:
 def _rows(entries: Iterable[InputEntry]) -> str:
     """Return the joints on which the torques of these entries of G act."""
     return joints_in_ranges(tuple(sorted({entry.row for entry in entries})))
-
-
-def _triangle(cells: dict[tuple[int, int], str], n: int) -> list[str]:
-    """Return the rows of a lower triangle, its columns aligned."""
-    lines: list[str] = []
-    widths = [0] * n
-    for (_, column), text in cells.items():
-        widths[column] = max(widths[column], len(text))
-    for row in range(n):
-        line = f"  {row + 1:>2}"
-        for column in range(row + 1):
-            line += f"  {cells[row, column]:<{widths[column]}}"
-        lines.append(line)
-    return list(map(str.rstrip, lines))
 
 
 def _indented(title: str, paragraphs: Iterable[str]) -> str:

@@ -1,4 +1,4 @@
-"""Draw mass matrices, potential energies and torque regressors of an arm by Pinocchio, at random configurations.
+"""Draw mass matrices, torques of gravity and torque regressors of an arm by Pinocchio, at random configurations.
 
 With random inertials every sample has its own, each that of a possible rigid body: the pseudo-inertia is
 positive definite (Wensing, Kim and Slotine, RA-L 3(1), 2018).
@@ -22,15 +22,15 @@ ENGINE = f"Pinocchio {pin.__version__}"
 
 @dataclass(frozen=True)
 class NumericSamples:
-    """Hold samples in blocks, every one but the first with one coordinate moved.
+    """Hold samples: of M in blocks, every one but the first with one coordinate moved.
 
     ``mass`` (1 + n, samples, n(n+1)/2), each entry in units of ``scale`` (n(n+1)/2,), the geometric mean of
-    its row's and column's diagonal entries; ``potential`` (1 + n, samples), in units of its largest value.
+    its row's and column's diagonal entries; ``gravity`` dV/dq (samples, n), in units of its largest value.
     """
 
     mass: np.ndarray
     scale: np.ndarray
-    potential: np.ndarray
+    gravity: np.ndarray
 
     @property
     def changes(self) -> np.ndarray:
@@ -44,24 +44,22 @@ def draw(arm: Arm, count: int, rng: np.random.Generator, *, random_inertials: bo
     n = len(arm.coordinates)
     rows, columns = np.tril_indices(n)
     mass = np.zeros((1 + n, count, n, n))
-    potential = np.zeros((1 + n, count))
-    if not random_inertials:
-        dynamics = arm_dynamics(arm, Settings())
+    gravity = np.zeros((count, n))
     for sample in range(count):
+        drawn = arm
         if random_inertials:
-            dynamics = arm_dynamics(with_random_inertias(arm, rng), Settings())
+            drawn = with_random_inertias(arm, rng)
+        dynamics = arm_dynamics(drawn, Settings())
         base, moved = _positions(arm, rng), _positions(arm, rng)
         q = np.where(np.eye(1 + n, n, -1) == 1, moved, base)  # (1 + n, n)
         mass[:, sample] = dynamics.mass_matrix(q)
-        for block, configuration in enumerate(dynamics.configuration(q)):
-            energy = pin.computePotentialEnergy(dynamics.model, dynamics.data, configuration)
-            potential[block, sample] = energy
+        gravity[sample] = dynamics.gravity(base)
     # entries mix kilograms and kilogram square metres: each is judged in its own unit
     diagonal = np.abs(np.diagonal(mass, axis1=2, axis2=3)).mean(axis=(0, 1))
     scale = np.sqrt(np.outer(diagonal, diagonal))[rows, columns]
     scale[scale == 0] = 1.0
-    largest = np.abs(potential).max() or 1.0
-    return NumericSamples(mass[:, :, rows, columns] / scale, scale, potential / largest)
+    largest = np.abs(gravity).max() or 1.0
+    return NumericSamples(mass[:, :, rows, columns] / scale, scale, gravity / largest)
 
 
 def regressor(arm: Arm, rng: np.random.Generator) -> np.ndarray:

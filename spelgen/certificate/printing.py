@@ -1,4 +1,4 @@
-"""Keep SymPy's printers from rearranging what was chosen, and lines of one width.
+"""Print expressions with SymPy's own printers: text and LaTeX with decimals, Python with exact fractions.
 
 Blanks that must not end a line are no-break spaces until the lines are made.
 """
@@ -7,137 +7,76 @@ from __future__ import annotations
 
 import re
 import textwrap
-from functools import cache
 
-from sympy import Add, Expr, Function, Mul, Rational, Symbol
+from sympy import Add, Expr, Float, Rational
+from sympy.core.parameters import distribute
 from sympy.printing.latex import LatexPrinter
-from sympy.printing.precedence import PRECEDENCE
-from sympy.printing.printer import Printer
 from sympy.printing.str import StrPrinter
 
 # textwrap breaks lines at blanks alone, so a no-break space holds a line together
 _FIXED = "\N{NO-BREAK SPACE}"
 _LONG_SUM = 20
+_DIGITS = 12
 _DOUBLE = 10**17  # more digits than a double holds
 
 
-class _AsBuilt(Printer):  # type: ignore[misc]  # SymPy has no types
-    """Print sums and products in the order they were put together, numbers as decimals."""
-
-    times = "*"
-
-    def whole(self, expression: Expr) -> str:
-        """Return the expression in one line."""
-        return str(self.doprint(expression)).replace(_FIXED, " ")
-
-    def lines(self, expression: Expr, start: str, width: int, end: str = "") -> list[str]:
-        """Return the expression between ``start`` and ``end``, broken where lines get longer than ``width``.
-
-        Lines break before terms, and inside of those that are longer than a line.
-        """
-        indent = " " * (len(start) - len(start.lstrip()) + 4)
-        pieces: list[str] = []
-        for term in Add.make_args(expression):
-            text = str(self.doprint(term))
-            room = width - len(start)
-            if pieces:
-                text = self._signed(text)
-                room = width - len(indent)
-            if len(text) <= room:
-                text = text.replace(" ", _FIXED)
-            pieces.append(text)
-        lines = textwrap.wrap(
-            " ".join(pieces) + end, width, initial_indent=start, subsequent_indent=indent,
-            break_long_words=False, break_on_hyphens=False,
-        )  # fmt: skip
-        return [line.replace(_FIXED, " ") for line in lines]
-
-    def _signed(self, text: str) -> str:
-        if text.startswith("-"):
-            return f"-{_FIXED}{text[1:]}"
-        return f"+{_FIXED}{text}"
-
-    def _print_Add(self, expression: Add, order: str | None = None) -> str:
-        first, *following = map(self._print, expression.args)
-        return " ".join([first, *map(self._signed, following)])
-
-    def _print_Mul(self, expression: Mul) -> str:
-        number, factors = expression.as_coeff_mul()
-        written = [self.parenthesize(factor, PRECEDENCE["Mul"]) for factor in factors]
-        if abs(number) != 1:
-            written.insert(0, self._print(abs(number)))
-        return _sign(number) + self.times.join(written)
-
-    def _print_Function(self, expression: Function, **power: str) -> str:
-        text: str = super()._print_Function(expression, **power).replace(" ", _FIXED)
-        return text
-
-    def _print_Rational(self, number: Rational) -> str:
-        return _sign(number) + decimal(abs(number))
-
-    _print_Integer = _print_Rational
+def text(expression: Expr) -> str:
+    """Return it as one types it: numbers as decimals of up to twelve digits."""
+    result: str = StrPrinter({"full_prec": False}).doprint(_rounded(expression, 1, _DIGITS))
+    return result
 
 
-class Text(_AsBuilt, StrPrinter):  # type: ignore[misc]
-    """Print as one types: numbers as short decimals, else with twelve digits."""
+def latex(expression: Expr) -> str:
+    r"""Return a formula of LaTeX's, with brackets that unlike \left( may stand on different lines."""
+    names = {symbol: _latex_name(symbol.name) for symbol in expression.free_symbols}
+    printer = LatexPrinter({"full_prec": False, "mul_symbol": r" \, ", "symbol_names": names})
+    formula: str = printer.doprint(_rounded(expression, 1, _DIGITS))
+    return formula.replace(r"\left(", r"\bigl(").replace(r"\right)", r"\bigr)")
 
 
-class Latex(_AsBuilt, LatexPrinter):  # type: ignore[misc]
-    r"""Print a formula of LaTeX's, with brackets that unlike \left( may stand on different lines."""
-
-    times = rf"{_FIXED}\,{_FIXED}"
-
-    def _add_parens(self, text: str) -> str:
-        return rf"\bigl({text}\bigr)"
-
-    def _print_Symbol(self, symbol: Symbol, style: str = "plain") -> str:
-        """Return ``Izz1R`` as I with the index zz,1R."""
-        letter, axes, place = re.findall(r"(.)([a-z]*)(.*)", symbol.name)[0]
-        if not place:
-            return str(letter)
-        if axes:
-            return f"{letter}_{{{axes},{place}}}"
-        return f"{letter}_{{{place}}}"
-
-    def _print_Rational(self, number: Rational) -> str:
-        mantissa, _, exponent = super()._print_Rational(number).partition("e")
-        mantissa = re.sub(r"(\d+)/(\d+)", r"\\tfrac{\1}{\2}", mantissa)
-        if exponent:
-            return rf"{mantissa} \cdot 10^{{{int(exponent)}}}"
-        return mantissa
-
-    _print_Integer = _print_Rational
+def python(expression: Expr) -> str:
+    """Return Python that SymPy evaluates exactly, but for fractions of more digits than a double has."""
+    result: str = _PythonPrinter({"sympy_integers": True}).doprint(_rounded(expression, _DOUBLE, 17))
+    return result
 
 
-class Python(_AsBuilt, StrPrinter):  # type: ignore[misc]
-    """Print Python that SymPy evaluates exactly: fractions as they are, unless they have more digits than a double."""
+def lines(formula: str, start: str, width: int, end: str = "") -> list[str]:
+    """Return a formula between ``start`` and ``end``, broken where lines get longer than ``width``."""
+    indent = " " * (len(start) - len(start.lstrip()) + 4)
+    # a sign stays with what follows it; angles, and short brackets, stay in one line
+    formula = re.sub(r"([+-]) ", rf"\1{_FIXED}", formula)
+    unbroken = [x for x in re.findall(r"\((?:[^()]|\([^()]*\))+\)", formula) if len(x) < width // 2]
+    unbroken += re.findall(r"(?:cos|sin)\b.*?\)", formula)
+    for text in dict.fromkeys([*unbroken, r" \, "]):
+        formula = formula.replace(text, text.replace(" ", _FIXED))
+    wrapped = textwrap.wrap(
+        start + formula + end, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    )
+    return [line.replace(_FIXED, " ") for line in wrapped]
 
+
+class _PythonPrinter(StrPrinter):  # type: ignore[misc]  # SymPy has no types
     def _print_Add(self, expression: Add, order: str | None = None) -> str:
         """Print a long sum in one call, since Python cannot nest thousands of additions."""
         if len(expression.args) <= _LONG_SUM:
-            return super()._print_Add(expression)
+            result: str = super()._print_Add(expression, order)
+            return result
         return f"Add({', '.join(map(self._print, expression.args))})"
 
-    def _print_Rational(self, number: Rational) -> str:
-        if number.q == 1:
-            return str(number.p)
-        if max(abs(number.p), number.q) < _DOUBLE:
-            return f"Rational({number.p}, {number.q})"
-        return f"Float({float(number)!r})"
 
-    _print_Integer = _print_Rational
-
-
-@cache
-def decimal(value: Rational) -> str:
-    """Return a positive number as an exact decimal or a small fraction where it is one, else with twelve digits."""
-    short = f"{float(value):.12g}"
-    if Rational(short) == value or value.q > 16:
-        return short
-    return f"{value.p}/{value.q}"
+def _rounded(expression: Expr, largest: int, digits: int) -> Expr:
+    """Return it with decimals for fractions whose numerator or denominator exceeds ``largest``."""
+    decimals = {}
+    for number in expression.atoms(Rational):
+        if not number.is_Integer and max(abs(number.p), number.q) > largest:
+            decimals[number] = Float(number, digits)
+    # SymPy would else multiply brackets out
+    with distribute(False):
+        return expression.xreplace(decimals)
 
 
-def _sign(number: Rational) -> str:
-    if number < 0:
-        return "-"
-    return ""
+def _latex_name(name: str) -> str:
+    """Return ``Izz1R`` as I with the index zz,1R."""
+    letter, axes, place = re.findall(r"(.)([a-z]*)(.*)", name)[0]
+    index = ",".join(filter(None, [axes, place]))
+    return f"{letter}_{{{index}}}" if index else str(letter)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
 from spelgen.comparison.metrics import RunResult
 from spelgen.evaluation.tables import Row, Table, table
@@ -24,18 +23,20 @@ LOSSES: dict[str, Quantity] = {
     "prediction loss, 1 s": lambda run: run.prediction.loss,
     "velocity, 1 s": lambda run: run.prediction.velocity,
     "position, 1 s": lambda run: run.prediction.position,
-    "M, relative error": lambda run: run.mass.error,
+    "M, relative error": lambda run: run.mass_error,
 }
 RATIOS = {"prediction loss, 1 s": "prediction loss", "velocity, 1 s": "velocity"}
 """Of these the baseline's is told by that of each variant."""
-PUBLISHED = {
-    "training loss": "train_loss",
-    "test loss": "test_loss",
-    "prediction loss": "prediction_loss",
-    "velocity": "velocity",
-    "position": "position",
+PUBLISHED: dict[str, tuple[str, Callable[[float | None], str]]] = {
+    "parameters": ("parameters", "{:,.0f}".format),
+    "training step [s]": ("step_seconds", "{:.2f}".format),
+    "training loss": ("train_loss", number),
+    "test loss": ("test_loss", number),
+    "prediction loss": ("prediction_loss", number),
+    "velocity": ("velocity", number),
+    "position": ("position", number),
 }
-"""By label, fields of `PublishedFigures`."""
+"""By label, fields of `PublishedFigures` and the form of their numbers."""
 
 
 def comparison_tables(
@@ -44,27 +45,25 @@ def comparison_tables(
     """Return the tables of a comparison: sizes and speed, losses, those of each seed, invariants."""
     runs: dict[str, list[RunResult]] = {}
     losses: dict[str, dict[str, float | None]] = {}
-    for result in sorted(results, key=lambda result: result.seed):
-        losses.setdefault(f"seed {result.seed}", {})[result.variant] = result.prediction.loss
     for result in results:
         runs.setdefault(result.variant, []).append(result)
-    invariants = (
-        Row("least eigenvalue of M / mean", _summary(runs, lambda x: x.invariants.least_eigenvalue, min)),
-        Row("rise of energy, no input", _summary(runs, lambda x: x.invariants.energy_rise, max)),
-        Row("energy drift, no friction", _summary(runs, lambda x: x.invariants.energy_drift, max)),
-    )
+    for result in sorted(results, key=lambda result: result.seed):
+        losses.setdefault(f"seed {result.seed}", {})[result.variant] = result.prediction.loss
+    invariants = {
+        "least eigenvalue of M / mean": _summary(runs, lambda x: x.invariants.least_eigenvalue, min),
+        "rise of energy, no input": _summary(runs, lambda x: x.invariants.energy_rise, max),
+        "energy drift, no friction": _summary(runs, lambda x: x.invariants.energy_drift, max),
+    }
+    worst = tuple(Row(label, values, ranked=False) for label, values in invariants.items())
     return [
-        _sizes(runs, step_seconds, published),
+        _sizes(runs, step_seconds),
         _losses(runs, published),
         table("Prediction loss over 1 s of every run", list(losses), losses.values()),
-        Table(
-            "Invariants, worst over seeds; a negative rise is a fall",
-            tuple(replace(row, ranked=False) for row in invariants),
-        ),
+        Table("Invariants, worst over seeds; a negative rise is a fall", worst),
     ]
 
 
-def _sizes(runs: Runs, step_seconds: Mapping[str, float], published: Published) -> Table:
+def _sizes(runs: Runs, step_seconds: Mapping[str, float]) -> Table:
     sizes = {name: of_seeds[0].sizes for name, of_seeds in runs.items()}
     rows = []
     for k, matrix in enumerate("MDGV"):
@@ -74,10 +73,8 @@ def _sizes(runs: Runs, step_seconds: Mapping[str, float], published: Published) 
         Row("inputs of M", {name: size.inputs for name, size in sizes.items()}, ranked=False),
         Row("parameters", {name: size.parameters for name, size in sizes.items()}, "{:,.0f}".format),
         Row("training step [ms]", {name: 1e3 * step_seconds[name] for name in runs}, "{:.1f}".format),
-        *_published(runs, published, "parameters", "parameters", "{:,.0f}".format),
-        *_published(runs, published, "training step [s]", "step_seconds", "{:.2f}".format),
     ]
-    return Table("Sizes, and the time of a training step here; below, what is published", tuple(rows))
+    return Table("Sizes, and the time of a training step", tuple(rows))
 
 
 def _losses(runs: Runs, published: Published) -> Table:
@@ -86,14 +83,14 @@ def _losses(runs: Runs, published: Published) -> Table:
         medians = _summary(runs, quantity, statistics.median)
         rows.append(Row(label, medians))
         baseline = medians.get(BASELINE)
-        if BASELINE in runs and label in RATIOS:
-            ratios: dict[str, float | None] = dict.fromkeys(medians)
-            for name, median in medians.items():
-                if baseline is not None and median:
-                    ratios[name] = baseline / median
+        if baseline is not None and label in RATIOS:
+            ratios = {name: baseline / median if median else None for name, median in medians.items()}
             rows.append(Row(f"{BASELINE}'s {RATIOS[label]} / this", ratios, ranked=False))
-    for label, field in PUBLISHED.items():
-        rows += _published(runs, published, label, field)
+    for label, (field, form) in PUBLISHED.items():
+        figures = {name: getattr(published[name], field) for name in runs if name in published}
+        figures = {name: figure for name, figure in figures.items() if figure is not None}
+        if figures:
+            rows.append(Row(f"published: {label}", figures, form, ranked=False))
     title = (
         "Squared errors summed over joints [rad, m, s], mean over samples and windows, and the error of M, "
         "relative to M; median over seeds; below, what is published"
@@ -107,20 +104,8 @@ def _summary(
     """Return by variant one number of all seeds; a run that is not finite counts as infinitely bad."""
     summaries: dict[str, float | None] = {}
     for name, of_seeds in runs.items():
-        values = []
-        for run in of_seeds:
-            value = quantity(run)
-            # infinite and not left out: a variant that blows up in one seed of two is no better than the other seed
-            values.append(math.inf if value is None else value)
-        summary = combined(values)
+        values = list(map(quantity, of_seeds))
+        # infinite and not left out: a variant that blows up in one seed of two is no better than the other seed
+        summary = combined([math.inf if value is None else value for value in values])
         summaries[name] = summary if math.isfinite(summary) else None
     return summaries
-
-
-def _published(
-    runs: Runs, published: Published, label: str, field: str, form: Callable[[float | None], str] = number
-) -> list[Row]:
-    """Return a row of published figures, or none where there are none for this robot."""
-    figures = {name: getattr(published[name], field) for name in runs if name in published}
-    figures = {name: figure for name, figure in figures.items() if figure is not None}
-    return [Row(f"published: {label}", figures, form, ranked=False)] if figures else []

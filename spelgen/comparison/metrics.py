@@ -45,17 +45,9 @@ class Prediction:
 class Sizes:
     """outputs: of the networks of M, D, G and V. inputs: of the network of M."""
 
-    outputs: tuple[int, int, int, int]
+    outputs: tuple[int, ...]
     inputs: int
     parameters: int
-
-
-@dataclass(frozen=True)
-class LearnedMass:
-    """error: of M, see `mass_error`. along: M (T, n, n) at the measured positions of the example."""
-
-    error: float
-    along: list[list[list[float]]]
 
 
 @dataclass(frozen=True)
@@ -63,6 +55,7 @@ class RunResult:
     """The measurements of a trained variant.
 
     seconds: of training. train, test: errors over windows as long as those of training; prediction: over 1 s of tests.
+    mass_error: of M, see `mass_error`. mass: M (T, n, n) at the measured positions of the example.
     """
 
     variant: str
@@ -74,7 +67,8 @@ class RunResult:
     test: Prediction
     prediction: Prediction
     invariants: Invariants
-    mass: LearnedMass
+    mass_error: float
+    mass: list[list[list[float]]]
     example: PredictedMotion | None
 
     def save(self, path: Path) -> None:
@@ -110,24 +104,20 @@ def predict(model: EmittedModel, windows: Windows, substeps: int) -> Prediction:
 def sizes(model: EmittedModel) -> Sizes:
     """Return how many numbers the model's networks give and read, and how many are trained."""
     energies: Any = model.residuals if has_residuals(model) else model  # beside rigid bodies
-    mass = _network(energies, "mass")
-    networks = (
-        mass, _network(model, "friction"), _network(model, "input_network"), _network(energies, "potential")
-    )  # fmt: skip
+    mass, friction = _network(energies, "mass"), _network(model, "friction")
     outputs = []
-    for network in networks:
-        outputs.append(0 if network is None else _outputs(network))
-    if _network(model, "friction") is None:
+    for network in (mass, friction, _network(model, "input_network"), _network(energies, "potential")):
+        count = 0
+        if network is not None:
+            # how many depend on q: V that is constant has one output that reads no joint
+            last = network.get_buffer(f"mask{len(network.biases) - 1}")
+            count = int(last.flatten(1).any(dim=1).sum())
+        outputs.append(count)
+    if friction is None:
         outputs[1] = model.n  # a function of each joint's own
     inputs = 0 if mass is None else int(mass.mask0.flatten(1).any(dim=0).sum())
     parameters = sum(parameter.numel() for parameter in model.parameters())
-    return Sizes((outputs[0], outputs[1], outputs[2], outputs[3]), inputs, parameters)
-
-
-def _outputs(network: Any) -> int:
-    """Return how many outputs depend on q: V that is constant has one that reads no joint."""
-    last = network.get_buffer(f"mask{len(network.biases) - 1}")
-    return int(last.flatten(1).any(dim=1).sum())
+    return Sizes(tuple(outputs), inputs, parameters)
 
 
 def _network(model: Any, name: str) -> Any:

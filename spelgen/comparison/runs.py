@@ -12,7 +12,6 @@ import torch
 
 from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.comparison.metrics import (
-    LearnedMass,
     RunResult,
     mass_error,
     predict,
@@ -38,80 +37,69 @@ from spelgen.structure.nominal import working_range
 from spelgen.tasks import RunTasks
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    pass
 
 TUNING = ComparisonTuning()
 
 
 def run_study(study: Study, run_tasks: RunTasks, *, note: Callable[[str], None]) -> None:
     """Train and measure what is not yet done; `note` hears of each run that ends. What a run raises ends all."""
-    waiting = []
     # seed by seed: a comparison that is stopped has all variants of the first seeds
-    for seed in range(study.settings.seeds):
-        for variant in study.variants:
-            if not study.result(variant, seed).exists():
-                waiting.append((variant, seed))
-    count = len(study.variants) * study.settings.seeds
-    done = count - len(waiting)
+    tasks = [(variant, seed) for seed in range(study.settings.seeds) for variant in study.variants]
+    waiting = [task for task in tasks if not study.result(*task).exists()]
+    done = len(tasks) - len(waiting)
     if done:
-        note(f"{done} of {count} runs are done already")
+        note(f"{done} of {len(tasks)} runs are done already")
     for (variant, seed), result in run_tasks(partial(_run, study), waiting):
         if isinstance(result, Exception):
             raise result
         done += 1
-        loss = result.prediction.loss
-        loss_text = "not finite" if loss is None else f"{loss:.3g}"
-        took = f"{result.seconds:.0f} s"
-        note(f"{done}/{count} {variant.name}, seed {seed}: prediction loss {loss_text}, {took}")
+        loss = "not finite" if result.prediction.loss is None else f"{result.prediction.loss:.3g}"
+        heading = f"{done}/{len(tasks)} {variant.name}, seed {seed}"
+        note(f"{heading}: prediction loss {loss}, {result.seconds:.0f} s")
 
 
 def _run(study: Study, task: tuple[Variant, int]) -> RunResult:
     """Train one variant with one seed, or go on where it was stopped, and measure it."""
     variant, seed = task
-    folder = study.run(variant, seed)
-    run = RunFolder(folder)
+    run = RunFolder(study.run(variant, seed))
     resume = run.checkpoint.exists()
     fit = train(
-        study.module(variant), [study.logs], folder, study.training, preprocessing=study.preprocessing,
+        study.module(variant), [study.logs], run.path, study.training, preprocessing=study.preprocessing,
         validation=study.validation_fraction, seed=seed, urdf=study.urdf,
         options=RunOptions(resume=resume, force=not resume),
     )  # fmt: skip
     if fit.status == "interrupted":
         raise KeyboardInterrupt
     model = trained_model(run)
-    result = _measure(study, variant.name, seed, fit.seconds, fit.substeps, model)
-    result.save(study.result(variant, seed))
-    return result
-
-
-def _measure(
-    study: Study, variant: str, seed: int, seconds: float, substeps: int, model: EmittedModel
-) -> RunResult:
     decimation, training, testing = study.decimation, study.read_logs("train"), study.read_logs("test")
     steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = thinned(testing, steps + 1, decimation)
-    # M is looked at where the arm may be
+    # M is looked at where the arm may be, and judged where it has been
     ranges = list(map(working_range, load_arm(study.source).arm.coordinates))
     low, high = torch.tensor(ranges, dtype=torch.float64).T
-    example = predict_example(of_dynamics(variant, model, far), testing, steps, decimation)
+    seen = far.q[:, 0]
+    example = predict_example(of_dynamics(variant.name, model, far), testing, steps, decimation)
     along = []  # no test trajectory may be long enough
     if example is not None:
         # at the positions as the file has them
         along = model.mass_matrix(torch.from_numpy(array(listed(example.q)))).tolist()
-    seen = far.q[:, 0]  # M is judged where the arm has been
-    return RunResult(
-        variant=variant,
+    result = RunResult(
+        variant=variant.name,
         seed=seed,
-        seconds=seconds,
-        substeps=substeps,
+        seconds=fit.seconds,
+        substeps=fit.substeps,
         sizes=sizes(model),
-        train=predict(model, thinned(training, study.window, decimation), substeps),
-        test=predict(model, thinned(testing, study.window, decimation), substeps),
-        prediction=predict(model, far, substeps),
+        train=predict(model, thinned(training, study.window, decimation), fit.substeps),
+        test=predict(model, thinned(testing, study.window, decimation), fit.substeps),
+        prediction=predict(model, far, fit.substeps),
         invariants=invariants(model, far, low, high),
-        mass=LearnedMass(mass_error(model.mass_matrix(seen), true_mass(study.source, seen)), along),
+        mass_error=mass_error(model.mass_matrix(seen), true_mass(study.source, seen)),
+        mass=along,
         example=example,
     )
+    result.save(study.result(variant, seed))
+    return result
 
 
 def predict_example(
@@ -123,9 +111,8 @@ def predict_example(
         if len(log) > span:
             # a multiple of the decimation: the controller holds its torque so long
             start = (len(log) - 1 - span) // (2 * decimation) * decimation
-            window = cut_windows(
-                [log[start : start + span + 1]], steps + 1, decimation=decimation, measured=False
-            )
+            piece = log[start : start + span + 1]
+            window = cut_windows([piece], steps + 1, decimation=decimation, measured=False)
             return predicted_motion(log.name, window, predictor.solver(window))
     return None
 

@@ -8,15 +8,15 @@ by. With kinematics alone all are trained for the same steps, as the robot's set
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import yaml
+from pydantic import TypeAdapter
 
-from spelgen.comparison.known_urdf import with_wrong_inertials, without_inertials
+from spelgen.comparison.known_urdf import known_urdf
 from spelgen.comparison.metrics import RunResult
 from spelgen.design import Design, Net, Preset, load_design
 from spelgen.errors import RunError, SettingsError
@@ -26,14 +26,13 @@ from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline import generate
+from spelgen.pipeline import generate, require_own_module
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.fits import Rollout, fit_config
 from spelgen.settings.settings import Settings
 from spelgen.spec import read_facts
-from spelgen.trust import require_own_module
 
-SCHEMA = 5
+SCHEMA = 6
 
 
 @dataclass(frozen=True)
@@ -155,9 +154,8 @@ def prepare_study(
             do="`spelgen train` fits what servos have to beat beside the model, `spelgen evaluate` compares them",
         )  # fmt: skip
     settings = loaded.settings.comparison
-    settings = settings.model_copy(
-        update={"seeds": seeds or settings.seeds, "steps": steps or settings.steps}
-    )
+    chosen = {"seeds": seeds or settings.seeds, "steps": steps or settings.steps}
+    settings = settings.model_copy(update=chosen)
     training = None
     if urdf_error is None:
         training = _training(loaded.settings, settings)
@@ -176,12 +174,9 @@ def prepare_study(
     description = _description(study, loaded)
     path = folder / "study.json"
     if path.exists() and not force:
-        if read_json(path, RunError) != json.loads(json.dumps(description)):
-            raise RunError(
-                "a comparison with other settings",
-                file=path,
-                do="--force begins anew, -o names another folder",
-            )
+        if read_json(path, RunError) != description:
+            hint = "--force begins anew, -o names another folder"
+            raise RunError("a comparison with other settings", file=path, do=hint)
         for variant in study.variants:  # the folder may come from elsewhere
             require_own_module(study.module(variant), study.urdf)
         return study
@@ -196,10 +191,7 @@ def prepare_study(
 
 def _write_modules(study: Study, loaded: LoadedArm) -> None:
     """Write the URDF that the models know, and a module of each variant."""
-    if study.urdf_error is None:
-        study.urdf.write_bytes(without_inertials(study.source))
-    else:
-        study.urdf.write_bytes(with_wrong_inertials(study.source, study.urdf_error))
+    study.urdf.write_bytes(known_urdf(study.source, study.urdf_error))
     gravity = yaml.safe_dump({"gravity": list(loaded.settings.gravity)})
     write_text(study.urdf.with_suffix(".yaml"), gravity)
     width, depth = study.settings.width, study.settings.depth
@@ -211,8 +203,9 @@ def _write_modules(study: Study, loaded: LoadedArm) -> None:
 def _training(settings: Settings, comparison: ComparisonSettings) -> Rollout:
     """Return how every variant is trained: without the URDF's regularizer, which would tell the answer."""
     epochs = -(-comparison.steps // TUNING.epoch_steps)
-    options: dict[str, object] = {"urdf_weight": 0.0, "epochs": epochs, "patience": epochs}
-    options["momentum_steps"] = comparison.momentum_steps
+    options: dict[str, object] = {
+        "urdf_weight": 0.0, "epochs": epochs, "patience": epochs, "momentum_steps": comparison.momentum_steps
+    }  # fmt: skip
     if comparison.weight_decay is not None:
         options["weight_decay"] = comparison.weight_decay
     defaults = settings.training.options
@@ -221,17 +214,13 @@ def _training(settings: Settings, comparison: ComparisonSettings) -> Rollout:
 
 def _description(study: Study, loaded: LoadedArm) -> dict[str, object]:
     """Return what must be the same for a comparison to go on; seeds may be added."""
+    apart: Any = {"folder": True, "source": True, "settings": {"seeds"}, "variants": {"__all__": {"preset"}}}
     return {
         "schema": SCHEMA,
-        "robot": study.robot,
         "urdf_sha256": loaded.robot.digest,
         "simulation": loaded.settings.simulation.model_dump(mode="json"),
         "tracking": loaded.settings.tracking.model_dump(mode="json"),
-        "comparison": study.settings.model_dump(mode="json", exclude={"seeds"}),
-        "training": None if study.training is None else study.training.model_dump(mode="json"),
-        "urdf_error": study.urdf_error,
-        "preprocessing": asdict(study.preprocessing),
-        "variants": [variant.name for variant in study.variants],
+        **TypeAdapter(Study).dump_python(study, mode="json", exclude=apart),
     }
 
 

@@ -22,11 +22,12 @@ from spelgen.fitting.fitted import load_run
 from spelgen.fitting.objectives import chosen_config
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.train import train
+from spelgen.fleet.prepare import SplitLogs
+from spelgen.fleet.schema import Fleet, FleetRobot
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.pipeline import generate
 from spelgen.settings.fits import FitConfig
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.settings import load_settings
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Group
@@ -40,27 +41,25 @@ RunResult = dict[str, Any]
 
 
 class Job(Group):
-    """A run. robot, preset, seed, split: its name in the report; `folder`: of the run. data: digest of the logs.
+    """A run of a fleet. robot: its name there. design: a preset or its file. folder: of the run."""
 
-    design: a preset or its file. joints, tip, width, depth: of its module. training: over the settings beside the URDF.
-    """
-
+    fleet: Fleet
     robot: str
-    preset: str
+    design: str
     seed: int
     split: int
+    logs: SplitLogs
     folder: Path
-    urdf: Path
-    train: tuple[Path, ...]
-    test: tuple[Path, ...]
-    data: str
-    design: str
-    mapping: LogMapping = LogMapping()
-    joints: tuple[str, ...] | None = None
-    tip: str | None = None
-    width: int = 64
-    depth: int = 2
-    training: TrainingSettings = TrainingSettings()
+
+    @property
+    def arm(self) -> FleetRobot:
+        """Return the arm that is trained."""
+        return self.fleet.robots[self.robot]
+
+    @property
+    def preset(self) -> str:
+        """Return the preset's name for people."""
+        return Path(self.design).stem
 
     @property
     def name(self) -> str:
@@ -76,8 +75,13 @@ class Job(Group):
         design = self.design
         if Path(design).suffix:
             design = read_bytes(Path(design), RunError).decode("utf-8", "replace")
-        # where files lie does not change a result; `data` is the digest of what is in them
-        content = self.model_dump_json(exclude={"folder", "train", "test"}, exclude_unset=True)
+        # where files lie does not change a result; `logs` has a digest of what is in them, and of the arm
+        apart: dict[str, Any] = {
+            "folder": True,
+            "fleet": {"robots", "presets", "seeds", "splits"},
+            "logs": {"train", "test"},
+        }
+        content = self.model_dump_json(exclude=apart, exclude_unset=True)
         return hashlib.sha256(f"{__version__} {design} {content}".encode()).hexdigest()[:16]
 
     def result(self) -> RunResult | None:
@@ -101,19 +105,30 @@ def run_job(job: Job) -> RunResult:
     torch.set_num_threads(1)
     start, run = time.monotonic(), RunFolder(job.folder)
     _remove_foreign_run(job, run)
-    training = _training(job)
+    # the robot's settings, and the fleet's over them
+    training = load_settings(job.arm.urdf).training
+    changes = job.fleet.training
+    training = training.model_copy(update={name: getattr(changes, name) for name in changes.model_fields_set})
     resume = run.config.exists()
+    module = run.module
+    if not resume:
+        arm = load_arm(job.arm.urdf, job.arm.joints, job.arm.tip)
+        source = generate(arm, job.design, width=job.fleet.width, depth=job.fleet.depth)
+        module = write_text(job.folder / "built.py", source)
     fit = train(
-        run.module if resume else _module(job), job.train, job.folder, partial(_config, training), urdf=job.urdf,
+        module, job.logs.train, job.folder, partial(_config, training), urdf=job.arm.urdf,
         preprocessing=Preprocessing(**training.preprocessing), validation=training.validation_fraction,
-        seed=job.seed, options=RunOptions(mapping=job.mapping, resume=resume, force=not resume),
+        seed=job.seed, options=RunOptions(mapping=job.logs.mapping, resume=resume, force=not resume),
     )  # fmt: skip
     # a worker that is asked to end leaves a checkpoint, from which the next one goes on
     if fit.status == "interrupted":
         raise KeyboardInterrupt
     result = {
         "key": job.key,
-        **job.model_dump(include={"robot", "preset", "seed", "split"}),
+        "robot": job.robot,
+        "preset": job.preset,
+        "seed": job.seed,
+        "split": job.split,
         "status": fit.status,
         "parameters": fit.parameters,
         "validation": fit.best_validation,
@@ -133,19 +148,6 @@ def _remove_foreign_run(job: Job, run: RunFolder) -> None:
     write_json(owner, {"key": job.key})
 
 
-def _module(job: Job) -> Path:
-    """Write the module of the job's arm and preset; return its path."""
-    arm = load_arm(job.urdf, job.joints, job.tip)
-    source = generate(arm, job.design, width=job.width, depth=job.depth)
-    return write_text(job.folder / "built.py", source)
-
-
-def _training(job: Job) -> TrainingSettings:
-    """Return the robot's settings, and the fleet's over them."""
-    fleet = {name: getattr(job.training, name) for name in job.training.model_fields_set}
-    return load_settings(job.urdf).training.model_copy(update=fleet)
-
-
 def _config(
     training: TrainingSettings, model: EmittedModel, rates: Sequence[float] | None
 ) -> FitConfig | None:
@@ -163,9 +165,9 @@ def _judged(job: Job, run: RunFolder) -> RunResult:
     Least squares is left out, for it is kept only afterwards: its stiff rollouts take ten times as long as all else,
     for every run anew.
     """
-    logs = read_test_logs(job.folder, job.test, job.mapping)
+    logs = read_test_logs(job.folder, job.logs.test, job.logs.mapping)
     results = evaluate(load_run(job.folder), logs)
-    keep_baseline(run.path, job.train)
+    keep_baseline(run.path, job.logs.train)
     write_json(run.evaluation, results.to_dict())
     errors: dict[str, dict[str, float | None]] = {}
     for horizon in results.horizons:

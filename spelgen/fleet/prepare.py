@@ -21,6 +21,7 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import split_validation
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.settings import load_mapping
+from spelgen.settings.values import Group
 
 HELD_OUT = 0.25  # of logs that do not say which are for the test
 Split = tuple[Sequence[Trajectory], Sequence[Trajectory]]
@@ -37,50 +38,49 @@ class Preparation:
     folder: Path
 
 
-@dataclass(frozen=True)
-class PreparedArm:
-    """Hold an arm's logs.
+class SplitLogs(Group):
+    """Hold the logs of one split, which `mapping` reads. digest: of all that they were made from."""
 
-    key: digest of all that they were made from. data: by split, the paths of training and of test logs, which
-    `mapping` reads.
-    """
-
-    name: str
-    key: str
-    data: tuple[tuple[tuple[Path, ...], tuple[Path, ...]], ...]
-    mapping: LogMapping
+    train: tuple[Path, ...] = ()
+    test: tuple[Path, ...] = ()
+    digest: str
+    mapping: LogMapping = LogMapping()
 
 
-def prepare(preparation: Preparation) -> PreparedArm:
+def prepare(preparation: Preparation) -> list[SplitLogs]:
     """Write the logs of every split, unless they are there already. Raises what reading and simulating raise."""
-    robot, folder, splits = preparation.robot, preparation.folder, preparation.splits
+    robot, folder, count = preparation.robot, preparation.folder, preparation.splits
     arm = load_arm(robot.urdf, robot.joints, robot.tip)
     mapping = arm.settings.logs
     if robot.mapping is not None:
         mapping = load_mapping(robot.mapping, [joint.name for joint in arm.robot.joints])
-    settings = arm.settings.model_dump_json(exclude_unset=True)
     # reading logs takes longer than asking for their times of change
-    chain = (arm.robot.digest, robot.joints, robot.tip)
-    key = _digest(*chain, settings, mapping.model_dump_json(exclude_unset=True), _stamps(robot), splits)
+    files, errors = log_files(robot.data)
+    collect(errors)
+    stamps = [(file, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    settings = [x.model_dump_json(exclude_unset=True) for x in (arm.settings, mapping)]
+    sources = [arm.robot.digest, robot.joints, robot.tip, *settings, stamps, count]
+    digest = hashlib.sha256(json.dumps(sources, default=str).encode()).hexdigest()[:16]
     names = arm.arm.joint_names
     element = f"robots.{preparation.name}.data"
     if robot.data and large_files(robot.data, names):
-        if splits > 1:
+        if count > 1:
             raise LogError("logs larger than memory", element=element, expected="splits: 1 of them")
-        return PreparedArm(preparation.name, key, ((robot.data, robot.data),), mapping)
-    paths = [
-        (folder / f"split{k}" / "train.parquet", folder / f"split{k}" / "test.parquet") for k in range(splits)
-    ]
+        return [SplitLogs(train=robot.data, test=robot.data, digest=digest, mapping=mapping)]
+    splits = []
+    for number in range(count):
+        train, test = (folder / f"split{number}" / f"{role}.parquet" for role in ("train", "test"))
+        splits.append(SplitLogs(train=(train,), test=(test,), digest=digest))
     # written last: a folder without it holds logs that were cut off
     record = folder / "prepared.json"
-    if not record.exists() or read_json(record, RunError) != {"key": key}:
+    if not record.exists() or read_json(record, RunError) != {"key": digest}:
         record.unlink(missing_ok=True)
-        for split_paths, split in zip(paths, _splits(robot, arm, mapping, splits, element), strict=True):
-            for path, trajectories in zip(split_paths, split, strict=True):
-                write_logs(path, trajectories, names)
-        write_json(record, {"key": key})
-    data = tuple(((train,), (test,)) for train, test in paths)
-    return PreparedArm(preparation.name, key, data, LogMapping())
+        trajectories = _splits(robot, arm, mapping, count, element)
+        for files_of_split, (training, testing) in zip(splits, trajectories, strict=True):
+            write_logs(files_of_split.train[0], training, names)
+            write_logs(files_of_split.test[0], testing, names)
+        write_json(record, {"key": digest})
+    return splits
 
 
 def _splits(robot: FleetRobot, arm: LoadedArm, mapping: LogMapping, count: int, element: str) -> list[Split]:
@@ -115,14 +115,3 @@ def _roles(robot: FleetRobot, arm: LoadedArm, mapping: LogMapping) -> Split:
     if log_files(robot.data, "train") == log_files(robot.data):
         return train, []
     return train, read_logs(robot.data, arm, mapping, "test")
-
-
-def _stamps(robot: FleetRobot) -> list[tuple[str, int, int]]:
-    """Return path, size and time of the last change of each log file."""
-    files, errors = log_files(robot.data)
-    collect(errors)
-    return [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-
-
-def _digest(*values: object) -> str:
-    return hashlib.sha256(json.dumps(values, default=str).encode()).hexdigest()[:16]

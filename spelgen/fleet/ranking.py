@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from spelgen.baselines.names import MODEL
@@ -18,14 +17,10 @@ MEASURE = "relative RMS after each time (0: no error, 1: as if the arm had stood
 
 def fleet_listings(fleet: FleetResults) -> list[Listing]:
     """Return all tables of a fleet's report."""
-    tables = []
-    for robot, runs in _by_robot(fleet).items():
-        tables.append(ranking(robot, runs))
-    if fleet.failures:
-        rows = []
-        for name, reason in fleet.failures.items():
-            rows.append((f"{name}: {reason}",))
-        tables.append(Listing("Failed runs; the same command runs them again", ("",), tuple(rows)))
+    tables = [ranking(robot, runs) for robot, runs in _by_robot(fleet).items()]
+    failures = tuple((f"{name}: {reason}",) for name, reason in fleet.failures.items())
+    if failures:
+        tables.append(Listing("Failed runs; the same command runs them again", ("",), failures))
     return tables
 
 
@@ -46,65 +41,41 @@ def ranking(robot: str, runs: Sequence[RunResult]) -> Listing:
     presets: dict[str, list[RunResult]] = {}
     for run in runs:
         presets.setdefault(run["preset"], []).append(run)
-    horizons = _common(run["errors"] for run in runs)
+    horizons = _common([run["errors"] for run in runs])
     lines = []
     for preset, of_preset in presets.items():
         seconds = statistics.median(run["seconds"] for run in of_preset)
         facts = (f"{of_preset[0]['parameters']:,}", f"{len(of_preset):,}", number(seconds))
-        lines.append(_Line(preset, _medians(of_preset, MODEL, horizons), facts))
+        lines.append((_medians(of_preset, MODEL, horizons), preset, facts))
     # judged at every horizon, or by torque
-    for name in _common([*_common(run["errors"].values()), *run["torque"]] for run in runs):
+    for name in _common([[*_common(list(run["errors"].values())), *run["torque"]] for run in runs]):
         if name != MODEL:
-            lines.append(_Line(f"({name})", _medians(runs, name, horizons)))
+            lines.append((_medians(runs, name, horizons), f"({name})", ("-", "-", "-")))
     # baselines stand among the models: a model below one of them is not worth its training
-    lines.sort(key=lambda line: line.order)
+    lines.sort(key=lambda line: line[0][-2::-1] + line[0][-1:])
+    rows = tuple((name, *map(number, errors), *facts) for errors, name, facts in lines)
     head = ("", *horizons, "nMSE", "parameters", "runs", "time [s]")
-    return Listing(f"{robot}, best first: {MEASURE}; medians of all runs", head, tuple(x.row for x in lines))
-
-
-@dataclass(frozen=True)
-class _Line:
-    """A model or a baseline: errors by horizon, then nMSE of torques. facts: parameters, runs and seconds a run."""
-
-    name: str
-    errors: tuple[float, ...]
-    facts: tuple[str, str, str] = ("-", "-", "-")
-
-    @property
-    def order(self) -> tuple[float, ...]:
-        """Return what lines are sorted by: errors, of the longest horizon first, then of torque."""
-        *horizons, torque = self.errors
-        return (*reversed(horizons), torque)
-
-    @property
-    def row(self) -> tuple[str, ...]:
-        """Return the line as text."""
-        return (self.name, *map(number, self.errors), *self.facts)
+    return Listing(f"{robot}, best first: {MEASURE}; medians of all runs", head, rows)
 
 
 def _medians(runs: Sequence[RunResult], predictor: str, horizons: Sequence[str]) -> tuple[float, ...]:
     """Return the median error of each horizon, then of torques."""
-    columns: dict[str, list[float]] = {}
-    for run in runs:
-        errors = dict.fromkeys(horizons)
-        for horizon in horizons:
-            errors[horizon] = run["errors"][horizon].get(predictor)
-        errors["torque"] = run["torque"].get(predictor)
-        for name, error in errors.items():
+    medians = []
+    for horizon in (*horizons, None):
+        errors = []
+        for run in runs:
+            judged = run["torque"] if horizon is None else run["errors"][horizon]
+            error = judged.get(predictor)
             # an error that is not finite counts as infinitely bad
-            columns.setdefault(name, []).append(math.inf if error is None else error)
-    return tuple(map(statistics.median, columns.values()))
+            errors.append(math.inf if error is None else error)
+        medians.append(statistics.median(errors))
+    return tuple(medians)
 
 
-def _common(lists: Iterable[Iterable[str]]) -> list[str]:
+def _common(lists: Sequence[Iterable[str]]) -> list[str]:
     """Return the names that are in all lists, once, in the order of the first."""
-    common: dict[str, None] | None = None
-    for names in lists:
-        if common is None:
-            common = dict.fromkeys(names)
-        else:
-            common = dict.fromkeys(name for name in common if name in names)
-    return list(common or ())
+    names = dict.fromkeys(lists[0]) if lists else {}
+    return [name for name in names if all(name in others for others in lists)]
 
 
 def _by_robot(fleet: FleetResults) -> dict[str, list[RunResult]]:

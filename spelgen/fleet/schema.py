@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +12,7 @@ from spelgen.errors import SettingsError, collect, suggestion
 from spelgen.settings.messages import dotted, validated
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Count, Group
-from spelgen.settings.yaml_document import Document, Location, read_document
+from spelgen.settings.yaml_document import Location, read_document
 
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,60}$")]
 
@@ -30,6 +29,19 @@ class FleetRobot(Group):
     mapping: Path | None = None
     joints: tuple[str, ...] | None = None
     tip: str | None = None
+
+    def paths(self) -> list[tuple[str, Path]]:
+        """Return its files, each with its key."""
+        paths = [("urdf", self.urdf), *(("data", path) for path in self.data)]
+        if self.mapping is not None:
+            paths.append(("mapping", self.mapping))
+        return paths
+
+    def in_folder(self, folder: Path) -> FleetRobot:
+        """Return it with paths that are relative to the folder."""
+        mapping = self.mapping and folder / self.mapping
+        data = tuple(folder / path for path in self.data)
+        return self.model_copy(update={"urdf": folder / self.urdf, "data": data, "mapping": mapping})
 
 
 class Fleet(Group):
@@ -56,42 +68,20 @@ def load_fleet(path: Path) -> Fleet:
     # YAML that knows its lines, for messages
     document = read_document(path)
     fleet = validated(Fleet, document.value(), document)
-    collect([*_preset_errors(fleet, document), *_path_errors(fleet, document)])
-    folder = path.parent
-    presets = tuple(name if name in PRESET_NAMES else str(folder / name) for name in fleet.presets)
-    robots = {name: _resolved(robot, folder) for name, robot in fleet.robots.items()}
-    return fleet.model_copy(update={"robots": robots, "presets": presets})
-
-
-def _resolved(robot: FleetRobot, folder: Path) -> FleetRobot:
-    paths: dict[str, object] = {
-        "urdf": folder / robot.urdf,
-        "data": tuple(folder / path for path in robot.data),
-    }
-    if robot.mapping is not None:
-        paths["mapping"] = folder / robot.mapping
-    return robot.model_copy(update=paths)
-
-
-def _preset_errors(fleet: Fleet, document: Document) -> Iterator[SettingsError]:
+    problems: list[tuple[Location, str, str]] = []
     for number, preset in enumerate(fleet.presets):
         if preset not in PRESET_NAMES and Path(preset).suffix not in (".yaml", ".yml"):
-            yield _error(
-                document, ("presets", number), f"unknown preset {preset!r}", suggestion(preset, PRESET_NAMES)
-            )
-
-
-def _path_errors(fleet: Fleet, document: Document) -> Iterator[SettingsError]:
+            hint = suggestion(preset, PRESET_NAMES)
+            problems.append((("presets", number), f"unknown preset {preset!r}", hint))
     for name, robot in fleet.robots.items():
-        paths = [("urdf", robot.urdf), *(("data", path) for path in robot.data)]
-        if robot.mapping is not None:
-            paths.append(("mapping", robot.mapping))
-        for key, path in paths:
-            if not (document.path.parent / path).exists():
-                yield _error(document, ("robots", name, key), f"no such file: {path}", "check the path")
-
-
-def _error(document: Document, location: Location, got: str, do: str) -> SettingsError:
-    return SettingsError(
-        got, file=document.path, line=document.line(location), element=dotted(location), do=do
-    )
+        for key, file in robot.paths():
+            if not (path.parent / file).exists():
+                problems.append((("robots", name, key), f"no such file: {file}", "check the path"))
+    errors = []
+    for place, got, do in problems:
+        line = document.line(place)
+        errors.append(SettingsError(got, file=path, line=line, element=dotted(place), do=do))
+    collect(errors)
+    presets = tuple(name if name in PRESET_NAMES else str(path.parent / name) for name in fleet.presets)
+    robots = {name: robot.in_folder(path.parent) for name, robot in fleet.robots.items()}
+    return fleet.model_copy(update={"robots": robots, "presets": presets})

@@ -14,7 +14,7 @@ from spelgen.baselines.names import MODEL
 from spelgen.certificate.facts import facts
 from spelgen.certificate.formulas import formulas
 from spelgen.certificate.inspection import LETTERS
-from spelgen.certificate.printing import Text
+from spelgen.certificate.printing import text
 from spelgen.evaluation.plain import Curve, record
 from spelgen.evaluation.traces import Traces
 from spelgen.labels import entry_name, joint_ranges, joints_in_ranges
@@ -93,7 +93,7 @@ def _explanations(arm: Arm, structure: Structure) -> dict[str, str]:
                 lines.append(str(fact))
         formula = closed[name]
         if formula.expression is not None:
-            lines.append(f"{name} = {Text().whole(formula.expression)}")
+            lines.append(f"{name} = {text(formula.expression)}")
         elif entry.kind != "zero":
             terms = formula.terms or "too many"
             lines.append(f"Its formula has {terms} terms: `spelgen inspect --entry` writes it.")

@@ -87,7 +87,7 @@ def _mass_panels(
     masses = {"true": true_mass(study.source, torch.from_numpy(along.q)).numpy()}
     for result in results:
         if result.variant in examples:
-            masses[result.variant] = array(result.mass.along)
+            masses[result.variant] = array(result.mass)
     rows, columns = np.tril_indices(len(joint_types))
     entries = {name: mass[:, rows, columns].T for name, mass in masses.items()}
     return mass_panels(along.t, entries, {"true": "truth", **styles}, joint_types, width=400)

@@ -75,17 +75,17 @@ class Budget:
 
 
 class Expansion:
-    """Hold the recursion of ``arm``, written down over c1, s1, q1, c2, ... three variables a coordinate."""
+    """Hold the recursion of ``arm``, written down over s1, c1, q1, s2, ... three variables a coordinate."""
 
     def __init__(self, arm: Arm):
         n = len(arm.coordinates)
         names: list[str] = []
         for k in range(n):
-            names += (f"c{k + 1}", f"s{k + 1}", f"q{k + 1}")
+            names += (f"s{k + 1}", f"c{k + 1}", f"q{k + 1}")
         self.context = fmpq_mpoly_ctx.get(names, Ordering.lex)
         variables = [Deferred("constant", x) for x in self.context.gens()]
         self._parameters = [Deferred("parameter", index) for index in range(10 * len(arm.bodies))]
-        positions = list(map(Position, variables[::3], variables[1::3], variables[2::3]))
+        positions = list(map(Position, variables[1::3], variables[::3], variables[2::3]))
         inertias: list[Sequence[Deferred]] = []
         for body in range(len(arm.bodies)):
             inertias.append(self._parameters[10 * body : 10 * body + 10])

@@ -32,9 +32,7 @@ class CertificateTuning:
 
     readable_terms: int = 40  # of an entry that a person reads among others: three lines of a terminal
     writable_terms: int = 3000  # of an entry that a program reads, or a person who asks for it alone
-    entry_budget: int = 300_000  # multiplications of terms for one entry, about 0.3 s
     budget: int = 2_000_000  # multiplications of terms for all entries of an arm, about 2 s
-    most_terms_shortened: int = 60  # of a function; shortening longer ones takes seconds and they stay long
     rounding: float = 1e-12  # of its scale: a smaller number of a check is rounding; what is measured is told
     form_rounding: float = 1e-6  # the same for the smallest form, whose long fractions are doubles
     fine: float = 1e-3  # an arm with smaller nonzero numbers may have products that vanish in rounding

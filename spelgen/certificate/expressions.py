@@ -1,0 +1,144 @@
+"""Write polynomials in cosines, sines and distances as SymPy expressions, in one canonical way.
+
+Products of cosines and sines along a run of joints with parallel axes become cosines and sines of sums of these
+angles. Other ways (powers of single angles, common factors of several terms) made long formulas a fifth shorter, and
+those that a person reads no shorter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cache, lru_cache
+
+from flint import fmpq, fmpq_mpoly, fmpq_mpoly_ctx
+from sympy import Add, Expr, Integer, Mul, Rational, Symbol, cos, sin
+from sympy.core.parameters import distribute
+
+from spelgen.arm.arm import Arm
+from spelgen.certificate.axes import Axes, is_plain
+from spelgen.structure.recursion import base_denominators
+
+Terms = dict[Expr, fmpq]
+"""A sum of products of distances, cosines and sines, each times a number that is not 0."""
+
+
+@cache
+def coordinate(joint: int) -> Symbol:
+    """Return the position of a joint, counted from 0."""
+    return Symbol(f"q{joint + 1}", real=True)
+
+
+def parameter(name: str) -> Symbol:
+    """Return a base parameter, or an inertial parameter of a body."""
+    return Symbol(name, real=True)
+
+
+def weighted_sum(terms: Mapping[Expr, fmpq]) -> Expr:
+    """Return the sum of the expressions, each times its number."""
+    # SymPy would else make 2*(a + b) into 2*a + 2*b
+    with distribute(False):
+        return Add(*(Rational(int(x.p), int(x.q)) * expression for expression, x in terms.items()))
+
+
+class PolynomialWriter:
+    """Write the polynomials of one arm, over s1, c1, q1, s2, ..."""
+
+    def __init__(self, arm: Arm, context: fmpq_mpoly_ctx):
+        generators = context.gens()
+        self._circles = []
+        for sine, cosine in zip(generators[::3], generators[1::3], strict=True):
+            self._circles.append(sine**2 + cosine**2 - 1)
+        self._angles: list[Expr] = []
+        for joint, denominator in enumerate(base_denominators(arm)):
+            # mimic joints may turn by fractions of a coordinate
+            self._angles.append(coordinate(joint) / denominator)
+        self._runs = parallel_runs(arm)
+
+    def reduced(self, polynomial: fmpq_mpoly) -> fmpq_mpoly:
+        """Return the same function with every sine to the first power at most."""
+        for circle in self._circles:
+            polynomial %= circle
+        return polynomial
+
+    def terms(self, polynomial: fmpq_mpoly) -> Terms:
+        """Return a polynomial with its products of cosines and sines as multiple angles."""
+        result: Terms = {}
+        for exponents, coefficient in polynomial.terms():
+            products = {
+                Mul(*(coordinate(k) ** power for k, power in enumerate(exponents[2::3]))): coefficient
+            }
+            for run in self._runs:
+                powers = tuple((self._angles[k], exponents[3 * k], exponents[3 * k + 1]) for k in run)
+                waves = multiple_angles(powers)
+                products = {
+                    x * wave: y * number for x, y in products.items() for wave, number in waves.items()
+                }
+            for factors, value in products.items():
+                result[factors] = result.get(factors, fmpq(0)) + value
+        return {factors: value for factors, value in result.items() if value != 0}
+
+
+def parallel_runs(arm: Arm) -> list[list[int]]:
+    """Return the turning coordinates by runs of axes that are parallel however the arm moves.
+
+    Where bodies share coordinates, each is a run of its own.
+    """
+    turning = sorted({body.coordinate for body in arm.bodies if body.kind == "revolute"})
+    if not is_plain(arm):
+        return [[joint] for joint in turning]
+    axes = Axes(arm)
+    runs: list[list[int]] = []
+    for joint in turning:
+        if runs and axes.parallel(joint, runs[-1][-1]):
+            runs[-1].append(joint)
+        else:
+            runs.append([joint])
+    return runs
+
+
+@lru_cache(4096)
+def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
+    """Return a product of powers, given as (angle, power of sin, power of cos), as a sum.
+
+    Each term is a multiple of one or of a cosine or sine of a sum of the angles.
+    """
+    # a wave is cos(sum of angles - quarters pi/2), in which sin(x) is cos(x - pi/2)
+    waves: dict[tuple[Expr, int], fmpq] = {(Integer(0), 0): fmpq(1)}
+    for angle, sines, cosines in powers:
+        for quarter in [1] * sines + [0] * cosines:
+            products: dict[tuple[Expr, int], fmpq] = {}
+            for (total, quarters), value in waves.items():
+                # cos a cos b = (cos(a + b) + cos(a - b)) / 2
+                for sign in (1, -1):
+                    wave = (total + sign * angle, (quarters + sign * quarter) % 4)
+                    products[wave] = products.get(wave, fmpq(0)) + value / 2
+            waves = products
+    result: Terms = {}
+    for (total, quarters), value in waves.items():
+        function = cos(total)
+        if quarters % 2:
+            function = sin(total)
+        # SymPy writes cos(-a) as cos(a) and sin(-a) as -sin(a)
+        sign, function = function.as_coeff_Mul()
+        if quarters > 1:
+            sign = -sign
+        result[function] = result.get(function, fmpq(0)) + value * int(sign)
+    return result
+
+
+def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
+    """Return the sum of parameters times functions; parameters with one function, up to a factor, together."""
+    groups: dict[tuple[tuple[Expr, fmpq], ...], dict[Expr, fmpq]] = {}
+    for symbol, terms in functions:
+        leading = next(iter(terms.values()))
+        unit = tuple((function, value / leading) for function, value in terms.items())
+        groups.setdefault(unit, {})[symbol] = leading
+    total = []
+    for unit, parameters in groups.items():
+        factor = fmpq(1)
+        # the numbers of a function that stands alone are those of the arm
+        if len(parameters) == 1:
+            factor = abs(next(iter(parameters.values())))
+        symbols = weighted_sum({symbol: value / factor for symbol, value in parameters.items()})
+        total.append(symbols * weighted_sum({function: value * factor for function, value in unit}))
+    return Add(*total)
