@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from spelgen.logs.checks import VelocityAgreement, velocity_agreement
 from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.tuning.log_checks import LogCheckTuning
@@ -47,7 +46,6 @@ class Statistics:
     high: dict[str, np.ndarray]
     noise: dict[str, np.ndarray]
     steps: dict[str, np.ndarray]
-    agreement: VelocityAgreement
 
 
 def statistics(trajectory: Trajectory) -> Statistics:
@@ -61,11 +59,10 @@ def statistics(trajectory: Trajectory) -> Statistics:
         steps[name] = np.array(list(map(quantisation_step, signals.T)))
         if dense:
             noise[name] = noise_level(trajectory.t, signals)
-    agreement = velocity_agreement(trajectory)
-    return Statistics(clock_of(trajectory), low, high, noise, steps, agreement)
+    return Statistics(_clock(trajectory), low, high, noise, steps)
 
 
-def clock_of(trajectory: Trajectory) -> Clock:
+def _clock(trajectory: Trajectory) -> Clock:
     """Return when the samples of a trajectory were taken."""
     steps = trajectory.regular_steps
     gaps = len(trajectory) - 1 - len(steps)

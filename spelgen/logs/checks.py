@@ -95,20 +95,16 @@ class VelocityAgreement:
     def __add__(self, sums: VelocityAgreement) -> VelocityAgreement:
         return VelocityAgreement(self.xx + sums.xx, self.yy + sums.yy, self.xy + sums.xy)
 
-    def factor(self, joint: int) -> float:
-        """Return by what qd must be multiplied to be dq/dt; 1 where qd says nothing."""
-        if not self.xx[joint] > 0:
-            return 1.0
-        return float(self.xy[joint, joint] / self.xx[joint])
+    @cached_property
+    def factor(self) -> np.ndarray:
+        """(n,) by what qd must be multiplied to be dq/dt; NaN where it rests."""
+        return np.asarray(self.xy.diagonal() / np.where(self.xx > 0, self.xx, np.nan))
 
-    def correlation(self, joint: int, q_joint: int | None = None) -> float | None:
-        """Return 1 if qd of a joint is dq/dt, of the other one or its own, but for a factor; None where one rests."""
-        if q_joint is None:
-            q_joint = joint
-        size = float(np.sqrt(self.xx[joint]) * np.sqrt(self.yy[q_joint]))
-        if size < 1e-12:
-            return None
-        return float(self.xy[joint, q_joint]) / size
+    @cached_property
+    def correlation(self) -> np.ndarray:
+        """(n, n) 1 where qd of the row's joint is dq/dt of the column's, but for a factor; NaN where one rests."""
+        size = np.outer(np.sqrt(self.xx), np.sqrt(self.yy))
+        return np.asarray(self.xy / np.where(size > 1e-12, size, np.nan))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,15 +127,15 @@ class JointSignals:
         """(T,) [rad/s, m/s]."""
         return self.trajectory.qd[:, self.index]
 
-    @cached_property
+    @property
     def factor(self) -> float:
-        """By what qd must be multiplied to be dq/dt."""
-        return self.agreement.factor(self.index)
+        """By what qd must be multiplied to be dq/dt; NaN where it rests."""
+        return float(self.agreement.factor[self.index])
 
-    @cached_property
-    def correlation(self) -> float | None:
-        """Of qd and dq/dt."""
-        return self.agreement.correlation(self.index)
+    @property
+    def correlation(self) -> float:
+        """Of qd and dq/dt; NaN where one rests."""
+        return float(self.agreement.correlation[self.index, self.index])
 
 
 def is_factor(value: float, unit: float) -> bool:
@@ -151,8 +147,8 @@ def find_degrees(signals: JointSignals) -> str | None:
     """Find revolute joints that look recorded in degrees."""
     if signals.kind != "revolute":
         return None
-    factor, correlation = signals.factor, signals.correlation
-    if correlation is not None and correlation > TUNING.agreement:
+    factor = signals.factor
+    if signals.correlation > TUNING.agreement:
         if is_factor(factor, DEGREES):
             return f"q that changes {factor:.3g} times as fast as qd says (180/pi is 57.3)"
         if is_factor(factor, 1 / DEGREES):
@@ -182,7 +178,7 @@ def find_time_unit(signals: JointSignals) -> str | None:
     if steps.size and np.median(steps) > TUNING.slowest_step:
         # told once, and not of each joint
         return None if signals.index else f"a sample every {np.median(steps):.3g} s"
-    if signals.correlation is None or signals.correlation <= TUNING.agreement:
+    if not signals.correlation > TUNING.agreement:  # NaN included
         return None
     for unit, seconds in TIMES.items():
         if unit != "s" and is_factor(signals.factor, seconds):
@@ -214,25 +210,17 @@ def find_no_torques(signals: JointSignals) -> str | None:
 
 def find_wrong_velocity(signals: JointSignals) -> str | None:
     """Find velocities that are not the positions' derivative, and say what else they may be."""
-    factor, correlation = signals.factor, signals.correlation
-    if correlation is None:
+    factor, correlation, tolerance = signals.factor, signals.correlation, 1 - TUNING.agreement
+    if np.isnan(correlation) or (correlation >= TUNING.agreement and abs(factor - 1) <= tolerance):
         return None
-    if correlation >= TUNING.agreement and abs(factor - 1) <= 1 - TUNING.agreement:
-        return None
-    return (
-        f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}; "
-        f"{_velocity_advice(signals, correlation)}"
-    )
-
-
-def _velocity_advice(signals: JointSignals, correlation: float) -> str:
-    for index, joint in enumerate(signals.joints):
-        fit = signals.agreement.correlation(signals.index, index)
-        if index != signals.index and fit is not None and fit > max(TUNING.agreement, correlation):
-            return f"it fits q of joint {joint!r}"
-    if abs(signals.factor + 1) <= 1 - TUNING.agreement:
-        return "its sign is the opposite of that of q"
-    return "check units, signs and the order of the joints"
+    advice = "check units, signs and the order of the joints"
+    if abs(factor + 1) <= tolerance:
+        advice = "its sign is the opposite of that of q"
+    for joint, fit in zip(signals.joints, signals.agreement.correlation[signals.index].tolist(), strict=True):
+        if fit > max(TUNING.agreement, correlation):
+            advice = f"it fits q of joint {joint!r}"
+            break
+    return f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}; {advice}"
 
 
 def find_constant_torque(signals: JointSignals) -> str | None:
@@ -280,15 +268,40 @@ CHECKS: list[Check[JointSignals]] = [
 ]  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Finding:
-    """Say what a check finds odd about one joint of one trajectory."""
+class LogChecks:
+    """Check logs by themselves, one trajectory after another: they need not lie in memory together.
 
-    check: Check[JointSignals]
-    trajectory: str
-    file: Path | None
-    joint: str
-    message: str
+    clock: what is odd about times, of each trajectory. agreement: of all velocities with positions.
+    """
+
+    def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
+        self.clock: list[Diagnostic] = []
+        self.agreement = _no_agreement(len(joints))
+        self._joints, self._kinds = joints, joint_types
+        self._odd: dict[tuple[str, Check[JointSignals]], list[tuple[str, str, Path | None]]] = {}
+        self._count = 0
+
+    def add(self, trajectory: Trajectory) -> None:
+        """Take in a trajectory."""
+        agreement = velocity_agreement(trajectory)
+        self.agreement += agreement
+        self.clock += clock_diagnostics(trajectory)
+        self._count += 1
+        for index, (joint, kind) in enumerate(zip(self._joints, self._kinds, strict=True)):
+            signals = JointSignals(trajectory, index, self._joints, kind, agreement)
+            where = f"trajectory {trajectory.name}, joint {joint!r}"
+            for odd, message in run_checks(CHECKS, signals, trajectory.accepted):
+                self._odd.setdefault((joint, odd), []).append((message, where, trajectory.file))
+
+    def findings(self) -> Findings:
+        """Return what is odd about the joints: a sentence for each joint and check."""
+        summary = Findings()
+        for (_, odd), occurrences in self._odd.items():
+            # a joint that rests in one motion and moves in another is no oddity
+            if not odd.everywhere or len(occurrences) == self._count:
+                message, where, file = occurrences[0]
+                summary.add(odd, _with_others(message, len(occurrences) - 1), where, file)
+        return summary
 
 
 def check(
@@ -299,16 +312,12 @@ def check(
     Raises LogError when revolute joints look recorded in degrees, unless units are declared, and when a
     position or a velocity never changes while the other one does.
     """
-    notes: list[Diagnostic] = []
-    results: list[Finding] = []
-    count = 0
+    checks = LogChecks(joints, joint_types)
     for trajectory in trajectories:
-        notes += clock_diagnostics(trajectory)
-        results += findings(trajectory, joints, joint_types)
-        count += 1
-    summary = summarised(results, joints, count)
+        checks.add(trajectory)
+    summary = checks.findings()
     collect(summary.errors)
-    return [*once(notes), *summary.notes]
+    return [*once(checks.clock), *summary.notes]
 
 
 def once(notes: Sequence[Diagnostic]) -> list[Diagnostic]:
@@ -353,44 +362,14 @@ def clock_diagnostics(trajectory: Trajectory) -> list[Diagnostic]:
     return notes
 
 
-def findings(
-    trajectory: Trajectory,
-    joints: Sequence[str],
-    joint_types: Sequence[str],
-    agreement: VelocityAgreement | None = None,
-) -> list[Finding]:
-    """Return what is odd about the joints of one trajectory. agreement: where it is known already."""
-    if agreement is None:
-        agreement = velocity_agreement(trajectory)
-    results = []
-    for index, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
-        signals = JointSignals(trajectory, index, joints, kind, agreement)
-        for odd, message in run_checks(CHECKS, signals, trajectory.accepted):
-            results.append(Finding(odd, trajectory.name, trajectory.file, joint, message))
-    return results
-
-
-def summarised(results: Sequence[Finding], joints: Sequence[str], trajectories: int) -> Findings:
-    """Return notes and errors about so many trajectories: a sentence for each joint and check."""
-    groups: dict[tuple[str, str], list[Finding]] = {}
-    for finding in results:
-        groups.setdefault((finding.joint, finding.check.code), []).append(finding)
-    summary = Findings()
-    for joint in joints:
-        for odd in CHECKS:
-            alike = groups.get((joint, odd.code), [])
-            # a joint that rests in one motion and moves in another is no oddity
-            if not alike or (odd.everywhere and len(alike) < trajectories):
-                continue
-            message = _with_others(alike[0].message, len(alike) - 1)
-            summary.add(odd, message, f"trajectory {alike[0].trajectory}, joint {joint!r}", alike[0].file)
-    return summary
+def _no_agreement(joints: int) -> VelocityAgreement:
+    return VelocityAgreement(np.zeros(joints), np.zeros(joints), np.zeros((joints, joints)))
 
 
 def velocity_agreement(trajectory: Trajectory) -> VelocityAgreement:
     """Return how far qd is dq/dt, within gap-free pieces."""
     n = trajectory.q.shape[1]
-    total = VelocityAgreement(np.zeros(n), np.zeros(n), np.zeros((n, n)))
+    total = _no_agreement(n)
     for piece in split_at_gaps(trajectory):
         span = min(TUNING.increments, len(piece) - 1)
         if span:

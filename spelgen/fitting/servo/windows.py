@@ -17,8 +17,8 @@ import torch
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.errors import LogError
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
+from spelgen.logs.filtering import smoothed, velocities
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.smoothing import smoothed, velocities
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.settings.tuning.servo import ServoWindowTuning
 
