@@ -15,7 +15,8 @@ from spelgen.errors import Diagnostic, LogError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
 from spelgen.logs.checks import check, once
 from spelgen.logs.chunks import scan
-from spelgen.logs.filtering import low_pass, prepare, regular_times, resampled
+from spelgen.logs.filtering import low_pass, regular_times, resampled
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import automatic_cutoff, automatic_decimation, shows_accelerations
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.trajectory import split_at_gaps
@@ -359,7 +360,7 @@ def test_gaps_split_and_are_said():
 
 
 def test_no_window_crosses_a_gap():
-    pieces = prepare([with_gap()], shortest=5, cutoff=None)
+    pieces = Preprocessing(cutoff=0.0).pieces([with_gap()], shortest=5)
     windows = cut_windows(pieces, 5, measured=False)
     assert len(windows) == (120 - 4) + (80 - 4)
     assert windows.dt.max() < 0.02
@@ -367,7 +368,7 @@ def test_no_window_crosses_a_gap():
 
 def test_a_trajectory_without_a_whole_window_is_refused():
     with pytest.raises(LogError) as caught:
-        prepare([with_gap()], shortest=121, cutoff=None)
+        Preprocessing(cutoff=0.0).pieces([with_gap()], shortest=121)
     assert str(caught.value) == (
         "trajectory gap: got 120 samples without a gap, expected at least 121, one window; "
         "record longer or train with a shorter window"
@@ -461,7 +462,7 @@ def test_a_gap_does_not_leak_into_validation():
     trajectories = [with_gap(), swing("other")]
     split = split_validation(trajectories, 0.5, seed=0)
     names = [
-        {x.name for x in prepare(part, shortest=5, cutoff=None)}
+        {x.name for x in Preprocessing(cutoff=0.0).pieces(part, shortest=5)}
         for part in (split.training, split.validation)
     ]
     assert names[0].isdisjoint(names[1])
@@ -482,7 +483,7 @@ def test_real_logs_are_read(shared):
     assert trajectory.q.shape == (20544, 7)
     notes = check([trajectory], joints, ("revolute",) * 7)
     assert [x.code for x in notes] == ["gap"]
-    assert len(prepare([trajectory], shortest=5, cutoff=8.0)) == 5
+    assert len(Preprocessing(cutoff=8.0).pieces([trajectory], shortest=5)) == 5
 
 
 def test_a_models_logs_have_the_urdfs_names(tmp_path):

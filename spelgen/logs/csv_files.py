@@ -17,7 +17,7 @@ from spelgen.logs.values import is_number
 from spelgen.settings.log_mapping import PLAIN, LogMapping
 from spelgen.settings.tuning.logs import LogTuning
 
-STAMP = ("sec", "nanosec")  # of a message's header
+STAMP = ("sec", "nanosec", "frame_id")  # of a message's header
 TUNING = LogTuning()
 
 
@@ -34,48 +34,46 @@ def csv_columns(file: Path) -> pa.Table:
     """
     with reading(file):
         encoding, head = _decoded_head(file)
-        names, _, rows = head.partition("\n")
-        delimiter = max(",;\t", key=names.count)
-        header = None
-        if is_number(names.split(delimiter)[0]):
-            header = _joint_state_header(names.split(delimiter), file)
-        decimal_point = "."
-        if delimiter != "," and re.search(rf"(^|{delimiter}) *-?\d+,\d", rows, re.MULTILINE):
-            decimal_point = ","
+        first_line, _, rows = head.partition("\n")
+        delimiter = max(",;\t", key=first_line.count)
+        cells = first_line.split(delimiter)
+        names = _joint_state_columns(cells, file) if is_number(cells[0]) else None
+        decimal_commas = delimiter != "," and re.search(rf"(^|{delimiter}) *-?\d+,\d", rows, re.MULTILINE)
         table = pa.csv.read_csv(
             file,
-            pa.csv.ReadOptions(encoding=encoding, column_names=header),
+            pa.csv.ReadOptions(encoding=encoding, column_names=names),
             pa.csv.ParseOptions(delimiter=delimiter),
-            pa.csv.ConvertOptions(decimal_point=decimal_point),
+            pa.csv.ConvertOptions(decimal_point="," if decimal_commas else "."),
         )
-    if header is None:
+    if names is None:
         return table.rename_columns([name.strip() for name in table.column_names])
-    seconds, nanoseconds = (table[name].cast(pa.int64()) for name in STAMP)
+    seconds, nanoseconds = table[STAMP[0]].cast(pa.int64()), table[STAMP[1]].cast(pa.int64())
     times = pa.compute.add(pa.compute.multiply(seconds, 1_000_000_000), nanoseconds)
     return table.append_column(PLAIN["t"], times.cast(pa.duration("ns")))
 
 
-def _joint_state_header(cells: Sequence[str], file: Path) -> list[str]:
+def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
     """Return names for the columns of joint states as `ros2 topic echo --csv` writes them, which has no header.
 
     Raises LogError for any other file that begins with numbers.
     """
+    columns = [*STAMP]
     names: list[str] = []
-    for cell in cells[len(STAMP) + 1 :]:
+    for cell in cells[len(STAMP) :]:
         if is_number(cell):
             break
         names.append(cell)
-    values = len(cells) - len(STAMP) - 1 - len(names)
-    if not names or values % len(names) or not 0 < values // len(names) <= len(FIELDS):
+        columns.append(f"name_{cell}")
+    for quantity in FIELDS:
+        if len(columns) < len(cells):
+            columns += [PLAIN[quantity].replace("{joint}", name) for name in names]
+    if not names or len(columns) != len(cells):
         raise LogError(
             f"numbers in the first line ({', '.join(cells[:3])}, ...)", file=file, line=1,
             expected="a header: the names of the columns",
             do="write one, t,q_<joint>,...,qd_<joint>,...,tau_<joint>,... for example",
         )  # fmt: skip
-    header = [*STAMP, "frame_id", *(f"name_{name}" for name in names)]
-    for quantity in list(FIELDS)[: values // len(names)]:
-        header += [PLAIN[quantity].replace("{joint}", name) for name in names]
-    return header
+    return columns
 
 
 def _decoded_head(file: Path) -> tuple[str, str]:

@@ -23,11 +23,9 @@ FORMATS: list[LogFormat] = [PARQUET, CSV, NPZ, BAG, LEROBOT]
 
 def format_of(path: Path) -> LogFormat | None:
     """Return the format of a file or folder; None of what is no log, such as a pipe that might never end."""
-    is_folder, is_file = path.is_dir(), path.is_file()
     for log_format in FORMATS:
-        if is_folder and log_format.is_folder is not None and log_format.is_folder(path):
-            return log_format
-        if is_file and path.suffix in log_format.suffixes:
+        is_folder = log_format.marker and (path / log_format.marker).is_file()
+        if is_folder or (path.suffix in log_format.suffixes and path.is_file()):
             return log_format
     return None
 

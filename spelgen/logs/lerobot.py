@@ -16,11 +16,6 @@ STATE, ACTION = "observation.state", "action"
 ENDING = ".pos"
 
 
-def is_dataset(folder: Path) -> bool:
-    """Whether a folder is a data set."""
-    return (folder / INFO).is_file()
-
-
 def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
     """Return the tables of all files. Raises LogError where there are none, or a joint is not among the motors."""
     mapping = dataset_mapping(folder, joints, mapping)
@@ -74,4 +69,4 @@ def _motor_names(folder: Path, feature: str) -> list[str]:
         ) from error  # fmt: skip
 
 
-LEROBOT = LogFormat(read_dataset, is_folder=is_dataset, folder="a LeRobot data set")
+LEROBOT = LogFormat(read_dataset, marker=INFO, folder="a LeRobot data set")

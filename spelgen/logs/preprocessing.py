@@ -6,11 +6,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
 
-from spelgen.errors import Diagnostic, SettingsError
-from spelgen.logs.filtering import prepare
+from spelgen.errors import Diagnostic, SettingsError, SpelgenError, collect
+from spelgen.logs.filtering import low_pass
 from spelgen.logs.rates import automatic_cutoff, automatic_decimation
 from spelgen.logs.recording import earlier
-from spelgen.logs.trajectory import GAP, Trajectory
+from spelgen.logs.trajectory import GAP, Trajectory, split_at_gaps
 from spelgen.settings.tuning.logs import LogTuning
 
 TUNING = LogTuning()
@@ -75,9 +75,23 @@ class Preprocessing:
         return [Diagnostic("info", "filter", "logs", None, message)]
 
     def pieces(self, trajectories: Sequence[Trajectory], *, shortest: int) -> list[Trajectory]:
-        """Return gap-free pieces of at least so many samples, filtered; of a ``resolved`` one. Raises LogError."""
-        moved = self.moved(trajectories)
-        return prepare(moved, shortest=shortest, cutoff=self.cutoff or None, gap=self.gap)
+        """Return gap-free pieces (see `gap_ends`) of at least so many samples, filtered; of a ``resolved`` one.
+
+        Raises LogError when a trajectory holds no piece that long.
+        """
+        prepared: list[Trajectory] = []
+        errors: list[SpelgenError] = []
+        for trajectory in self.moved(trajectories):
+            pieces = split_at_gaps(trajectory, self.gap)
+            if max(map(len, pieces)) < shortest:
+                got = f"{max(map(len, pieces))} samples without a gap"
+                do = "record longer or train with a shorter window"
+                errors.append(trajectory.error(got, f"at least {shortest}, one window", do))
+            for piece in pieces:
+                if len(piece) >= shortest:
+                    prepared.append(low_pass(piece, self.cutoff) if self.cutoff else piece)
+        collect(errors)
+        return prepared
 
     def moved(self, trajectories: Sequence[Trajectory]) -> Sequence[Trajectory]:
         """Return trajectories with torques at the times at which they act."""

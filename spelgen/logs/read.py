@@ -14,9 +14,8 @@ import pyarrow.parquet
 from spelgen.errors import LogError, collect
 from spelgen.files import replacing
 from spelgen.logs.arm_mapping import GivenMapping, LoggedArm, log_source
-from spelgen.logs.clock import in_time_order
 from spelgen.logs.formats import log_files, read_tables
-from spelgen.logs.recording import make_trajectory
+from spelgen.logs.recording import in_time_order, make_trajectory
 from spelgen.logs.tables import UNITS, UNITS_KEY, LogTable
 from spelgen.logs.trajectory import Trajectory, require_joints
 from spelgen.logs.values import clock_start, values_in_si
@@ -96,8 +95,8 @@ def _trajectories(log: LogTable, file: Path) -> list[Trajectory]:
     """Return the trajectories of one table."""
     if not log.table.num_rows:
         raise LogError("no rows", file=file, expected="at least one window of samples")
-    times = log.layout.columns[0]
-    data = values_in_si(log.table, log.layout, file, clock_start(log.table[times]))
+    start = clock_start(log.table, log.layout, file)
+    data = values_in_si(log.table, log.layout, file, start)
     trajectories = []
     for name, rows in _recordings(log, file.stem):
         values, repairs = in_time_order(data[rows], rows, log.layout, file)
@@ -124,14 +123,9 @@ def _recordings(log: LogTable, stem: str) -> list[tuple[str, np.ndarray]]:
 
 def _with_unique_names(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
     """Return the trajectories under the shortest names that tell all of them apart."""
-    short, with_stem, with_path = [], [], []
-    for trajectory in trajectories:
-        assert trajectory.file is not None
-        short.append(trajectory.name)
-        with_stem.append(f"{trajectory.file.stem}/{trajectory.name}")
-        with_path.append(f"{trajectory.file}/{trajectory.name}")
-    names = with_path
-    for candidates in (with_stem, short):
-        if len(set(candidates)) == len(candidates):
-            names = candidates
+    names: list[str] = []
+    for form in ("{0.name}", "{0.file.stem}/{0.name}", "{0.file}/{0.name}"):
+        names = list(map(form.format, trajectories))
+        if len(set(names)) == len(names):
+            break
     return [replace(x, name=name) for x, name in zip(trajectories, names, strict=True)]

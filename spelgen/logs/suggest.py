@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -25,30 +25,18 @@ WORDS = {
     "qd": {"qd", "dq", "vel", "velocity", "velocities", "speed", "speeds", "omega"},
     "tau": {"tau", "torque", "torques", "effort", "efforts", "current", "currents", "amps", "curr", "moment"},
 }  # fmt: skip
+# set points have the names of what they are set points of
 NOT_MEASURED = {"target", "desired", "command", "cmd", "reference", "ref", "setpoint", "goal", "error", "std"}
 UNITS = {"ms": "ms", "millis": "ms", "us": "us", "ns": "ns", "mnm": "mNm", "ma": "mA"}
 UNITS |= dict.fromkeys(("amps", "current", "currents", "curr"), "A")
 
 
 class Column(NamedTuple):
-    """Describe a column, or one element of a column of lists. number: its place, or the last number in its name."""
+    """Name a column, or an element of a column of lists. number: its place, or the last number in its name."""
 
     name: str
     words: frozenset[str]
     number: int | None
-
-    @property
-    def quantity(self) -> str | None:
-        """What it measures; None where its name does not say."""
-        # set points have the names of what they are set points of
-        if not NOT_MEASURED.isdisjoint(self.words):
-            return None
-        return next((quantity for quantity, words in WORDS.items() if words & self.words), None)
-
-    @property
-    def unit(self) -> str | None:
-        """The unit that its name says."""
-        return next((unit for word, unit in UNITS.items() if word in self.words), None)
 
 
 @dataclass(frozen=True)
@@ -66,21 +54,22 @@ def suggest_mapping(file: Path, joints: Sequence[str]) -> Suggestion:
         suffixes = [x.suffixes[0] for x in FORMATS if x.columns is not None]
         raise LogError(f"a file of kind {file.suffix!r}", file=file, expected=" or ".join(suffixes))
     columns = _columns(log_format.columns(file))
-    by_quantity: dict[str | None, list[Column]] = {}
+    measured: dict[str, list[Column]] = {quantity: [] for quantity in WORDS}
     for column in columns:
-        by_quantity.setdefault(column.quantity, []).append(column)
-    if "t" not in by_quantity:
+        for quantity, words in WORDS.items():
+            if column.words & words and not column.words & NOT_MEASURED:
+                measured[quantity].append(column)
+                break
+    if not measured["t"]:
         names = shortened([column.name for column in columns], LogTuning().listed)
         raise LogError(f"only the columns {names}", file=file, expected="one of times, called t or time")
     # `time` before `timestamp_of_receipt`: what has the fewest words is the plain clock
-    clock = min(by_quantity["t"], key=lambda column: len(column.words))
-    by_joint: dict[str, dict[str, Column]] = {}
-    for quantity in ("q", "qd", "tau"):
-        by_joint[quantity] = _by_joint(by_quantity.get(quantity, []), joints)
-    units = {"t": clock.unit or "s"}
-    for column in by_joint["tau"].values():
-        if column.unit is not None:
-            units["tau"] = column.unit
+    clock = min(measured.pop("t"), key=lambda column: len(column.words))
+    by_joint = {quantity: _by_joint(named, joints) for quantity, named in measured.items()}
+    units = {"t": _unit([clock]) or "s"}
+    torque_unit = _unit(by_joint["tau"].values())
+    if torque_unit:
+        units["tau"] = torque_unit
     lines = [
         f"# Drafted from the column names of {json.dumps(file.name)}: check it, and the order of the joints.",
         f"columns: {{t: {json.dumps(clock.name)}}}",
@@ -90,21 +79,27 @@ def suggest_mapping(file: Path, joints: Sequence[str]) -> Suggestion:
         lines.append("velocity: differentiated")
         del by_joint["qd"]
     lines.append("joints:")
-    missing: list[str] = []
+    missing = []
     for joint in joints:
-        entries: dict[str, str] = {}
-        for quantity, named in by_joint.items():
-            if joint in named:
-                entries[quantity] = named[joint].name
-            else:
-                missing.append(f"{quantity} of {joint}")
+        entries = {quantity: named[joint].name for quantity, named in by_joint.items() if joint in named}
+        missing += [f"{quantity} of {joint}" for quantity in by_joint if quantity not in entries]
         lines += [f"  {json.dumps(joint)}:", f"    columns: {json.dumps(entries)}"]
-        if units.get("tau") in ("A", "mA"):
+        if torque_unit in ("A", "mA"):
             lines.append(
-                f"    gain: 1.0 # Nm per {units['tau']} at the joint, the gear included: write its value"
+                f"    gain: 1.0 # Nm per {torque_unit} at the joint, the gear included: write its value"
             )
     lines += [f"# no column was found for {column}" for column in missing]
     return Suggestion("\n".join(lines) + "\n", tuple(missing))
+
+
+def _unit(columns: Iterable[Column]) -> str | None:
+    """Return the unit that the columns' names say, the last of several."""
+    unit = None
+    for column in columns:
+        for word in reversed(UNITS):
+            if word in column.words:
+                unit = UNITS[word]
+    return unit
 
 
 def _columns(table: pa.Table) -> list[Column]:
@@ -113,11 +108,10 @@ def _columns(table: pa.Table) -> list[Column]:
     for name in table.column_names:
         # jointPos0 -> joint, pos
         separated = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
-        words = frozenset(word.lower() for word in re.findall(r"[A-Za-z]+", separated))
+        words = frozenset(re.findall(r"[a-z]+", separated.lower()))
         values = table[name].drop_null()
         if pa.types.is_nested(values.type) and len(values):
-            for index in range(len(values[0])):
-                columns.append(Column(f"{name}[{index}]", words, index))
+            columns += [Column(f"{name}[{index}]", words, index) for index in range(len(values[0]))]
         else:
             numbers = re.findall(r"\d+", name)
             columns.append(Column(name, words, int(numbers[-1]) if numbers else None))

@@ -6,17 +6,16 @@ import difflib
 import re
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from itertools import chain
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
-from spelgen.settings.log_mapping import TIMES, LogMapping
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.tuning.logs import LogTuning
 
 UNITS_KEY = b"units"  # in a Parquet file's metadata: the file declares its units
@@ -43,15 +42,6 @@ class Layout:
     mapping: LogMapping
     accepted: tuple[str, ...]
 
-    @cached_property
-    def units(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return factors and offsets (C,) of the columns: a value in SI units is factor * logged value + offset."""
-        factors, offsets = [TIMES[self.mapping.units.t]], [0.0]
-        for quantity, joint in self.mapping.signals(self.joints):
-            factors.append(self.mapping.scale(quantity, joint))
-            offsets.append(self.mapping.offset(quantity, joint))
-        return np.array(factors), np.array(offsets)
-
 
 @dataclass(frozen=True, eq=False)
 class LogTable:
@@ -68,13 +58,13 @@ class LogFormat:
 
     read: from a path, the joints and the mapping to tables; raises LogError. suffixes: of its files. columns: from a
     file to all its columns, of which `suggest` drafts a mapping; None where the format itself says what they are.
-    is_folder: whether a folder is a log of this format; folder: what such a folder is called.
+    marker: a file in each folder that is a log of this format; folder: what such a folder is called.
     """
 
     read: Callable[[Path, Sequence[str], LogMapping], list[LogTable]]
     suffixes: tuple[str, ...] = ()
     columns: Callable[[Path], pa.Table] | None = None
-    is_folder: Callable[[Path], bool] | None = None
+    marker: str = ""
     folder: str = ""
 
 
@@ -126,17 +116,14 @@ def stored_columns(layout: Layout, columns: Collection[str]) -> list[str]:
 def _require_columns(
     columns: Sequence[str], required: Sequence[str], file: Path, mapping: LogMapping, joints: Sequence[str]
 ) -> None:
-    shared = sorted({name for name in required if required.count(name) > 1})
-    if shared:
-        raise LogError(
-            "one column for several joints", file=file, element=f"column {', '.join(shared)}",
-            expected="'{joint}' in its name under 'logs'",
-        )  # fmt: skip
-    repeated = sorted({name for name in required if columns.count(name) > 1})
-    if repeated:
-        raise LogError(
-            "the same column twice", file=file, element=f"column {', '.join(repeated)}", expected="it once"
-        )
+    for name in required:
+        if required.count(name) > 1:
+            got, expected = "one column for several joints", "'{joint}' in its name under 'logs'"
+        elif columns.count(name) > 1:
+            got, expected = "the same column twice", "it once"
+        else:
+            continue
+        raise LogError(got, file=file, element=f"column {name}", expected=expected)
     missing = [name for name in required if name not in columns and not list_element(name, columns)]
     if missing:
         raise missing_columns(missing, columns, file, mapping, joints)
@@ -145,41 +132,45 @@ def _require_columns(
 def missing_columns(
     missing: Sequence[str], columns: Collection[str], file: Path, mapping: LogMapping, joints: Sequence[str]
 ) -> LogError:
-    """Return the error about columns that are not there."""
-    expected = [mapping.columns.t]
-    for quantity in mapping.quantities:
+    """Return the error about columns that are not there, with what to do."""
+    quantities, expected = mapping.quantities, [mapping.columns.t]
+    for quantity in quantities:
         expected.append(getattr(mapping.columns, quantity).replace("{joint}", "<joint>"))
+    of_quantity = {x: [mapping.column(x, joint) for joint in joints] for x in quantities}
+    unlogged = []
+    for joint, *names in zip(joints, *of_quantity.values(), strict=True):
+        if set(names) <= set(missing):
+            unlogged.append(joint)
+    if unlogged and len(unlogged) < len(joints):
+        do = (
+            f"nothing was logged of {', '.join(unlogged)}: say which joints are the arm's, by --tip, --joints, or "
+            "'tip' or 'moving_joints' in the robot's YAML, or map its columns under 'logs'"
+        )
+    # the usual gap of loggers, and the only one with a remedy of its own
+    elif set(missing) <= set(of_quantity.get("qd", ())):
+        do = "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
+    else:
+        do = _renaming(missing[0], columns, of_quantity, [mapping.log_name(joint) for joint in joints])
+    listed = LogTuning().listed
     return LogError(
-        f"only the columns {shortened(list(columns), LogTuning().listed)}", file=file,
-        element=f"missing column{'s' * (len(missing) > 1)} {shortened(missing, LogTuning().listed)}",
-        expected=", ".join(expected), do=_advice(missing, columns, mapping, joints),
+        f"only the columns {shortened(list(columns), listed)}", file=file,
+        element=f"missing column{'s' * (len(missing) > 1)} {shortened(missing, listed)}",
+        expected=", ".join(expected), do=do,
     )  # fmt: skip
 
 
-def _advice(
-    missing: Sequence[str], columns: Collection[str], mapping: LogMapping, joints: Sequence[str]
+def _renaming(
+    name: str, columns: Collection[str], of_quantity: Mapping[str, Sequence[str]], joints: Sequence[str]
 ) -> str:
-    """Say what to do about missing columns: offer one that names the same joint and is no other quantity's."""
-    owners: dict[str, tuple[str, str]] = {}
-    for quantity, joint in mapping.signals(joints):
-        owners[mapping.column(quantity, joint)] = (quantity, joint)
-    bare = [joint for joint in joints if all(mapping.column(x, joint) in missing for x in mapping.quantities)]
-    if bare and len(bare) < len(joints):
-        return (
-            f"nothing was logged of {', '.join(bare)}: say which joints are the arm's, by --tip, --joints, or 'tip' or "
-            "'moving_joints' in the robot's YAML, or map its columns under 'logs'"
-        )
-    quantities = {owners.get(name, ("", ""))[0] for name in missing}
-    # the usual gap of loggers, and the only one with a remedy of its own
-    if quantities == {"qd"}:
-        return "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
-    joint = ""
-    if missing[0] in owners:
-        joint = mapping.log_name(owners[missing[0]][1])
-    unused = [name for name in columns if name not in owners]
-    for close in difflib.get_close_matches(missing[0], unused, n=5):
+    """Offer a column in place of one that is missing: one that names the same joint and is no other quantity's."""
+    joint, used = "", set(chain(*of_quantity.values()))
+    for names in of_quantity.values():
+        if name in names:
+            joint = joints[names.index(name)]
+    unused = [column for column in columns if column not in used]
+    for close in difflib.get_close_matches(name, unused, n=5):
         if names_joint(close, joint):
-            return f"rename the column {close!r} to {missing[0]!r}?"
+            return f"rename the column {close!r} to {name!r}?"
     return (
         "rename the columns, or write their names under 'logs' in the robot's YAML: "
         "`spelgen logs LOGS --robot ROBOT.urdf --suggest FILE` drafts them"

@@ -84,43 +84,31 @@ def cut_windows(
     whose states z are wanted, which begin straight with each piece. Raises LogError when there is no window.
     """
     span = (window - 1) * decimation
-    batches: list[list[np.ndarray]] = []
+    batches: list[Windows] = []
     for piece in pieces:
         if len(piece) > span:
-            batches.append(_cut(piece, window, stride, decimation, measured, reach))
+            tau = piece.tau[:-1]
+            if measured:
+                tau = (tau + piece.tau[1:]) / 2
+            # sums of impulses: steps of a jittered clock are not alike
+            impulses = tau * np.diff(piece.t)[:, None]
+            impulse = sliding_window_view(impulses, decimation, axis=0).sum(axis=-1)  # (T - decimation, n)
+            dt = (piece.t[decimation:] - piece.t[:-decimation])[:, None]
+            columns = [(dt, window - 1), (piece.q, window), (piece.qd, window), (impulse / dt, window - 1)]
+            steps, *motion = (_slide(values, size, stride, decimation) for values, size in columns)
+            tensors = [steps[..., 0], *motion]
+            if reach is not None and reach.elements:
+                tensors.append(torch.tensor(bristles_along(piece.q, reach)[: len(piece) - span : stride]))
+            batches.append(Windows(*tensors))
     if not batches:
         raise LogError(f"no trajectory of {span + 1} samples", expected="one window")
-    columns = map(np.concatenate, zip(*batches, strict=True))
-    return Windows(*map(torch.from_numpy, columns))
+    return joined(batches)
 
 
-def _cut(
-    piece: Trajectory, window: int, stride: int, decimation: int, measured: bool, reach: BristleReach | None
-) -> list[np.ndarray]:
-    """Return dt, q, qd, tau, and z where a reach is given, of the windows of one piece."""
-    tau = piece.tau[:-1]
-    if measured:
-        tau = (tau + piece.tau[1:]) / 2
-    # sums of impulses: steps of a jittered clock are not alike
-    impulses = tau * np.diff(piece.t)[:, None]
-    impulse = sliding_window_view(impulses, decimation, axis=0).sum(axis=-1)  # (T - decimation, n)
-    dt = (piece.t[decimation:] - piece.t[:-decimation])[:, None]
-    columns = [
-        _slide(dt, window - 1, stride, decimation)[..., 0],
-        _slide(piece.q, window, stride, decimation),
-        _slide(piece.qd, window, stride, decimation),
-        _slide(impulse / dt, window - 1, stride, decimation),
-    ]
-    if reach is not None and reach.elements:
-        starts = len(piece) - (window - 1) * decimation
-        columns.append(bristles_along(piece.q, reach)[:starts:stride])
-    return columns
-
-
-def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> np.ndarray:
+def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> torch.Tensor:
     """(T, n) -> (W, window, n)."""
-    windows = sliding_window_view(values, (window - 1) * decimation + 1, axis=0)[::stride, :, ::decimation]
-    return windows.transpose(0, 2, 1)
+    windows = torch.tensor(values).unfold(0, (window - 1) * decimation + 1, stride)
+    return windows[..., ::decimation].transpose(1, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,18 +131,13 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
     # whole trajectories: neighbouring windows share samples, and would tell the answer
     count = min(max(1, round(fraction * total)), total - 1)
     chosen = set(np.random.default_rng(seed).permutation(total)[:count].tolist())
-    training: list[Trajectory] = []
-    validation: list[Trajectory] = []
-    for index, trajectory in enumerate(trajectories):
-        if index in chosen:
-            validation.append(trajectory)
-        else:
-            training.append(trajectory)
+    validation = tuple(trajectories[k] for k in sorted(chosen))
+    training = tuple(x for k, x in enumerate(trajectories) if k not in chosen)
     names = f"{count} of {total} trajectories"
     if count <= 3:
         names = ", ".join(x.name for x in validation)
     note = Diagnostic("info", "validation-split", "logs", None, f"validation on whole trajectories: {names}")
-    return Split(tuple(training), tuple(validation), note)
+    return Split(training, validation, note)
 
 
 def _split_in_time(trajectory: Trajectory, fraction: float) -> Split:
