@@ -21,7 +21,7 @@ from spelgen.logs.chunks import scan
 from spelgen.logs.formats import FORMATS
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.suggest import suggest_mapping
-from spelgen.logs.tables import LogFormat, LogTable, table_layout
+from spelgen.logs.tables import LogFormat, table_layout
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.log_mapping import LogMapping
 
@@ -347,7 +347,7 @@ def test_a_new_format_is_a_reader_and_its_name_among_the_formats(tmp_path, monke
 
     def read(file, joints, mapping):
         table = as_table(file)
-        return [LogTable(None, table, table_layout(table.schema, joints, mapping, file))]
+        return [(table_layout(table.schema, joints, mapping, file), table)]
 
     monkeypatch.setattr(formats, "FORMATS", [*FORMATS, LogFormat(read, suffixes=(".txt",), columns=as_table)])
     np.savetxt(tmp_path / "x.txt", np.stack(list(columns().values()), axis=1), fmt="%.17g")

@@ -1,5 +1,6 @@
 """Logs: read back exactly, refused clearly, filtered without delay, split and cut without leaking."""
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from time import process_time
@@ -11,9 +12,9 @@ import pytest
 import torch
 
 from spelgen.building import build
-from spelgen.errors import Diagnostic, LogError, SpelgenErrors
+from spelgen.errors import LogError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
-from spelgen.logs.checks import check, once
+from spelgen.logs.checks import check
 from spelgen.logs.chunks import scan
 from spelgen.logs.filtering import low_pass, regular_times, resampled
 from spelgen.logs.preprocessing import Preprocessing
@@ -502,8 +503,7 @@ def test_a_models_logs_have_the_urdfs_names(tmp_path):
 
 
 def test_what_is_said_of_many_recordings_is_said_once():
-    slow, other = (Diagnostic("warning", "low-rate", f"trajectory {k}", None, "slow") for k in "ab")
-    gap = Diagnostic("info", "gap", "trajectory a", None, "1 gap in time")
-    first, second = once([slow, gap, other])
-    assert (first.where, first.message) == ("trajectory a", "slow (and in 1 more trajectory)")
-    assert second == gap
+    slow = swing("a", dt=0.05)
+    (note,) = check([slow, replace(slow, name="b")], JOINTS, ("revolute", "revolute"))
+    assert (note.code, note.where) == ("low-rate", "trajectory a")
+    assert note.message.startswith("20 Hz: ") and note.message.endswith(" (and in 1 more trajectory)")

@@ -30,8 +30,7 @@ from spelgen.evaluation.horizons import JudgedLogs, Predictions, TipPosition
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.replay import Missed
 from spelgen.fitting.rollout import AT_REST, loss_scales, position_difference
-from spelgen.logs.coverage import coverage
-from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.trajectory import Trajectory, coverage
 from spelgen.settings.tuning.evaluation import TraceTuning
 
 if TYPE_CHECKING:

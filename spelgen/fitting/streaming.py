@@ -134,4 +134,4 @@ def _read_once(logs: LargeLogs) -> LogContents:
     # the last samples of a recording may be a chunk of their own, too short to tell a rate
     lengths = np.array(list(map(sum, pieces)))
     reliable = np.array(rates)[lengths > lengths.max() / 10].tolist()
-    return LogContents(chunks, reliable, [*checks.clock[:1], *summary.notes], numbers.hexdigest(), pieces)
+    return LogContents(chunks, reliable, summary.notes, numbers.hexdigest(), pieces)

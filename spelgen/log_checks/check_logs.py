@@ -20,7 +20,7 @@ from spelgen.log_checks.gravity import find_opposed_inertia, fit_gravity, joined
 from spelgen.log_checks.report import TUNING, JointReport, LogReport, joint_report, percent, signal_tables
 from spelgen.log_checks.robot_checks import CHECKS, SENSE, JointEvidence
 from spelgen.log_checks.statistics import Statistics, statistics
-from spelgen.logs.checks import Findings, LogChecks, once, run_checks
+from spelgen.logs.checks import Findings, LogChecks, run_checks
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
@@ -72,7 +72,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
         trajectories=tuple(x.clock for x in measured),
         joints=completed,
         tables=tables,
-        findings=(*once(alone.clock), *summary.notes),
+        findings=tuple(summary.notes),
         errors=tuple(summary.errors),
         examples=tuple(examples),
     )

@@ -12,7 +12,6 @@ from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, SpelgenError
 from spelgen.labels import UNITS, counted
 from spelgen.listing import WIDTH, Listing, number
-from spelgen.log_checks.following import JointFollowing
 from spelgen.log_checks.gravity import GravityFit
 from spelgen.log_checks.statistics import Clock, Statistics
 from spelgen.logs.checks import VelocityAgreement
@@ -22,6 +21,21 @@ from spelgen.settings.tuning.log_checks import LogCheckTuning
 TUNING = LogCheckTuning()
 UNFITTED = GravityFit()
 MEASURES = {"q": "position", "qd": "velocity", "tau": "torque", "u": "position"}
+
+
+@dataclass(frozen=True)
+class JointFollowing:
+    """Say how a joint follows its command; None where it cannot be said.
+
+    lag: by which positions come after commands [s]. tracking_rms: root mean square of u, delayed by the lag, less q
+    [rad, m]. steady_state_error: nine tenths of the distances u - q are smaller while both rest. saturated: fraction of
+    the time that kp (u - q) is beyond the effort limit.
+    """
+
+    lag: float | None
+    tracking_rms: float
+    steady_state_error: float | None
+    saturated: float | None
 
 
 @dataclass(frozen=True)
@@ -45,6 +59,10 @@ class JointReport:
     velocity_correlation: float | None
     gravity: GravityFit = UNFITTED
     following: JointFollowing | None = None
+
+    def largest(self, quantity: str) -> float:
+        """Return the largest size of "q", "qd", "tau" or "u"."""
+        return max(abs(self.low[quantity]), abs(self.high[quantity]))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

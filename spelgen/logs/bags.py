@@ -43,7 +43,7 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     # the messages' own fields, in SI units by definition: the mapping says no columns
     mapping = mapping.with_joint_columns(dict.fromkeys(joints, dict.fromkeys(FIELDS)))
     mapping = mapping.model_copy(update={"columns": LogColumns()})
-    return [LogTable(None, table, table_layout(table.schema, joints, mapping, path))]
+    return [(table_layout(table.schema, joints, mapping, path), table)]
 
 
 def _joint_states(path: Path, names: Sequence[str], topic: str | None) -> pa.Table:

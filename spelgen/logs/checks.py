@@ -7,12 +7,13 @@ so that logs need not lie in memory together. `log_checks` has the checks that t
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Generic, Literal, TypeVar
+from typing import Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.labels import counted
@@ -107,35 +108,30 @@ class VelocityAgreement:
         return np.asarray(self.xy / np.where(size > 1e-12, size, np.nan))
 
 
-@dataclass(frozen=True, eq=False)
-class JointSignals:
-    """Hold what one trajectory shows of one joint: the subject of the checks of logs alone."""
+class JointSignals(NamedTuple):
+    """Hold what one trajectory shows of one joint: the subject of the checks of logs alone.
+
+    q, qd: (T,). factor: by what qd must be multiplied to be dq/dt; NaN where it rests. correlations: of qd with dq/dt
+    of every joint; NaN where one rests.
+    """
 
     trajectory: Trajectory
     index: int
-    joints: Sequence[str]
     kind: str
-    agreement: VelocityAgreement
-
-    @property
-    def q(self) -> np.ndarray:
-        """(T,) [rad, m]."""
-        return self.trajectory.q[:, self.index]
-
-    @property
-    def qd(self) -> np.ndarray:
-        """(T,) [rad/s, m/s]."""
-        return self.trajectory.qd[:, self.index]
-
-    @property
-    def factor(self) -> float:
-        """By what qd must be multiplied to be dq/dt; NaN where it rests."""
-        return float(self.agreement.factor[self.index])
+    joints: Sequence[str]
+    q: np.ndarray
+    qd: np.ndarray
+    factor: float
+    correlations: Sequence[float]
 
     @property
     def correlation(self) -> float:
-        """Of qd and dq/dt; NaN where one rests."""
-        return float(self.agreement.correlation[self.index, self.index])
+        """Of qd and dq/dt."""
+        return self.correlations[self.index]
+
+    def changes_by(self, unit: float) -> bool:
+        """Whether q changes that many times as fast as qd says, as beside a wrong unit."""
+        return self.correlation > TUNING.agreement and is_factor(self.factor, unit)
 
 
 def is_factor(value: float, unit: float) -> bool:
@@ -147,26 +143,22 @@ def find_degrees(signals: JointSignals) -> str | None:
     """Find revolute joints that look recorded in degrees."""
     if signals.kind != "revolute":
         return None
-    factor = signals.factor
-    if signals.correlation > TUNING.agreement:
-        if is_factor(factor, DEGREES):
-            return f"q that changes {factor:.3g} times as fast as qd says (180/pi is 57.3)"
-        if is_factor(factor, 1 / DEGREES):
-            return f"qd that is {1 / factor:.3g} times as large as q changes (180/pi is 57.3)"
-    q = signals.q
-    if np.ptp(q) > TURNS:
-        return f"q from {q.min():.3g} to {q.max():.3g}, more than two turns"
+    if signals.changes_by(DEGREES):
+        return f"q that changes {signals.factor:.3g} times as fast as qd says (180/pi is 57.3)"
+    if signals.changes_by(1 / DEGREES):
+        return f"qd that is {1 / signals.factor:.3g} times as large as q changes (180/pi is 57.3)"
+    if np.ptp(signals.q) > TURNS:
+        return f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
     return None
 
 
 def find_frozen(signals: JointSignals) -> str | None:
     """Find a position or a velocity that never changes while the other one does."""
     q, qd = signals.q, signals.qd
-    # the trapezoidal rule: a constant q with a noisy qd around zero stays where it is
-    moved = np.cumsum((qd[1:] + qd[:-1]) / 2 * np.diff(signals.trajectory.t))
-    drift = np.abs(moved).max(initial=0.0)
     if np.ptp(qd) == 0 and np.ptp(q) > TUNING.drift:
         return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
+    # the trapezoidal rule: a constant q with a noisy qd around zero stays where it is
+    drift = np.abs(cumulative_trapezoid(qd, signals.trajectory.t)).max(initial=0.0)
     if np.ptp(q) == 0 and drift > TUNING.drift:
         return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
     return None
@@ -178,24 +170,21 @@ def find_time_unit(signals: JointSignals) -> str | None:
     if steps.size and np.median(steps) > TUNING.slowest_step:
         # told once, and not of each joint
         return None if signals.index else f"a sample every {np.median(steps):.3g} s"
-    if not signals.correlation > TUNING.agreement:  # NaN included
-        return None
-    for unit, seconds in TIMES.items():
-        if unit != "s" and is_factor(signals.factor, seconds):
+    for unit in ("ms", "us", "ns"):
+        if signals.changes_by(TIMES[unit]):
             return f"q that changes {signals.factor:.3g} times as fast as qd says: times in {unit}"
     return None
 
 
 def find_dropouts(signals: JointSignals) -> str | None:
     """Find moments at which the position or the torque falls to 0 and comes back."""
-    for name in ("q", "tau"):
-        values = getattr(signals.trajectory, name)
-        if not values.size:
-            continue
-        rows = np.flatnonzero(is_dropout(values[:, signals.index]))
-        if rows.size:
-            t = signals.trajectory.t[rows[0]]
-            return f"{name} that falls to 0 for a moment at t = {t:.4g} s ({rows.size} such samples)"
+    trajectory = signals.trajectory
+    for name, values in (("q", trajectory.q), ("tau", trajectory.tau)):
+        if values.size:
+            rows = np.flatnonzero(is_dropout(values[:, signals.index]))
+            if rows.size:
+                t = trajectory.t[rows[0]]
+                return f"{name} that falls to 0 for a moment at t = {t:.4g} s ({rows.size} such samples)"
     return None
 
 
@@ -216,7 +205,7 @@ def find_wrong_velocity(signals: JointSignals) -> str | None:
     advice = "check units, signs and the order of the joints"
     if abs(factor + 1) <= tolerance:
         advice = "its sign is the opposite of that of q"
-    for joint, fit in zip(signals.joints, signals.agreement.correlation[signals.index].tolist(), strict=True):
+    for joint, fit in zip(signals.joints, signals.correlations, strict=True):
         if fit > max(TUNING.agreement, correlation):
             advice = f"it fits q of joint {joint!r}"
             break
@@ -238,6 +227,31 @@ def find_rest(signals: JointSignals) -> str | None:
     return "does not move: the logs do not excite its dynamics"
 
 
+def find_gaps(trajectory: Trajectory) -> str | None:
+    """Find holes in time."""
+    gaps = len(gap_ends(trajectory.t)) - 2
+    if not gaps:
+        return None
+    return f"{counted(gaps, 'gap')} in time, up to {np.diff(trajectory.t).max():.3g} s long; no window crosses one"
+
+
+def find_low_rate(trajectory: Trajectory) -> str | None:
+    """Find a sample rate at which accelerations are hardly seen; arms under servos do without."""
+    rate = trajectory.sample_rate
+    if trajectory.u is not None or rate == 0 or is_dense(rate):
+        return None
+    use = f"too slow for fits to torques, which need {SLOWEST:g} Hz"
+    if shows_accelerations(rate):
+        use = "interpolated for fits to torques"
+    return (
+        f"{rate:.3g} Hz: {use}; motion faster than {rate / 2:.3g} Hz, delays below "
+        f"{1e3 / rate:.0f} ms and friction where a joint reverses are not visible at this rate"
+    )
+
+
+CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", find_low_rate)]
+# said when a log is read: each repair is a message of its own
+REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
     Check(
         "degrees", "error", find_degrees, expected="radians and rad/s",
@@ -268,39 +282,54 @@ CHECKS: list[Check[JointSignals]] = [
 ]  # fmt: skip
 
 
+AnyCheck = Check[JointSignals] | Check[Trajectory]
+
+
 class LogChecks:
     """Check logs by themselves, one trajectory after another: they need not lie in memory together.
 
-    clock: what is odd about times, of each trajectory. agreement: of all velocities with positions.
+    agreement: of all velocities with positions.
     """
 
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
-        self.clock: list[Diagnostic] = []
         self.agreement = _no_agreement(len(joints))
         self._joints, self._kinds = joints, joint_types
-        self._odd: dict[tuple[str, Check[JointSignals]], list[tuple[str, str, Path | None]]] = {}
+        self._results: dict[tuple[str, AnyCheck], list[tuple[str, str, Path | None]]] = {}
         self._count = 0
 
     def add(self, trajectory: Trajectory) -> None:
         """Take in a trajectory."""
+        self._count += 1
+        where = f"trajectory {trajectory.name}"
+        for clock_check in CLOCK_CHECKS:
+            message = clock_check.find(trajectory)
+            if message is not None:
+                self._add(message, clock_check, message, where, trajectory)
+        for repair in trajectory.repairs:
+            self._add(repair, REPAIRED, repair, where, trajectory)
         agreement = velocity_agreement(trajectory)
         self.agreement += agreement
-        self.clock += clock_diagnostics(trajectory)
-        self._count += 1
-        for index, (joint, kind) in enumerate(zip(self._joints, self._kinds, strict=True)):
-            signals = JointSignals(trajectory, index, self._joints, kind, agreement)
-            where = f"trajectory {trajectory.name}, joint {joint!r}"
-            for odd, message in run_checks(CHECKS, signals, trajectory.accepted):
-                self._odd.setdefault((joint, odd), []).append((message, where, trajectory.file))
+        factors, correlations = agreement.factor.tolist(), agreement.correlation.tolist()
+        for k, (joint, kind) in enumerate(zip(self._joints, self._kinds, strict=True)):
+            columns = trajectory.q[:, k], trajectory.qd[:, k]
+            signals = JointSignals(trajectory, k, kind, self._joints, *columns, factors[k], correlations[k])
+            for joint_check, message in run_checks(CHECKS, signals, trajectory.accepted):
+                self._add(joint, joint_check, message, f"{where}, joint {joint!r}", trajectory)
+
+    def _add(self, group: str, result: AnyCheck, message: str, where: str, trajectory: Trajectory) -> None:
+        self._results.setdefault((group, result), []).append((message, where, trajectory.file))
 
     def findings(self) -> Findings:
-        """Return what is odd about the joints: a sentence for each joint and check."""
+        """Return what is odd: a sentence for each joint and check, of clocks for each message."""
         summary = Findings()
-        for (_, odd), occurrences in self._odd.items():
+        for (_, result), occurrences in self._results.items():
             # a joint that rests in one motion and moves in another is no oddity
-            if not odd.everywhere or len(occurrences) == self._count:
-                message, where, file = occurrences[0]
-                summary.add(odd, _with_others(message, len(occurrences) - 1), where, file)
+            if result.everywhere and len(occurrences) < self._count:
+                continue
+            message, where, file = occurrences[0]
+            if len(occurrences) > 1:
+                message += f" (and in {counted(len(occurrences) - 1, 'more trajectory')})"
+            summary.add(result, message, where, file)
         return summary
 
 
@@ -317,49 +346,7 @@ def check(
         checks.add(trajectory)
     summary = checks.findings()
     collect(summary.errors)
-    return [*once(checks.clock), *summary.notes]
-
-
-def once(notes: Sequence[Diagnostic]) -> list[Diagnostic]:
-    """Return each message of trajectories once, with how many others it is about."""
-    groups: dict[tuple[str, str], list[Diagnostic]] = {}
-    for note in notes:
-        groups.setdefault((note.code, note.message), []).append(note)
-    merged = []
-    for first, *others in groups.values():
-        merged.append(replace(first, message=_with_others(first.message, len(others))))
-    return merged
-
-
-def _with_others(message: str, others: int) -> str:
-    """Return a message that is about so many other trajectories, too."""
-    if not others:
-        return message
-    return f"{message} (and in {counted(others, 'more trajectory')})"
-
-
-def clock_diagnostics(trajectory: Trajectory) -> list[Diagnostic]:
-    """Return what the times of a recording keep from being seen: holes, and a low sample rate."""
-    notes: list[Diagnostic] = []
-    where = f"trajectory {trajectory.name}"
-    gaps = len(gap_ends(trajectory.t)) - 2
-    if gaps:
-        longest = np.diff(trajectory.t).max()
-        message = f"{counted(gaps, 'gap')} in time, up to {longest:.3g} s long; no window crosses one"
-        notes.append(Diagnostic("info", "gap", where, None, message))
-    for repair in trajectory.repairs:
-        notes.append(Diagnostic("warning", "repaired", where, None, repair))
-    rate = trajectory.sample_rate
-    if trajectory.u is None and rate > 0 and not is_dense(rate):
-        use = f"too slow for fits to torques, which need {SLOWEST:g} Hz"
-        if shows_accelerations(rate):
-            use = "interpolated for fits to torques"
-        message = (
-            f"{rate:.3g} Hz: {use}; motion faster than {rate / 2:.3g} Hz, delays below "
-            f"{1e3 / rate:.0f} ms and friction where a joint reverses are not visible at this rate"
-        )
-        notes.append(Diagnostic("warning", "low-rate", where, None, message))
-    return notes
+    return summary.notes
 
 
 def _no_agreement(joints: int) -> VelocityAgreement:
@@ -368,14 +355,11 @@ def _no_agreement(joints: int) -> VelocityAgreement:
 
 def velocity_agreement(trajectory: Trajectory) -> VelocityAgreement:
     """Return how far qd is dq/dt, within gap-free pieces."""
-    n = trajectory.q.shape[1]
-    total = _no_agreement(n)
-    for piece in split_at_gaps(trajectory):
+    total = _no_agreement(trajectory.q.shape[1])
+    for piece in split_at_gaps(trajectory, shortest=2):
+        # over several steps: from one sample to the next quantisation of q is larger than its change
         span = min(TUNING.increments, len(piece) - 1)
-        if span:
-            steps = (piece.qd[1:] + piece.qd[:-1]) / 2 * np.diff(piece.t)[:, None]
-            # over several steps: from one sample to the next quantisation of q is larger than its change
-            integral = np.concatenate([np.zeros((1, n)), np.cumsum(steps, axis=0)])
-            x, y = integral[span:] - integral[:-span], piece.q[span:] - piece.q[:-span]
-            total += VelocityAgreement((x * x).sum(axis=0), (y * y).sum(axis=0), x.T @ y)
+        integral = cumulative_trapezoid(piece.qd, piece.t, axis=0, initial=0)
+        x, y = integral[span:] - integral[:-span], piece.q[span:] - piece.q[:-span]
+        total += VelocityAgreement((x * x).sum(axis=0), (y * y).sum(axis=0), x.T @ y)
     return total

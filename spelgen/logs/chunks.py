@@ -21,7 +21,7 @@ from spelgen.logs.read import read_logs
 from spelgen.logs.recording import make_trajectory, require_increasing_times
 from spelgen.logs.tables import Layout, reading, stored_columns, table_layout
 from spelgen.logs.trajectory import Trajectory
-from spelgen.logs.values import clock_start, row_error, values_in_si
+from spelgen.logs.values import clock_start, values_in_si
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.tuning.logs import LogTuning
 
@@ -29,30 +29,25 @@ TUNING = LogTuning()
 
 
 @dataclass(frozen=True)
-class ParquetLog:
-    """Say how a file is read. stored: columns that are needed. start: of its clock. stamp: of its last change."""
+class Chunk:
+    """Name a stretch of one recording, rows first..stop of a file; `load` reads it.
 
-    file: Path
+    stored: columns that are needed. start: of the file's clock. stamp: of its last change.
+    """
+
+    name: str
     layout: Layout
     stored: list[str]
     start: pa.Scalar | None
     stamp: tuple[int, int]
-
-
-@dataclass(frozen=True)
-class Chunk:
-    """Name a stretch of one recording, rows first..stop of a file; `load` reads it."""
-
-    name: str
-    log: ParquetLog
     first: int
     stop: int
 
     def load(self) -> Trajectory:
         """Return the chunk's samples. Raises LogError where the file has changed, or times do not increase."""
-        log, file = self.log, self.log.file
+        file = self.layout.file
         # rows of another file under the same name would be fitted without a word
-        if _stamp(file) != log.stamp:
+        if _stamp(file) != self.stamp:
             raise LogError("a file that has changed since it was first read", file=file, do="start a new run")
         source = _opened(file)
         starts = [0]
@@ -61,17 +56,17 @@ class Chunk:
         groups = range(bisect_right(starts, self.first) - 1, bisect_left(starts, self.stop))
         row = starts[groups[0]]
         stretches = []
-        for batch in source.iter_batches(TUNING.chunk_samples, row_groups=list(groups), columns=log.stored):
+        for batch in source.iter_batches(TUNING.chunk_samples, row_groups=list(groups), columns=self.stored):
             low, high = max(self.first - row, 0), min(self.stop - row, batch.num_rows)
             if low < high:
                 rows = batch.slice(low, high - low)
-                stretches.append(values_in_si(rows, log.layout, file, log.start, row + low))
+                stretches.append(values_in_si(rows, self.layout, self.start, row + low))
             row += batch.num_rows
             if row >= self.stop:
                 break
         data = np.concatenate(stretches)
-        require_increasing_times(data[:, 0], range(self.first, self.stop), file, log.layout.columns[0])
-        return make_trajectory(data, log.layout, self.name, file)
+        require_increasing_times(data[:, 0], range(self.first, self.stop), self.layout)
+        return make_trajectory(data, self.layout, self.name)
 
 
 def large_files(
@@ -130,20 +125,21 @@ def scan(
     # names as `read_logs` gives them, though not all files are known when the first is read
     stems = Counter(file.stem for file in files)
     for file in files:
-        log = _open_log(file, joints, mapping)
-        stem = file.stem if stems[file.stem] == 1 else str(file)
-        for recording in _recordings(log, stem, len(files) > 1):
+        whole = _whole_file(file, joints, mapping)
+        if stems[file.stem] > 1:
+            whole = replace(whole, name=str(file))
+        for recording in _recordings(whole, len(files) > 1):
             latest = -np.inf
             for chunk in _cut(recording):
                 trajectory = chunk.load()
                 # times must increase across the border between chunks, too
                 border, rows = np.array([latest, trajectory.t[0]]), (chunk.first - 1, chunk.first)
-                require_increasing_times(border, rows, file, log.layout.columns[0])
+                require_increasing_times(border, rows, chunk.layout)
                 latest = trajectory.t[-1]
                 yield chunk, trajectory
 
 
-def _open_log(file: Path, joints: Sequence[str], mapping: LogMapping) -> ParquetLog:
+def _whole_file(file: Path, joints: Sequence[str], mapping: LogMapping) -> Chunk:
     stamp = _stamp(file)
     with reading(file):
         source = _opened(file)
@@ -152,7 +148,8 @@ def _open_log(file: Path, joints: Sequence[str], mapping: LogMapping) -> Parquet
     head = next(source.iter_batches(1, columns=stored), None)
     if head is None:
         raise LogError("no rows", file=file, expected="at least one window of samples")
-    return ParquetLog(file, layout, stored, clock_start(head, layout, file), stamp)
+    rows = source.metadata.num_rows
+    return Chunk(file.stem, layout, stored, clock_start(head, layout), stamp, 0, rows)
 
 
 def _cut(recording: Chunk) -> Iterator[Chunk]:
@@ -166,14 +163,14 @@ def _cut(recording: Chunk) -> Iterator[Chunk]:
         yield replace(recording, name=f"{recording.name} [{number}]", first=first, stop=stop)
 
 
-def _recordings(log: ParquetLog, stem: str, several_files: bool) -> list[Chunk]:
+def _recordings(whole: Chunk, several_files: bool) -> list[Chunk]:
     """Return each recording of a file, uncut. Raises LogError where the rows of one do not lie together."""
-    source, column = _opened(log.file), log.layout.labels
+    column = whole.layout.labels
     if column is None:
-        return [Chunk(stem, log, 0, source.metadata.num_rows)]
+        return [whole]
     stops: dict[str, int] = {}
     latest, first_row, stop = None, 0, 0
-    for batch in source.iter_batches(TUNING.chunk_samples, columns=[column]):
+    for batch in _opened(whole.layout.file).iter_batches(TUNING.chunk_samples, columns=[column]):
         # runs, and not rows: a label repeats a million times
         runs = pa.compute.run_end_encode(batch.column(0).cast(pa.string()))
         for value, end in zip(runs.values.to_pylist(), runs.run_ends.to_pylist(), strict=True):
@@ -181,13 +178,14 @@ def _recordings(log: ParquetLog, stem: str, several_files: bool) -> list[Chunk]:
             if label != latest and label in stops:
                 got, do = f"trajectory {label} once more, after others", "sort the rows"
                 expected = "its rows together, in a log too large for memory"
-                raise row_error(got, log.file, stop, column, expected, do)
+                raise whole.layout.row_error(got, stop, column, expected, do)
             latest, stop = label, first_row + end
             stops[label] = stop
         first_row += batch.num_rows
     recordings = []
     for (label, stop), first in zip(stops.items(), [0, *stops.values()], strict=False):
-        recordings.append(Chunk(f"{stem}/{label}" if several_files else label, log, first, stop))
+        name = f"{whole.name}/{label}" if several_files else label
+        recordings.append(replace(whole, name=name, first=first, stop=stop))
     return recordings
 
 

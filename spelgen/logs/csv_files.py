@@ -24,7 +24,7 @@ TUNING = LogTuning()
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
     """Return the one table of a file."""
     table = csv_columns(file)
-    return [LogTable(None, table, table_layout(table.schema, joints, mapping, file))]
+    return [(table_layout(table.schema, joints, mapping, file), table)]
 
 
 def csv_columns(file: Path) -> pa.Table:

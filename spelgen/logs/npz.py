@@ -117,7 +117,7 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
     schema = pa.schema([(name, pa.null()) for name in arrays.names])
     layout = table_layout(schema, joints, mapping, arrays.file)
     if recording is not None:
-        layout = replace(layout, labels=None)
+        layout = replace(layout, labels=None, recording=recording)
     columns: dict[str, pa.Array] = {}
     samples = arrays[layout.columns[0]].shape
     for name in stored_columns(layout, arrays.names):
@@ -128,7 +128,7 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
                 expected=f"a value for each of the {samples[0] if samples else 0} times",
             )  # fmt: skip
         columns[name] = arrays.column(name)
-    return LogTable(recording, pa.table(columns), layout)
+    return layout, pa.table(columns)
 
 
 def _matrix_columns(arrays: NpzArrays, matrix: str, joints: Sequence[str]) -> list[int]:

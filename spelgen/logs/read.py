@@ -16,7 +16,7 @@ from spelgen.files import replacing
 from spelgen.logs.arm_mapping import GivenMapping, LoggedArm, log_source
 from spelgen.logs.formats import log_files, read_tables
 from spelgen.logs.recording import in_time_order, make_trajectory
-from spelgen.logs.tables import UNITS, UNITS_KEY, LogTable
+from spelgen.logs.tables import UNITS, UNITS_KEY, Layout
 from spelgen.logs.trajectory import Trajectory, require_joints
 from spelgen.logs.values import clock_start, values_in_si
 from spelgen.settings.tuning.logs import LogTuning
@@ -49,8 +49,8 @@ def read_logs(
     trajectories: list[Trajectory] = []
     for file in files:
         try:
-            for table in read_tables(file, source.joints, source.mapping):
-                trajectories += _trajectories(table, file)
+            for layout, table in read_tables(file, source.joints, source.mapping):
+                trajectories += _trajectories(layout, table)
         except LogError as error:  # all files are told of at once
             errors.append(error)
     collect(errors)
@@ -91,25 +91,24 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
     return path
 
 
-def _trajectories(log: LogTable, file: Path) -> list[Trajectory]:
+def _trajectories(layout: Layout, table: pa.Table) -> list[Trajectory]:
     """Return the trajectories of one table."""
-    if not log.table.num_rows:
-        raise LogError("no rows", file=file, expected="at least one window of samples")
-    start = clock_start(log.table, log.layout, file)
-    data = values_in_si(log.table, log.layout, file, start)
+    if not table.num_rows:
+        raise LogError("no rows", file=layout.file, expected="at least one window of samples")
+    data = values_in_si(table, layout, clock_start(table, layout))
     trajectories = []
-    for name, rows in _recordings(log, file.stem):
-        values, repairs = in_time_order(data[rows], rows, log.layout, file)
-        trajectories.append(make_trajectory(values, log.layout, name, file, repairs))
+    for name, rows in _recordings(layout, table):
+        values, repairs = in_time_order(data[rows], rows, layout)
+        trajectories.append(make_trajectory(values, layout, name, repairs))
     return trajectories
 
 
-def _recordings(log: LogTable, stem: str) -> list[tuple[str, np.ndarray]]:
+def _recordings(layout: Layout, table: pa.Table) -> list[tuple[str, np.ndarray]]:
     """Return name and rows of each recording of a table, in order of their first rows."""
-    if log.layout.labels is None:
-        return [(log.recording or stem, np.arange(log.table.num_rows))]
+    if layout.labels is None:
+        return [(layout.recording or layout.file.stem, np.arange(table.num_rows))]
     # each label once: a name of a megabyte on a million rows is a small file
-    labels = log.table[log.layout.labels].dictionary_encode("encode").combine_chunks()
+    labels = table[layout.labels].dictionary_encode("encode").combine_chunks()
     codes: dict[str, int] = {}
     code_of_label = []
     for label in labels.dictionary.to_pylist():

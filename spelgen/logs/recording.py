@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 
 from spelgen.errors import LogError
 from spelgen.logs.tables import Layout
 from spelgen.logs.trajectory import Trajectory, gap_ends
-from spelgen.logs.values import row_error
 from spelgen.settings.tuning.logs import LogTuning
 
 TUNING = LogTuning()
 
 
-def make_trajectory(
-    data: np.ndarray, layout: Layout, name: str, file: Path, repairs: tuple[str, ...] = ()
-) -> Trajectory:
+def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[str, ...] = ()) -> Trajectory:
     """Return a trajectory of these rows (T, C) in SI units, velocities differentiated where there are none."""
     mapping = layout.mapping
     if mapping.dropouts == "dropped":
@@ -32,18 +28,16 @@ def make_trajectory(
     q, tau = signals["q"], signals.get("tau", np.zeros((len(t), 0)))
     qd = signals["qd"] if "qd" in signals else _differentiated(t, q)
     tau = earlier(t, tau, mapping.torque_delay)
-    return Trajectory(t, q, qd, tau, name, file, layout.accepted, signals.get("u"), repairs)
+    return Trajectory(t, q, qd, tau, name, layout.file, layout.accepted, signals.get("u"), repairs)
 
 
-def in_time_order(
-    data: np.ndarray, rows: np.ndarray, layout: Layout, file: Path
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return values (T, C) of these rows of a file with increasing times, and what was mended for that.
 
     Rows are sorted where positions become smoother by it, and of rows of one time the first is taken. Raises LogError
     for a clock that begins anew, or that is too coarse.
     """
-    t, column = data[:, 0], layout.columns[0]
+    t = data[:, 0]
     repairs: tuple[str, ...] = ()
     late = np.count_nonzero(np.diff(t) < 0)
     if late:
@@ -51,14 +45,15 @@ def in_time_order(
         positions = slice(1, 1 + len(layout.joints))
         # two recordings in one file would be interleaved by sorting
         if _roughness(ordered[:, positions]) > _roughness(data[:, positions]):
-            require_increasing_times(t, rows, file, column)
+            require_increasing_times(t, rows, layout)
         data = ordered
         repairs += (f"{late} times before that of the row above: the rows were sorted",)
     is_repeat = np.diff(data[:, 0], prepend=-np.inf) == 0
     repeats = np.count_nonzero(is_repeat)
     if 2 * repeats > len(data):
         raise LogError(
-            f"{repeats} of {len(data)} rows with the time of another row", file=file, element=f"column {column}",
+            f"{repeats} of {len(data)} rows with the time of another row", file=layout.file,
+            element=f"column {layout.columns[0]}",
             expected="a time for each row",
             do="log times with more digits, or split recordings by a column 'trajectory'",
         )  # fmt: skip
@@ -75,16 +70,14 @@ def _roughness(positions: np.ndarray) -> float:
     return float((way / np.where(ranges > 0, ranges, 1.0)).sum())
 
 
-def require_increasing_times(
-    t: np.ndarray, rows: Sequence[int] | np.ndarray, file: Path, column: str
-) -> None:
+def require_increasing_times(t: np.ndarray, rows: Sequence[int] | np.ndarray, layout: Layout) -> None:
     """Raise LogError unless times (T,), of these rows of the file, increase."""
     backward = np.flatnonzero(np.diff(t) < TUNING.shortest_step)
     if backward.size:
         k = backward[0]
         got = f"t = {t[k + 1]:g} s after {t[k]:g} s ({backward.size} such steps, this is the first)"
         do = "sort the rows, drop repeats, or split recordings by a column 'trajectory'"
-        raise row_error(got, file, rows[k + 1], column, "increasing times", do)
+        raise layout.row_error(got, rows[k + 1], layout.columns[0], "increasing times", do)
 
 
 def is_dropout(values: np.ndarray) -> np.ndarray:

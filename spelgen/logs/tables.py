@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, starmap
 from pathlib import Path
 
 import pyarrow as pa
@@ -32,24 +32,27 @@ UNREADABLE = (
 class Layout:
     """Say where the quantities of an arm stand in a log, and how they are measured.
 
-    columns: of t, then of q, qd and tau by joint; without qd where velocities are to be differentiated. labels: the
-    column that splits the log into recordings, None without. accepted: see `Trajectory`.
+    file: what errors and trajectories name. columns: of t, then of q, qd and tau by joint; without qd where velocities
+    are to be differentiated. labels: the column that splits the log into recordings, None without. accepted: see
+    `Trajectory`. recording: its name, where the format keeps recordings apart.
     """
 
+    file: Path
     columns: tuple[str, ...]
     labels: str | None
     joints: tuple[str, ...]
     mapping: LogMapping
     accepted: tuple[str, ...]
+    recording: str | None = None
+
+    def row_error(self, got: str, row: int, column: str, expected: str, do: str | None = None) -> LogError:
+        """Return an error about a column in a 0-based data row, with the line of a CSV, whose first is its header."""
+        line = int(row) + 2 if self.file.suffix == ".csv" else None
+        element = f"row {row + 1}, column {column}"
+        return LogError(got, file=self.file, line=line, element=element, expected=expected, do=do)
 
 
-@dataclass(frozen=True, eq=False)
-class LogTable:
-    """Hold one table of a log file. recording: its name, where the format keeps recordings apart."""
-
-    recording: str | None
-    table: pa.Table
-    layout: Layout
+LogTable = tuple[Layout, pa.Table]
 
 
 @dataclass(frozen=True)
@@ -77,10 +80,18 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     # simulated logs of an arm whose settings describe its real logger
     if metadata.get(UNITS_KEY) == UNITS:
         mapping = LogMapping(input=mapping.input)
-    columns = [mapping.columns.t]
-    for quantity, joint in mapping.signals(joints):
-        columns.append(mapping.column(quantity, joint))
-    _require_columns(schema.names, columns, file, mapping, joints)
+    columns = [mapping.columns.t, *starmap(mapping.column, mapping.signals(joints))]
+    missing = []
+    for name in columns:
+        if columns.count(name) > 1:
+            got, expected = "one column for several joints", "'{joint}' in its name under 'logs'"
+            raise LogError(got, file=file, element=f"column {name}", expected=expected)
+        if schema.names.count(name) > 1:
+            raise LogError("the same column twice", file=file, element=f"column {name}", expected="it once")
+        if name not in schema.names and not list_element(name, schema.names):
+            missing.append(name)
+    if missing:
+        raise missing_columns(missing, schema.names, file, mapping, joints)
     labels = mapping.columns.trajectory if mapping.columns.trajectory in schema.names else None
     # a list has no text that names a recording
     if labels and pa.types.is_nested(schema.field(labels).type):
@@ -91,7 +102,7 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
         accepted += UNIT_CODES
     elif all(mapping.unit("q", joint) for joint in joints):
         accepted += ("degrees",)
-    return Layout(tuple(columns), labels, tuple(joints), mapping, accepted)
+    return Layout(file, tuple(columns), labels, tuple(joints), mapping, accepted)
 
 
 def list_element(name: str, columns: Collection[str]) -> tuple[str, int] | None:
@@ -111,22 +122,6 @@ def stored_columns(layout: Layout, columns: Collection[str]) -> list[str]:
     if layout.labels:
         stored[layout.labels] = None
     return list(stored)
-
-
-def _require_columns(
-    columns: Sequence[str], required: Sequence[str], file: Path, mapping: LogMapping, joints: Sequence[str]
-) -> None:
-    for name in required:
-        if required.count(name) > 1:
-            got, expected = "one column for several joints", "'{joint}' in its name under 'logs'"
-        elif columns.count(name) > 1:
-            got, expected = "the same column twice", "it once"
-        else:
-            continue
-        raise LogError(got, file=file, element=f"column {name}", expected=expected)
-    missing = [name for name in required if name not in columns and not list_element(name, columns)]
-    if missing:
-        raise missing_columns(missing, columns, file, mapping, joints)
 
 
 def missing_columns(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import starmap
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -20,20 +19,18 @@ Table = pa.Table | pa.RecordBatch
 Column = pa.ChunkedArray | pa.Array
 
 
-def values_in_si(
-    table: Table, layout: Layout, file: Path, start: pa.Scalar | None, row: int = 0
-) -> np.ndarray:
+def values_in_si(table: Table, layout: Layout, start: pa.Scalar | None, row: int = 0) -> np.ndarray:
     """Return the columns of a layout (T, C) in SI units, times from `start` on. row: of the table in its file.
 
     Raises LogError naming row and column where a value is no number, or none that an arm can have.
     """
-    times, unit = _clock(table, layout, file)
+    times, unit = _clock(table, layout)
     if start is not None:
         # before they become floats: 1.7e18 ns keeps no microseconds as a double
         times = pa.compute.subtract(times, start)
-    logged = [_floats(times, layout.columns[0], file, row)]
+    logged = [_floats(times, layout.columns[0], layout, row)]
     for name in layout.columns[1:]:
-        logged.append(_floats(_column(table, name), name, file, row))
+        logged.append(_floats(_column(table, name), name, layout, row))
     mapping, signals = layout.mapping, layout.mapping.signals(layout.joints)
     factors = np.array([unit, *starmap(mapping.scale, signals)])
     offsets = np.array([0.0, *starmap(mapping.offset, signals)])
@@ -52,13 +49,13 @@ def values_in_si(
             got, expected = f"no finite number ({rows} gap", "a number"
             do = "remove those rows; a gap in t is understood"
         got += ", this is the first)"
-        raise row_error(got, file, row + first, layout.columns[k], expected, do)
+        raise layout.row_error(got, row + first, layout.columns[k], expected, do)
     return data
 
 
-def clock_start(table: Table, layout: Layout, file: Path) -> pa.Scalar | None:
+def clock_start(table: Table, layout: Layout) -> pa.Scalar | None:
     """Return from where times count: the first one of a clock that shows the date, else None."""
-    times, _ = _clock(table.slice(0, 1), layout, file)
+    times, _ = _clock(table.slice(0, 1), layout)
     if pa.types.is_integer(times.type) or pa.types.is_floating(times.type):
         first = times[0].as_py()
         # seconds since 1970 leave floating-point numbers no digits for what follows
@@ -67,7 +64,7 @@ def clock_start(table: Table, layout: Layout, file: Path) -> pa.Scalar | None:
     return None
 
 
-def _clock(table: Table, layout: Layout, file: Path) -> tuple[Column, float]:
+def _clock(table: Table, layout: Layout) -> tuple[Column, float]:
     """Return the times as plain numbers, and their unit [s]. Raises LogError for dates beyond what Arrow counts."""
     name = layout.columns[0]
     times = _column(table, name)
@@ -83,7 +80,7 @@ def _clock(table: Table, layout: Layout, file: Path) -> tuple[Column, float]:
         return times.cast(counted).cast(pa.int64()), TIMES["ns"]
     except pa.ArrowInvalid as error:
         raise LogError(
-            f"dates beyond what nanoseconds count ({times.type})", file=file, element=f"column {name}",
+            f"dates beyond what nanoseconds count ({times.type})", file=layout.file, element=f"column {name}",
             expected="years from 1678 to 2262", do="check the unit of the stamps",
         ) from error  # fmt: skip
 
@@ -105,7 +102,7 @@ def _column(table: Table, name: str) -> Column:
     return pa.compute.replace_substring_regex(elements, "^$", "nan") if is_text else elements
 
 
-def _floats(values: Column, name: str, file: Path, row: int) -> np.ndarray:
+def _floats(values: Column, name: str, layout: Layout, row: int) -> np.ndarray:
     """Return a column as float64 (T,)."""
     try:
         return np.asarray(values.cast(pa.float64()).to_numpy(zero_copy_only=False))
@@ -114,9 +111,9 @@ def _floats(values: Column, name: str, file: Path, row: int) -> np.ndarray:
         texts = values.to_pylist() if pa.types.is_string(values.type) else []
         for index, text in enumerate(texts):
             if text and not is_number(text):
-                raise row_error(repr(text[:60]), file, row + index, name, "a number") from error
+                raise layout.row_error(repr(text[:60]), row + index, name, "a number") from error
         got = f"values of type {values.type}"
-        raise LogError(got, file=file, element=f"column {name}", expected="numbers") from error
+        raise LogError(got, file=layout.file, element=f"column {name}", expected="numbers") from error
 
 
 def is_number(text: str) -> bool:
@@ -126,10 +123,3 @@ def is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def row_error(got: str, file: Path, row: int, column: str, expected: str, do: str | None = None) -> LogError:
-    """Return an error about a column in a 0-based data row, with the line of a CSV, whose first is its header."""
-    line = int(row) + 2 if file.suffix == ".csv" else None
-    element = f"row {row + 1}, column {column}"
-    return LogError(got, file=file, line=line, element=element, expected=expected, do=do)
