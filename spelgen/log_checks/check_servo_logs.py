@@ -35,21 +35,18 @@ FOLLOWS = LogCheckTuning().agreement
 
 @dataclass(frozen=True, eq=False)
 class Following:
-    """Hold how n joints follow their commands at each of the D `DELAYS`.
+    """Hold how n joints follow their commands.
 
-    moves: (n,) whether the command moves. correlation, gain: (D, n, n) of the command of one joint with the position of
-    another, and how far that moves by the command. joints: by joint.
+    moves: (n,) whether the command moves. delay, correlation: (n, n) of the command of the row's joint with the
+    position of the column's, at the delay [s] at which the two are most alike. gain: (n,) how far a joint moves by its
+    own command. joints: by joint.
     """
 
     moves: np.ndarray
+    delay: np.ndarray
     correlation: np.ndarray
     gain: np.ndarray
     joints: list[JointFollowing]
-
-
-def best_delay(correlation: np.ndarray, command: int, position: int) -> int:
-    """Return the index among `DELAYS` at which the command of one joint is most like the position of another."""
-    return int(np.argmax(np.abs(correlation[:, command, position])))
 
 
 def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Following | None:
@@ -64,32 +61,26 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
         return None
     q = np.concatenate([_midpoints(piece.q) for piece in pieces])
     commands = np.concatenate([require_commands(piece)[:-1] for piece in pieces])
-    correlation, gain = np.zeros((2, len(DELAYS), len(saturation), len(saturation)))
-    tracking_rms = np.zeros((len(DELAYS), len(saturation)))
-    # means differ by the static error, which is no matter of delay
-    q_centred = q - q.mean(axis=0)
-    for k, delay in enumerate(DELAYS.tolist()):
-        delayed = [delayed_commands(piece, slice(0, len(piece)), delay, 1)[:, 0] for piece in pieces]
-        u = np.concatenate(delayed)
-        u_centred, u_std = u - u.mean(axis=0), u.std(axis=0)
-        covariance = u_centred.T @ q_centred / len(u)
-        correlation[k] = covariance / np.maximum(np.outer(u_std, q.std(axis=0)), 1e-6)
-        gain[k] = covariance / np.maximum(u_std**2, 1e-12)[:, None]
-        tracking_rms[k] = np.sqrt(np.mean((u - q) ** 2, axis=0))
-    moves = commands.std(axis=0) > TUNING.idle_command
+    q_std, u_std = q.std(axis=0), commands.std(axis=0)
+    correlations, tracking_rms = [], []
+    for delay in DELAYS.tolist():
+        u = np.concatenate([delayed_commands(x, slice(0, len(x)), delay, 1)[:, 0] for x in pieces])
+        # means differ by the static error, which is no matter of delay
+        covariance = (u - u.mean(axis=0)).T @ (q - q.mean(axis=0)) / len(u)
+        correlations.append(covariance / np.maximum(np.outer(u.std(axis=0), q_std), 1e-6))
+        tracking_rms.append(np.sqrt(np.mean((u - q) ** 2, axis=0)))
+    best = np.abs(correlations).argmax(axis=0)
+    correlation = np.take_along_axis(np.array(correlations), best[None], axis=0)[0]
+    moves = u_std > TUNING.idle_command
     saturated = np.mean(np.abs(commands - q) > saturation, axis=0)
     joints = []
-    for joint, error in enumerate(_steady_state_errors(pieces)):
-        delay_index = best_delay(correlation, joint, joint) if moves[joint] else NO_DELAY
-        joints.append(
-            JointFollowing(
-                lag=float(DELAYS[delay_index]) if moves[joint] else None,
-                tracking_rms=float(tracking_rms[delay_index, joint]),
-                steady_state_error=error,
-                saturated=float(saturated[joint]) if np.isfinite(saturation[joint]) else None,
-            )
-        )
-    return Following(moves, correlation, gain, joints)
+    for k, error in enumerate(_steady_state_errors(pieces)):
+        delay_index = best[k, k] if moves[k] else NO_DELAY
+        lag = float(DELAYS[delay_index]) if moves[k] else None
+        fraction = float(saturated[k]) if np.isfinite(saturation[k]) else None
+        joints.append(JointFollowing(lag, float(tracking_rms[delay_index][k]), error, fraction))
+    gain = correlation.diagonal() * q_std / np.maximum(u_std, 1e-6)
+    return Following(moves, DELAYS[best], correlation, gain, joints)
 
 
 def _steady_state_errors(pieces: Sequence[Trajectory]) -> list[float | None]:
@@ -176,8 +167,7 @@ def _odd_command(
     """
     where = f"joint {joints[k]!r}"
     # judged at the delay at which the two are most alike: a slow servo is no wrong one
-    delay = best_delay(following.correlation, k, k)
-    correlation, gain = float(following.correlation[delay, k, k]), float(following.gain[delay, k, k])
+    correlation, gain = following.correlation[k, k], following.gain[k]
     if is_copy:
         code, message = (
             "commands-are-positions",
@@ -198,14 +188,13 @@ def _odd_command(
     elif correlation < TUNING.ignores:
         # swapped columns: another joint follows this command
         for other, name in enumerate(joints):
-            delay = best_delay(following.correlation, k, other)
-            if other != k and following.correlation[delay, k, other] > FOLLOWS:
+            if following.correlation[k, other] > FOLLOWS:
                 got = f"a command that joint {name!r} follows, and this one does not"
                 do = "check the names of the columns"
                 return LogError(got, element=where, expected="its own command", do=do)
         code, message = "not-following", f"it does not follow its command (correlation {correlation:.2g})"
-    elif DELAYS[delay] < 0:
-        early = -1000 * DELAYS[delay]
+    elif following.delay[k, k] < 0:
+        early = -1000 * following.delay[k, k]
         code, message = (
             "ahead-of-command",
             f"positions come {early:.0f} ms before commands: are rows shifted?",

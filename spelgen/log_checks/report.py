@@ -207,19 +207,18 @@ def signal_tables(joints: Sequence[JointReport], quantities: Sequence[str]) -> t
         numbers = [*map((joint.noise or {}).get, quantities), *map(joint.steps.get, quantities)]
         signals.append((joint.name, *map(number, numbers)))
     units = []
-    for kind in UNITS:
+    for kind, unit in UNITS.items():
         if any(joint.kind == kind for joint in joints):
-            names = dict.fromkeys(getattr(UNITS[kind], MEASURES[name]) for name in quantities)
-            units.append(", ".join(names))
+            units.append(", ".join(dict.fromkeys(getattr(unit, MEASURES[name]) for name in quantities)))
     head = ("joint", quantities[0], "of its range", *quantities[1:])
+    columns = [f"{name} {what}" for what in ("noise", "step") for name in quantities]
     note = (
         "noise: standard deviation between samples, for sample rates from 50 Hz; step: quantisation step; in the "
         "units above."
     )
-    names = [f"{name} {what}" for what in ("noise", "step") for name in quantities]
     return (
         Listing(f"Ranges [{'; '.join(units)}]", head, tuple(ranges)),
-        Listing("Signals", ("joint", *names), tuple(signals), note),
+        Listing("Signals", ("joint", *columns), tuple(signals), note),
     )
 
 

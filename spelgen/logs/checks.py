@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Generic, Literal, NamedTuple, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -55,7 +55,7 @@ class Findings:
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
 
-    def add(self, check: Check[Subject], message: str, where: str, file: Path | None = None) -> None:
+    def add(self, check: Check[Any], message: str, where: str, file: Path | None = None) -> None:
         """Add what a check says; of an error, how to have it accepted."""
         if check.severity == "error":
             do = f"{check.do}; --accept {check.code} if it is right"
@@ -116,7 +116,7 @@ class JointSignals(NamedTuple):
     """
 
     trajectory: Trajectory
-    index: int
+    number: int
     kind: str
     joints: Sequence[str]
     q: np.ndarray
@@ -127,7 +127,7 @@ class JointSignals(NamedTuple):
     @property
     def correlation(self) -> float:
         """Of qd and dq/dt."""
-        return self.correlations[self.index]
+        return self.correlations[self.number]
 
     def changes_by(self, unit: float) -> bool:
         """Whether q changes that many times as fast as qd says, as beside a wrong unit."""
@@ -169,7 +169,7 @@ def find_time_unit(signals: JointSignals) -> str | None:
     steps = np.diff(signals.trajectory.t)
     if steps.size and np.median(steps) > TUNING.slowest_step:
         # told once, and not of each joint
-        return None if signals.index else f"a sample every {np.median(steps):.3g} s"
+        return None if signals.number else f"a sample every {np.median(steps):.3g} s"
     for unit in ("ms", "us", "ns"):
         if signals.changes_by(TIMES[unit]):
             return f"q that changes {signals.factor:.3g} times as fast as qd says: times in {unit}"
@@ -181,7 +181,7 @@ def find_dropouts(signals: JointSignals) -> str | None:
     trajectory = signals.trajectory
     for name, values in (("q", trajectory.q), ("tau", trajectory.tau)):
         if values.size:
-            rows = np.flatnonzero(is_dropout(values[:, signals.index]))
+            rows = np.flatnonzero(is_dropout(values[:, signals.number]))
             if rows.size:
                 t = trajectory.t[rows[0]]
                 return f"{name} that falls to 0 for a moment at t = {t:.4g} s ({rows.size} such samples)"
@@ -192,7 +192,7 @@ def find_no_torques(signals: JointSignals) -> str | None:
     """Find recordings in which every joint's torque is 0 all the time."""
     trajectory = signals.trajectory
     # told once, and not of each joint
-    if signals.index or not trajectory.tau.size or trajectory.tau.any() or not np.ptp(trajectory.q):
+    if signals.number or not trajectory.tau.size or trajectory.tau.any() or not np.ptp(trajectory.q):
         return None
     return "torques that are all 0 while the arm moves"
 
@@ -215,9 +215,9 @@ def find_wrong_velocity(signals: JointSignals) -> str | None:
 def find_constant_torque(signals: JointSignals) -> str | None:
     """Find torques that never change; logs of commands have none."""
     tau = signals.trajectory.tau
-    if not tau.size or np.ptp(tau[:, signals.index]) > 0:
+    if not tau.size or np.ptp(tau[:, signals.number]) > 0:
         return None
-    return f"tau is always {tau[0, signals.index]:g}: right for a joint without a motor only"
+    return f"tau is always {tau[0, signals.number]:g}: right for a joint without a motor only"
 
 
 def find_rest(signals: JointSignals) -> str | None:
@@ -282,9 +282,6 @@ CHECKS: list[Check[JointSignals]] = [
 ]  # fmt: skip
 
 
-AnyCheck = Check[JointSignals] | Check[Trajectory]
-
-
 class LogChecks:
     """Check logs by themselves, one trajectory after another: they need not lie in memory together.
 
@@ -294,7 +291,7 @@ class LogChecks:
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
         self.agreement = _no_agreement(len(joints))
         self._joints, self._kinds = joints, joint_types
-        self._results: dict[tuple[str, AnyCheck], list[tuple[str, str, Path | None]]] = {}
+        self._results: dict[tuple[str, Check[Any]], list[tuple[str, str, Path | None]]] = {}
         self._count = 0
 
     def add(self, trajectory: Trajectory) -> None:
@@ -316,7 +313,7 @@ class LogChecks:
             for joint_check, message in run_checks(CHECKS, signals, trajectory.accepted):
                 self._add(joint, joint_check, message, f"{where}, joint {joint!r}", trajectory)
 
-    def _add(self, group: str, result: AnyCheck, message: str, where: str, trajectory: Trajectory) -> None:
+    def _add(self, group: str, result: Check[Any], message: str, where: str, trajectory: Trajectory) -> None:
         self._results.setdefault((group, result), []).append((message, where, trajectory.file))
 
     def findings(self) -> Findings:

@@ -72,14 +72,10 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
     for trajectory in trajectories:
         require_joints(trajectory, joints)
         names += [trajectory.name] * len(trajectory)
-    columns: dict[str, np.ndarray | list[str]] = {
-        "trajectory": names,
-        "t": np.concatenate([x.t for x in trajectories]),
-    }
+    columns = {"trajectory": pa.array(names), "t": np.concatenate([x.t for x in trajectories])}
     for quantity in trajectories[0].quantities:
         values = np.concatenate([getattr(x, quantity) for x in trajectories])
-        for index, joint in enumerate(joints):
-            columns[f"{quantity}_{joint}"] = values[:, index]
+        columns |= {f"{quantity}_{joint}": column for joint, column in zip(joints, values.T, strict=True)}
     # the file says that it is in SI units, so that no mapping is applied when it is read back
     table = pa.table(columns).replace_schema_metadata({UNITS_KEY: UNITS})
     with replacing(path) as unfinished:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -26,7 +26,10 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
     t, columns = data[:, 0], np.split(data[:, 1:], len(mapping.quantities), axis=1)
     signals = dict(zip(mapping.quantities, columns, strict=True))
     q, tau = signals["q"], signals.get("tau", np.zeros((len(t), 0)))
-    qd = signals["qd"] if "qd" in signals else _differentiated(t, q)
+    qd = signals.get("qd", np.zeros_like(q))
+    if "qd" not in signals:
+        for rows in _pieces(t):
+            qd[rows] = np.gradient(q[rows], t[rows], axis=0)  # central differences
     tau = earlier(t, tau, mapping.torque_delay)
     return Trajectory(t, q, qd, tau, name, layout.file, layout.accepted, signals.get("u"), repairs)
 
@@ -91,16 +94,14 @@ def is_dropout(values: np.ndarray) -> np.ndarray:
     # a signal that passes through 0 comes near it first
     nearest = np.minimum(np.abs(values[logged[:-1]]), np.abs(values[logged[1:]]))
     is_lost[logged[0] : logged[-1]] = np.repeat(nearest > TUNING.dropout * usual, np.diff(logged))
-    return is_lost & (values == 0)
+    return np.asarray(is_lost & (values == 0))
 
 
-def _differentiated(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return central differences (T, n) within each gap-free piece; 0 for a lone sample, of which no window is cut."""
-    qd = np.zeros_like(q)
+def _pieces(t: np.ndarray) -> Iterator[slice]:
+    """Yield the gap-free pieces of two samples or more; of a lone sample no window is cut."""
     for start, stop in pairwise(gap_ends(t)):
         if stop - start > 1:
-            qd[start:stop] = np.gradient(q[start:stop], t[start:stop], axis=0)
-    return qd
+            yield slice(start, stop)
 
 
 def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
@@ -110,10 +111,8 @@ def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
     from scipy.interpolate import CubicSpline  # takes long to import, as in `low_pass`
 
     moved = values.copy()
-    for start, stop in pairwise(gap_ends(t)):
-        if stop - start > 1:
-            times = t[start:stop]
-            # a line from sample to sample would damp torques at times between samples, and noise with them
-            spline = CubicSpline(times, values[start:stop])
-            moved[start:stop] = spline(np.clip(times + delay, times[0], times[-1]))
+    for rows in _pieces(t):
+        # a line from sample to sample would damp torques at times between samples, and noise with them
+        spline = CubicSpline(t[rows], values[rows])
+        moved[rows] = spline(np.clip(t[rows] + delay, t[rows][0], t[rows][-1]))
     return moved

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import starmap
+from typing import TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -15,8 +16,8 @@ from spelgen.settings.tuning.logs import LogTuning
 
 TUNING = LogTuning()
 
-Table = pa.Table | pa.RecordBatch
-Column = pa.ChunkedArray | pa.Array
+Table: TypeAlias = "pa.Table | pa.RecordBatch"
+Column: TypeAlias = "pa.ChunkedArray | pa.Array"
 
 
 def values_in_si(table: Table, layout: Layout, start: pa.Scalar | None, row: int = 0) -> np.ndarray:

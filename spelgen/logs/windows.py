@@ -127,26 +127,21 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
     """
     total = len(trajectories)
     if total == 1:
-        return _split_in_time(trajectories[0], fraction)
+        (trajectory,) = trajectories
+        t = trajectory.t
+        cut = int(np.searchsorted(t, t[-1] - fraction * trajectory.duration))
+        message = (
+            f"only one trajectory: training on its first {t[cut - 1] - t[0]:.3g} s, "
+            f"validation on the last {t[-1] - t[cut]:.3g} s"
+        )
+        note = Diagnostic("warning", "validation-split", "logs", None, message)
+        last = replace(trajectory[cut:], name=f"{trajectory.name} (last part)")
+        return Split((trajectory[:cut],), (last,), note)
     # whole trajectories: neighbouring windows share samples, and would tell the answer
     count = min(max(1, round(fraction * total)), total - 1)
     chosen = set(np.random.default_rng(seed).permutation(total)[:count].tolist())
     validation = tuple(trajectories[k] for k in sorted(chosen))
     training = tuple(x for k, x in enumerate(trajectories) if k not in chosen)
-    names = f"{count} of {total} trajectories"
-    if count <= 3:
-        names = ", ".join(x.name for x in validation)
+    names = ", ".join(x.name for x in validation) if count <= 3 else f"{count} of {total} trajectories"
     note = Diagnostic("info", "validation-split", "logs", None, f"validation on whole trajectories: {names}")
     return Split(training, validation, note)
-
-
-def _split_in_time(trajectory: Trajectory, fraction: float) -> Split:
-    t = trajectory.t
-    cut = int(np.searchsorted(t, t[-1] - fraction * (t[-1] - t[0])))
-    first, last = trajectory[:cut], replace(trajectory[cut:], name=f"{trajectory.name} (last part)")
-    message = (
-        f"only one trajectory: training on its first {t[cut - 1] - t[0]:.3g} s, "
-        f"validation on the last {t[-1] - t[cut]:.3g} s"
-    )
-    note = Diagnostic("warning", "validation-split", "logs", None, message)
-    return Split((first,), (last,), note)
