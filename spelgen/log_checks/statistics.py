@@ -95,8 +95,6 @@ def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def quantisation_step(values: np.ndarray) -> float:
     """Return the step of a quantised signal (T,); NaN where it is not quantised, or never changes."""
-    if len(values) < 4:
-        return float("nan")
     differences = np.diff(np.unique(values))
     # two levels more or less say nothing of a grid
     if len(differences) < 3:
@@ -106,9 +104,8 @@ def quantisation_step(values: np.ndarray) -> float:
     # over a hundred steps rounding adds up to what whole steps are told by
     near = differences[differences < 100 * step] / step
     is_whole = np.abs(near - np.round(near)) < TUNING.step_tolerance
-    if len(near) < 3 or is_whole.mean() <= 1 - TUNING.step_tolerance or _is_commanded(values, step):
-        return float("nan")
-    return step
+    is_grid = len(near) > 2 and is_whole.mean() > 1 - TUNING.step_tolerance
+    return step if is_grid and not _is_commanded(values, step) else float("nan")
 
 
 def _is_commanded(values: np.ndarray, step: float) -> bool:

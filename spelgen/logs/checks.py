@@ -69,17 +69,15 @@ def run_checks(
     checks: Iterable[Check[Subject]], subject: Subject, accepted: Collection[str] = ()
 ) -> list[tuple[Check[Subject], str]]:
     """Return the checks that find something odd, with their messages; accepted: codes that are passed over."""
-    results: list[tuple[Check[Subject], str]] = []
-    codes: set[str] = set()
+    results: dict[str, tuple[Check[Subject], str]] = {}
     for check in checks:
         # one cause, one message: degrees are no derivatives either
-        if check.code in accepted or not codes.isdisjoint(check.unless):
+        if check.code in accepted or not results.keys().isdisjoint(check.unless):
             continue
         message = check.find(subject)
         if message is not None:
-            results.append((check, message))
-            codes.add(check.code)
-    return results
+            results[check.code] = check, message
+    return list(results.values())
 
 
 @dataclass(frozen=True, eq=False)
