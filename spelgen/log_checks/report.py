@@ -43,7 +43,7 @@ class JointReport:
     """One joint over all trajectories; [rad, m], [rad/s, m/s], [Nm, N]; None where it cannot be told.
 
     low, high, noise, steps: of q, qd and tau, or of q, qd and commands u. range_fraction: of the joint's range that was
-    visited. noise: standard deviation of what changes from sample to sample. steps: of signals that are quantised in
+    visited. noise: standard deviation of what changes from sample to sample; empty of sparse logs. steps: of signals that are quantised in
     most trajectories. velocity_factor, velocity_correlation: both 1 where qd is dq/dt. following: of a joint under a
     position servo.
     """
@@ -53,7 +53,7 @@ class JointReport:
     low: dict[str, float]
     high: dict[str, float]
     range_fraction: float | None
-    noise: dict[str, float] | None
+    noise: dict[str, float]
     steps: dict[str, float | None]
     velocity_factor: float | None
     velocity_correlation: float | None
@@ -176,7 +176,7 @@ def joint_report(
         low=low,
         high=high,
         range_fraction=visited,
-        noise=noise or None,
+        noise=noise,
         steps=steps,
         velocity_factor=float(factor) if np.isfinite(factor) else None,
         velocity_correlation=float(correlation) if np.isfinite(correlation) else None,
@@ -204,7 +204,7 @@ def signal_tables(joints: Sequence[JointReport], quantities: Sequence[str]) -> t
     for joint in joints:
         spans = [f"{number(joint.low[name])} .. {number(joint.high[name])}" for name in quantities]
         ranges.append((joint.name, spans[0], percent(joint.range_fraction), *spans[1:]))
-        numbers = [*map((joint.noise or {}).get, quantities), *map(joint.steps.get, quantities)]
+        numbers = [*map(joint.noise.get, quantities), *map(joint.steps.get, quantities)]
         signals.append((joint.name, *map(number, numbers)))
     units = []
     for kind, unit in UNITS.items():
