@@ -43,9 +43,9 @@ class JointReport:
     """One joint over all trajectories; [rad, m], [rad/s, m/s], [Nm, N]; None where it cannot be told.
 
     low, high, noise, steps: of q, qd and tau, or of q, qd and commands u. range_fraction: of the joint's range that was
-    visited. noise: standard deviation of what changes from sample to sample; empty of sparse logs. steps: of signals that are quantised in
-    most trajectories. velocity_factor, velocity_correlation: both 1 where qd is dq/dt. following: of a joint under a
-    position servo.
+    visited. noise: standard deviation of what changes from sample to sample; empty of sparse logs. steps: of signals
+    that are quantised in most trajectories. velocity_factor, velocity_correlation: both 1 where qd is dq/dt.
+    following: of a joint under a position servo.
     """
 
     name: str
@@ -131,8 +131,11 @@ class LogReport:
     def text(self) -> str:
         """Return the report for a terminal, in 80 columns; the errors are not in it."""
         paragraphs = [self.heading(), *map(Listing.text, self.listings(TUNING.shown))]
+        findings = ["Findings"]
+        for finding in self.findings:
+            findings.append(textwrap.fill(str(finding), WIDTH, initial_indent="  ", subsequent_indent="    "))
         if self.findings:
-            paragraphs.append("\n".join(["Findings", *map(_wrapped, self.findings)]))
+            paragraphs.append("\n".join(findings))
         elif not self.errors:
             paragraphs.append("No findings.")
         return "\n\n".join(paragraphs)
@@ -225,7 +228,3 @@ def signal_tables(joints: Sequence[JointReport], quantities: Sequence[str]) -> t
 def percent(fraction: float | None, digits: int = 0) -> str:
     """Return a fraction in percent; a dash for None."""
     return "-" if fraction is None else f"{fraction:.{digits}%}"
-
-
-def _wrapped(finding: Diagnostic) -> str:
-    return textwrap.fill(str(finding), WIDTH, initial_indent="  ", subsequent_indent="    ")

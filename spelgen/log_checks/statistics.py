@@ -59,23 +59,19 @@ def statistics(trajectory: Trajectory) -> Statistics:
         steps[name] = np.array(list(map(quantisation_step, signals.T)))
         if dense:
             noise[name] = noise_level(trajectory.t, signals)
-    return Statistics(_clock(trajectory), low, high, noise, steps)
-
-
-def _clock(trajectory: Trajectory) -> Clock:
-    """Return when the samples of a trajectory were taken."""
-    steps = trajectory.regular_steps
-    gaps = len(trajectory) - 1 - len(steps)
-    return Clock(
+    regular = trajectory.regular_steps
+    gaps = len(trajectory) - 1 - len(regular)
+    clock = Clock(
         name=trajectory.name,
         file=None if trajectory.file is None else str(trajectory.file),
         samples=len(trajectory),
         duration=trajectory.duration,
         sample_rate=trajectory.sample_rate,
-        jitter=float(steps.std() / steps.mean()) if steps.size else 0.0,
+        jitter=float(regular.std() / regular.mean()) if regular.size else 0.0,
         gaps=gaps,
         longest_gap=float(np.diff(trajectory.t).max()) if gaps else 0.0,
     )
+    return Statistics(clock, low, high, noise, steps)
 
 
 def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -105,11 +101,7 @@ def quantisation_step(values: np.ndarray) -> float:
     near = differences[differences < 100 * step] / step
     is_whole = np.abs(near - np.round(near)) < TUNING.step_tolerance
     is_grid = len(near) > 2 and is_whole.mean() > 1 - TUNING.step_tolerance
-    return step if is_grid and not _is_commanded(values, step) else float("nan")
-
-
-def _is_commanded(values: np.ndarray, step: float) -> bool:
-    """Whether a signal (T,) of few levels jumps between them, as commands on round numbers do."""
+    # a smooth signal passes wide levels one after the other, commands on round numbers jump between them
     changes = np.abs(np.diff(values))
-    # a smooth signal passes such wide levels one after the other
-    return bool(np.ptp(values) < TUNING.levels * step and changes[changes > 0].mean() > 1.5 * step)
+    is_command = np.ptp(values) < TUNING.levels * step and changes[changes > 0].mean() > 1.5 * step
+    return step if is_grid and not is_command else float("nan")

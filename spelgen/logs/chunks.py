@@ -130,11 +130,15 @@ def scan(
             whole = replace(whole, name=str(file))
         for recording in _recordings(whole, len(files) > 1):
             latest = -np.inf
-            for chunk in _cut(recording):
+            starts = range(recording.first, recording.stop, TUNING.chunk_samples)
+            for number, first in enumerate(starts, start=1):
+                name = f"{recording.name} [{number}]" if len(starts) > 1 else recording.name
+                stop = min(first + TUNING.chunk_samples, recording.stop)
+                chunk = replace(recording, name=name, first=first, stop=stop)
                 trajectory = chunk.load()
                 # times must increase across the border between chunks, too
-                border, rows = np.array([latest, trajectory.t[0]]), (chunk.first - 1, chunk.first)
-                require_increasing_times(border, rows, chunk.layout)
+                border = np.array([latest, trajectory.t[0]])
+                require_increasing_times(border, (first - 1, first), chunk.layout)
                 latest = trajectory.t[-1]
                 yield chunk, trajectory
 
@@ -150,17 +154,6 @@ def _whole_file(file: Path, joints: Sequence[str], mapping: LogMapping) -> Chunk
         raise LogError("no rows", file=file, expected="at least one window of samples")
     rows = source.metadata.num_rows
     return Chunk(file.stem, layout, stored, clock_start(head, layout), stamp, 0, rows)
-
-
-def _cut(recording: Chunk) -> Iterator[Chunk]:
-    """Yield the chunks of a recording, numbered where there are several."""
-    starts = range(recording.first, recording.stop, TUNING.chunk_samples)
-    if len(starts) == 1:
-        yield recording
-        return
-    for number, first in enumerate(starts, start=1):
-        stop = min(first + TUNING.chunk_samples, recording.stop)
-        yield replace(recording, name=f"{recording.name} [{number}]", first=first, stop=stop)
 
 
 def _recordings(whole: Chunk, several_files: bool) -> list[Chunk]:
