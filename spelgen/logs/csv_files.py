@@ -7,17 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pyarrow as pa
-import pyarrow.compute
 import pyarrow.csv
 
 from spelgen.errors import LogError
-from spelgen.logs.bags import FIELDS
 from spelgen.logs.tables import LogFormat, LogTable, reading, table_layout
 from spelgen.logs.values import is_number
-from spelgen.settings.log_mapping import PLAIN, LogMapping
+from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.tuning.logs import LogTuning
 
-STAMP = ("sec", "nanosec", "frame_id")  # of a message's header
 TUNING = LogTuning()
 
 
@@ -34,46 +31,23 @@ def csv_columns(file: Path) -> pa.Table:
     """
     with reading(file):
         encoding, head = _decoded_head(file)
-        first_line, _, rows = head.partition("\n")
-        delimiter = max(",;\t", key=first_line.count)
-        cells = first_line.split(delimiter)
-        names = _joint_state_columns(cells, file) if is_number(cells[0]) else None
+        names, _, rows = head.partition("\n")
+        delimiter = max(",;\t", key=names.count)
+        cells = names.split(delimiter)
+        if is_number(cells[0]):
+            raise LogError(
+                f"numbers in the first line ({', '.join(cells[:3])}, ...)", file=file, line=1,
+                expected="a header: the names of the columns",
+                do="write one, t,q_<joint>,...,qd_<joint>,...,tau_<joint>,... for example",
+            )  # fmt: skip
         decimal_commas = delimiter != "," and re.search(rf"(^|{delimiter}) *-?\d+,\d", rows, re.MULTILINE)
         table = pa.csv.read_csv(
             file,
-            pa.csv.ReadOptions(encoding=encoding, column_names=names),
+            pa.csv.ReadOptions(encoding=encoding),
             pa.csv.ParseOptions(delimiter=delimiter),
             pa.csv.ConvertOptions(decimal_point="," if decimal_commas else "."),
         )
-    if names is None:
-        return table.rename_columns([name.strip() for name in table.column_names])
-    seconds, nanoseconds = table[STAMP[0]].cast(pa.int64()), table[STAMP[1]].cast(pa.int64())
-    times = pa.compute.add(pa.compute.multiply(seconds, 1_000_000_000), nanoseconds)
-    return table.append_column(PLAIN["t"], times.cast(pa.duration("ns")))
-
-
-def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
-    """Return names for the columns of joint states as `ros2 topic echo --csv` writes them, which has no header.
-
-    Raises LogError for any other file that begins with numbers.
-    """
-    columns = [*STAMP]
-    names: list[str] = []
-    for cell in cells[len(STAMP) :]:
-        if is_number(cell):
-            break
-        names.append(cell)
-        columns.append(f"name_{cell}")
-    for quantity in FIELDS:
-        if len(columns) < len(cells):
-            columns += [PLAIN[quantity].replace("{joint}", name) for name in names]
-    if not names or len(columns) != len(cells):
-        raise LogError(
-            f"numbers in the first line ({', '.join(cells[:3])}, ...)", file=file, line=1,
-            expected="a header: the names of the columns",
-            do="write one, t,q_<joint>,...,qd_<joint>,...,tau_<joint>,... for example",
-        )  # fmt: skip
-    return columns
+    return table.rename_columns([name.strip() for name in table.column_names])
 
 
 def _decoded_head(file: Path) -> tuple[str, str]:
