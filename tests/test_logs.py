@@ -18,7 +18,7 @@ from spelgen.logs.checks import check
 from spelgen.logs.chunks import scan
 from spelgen.logs.filtering import low_pass, regular_times, resampled
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.rates import automatic_cutoff, automatic_decimation, shows_accelerations
+from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.trajectory import split_at_gaps
 from spelgen.logs.windows import cut_windows, split_validation
@@ -411,15 +411,16 @@ def test_the_filter_needs_more_than_two_samples_per_period():
 
 
 def test_only_dense_logs_are_filtered_unasked():
-    assert automatic_cutoff([100.0]) == 8.0
-    assert automatic_cutoff([100.0, 20.0]) is None
-    assert automatic_decimation([100.1], 8.0) == 4
-    assert automatic_decimation([1000.0], None) == 1
+    automatic, filtered = Preprocessing(), Preprocessing(cutoff=8.0)
+    assert automatic.resolved([100.0]).cutoff == 8.0
+    assert automatic.resolved([100.0, 20.0]).cutoff is None
+    assert filtered.resolved([100.1]).decimation == 4
+    assert Preprocessing(cutoff=0.0).resolved([1000.0]).decimation == 1
     # what a logger's clock is off decides nothing
     for nominal in (50.0, 60.0, 100.0, 120.0, 500.0):
         rates = nominal * np.array([0.999, 1.0, 1.001])
-        assert len({automatic_decimation([rate], 8.0) for rate in rates}) == 1
-        assert len({automatic_cutoff([rate]) for rate in rates}) == 1
+        assert len({filtered.resolved([rate]).decimation for rate in rates}) == 1
+        assert len({automatic.resolved([rate]).cutoff for rate in rates}) == 1
         assert all(map(shows_accelerations, rates))
 
 

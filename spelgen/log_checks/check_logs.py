@@ -65,7 +65,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
     summary = alone.findings()
     reports = []
     for index, coordinate in enumerate(arm.arm.coordinates):
-        reports.append(joint_report(index, coordinate, measured, alone.agreement))
+        reports.append(joint_report(index, coordinate, measured, alone.products))
     completed, tables = checked.check(reports, summary)
     return LogReport(
         robot=arm.arm.name,

@@ -14,7 +14,7 @@ from spelgen.labels import UNITS, counted
 from spelgen.listing import WIDTH, Listing, number
 from spelgen.log_checks.gravity import GravityFit
 from spelgen.log_checks.statistics import Clock, Statistics
-from spelgen.logs.checks import VelocityAgreement
+from spelgen.logs.checks import velocity_agreement
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
@@ -155,9 +155,9 @@ class LogReport:
 
 
 def joint_report(
-    index: int, coordinate: Coordinate, measured: Sequence[Statistics], agreement: VelocityAgreement
+    index: int, coordinate: Coordinate, measured: Sequence[Statistics], products: np.ndarray
 ) -> JointReport:
-    """Put together what all trajectories show of one joint. agreement: of velocities in all of them."""
+    """Put together what all trajectories show of one joint. products: see `velocity_products`."""
     low, high, noise, steps = {}, {}, {}, {}
     # the median, since one trajectory with contacts would set the noise of all
     noisy = [x.noise for x in measured if x.noise]
@@ -168,7 +168,8 @@ def joint_report(
         steps[name] = float(np.median(finite)) if 2 * len(finite) > len(measured) else None
         if noisy:
             noise[name] = float(np.median([x[name][index] for x in noisy]))
-    factor, correlation = agreement.factor[index], agreement.correlation[index, index]
+    factors, correlations = velocity_agreement(products)
+    factor, correlation = factors[index], correlations[index, index]
     visited = None
     # limits of a URDF may be equal or swapped
     if coordinate.limits is not None and coordinate.limits[0] < coordinate.limits[1]:

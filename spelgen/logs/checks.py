@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
@@ -80,30 +79,30 @@ def run_checks(
     return list(results.values())
 
 
-@dataclass(frozen=True, eq=False)
-class VelocityAgreement:
-    """Hold sums over increments y of q and of the integral x of qd, over some steps, for n joints.
+def velocity_products(trajectory: Trajectory) -> np.ndarray:
+    """Return sums of products (2n, 2n) of increments over some steps: of the integrals of qd, then of q."""
+    products = np.zeros((2 * trajectory.q.shape[1],) * 2)
+    for piece in split_at_gaps(trajectory, shortest=2):
+        # over several steps: from one sample to the next quantisation of q is larger than its change
+        span = min(TUNING.increments, len(piece) - 1)
+        integral = cumulative_trapezoid(piece.qd, piece.t, axis=0, initial=0)
+        positions = np.concatenate([integral, piece.q], axis=1)
+        increments = positions[span:] - positions[:-span]
+        products += increments.T @ increments
+    return products
 
-    xx, yy: (n,). xy: (n, n), of qd of the joint of the row with q of that of the column.
+
+def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return factors (n,) by which qd must be multiplied to be dq/dt, and correlations (n, n).
+
+    These are 1 where qd of the row's joint is dq/dt of the column's, but for a factor. Both are NaN where one rests.
+    products: see `velocity_products`.
     """
-
-    xx: np.ndarray
-    yy: np.ndarray
-    xy: np.ndarray
-
-    def __add__(self, sums: VelocityAgreement) -> VelocityAgreement:
-        return VelocityAgreement(self.xx + sums.xx, self.yy + sums.yy, self.xy + sums.xy)
-
-    @cached_property
-    def factor(self) -> np.ndarray:
-        """(n,) by what qd must be multiplied to be dq/dt; NaN where it rests."""
-        return np.asarray(self.xy.diagonal() / np.where(self.xx > 0, self.xx, np.nan))
-
-    @cached_property
-    def correlation(self) -> np.ndarray:
-        """(n, n) 1 where qd of the row's joint is dq/dt of the column's, but for a factor; NaN where one rests."""
-        size = np.outer(np.sqrt(self.xx), np.sqrt(self.yy))
-        return np.asarray(self.xy / np.where(size > 1e-12, size, np.nan))
+    n = len(products) // 2
+    qd_squares, q_squares = np.split(products.diagonal(), 2)
+    sizes = np.outer(np.sqrt(qd_squares), np.sqrt(q_squares))
+    correlations = products[:n, n:] / np.where(sizes > 1e-12, sizes, np.nan)
+    return products[:n, n:].diagonal() / np.where(qd_squares > 0, qd_squares, np.nan), correlations
 
 
 class JointSignals(NamedTuple):
@@ -283,11 +282,11 @@ CHECKS: list[Check[JointSignals]] = [
 class LogChecks:
     """Check logs by themselves, one trajectory after another: they need not lie in memory together.
 
-    agreement: of all velocities with positions.
+    products: of all velocities and positions, see `velocity_products`.
     """
 
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
-        self.agreement = _no_agreement(len(joints))
+        self.products = np.zeros((2 * len(joints),) * 2)
         self._joints, self._kinds = joints, joint_types
         self._results: dict[tuple[str, Check[Any]], list[tuple[str, str, Path | None]]] = {}
         self._count = 0
@@ -302,9 +301,9 @@ class LogChecks:
                 self._add(message, clock_check, message, where, trajectory)
         for repair in trajectory.repairs:
             self._add(repair, REPAIRED, repair, where, trajectory)
-        agreement = velocity_agreement(trajectory)
-        self.agreement += agreement
-        factors, correlations = agreement.factor.tolist(), agreement.correlation.tolist()
+        products = velocity_products(trajectory)
+        self.products += products
+        factors, correlations = map(np.ndarray.tolist, velocity_agreement(products))
         for k, (joint, kind) in enumerate(zip(self._joints, self._kinds, strict=True)):
             columns = trajectory.q[:, k], trajectory.qd[:, k]
             signals = JointSignals(trajectory, k, kind, self._joints, *columns, factors[k], correlations[k])
@@ -342,19 +341,3 @@ def check(
     summary = checks.findings()
     collect(summary.errors)
     return summary.notes
-
-
-def _no_agreement(joints: int) -> VelocityAgreement:
-    return VelocityAgreement(np.zeros(joints), np.zeros(joints), np.zeros((joints, joints)))
-
-
-def velocity_agreement(trajectory: Trajectory) -> VelocityAgreement:
-    """Return how far qd is dq/dt, within gap-free pieces."""
-    total = _no_agreement(trajectory.q.shape[1])
-    for piece in split_at_gaps(trajectory, shortest=2):
-        # over several steps: from one sample to the next quantisation of q is larger than its change
-        span = min(TUNING.increments, len(piece) - 1)
-        integral = cumulative_trapezoid(piece.qd, piece.t, axis=0, initial=0)
-        x, y = integral[span:] - integral[:-span], piece.q[span:] - piece.q[:-span]
-        total += VelocityAgreement((x * x).sum(axis=0), (y * y).sum(axis=0), x.T @ y)
-    return total

@@ -28,12 +28,6 @@ def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list
         return [(layout, pa.parquet.read_table(file, columns=stored_columns(layout, schema.names)))]
 
 
-def parquet_columns(file: Path) -> pa.Table:
-    """Return all columns of a file."""
-    with reading(file):
-        return pa.parquet.read_table(file)
-
-
 def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
     """Return the tables of all files, with columns by the data set's names of motors; units stay the mapping's.
 
@@ -77,5 +71,5 @@ def _motor_names(folder: Path, feature: str) -> list[str]:
         ) from error  # fmt: skip
 
 
-PARQUET = LogFormat(read_parquet, suffixes=(".parquet",), columns=parquet_columns)
+PARQUET = LogFormat(read_parquet, suffixes=(".parquet",), columns=pa.parquet.read_table)
 LEROBOT = LogFormat(read_dataset, marker=INFO, folder="a LeRobot data set")

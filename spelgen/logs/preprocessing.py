@@ -8,7 +8,7 @@ from math import isfinite
 
 from spelgen.errors import Diagnostic, SettingsError, SpelgenError, collect
 from spelgen.logs.filtering import low_pass
-from spelgen.logs.rates import automatic_cutoff, automatic_decimation
+from spelgen.logs.rates import FAST
 from spelgen.logs.recording import earlier
 from spelgen.logs.trajectory import GAP, Trajectory, split_at_gaps
 from spelgen.settings.tuning.logs import LogTuning
@@ -21,9 +21,8 @@ class Preprocessing:
     """How logs are cut, filtered and thinned. Raises SettingsError for values that cannot be.
 
     cutoff: of the zero-phase low-pass on q, qd and tau [Hz]; 0: none; None: 8 Hz, and none for windows of logs of
-    which one is sampled at 50 Hz or less (see `automatic_cutoff`).
-    decimation: samples from one sample of a window to the next; None: as many as filtered logs can spare (see
-    `automatic_decimation`).
+    which one is sampled at 50 Hz or less.
+    decimation: samples from one sample of a window to the next; None: as many as filtered logs can spare.
     gap: a step longer than so many median steps is a hole in the recording, at which it is cut.
     torque_delay: how much later than positions the logs show torques [s]; None: found where torques are fitted.
     """
@@ -35,9 +34,8 @@ class Preprocessing:
 
     def __post_init__(self) -> None:
         if self.cutoff is not None and not (isfinite(self.cutoff) and self.cutoff >= 0):
-            raise SettingsError(
-                f"{self.cutoff!r}", element="cutoff", expected="a frequency [Hz], or 0 for none"
-            )
+            expected = "a frequency [Hz], or 0 for none"
+            raise SettingsError(f"{self.cutoff!r}", element="cutoff", expected=expected)
         if self.decimation is not None and self.decimation < 1:
             raise SettingsError(f"{self.decimation!r}", element="decimation", expected="1 or more samples")
         if not self.gap > 1:
@@ -49,10 +47,13 @@ class Preprocessing:
         A cutoff that stays None is that of logs too slow to be filtered unasked.
         """
         rates = list(rates)
-        cutoff = automatic_cutoff(rates) if self.cutoff is None else self.cutoff
-        decimation = self.decimation or automatic_decimation(rates, cutoff or None)
-        delay = self.torque_delay or 0.0
-        return replace(self, cutoff=cutoff, decimation=decimation, torque_delay=delay)
+        cutoff, decimation = self.cutoff, self.decimation or 1
+        if cutoff is None and all(rate > TUNING.dense_rate * FAST for rate in rates):
+            cutoff = TUNING.automatic_cutoff
+        # every sample counts, unless filtered logs are denser than their filter needs
+        if self.decimation is None and cutoff:
+            decimation = max(1, int(min(rates) * FAST / (TUNING.samples_per_period * cutoff)))
+        return replace(self, cutoff=cutoff, decimation=decimation, torque_delay=self.torque_delay or 0.0)
 
     @property
     def acceleration_cutoff(self) -> float | None:

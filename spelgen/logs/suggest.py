@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
 from spelgen.logs.formats import FORMATS, format_of
-from spelgen.logs.tables import names_joint
+from spelgen.logs.tables import names_joint, reading
 from spelgen.settings.tuning.logs import LogTuning
 
 WORDS = {
@@ -53,7 +53,8 @@ def suggest_mapping(file: Path, joints: Sequence[str]) -> Suggestion:
     if log_format is None or log_format.columns is None:
         suffixes = [x.suffixes[0] for x in FORMATS if x.columns is not None]
         raise LogError(f"a file of kind {file.suffix!r}", file=file, expected=" or ".join(suffixes))
-    columns = _columns(log_format.columns(file))
+    with reading(file):
+        columns = _columns(log_format.columns(file))
     measured: dict[str, list[Column]] = {quantity: [] for quantity in WORDS}
     for column in columns:
         for quantity, words in WORDS.items():
