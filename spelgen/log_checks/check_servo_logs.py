@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from spelgen.logs.commands import delayed_commands
 from spelgen.logs.filtering import derivative
 from spelgen.logs.trajectory import Trajectory, require_commands, split_at_gaps
 from spelgen.settings.tuning.identification import IdentificationTuning
-from spelgen.settings.tuning.log_checks import LogCheckTuning
+from spelgen.settings.tuning.log_checks import TUNING as CHECK_TUNING
 from spelgen.settings.tuning.servo import ServoLogTuning
 
 if TYPE_CHECKING:
@@ -30,11 +30,10 @@ DELAYS = (
 )  # no -0
 NO_DELAY = int(np.argmin(np.abs(DELAYS)))
 FILTER_SAMPLES = 12  # the shortest piece that the derivative's polynomial has room in
-FOLLOWS = LogCheckTuning().agreement
+FOLLOWS = CHECK_TUNING.agreement
 
 
-@dataclass(frozen=True, eq=False)
-class Following:
+class Following(NamedTuple):
     """Hold how n joints follow their commands.
 
     moves: (n,) whether the command moves. delay, correlation: (n, n) of the command of the row's joint with the

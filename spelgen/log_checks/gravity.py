@@ -14,9 +14,8 @@ from spelgen.dynamics.rigid_bodies import body_chain
 from spelgen.identification.drive_hints import drive_rows
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.settings.tuning.identification import IdentificationTuning
-from spelgen.settings.tuning.log_checks import LogCheckTuning
+from spelgen.settings.tuning.log_checks import TUNING
 
-TUNING = LogCheckTuning()
 MOVING = IdentificationTuning().moving
 
 

@@ -16,9 +16,8 @@ from spelgen.log_checks.gravity import GravityFit
 from spelgen.log_checks.statistics import Clock, Statistics
 from spelgen.logs.checks import velocity_agreement
 from spelgen.logs.trajectory import Trajectory
-from spelgen.settings.tuning.log_checks import LogCheckTuning
+from spelgen.settings.tuning.log_checks import TUNING
 
-TUNING = LogCheckTuning()
 UNFITTED = GravityFit()
 MEASURES = {"q": "position", "qd": "velocity", "tau": "torque", "u": "position"}
 

@@ -11,9 +11,8 @@ from spelgen.labels import UNITS
 from spelgen.log_checks.report import MEASURES, JointReport
 from spelgen.logs.checks import Check
 from spelgen.logs.trajectory import QUANTITIES
-from spelgen.settings.tuning.log_checks import LogCheckTuning
+from spelgen.settings.tuning.log_checks import TUNING
 
-TUNING = LogCheckTuning()
 SAY_UNIT = "write 'units: {tau: ...}' or a 'gain' under 'logs' in the robot's YAML; 'Nm' confirms the unit"
 TORQUE_ERRORS = ("torque-sense", "torque-unit", "torque-beyond-drive")
 

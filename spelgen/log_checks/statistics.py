@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import Trajectory
-from spelgen.settings.tuning.log_checks import LogCheckTuning
-
-TUNING = LogCheckTuning()
+from spelgen.settings.tuning.log_checks import TUNING
 
 
 @dataclass(frozen=True)
@@ -32,8 +31,7 @@ class Clock:
     longest_gap: float
 
 
-@dataclass(frozen=True, eq=False)
-class Statistics:
+class Statistics(NamedTuple):
     """One trajectory of n joints.
 
     low, high: of its quantities (see `Trajectory`), each (n,). noise: of these (n,), standard deviation of what changes

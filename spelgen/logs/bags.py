@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
@@ -21,15 +21,6 @@ if TYPE_CHECKING:
 MESSAGE = "sensor_msgs/msg/JointState"
 MEMORY = 2**29  # bytes beside what the messages of a bag take
 FIELDS = {"q": "position", "qd": "velocity", "tau": "effort"}
-
-
-class JointState(Protocol):
-    """Hold what a `sensor_msgs/msg/JointState` does."""
-
-    name: list[str]
-    position: np.ndarray
-    velocity: np.ndarray
-    effort: np.ndarray
 
 
 def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
@@ -87,7 +78,7 @@ def _joint_states(path: Path, names: Sequence[str], topic: str | None) -> pa.Tab
     return pa.table(columns)
 
 
-def _messages(path: Path, topic: str | None) -> Iterator[tuple[int, JointState]]:
+def _messages(path: Path, topic: str | None) -> Iterator[tuple[int, Any]]:
     """Yield times [ns] and joint states of one topic.
 
     Messages are decoded by the published definition of the standard type alone: definitions that come with a
@@ -111,8 +102,8 @@ def _messages(path: Path, topic: str | None) -> Iterator[tuple[int, JointState]]
         with limited_memory(MEMORY + 20 * size), Reader(path) as reader:
             by_header = None
             for _, recorded, raw in reader.messages(_connections(reader, topic, path)):
-                state: JointState = store.deserialize_cdr(raw, MESSAGE)  # type: ignore[assignment]
-                clock = state.header.stamp  # type: ignore[attr-defined]
+                state: Any = store.deserialize_cdr(raw, MESSAGE)
+                clock = state.header.stamp
                 stamp = clock.sec * 1_000_000_000 + clock.nanosec
                 # one clock for all messages: the two may be hours apart
                 if by_header is None:

@@ -20,9 +20,8 @@ from spelgen.logs.rates import SLOWEST, is_dense, shows_accelerations
 from spelgen.logs.recording import is_dropout
 from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
 from spelgen.settings.log_mapping import TIMES
-from spelgen.settings.tuning.log_checks import LogCheckTuning
+from spelgen.settings.tuning.log_checks import TUNING
 
-TUNING = LogCheckTuning()
 DEGREES = 180.0 / np.pi
 TURNS = 4 * np.pi  # [rad] no revolute joint turns further, so what does is in degrees
 

@@ -23,9 +23,7 @@ from spelgen.logs.tables import Layout, reading, stored_columns, table_layout
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.values import clock_start, values_in_si
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.tuning.logs import LogTuning
-
-TUNING = LogTuning()
+from spelgen.settings.tuning.logs import TUNING
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,7 @@ from spelgen.errors import LogError
 from spelgen.logs.tables import LogFormat, LogTable, reading, table_layout
 from spelgen.logs.values import is_number
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.tuning.logs import LogTuning
-
-TUNING = LogTuning()
+from spelgen.settings.tuning.logs import TUNING
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:

@@ -13,12 +13,12 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.settings.tuning.identification import IdentificationTuning
-from spelgen.settings.tuning.logs import LogTuning
+from spelgen.settings.tuning.logs import TUNING as LOG_TUNING
 
 TUNING = IdentificationTuning()
 FREQUENCY = TUNING.sample_rate
 SHORTEST = TUNING.shortest_piece
-HOLE = 0.25 / LogTuning().automatic_cutoff  # [s] a shorter one loses nothing that the filter lets through
+HOLE = 0.25 / LOG_TUNING.automatic_cutoff  # [s] a shorter one loses nothing that the filter lets through
 AUTOMATIC = Preprocessing()
 
 

@@ -9,11 +9,9 @@ import numpy as np
 
 from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import Trajectory
-from spelgen.settings.tuning.logs import LogTuning
+from spelgen.settings.tuning.logs import TUNING
 
 # SciPy is imported where it is called: that takes the better part of a second, which most commands can do without
-
-TUNING = LogTuning()
 
 
 def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:

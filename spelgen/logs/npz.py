@@ -20,9 +20,8 @@ from spelgen.logs.tables import (
     table_layout,
 )
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.tuning.logs import LogTuning
+from spelgen.settings.tuning.logs import TUNING
 
-TUNING = LogTuning()
 JOINT_NAMES = "joints"  # the array of joint names, by the columns of the matrices
 TRAJECTORY = "{trajectory}"
 

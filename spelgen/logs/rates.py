@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from spelgen.settings.tuning.logs import LogTuning
+from spelgen.settings.tuning.logs import TUNING
 
-TUNING = LogTuning()
 SLOWEST = TUNING.samples_per_period * TUNING.automatic_cutoff  # [Hz] of logs that show accelerations at all
 FAST = 1 + TUNING.clock_error
 

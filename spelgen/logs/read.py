@@ -19,9 +19,7 @@ from spelgen.logs.recording import in_time_order, make_trajectory
 from spelgen.logs.tables import UNITS, UNITS_KEY, Layout
 from spelgen.logs.trajectory import Trajectory, require_joints
 from spelgen.logs.values import clock_start, values_in_si
-from spelgen.settings.tuning.logs import LogTuning
-
-TUNING = LogTuning()
+from spelgen.settings.tuning.logs import TUNING
 
 
 def read_logs(

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +16,7 @@ import pyarrow as pa
 from spelgen.errors import LogError, shortened
 from spelgen.logs.formats import FORMATS, format_of
 from spelgen.logs.tables import names_joint, reading
-from spelgen.settings.tuning.logs import LogTuning
+from spelgen.settings.tuning.logs import TUNING
 
 WORDS = {
     "t": {"t", "time", "times", "timestamp", "stamp", "clock", "ms", "us", "ns", "sec", "secs", "seconds", "millis"},
@@ -39,8 +38,7 @@ class Column(NamedTuple):
     number: int | None
 
 
-@dataclass(frozen=True)
-class Suggestion:
+class Suggestion(NamedTuple):
     """Hold a mapping as YAML text, with comments on what was assumed. missing: what no column was found for."""
 
     text: str
@@ -62,7 +60,7 @@ def suggest_mapping(file: Path, joints: Sequence[str]) -> Suggestion:
                 measured[quantity].append(column)
                 break
     if not measured["t"]:
-        names = shortened([column.name for column in columns], LogTuning().listed)
+        names = shortened([column.name for column in columns], TUNING.listed)
         raise LogError(f"only the columns {names}", file=file, expected="one of times, called t or time")
     # `time` before `timestamp_of_receipt`: what has the fewest words is the plain clock
     clock = min(measured.pop("t"), key=lambda column: len(column.words))

@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.tuning.logs import LogTuning
+from spelgen.settings.tuning.logs import TUNING
 
 UNITS_KEY = b"units"  # in a Parquet file's metadata: the file declares its units
 UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")  # that a declared unit answers
@@ -146,7 +146,7 @@ def missing_columns(
         do = "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
     else:
         do = _renaming(missing[0], columns, of_quantity, [mapping.log_name(joint) for joint in joints])
-    listed = LogTuning().listed
+    listed = TUNING.listed
     return LogError(
         f"only the columns {shortened(list(columns), listed)}", file=file,
         element=f"missing column{'s' * (len(missing) > 1)} {shortened(missing, listed)}",

@@ -12,9 +12,8 @@ import numpy as np
 from spelgen.errors import LogError
 from spelgen.labels import counted
 from spelgen.listing import Listing
-from spelgen.settings.tuning.logs import LogTuning
+from spelgen.settings.tuning.logs import TUNING
 
-TUNING = LogTuning()
 QUANTITIES = ("q", "qd", "tau")
 GAP = TUNING.gap
 

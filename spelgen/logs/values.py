@@ -12,9 +12,7 @@ import pyarrow.compute
 from spelgen.errors import LogError
 from spelgen.logs.tables import Layout, list_element
 from spelgen.settings.log_mapping import TIMES
-from spelgen.settings.tuning.logs import LogTuning
-
-TUNING = LogTuning()
+from spelgen.settings.tuning.logs import TUNING
 
 Table: TypeAlias = "pa.Table | pa.RecordBatch"
 Column: TypeAlias = "pa.ChunkedArray | pa.Array"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -111,8 +112,7 @@ def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> tor
     return windows[..., ::decimation].transpose(1, 2)
 
 
-@dataclass(frozen=True, eq=False)
-class Split:
+class Split(NamedTuple):
     """Hold training and validation pieces, which share no sample, and how they were chosen."""
 
     training: tuple[Trajectory, ...]
