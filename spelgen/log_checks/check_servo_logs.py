@@ -25,9 +25,7 @@ if TYPE_CHECKING:
 
 TUNING = ServoLogTuning()
 MOVING = IdentificationTuning().moving
-DELAYS = (
-    np.arange(TUNING.earliest_delay, TUNING.latest_delay + 1e-9, TUNING.delay_step).round(9) + 0.0
-)  # no -0
+DELAYS = np.arange(TUNING.earliest_delay, TUNING.latest_delay + 1e-9, TUNING.delay_step).round(9)
 NO_DELAY = int(np.argmin(np.abs(DELAYS)))
 FILTER_SAMPLES = 12  # the shortest piece that the derivative's polynomial has room in
 FOLLOWS = CHECK_TUNING.agreement
@@ -75,7 +73,7 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
     joints = []
     for k, error in enumerate(_steady_state_errors(pieces)):
         delay_index = best[k, k] if moves[k] else NO_DELAY
-        lag = float(DELAYS[delay_index]) if moves[k] else None
+        lag = float(DELAYS[delay_index]) + 0.0 if moves[k] else None  # no -0
         fraction = float(saturated[k]) if np.isfinite(saturation[k]) else None
         joints.append(JointFollowing(lag, float(tracking_rms[delay_index][k]), error, fraction))
     gain = correlation.diagonal() * q_std / np.maximum(u_std, 1e-6)
@@ -122,7 +120,12 @@ class ServoLogs:
     ) -> tuple[list[JointReport], tuple[Listing, ...]]:
         """Return the reports with how joints follow their commands, and tables; add what is odd to the summary."""
         names = self._arm.arm.joint_names
-        following = measure_following(self._logs, self._saturation())
+        saturation = np.full(len(names), np.inf)
+        for k, coordinate in enumerate(self._arm.arm.coordinates):
+            kp = self._arm.settings.joint(coordinate.name).kp
+            if coordinate.effort and kp:
+                saturation[k] = coordinate.effort / kp
+        following = measure_following(self._logs, saturation)
         completed = []
         for k, (coordinate, report) in enumerate(zip(self._arm.arm.coordinates, reports, strict=True)):
             odd = None
@@ -147,14 +150,6 @@ class ServoLogs:
                 summary.notes.append(Diagnostic("warning", "sparse", f"trajectory {log.name}", None, message))
                 break  # said once: logs of one robot have one rate
         return completed, (*signal_tables(completed, ("q", "u")), _following_table(completed))
-
-    def _saturation(self) -> np.ndarray:
-        """Return distances from the command (n,) at which servos give all they can; infinite where unknown."""
-        distances = []
-        for coordinate in self._arm.arm.coordinates:
-            kp = self._arm.settings.joint(coordinate.name).kp
-            distances.append(coordinate.effort / kp if coordinate.effort and kp else np.inf)
-        return np.array(distances)
 
 
 def _odd_command(

@@ -86,9 +86,8 @@ def large_files(
         return []
     for file in files:
         if file not in parquet:
-            errors.append(
-                LogError("a log beside others too large for memory", file=file, expected="Parquet like them")
-            )
+            got = "a log beside others too large for memory"
+            errors.append(LogError(got, file=file, expected="Parquet like them"))
     collect(errors)
     return parquet
 

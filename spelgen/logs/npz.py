@@ -11,14 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError
-from spelgen.logs.tables import (
-    LogFormat,
-    LogTable,
-    missing_columns,
-    reading,
-    stored_columns,
-    table_layout,
-)
+from spelgen.logs.tables import LogFormat, LogTable, missing_columns, reading, stored_columns, table_layout
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.tuning.logs import TUNING
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from math import isfinite
+from math import inf
 
 from spelgen.errors import Diagnostic, SettingsError, SpelgenError, collect
 from spelgen.logs.filtering import low_pass
@@ -31,13 +31,14 @@ class Preprocessing:
     torque_delay: float | None = None
 
     def __post_init__(self) -> None:
-        if self.cutoff is not None and not (isfinite(self.cutoff) and self.cutoff >= 0):
-            expected = "a frequency [Hz], or 0 for none"
-            raise SettingsError(f"{self.cutoff!r}", element="cutoff", expected=expected)
-        if self.decimation is not None and self.decimation < 1:
-            raise SettingsError(f"{self.decimation!r}", element="decimation", expected="1 or more samples")
-        if not self.gap > 1:
-            raise SettingsError(f"{self.gap!r}", element="gap", expected="more than 1 median step")
+        limits = [
+            ("cutoff", self.cutoff is None or 0 <= self.cutoff < inf, "a frequency [Hz], or 0 for none"),
+            ("decimation", self.decimation is None or self.decimation >= 1, "1 or more samples"),
+            ("gap", self.gap > 1, "more than 1 median step"),
+        ]
+        for name, is_possible, expected in limits:
+            if not is_possible:
+                raise SettingsError(repr(getattr(self, name)), element=name, expected=expected)
 
     def resolved(self, rates: Iterable[float]) -> Preprocessing:
         """Return the same with all decided for windows of logs with these sample rates [Hz], as it is kept with a run.
