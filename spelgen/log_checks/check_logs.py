@@ -50,23 +50,23 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
     checked: TorqueLogs | ServoLogs = TorqueLogs(arm, mapping or arm.settings.logs)
     if arm.settings.input == "position":
         checked = ServoLogs(arm)
-    alone = LogChecks(joints, arm.arm.joint_types)
+    log_checks = LogChecks(joints, arm.arm.joint_types)
     measured: list[Statistics] = []
     examples: list[Trajectory] = []
     # one after another: a stream of logs may be larger than memory
     for trajectory in logs:
         require_joints(trajectory, joints)
         checked.add(trajectory)
-        alone.add(trajectory)
+        log_checks.add(trajectory)
         measured.append(statistics(trajectory))
         if len(examples) < TUNING.examples:
             examples.append(trajectory)
     if not measured:
         raise LogError("no trajectory", expected="at least one")
-    summary = alone.findings()
+    summary = log_checks.findings()
     reports = []
     for index, coordinate in enumerate(arm.arm.coordinates):
-        reports.append(joint_report(index, coordinate, measured, alone.products))
+        reports.append(joint_report(index, coordinate, measured, log_checks.products))
     completed, tables = checked.check(reports, summary)
     return LogReport(
         robot=arm.arm.name,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 
 import numpy as np
 
@@ -130,11 +131,10 @@ class LogReport:
     def text(self) -> str:
         """Return the report for a terminal, in 80 columns; the errors are not in it."""
         paragraphs = [self.heading(), *map(Listing.text, self.listings(TUNING.shown))]
-        findings = ["Findings"]
-        for finding in self.findings:
-            findings.append(textwrap.fill(str(finding), WIDTH, initial_indent="  ", subsequent_indent="    "))
-        if self.findings:
-            paragraphs.append("\n".join(findings))
+        wrapped = partial(textwrap.fill, width=WIDTH, initial_indent="  ", subsequent_indent="    ")
+        findings = list(map(wrapped, map(str, self.findings)))
+        if findings:
+            paragraphs.append("\n".join(["Findings", *findings]))
         elif not self.errors:
             paragraphs.append("No findings.")
         return "\n\n".join(paragraphs)

@@ -122,10 +122,10 @@ def scan(
     # names as `read_logs` gives them, though not all files are known when the first is read
     stems = Counter(file.stem for file in files)
     for file in files:
-        whole = _whole_file(file, joints, mapping)
+        uncut = _uncut_file(file, joints, mapping)
         if stems[file.stem] > 1:
-            whole = replace(whole, name=str(file))
-        for recording in _recordings(whole, len(files) > 1):
+            uncut = replace(uncut, name=str(file))
+        for recording in _recordings(uncut, len(files) > 1):
             latest = -np.inf
             starts = range(recording.first, recording.stop, TUNING.chunk_samples)
             for number, first in enumerate(starts, start=1):
@@ -140,7 +140,7 @@ def scan(
                 yield chunk, trajectory
 
 
-def _whole_file(file: Path, joints: Sequence[str], mapping: LogMapping) -> Chunk:
+def _uncut_file(file: Path, joints: Sequence[str], mapping: LogMapping) -> Chunk:
     stamp = _stamp(file)
     with reading(file):
         source = _opened(file)
@@ -153,14 +153,14 @@ def _whole_file(file: Path, joints: Sequence[str], mapping: LogMapping) -> Chunk
     return Chunk(file.stem, layout, stored, clock_start(head, layout), stamp, 0, rows)
 
 
-def _recordings(whole: Chunk, several_files: bool) -> list[Chunk]:
+def _recordings(uncut: Chunk, several_files: bool) -> list[Chunk]:
     """Return each recording of a file, uncut. Raises LogError where the rows of one do not lie together."""
-    column = whole.layout.labels
+    column = uncut.layout.labels
     if column is None:
-        return [whole]
+        return [uncut]
     stops: dict[str, int] = {}
     latest, first_row, stop = None, 0, 0
-    for batch in _opened(whole.layout.file).iter_batches(TUNING.chunk_samples, columns=[column]):
+    for batch in _opened(uncut.layout.file).iter_batches(TUNING.chunk_samples, columns=[column]):
         # runs, and not rows: a label repeats a million times
         runs = pa.compute.run_end_encode(batch.column(0).cast(pa.string()))
         for value, end in zip(runs.values.to_pylist(), runs.run_ends.to_pylist(), strict=True):
@@ -168,14 +168,14 @@ def _recordings(whole: Chunk, several_files: bool) -> list[Chunk]:
             if label != latest and label in stops:
                 got, do = f"trajectory {label} once more, after others", "sort the rows"
                 expected = "its rows together, in a log too large for memory"
-                raise whole.layout.row_error(got, stop, column, expected, do)
+                raise uncut.layout.row_error(got, stop, column, expected, do)
             latest, stop = label, first_row + end
             stops[label] = stop
         first_row += batch.num_rows
     recordings = []
     for (label, stop), first in zip(stops.items(), [0, *stops.values()], strict=False):
-        name = f"{whole.name}/{label}" if several_files else label
-        recordings.append(replace(whole, name=name, first=first, stop=stop))
+        name = f"{uncut.name}/{label}" if several_files else label
+        recordings.append(replace(uncut, name=name, first=first, stop=stop))
     return recordings
 
 

@@ -77,7 +77,7 @@ class Preprocessing:
     def pieces(self, trajectories: Sequence[Trajectory], *, shortest: int) -> list[Trajectory]:
         """Return gap-free pieces (see `gap_ends`) of at least so many samples, filtered; of a ``resolved`` one.
 
-        Raises LogError when a trajectory holds no piece that long.
+        Raises LogError where a trajectory has no piece that long.
         """
         prepared: list[Trajectory] = []
         errors: list[SpelgenError] = []

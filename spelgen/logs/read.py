@@ -103,15 +103,11 @@ def _recordings(layout: Layout, table: pa.Table) -> list[tuple[str, np.ndarray]]
         return [(layout.recording or layout.file.stem, np.arange(table.num_rows))]
     # each label once: a name of a megabyte on a million rows is a small file
     labels = table[layout.labels].dictionary_encode("encode").combine_chunks()
-    codes: dict[str, int] = {}
-    code_of_label = []
-    for label in labels.dictionary.to_pylist():
-        code_of_label.append(codes.setdefault(str(label), len(codes)))
-    code_of_row = np.array(code_of_label)[labels.indices.to_numpy()]
+    numbers = labels.indices.to_numpy()
     # sorting keeps time and memory in proportion to the rows, however many recordings there are
-    rows = np.argsort(code_of_row, kind="stable")
-    ends = np.cumsum(np.bincount(code_of_row))
-    return list(zip(codes, np.split(rows, ends[:-1]), strict=True))
+    rows = np.argsort(numbers, kind="stable")
+    ends = np.cumsum(np.bincount(numbers))
+    return list(zip(map(str, labels.dictionary.to_pylist()), np.split(rows, ends[:-1]), strict=True))
 
 
 def _with_unique_names(trajectories: Sequence[Trajectory]) -> list[Trajectory]:

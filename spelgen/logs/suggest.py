@@ -84,9 +84,8 @@ def suggest_mapping(file: Path, joints: Sequence[str]) -> Suggestion:
         missing += [f"{quantity} of {joint}" for quantity in by_joint if quantity not in entries]
         lines += [f"  {json.dumps(joint)}:", f"    columns: {json.dumps(entries)}"]
         if torque_unit in ("A", "mA"):
-            lines.append(
-                f"    gain: 1.0 # Nm per {torque_unit} at the joint, the gear included: write its value"
-            )
+            at_joint = "at the joint, the gear included: write its value"
+            lines.append(f"    gain: 1.0 # Nm per {torque_unit} {at_joint}")
     lines += [f"# no column was found for {column}" for column in missing]
     return Suggestion("\n".join(lines) + "\n", tuple(missing))
 
