@@ -43,7 +43,7 @@ class JointReport:
     """One joint over all trajectories; [rad, m], [rad/s, m/s], [Nm, N]; None where it cannot be told.
 
     low, high, noise, steps: of q, qd and tau, or of q, qd and commands u. range_fraction: of the joint's range that was
-    visited. noise: standard deviation of what changes from sample to sample; empty of sparse logs. steps: of signals
+    visited. noise: standard deviation of what changes from sample to sample; None of sparse logs. steps: of signals
     that are quantised in most trajectories. velocity_factor, velocity_correlation: both 1 where qd is dq/dt.
     following: of a joint under a position servo.
     """
@@ -53,7 +53,7 @@ class JointReport:
     low: dict[str, float]
     high: dict[str, float]
     range_fraction: float | None
-    noise: dict[str, float]
+    noise: dict[str, float | None]
     steps: dict[str, float | None]
     velocity_factor: float | None
     velocity_correlation: float | None
@@ -158,15 +158,11 @@ def joint_report(
 ) -> JointReport:
     """Put together what all trajectories show of one joint. products: see `velocity_products`."""
     low, high, noise, steps = {}, {}, {}, {}
-    # the median, since one trajectory with contacts would set the noise of all
-    noisy = [x.noise for x in measured if x.noise]
-    for name in measured[0].low:
-        low[name] = min(float(x.low[name][index]) for x in measured)
-        high[name] = max(float(x.high[name][index]) for x in measured)
-        finite = [x.steps[name][index] for x in measured if np.isfinite(x.steps[name][index])]
-        steps[name] = float(np.median(finite)) if 2 * len(finite) > len(measured) else None
-        if noisy:
-            noise[name] = float(np.median([x[name][index] for x in noisy]))
+    for name in measured[0].signals:
+        lows, highs, noises, quanta = np.array([x.signals[name][:, index] for x in measured]).T
+        low[name], high[name] = float(lows.min()), float(highs.max())
+        # medians, since one trajectory with contacts would set the noise of all
+        noise[name], steps[name] = _median(noises, 0.0), _median(quanta, 0.5)
     factors, correlations = velocity_agreement(products)
     factor, correlation = factors[index], correlations[index, index]
     visited = None
@@ -184,6 +180,12 @@ def joint_report(
         velocity_factor=float(factor) if np.isfinite(factor) else None,
         velocity_correlation=float(correlation) if np.isfinite(correlation) else None,
     )
+
+
+def _median(values: np.ndarray, share: float) -> float | None:
+    """Return the median of what is finite; None where that is no more than this share of all."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) > share * len(values) else None
 
 
 def _clock_table(trajectories: Sequence[Clock], limit: int | None) -> Listing:

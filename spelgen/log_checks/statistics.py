@@ -34,29 +34,25 @@ class Clock:
 class Statistics(NamedTuple):
     """One trajectory of n joints.
 
-    low, high: of its quantities (see `Trajectory`), each (n,). noise: of these (n,), standard deviation of what changes
-    from sample to sample; empty where the log is too sparse to tell. steps: of the quantised signals among them (n,),
-    NaN where a signal is not.
+    signals: of its quantities (see `Trajectory`), (4, n): the lowest and the highest value; the standard deviation of
+    what changes from sample to sample, NaN where the log is too sparse to tell; the step of a quantised signal, NaN of
+    others.
     """
 
     clock: Clock
-    low: dict[str, np.ndarray]
-    high: dict[str, np.ndarray]
-    noise: dict[str, np.ndarray]
-    steps: dict[str, np.ndarray]
+    signals: dict[str, np.ndarray]
 
 
 def statistics(trajectory: Trajectory) -> Statistics:
     """Return the numbers of one trajectory."""
-    low, high, noise, steps = {}, {}, {}, {}
     # third differences of sparse motion are motion
     dense = is_dense(trajectory.sample_rate) and len(trajectory) > 8
+    signals = {}
     for name in trajectory.quantities:
-        signals: np.ndarray = getattr(trajectory, name)
-        low[name], high[name] = signals.min(axis=0), signals.max(axis=0)
-        steps[name] = np.array(list(map(quantisation_step, signals.T)))
-        if dense:
-            noise[name] = noise_level(trajectory.t, signals)
+        values: np.ndarray = getattr(trajectory, name)
+        noise = noise_level(trajectory.t, values) if dense else np.full(values.shape[1], np.nan)
+        steps = list(map(quantisation_step, values.T))
+        signals[name] = np.array([values.min(axis=0), values.max(axis=0), noise, steps])
     regular = trajectory.regular_steps
     gaps = len(trajectory) - 1 - len(regular)
     clock = Clock(
@@ -69,7 +65,7 @@ def statistics(trajectory: Trajectory) -> Statistics:
         gaps=gaps,
         longest_gap=float(np.diff(trajectory.t).max()) if gaps else 0.0,
     )
-    return Statistics(clock, low, high, noise, steps)
+    return Statistics(clock, signals)
 
 
 def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
