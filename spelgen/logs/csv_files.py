@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.csv
 
 from spelgen.errors import LogError
-from spelgen.logs.tables import LogFormat, LogTable, reading, table_layout
+from spelgen.logs.tables import LogFormat, LogTable, table_layout
 from spelgen.logs.values import is_number
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.tuning.logs import TUNING
@@ -27,24 +27,23 @@ def csv_columns(file: Path) -> pa.Table:
 
     Text may be UTF-8, UTF-16 or Latin-1.
     """
-    with reading(file):
-        encoding, head = _decoded_head(file)
-        names, _, rows = head.partition("\n")
-        delimiter = max(",;\t", key=names.count)
-        cells = names.split(delimiter)
-        if is_number(cells[0]):
-            raise LogError(
-                f"numbers in the first line ({', '.join(cells[:3])}, ...)", file=file, line=1,
-                expected="a header: the names of the columns",
-                do="write one, t,q_<joint>,...,qd_<joint>,...,tau_<joint>,... for example",
-            )  # fmt: skip
-        decimal_commas = delimiter != "," and re.search(rf"(^|{delimiter}) *-?\d+,\d", rows, re.MULTILINE)
-        table = pa.csv.read_csv(
-            file,
-            pa.csv.ReadOptions(encoding=encoding),
-            pa.csv.ParseOptions(delimiter=delimiter),
-            pa.csv.ConvertOptions(decimal_point="," if decimal_commas else "."),
-        )
+    encoding, head = _decoded_head(file)
+    names, _, rows = head.partition("\n")
+    delimiter = max(",;\t", key=names.count)
+    cells = names.split(delimiter)
+    if is_number(cells[0]):
+        raise LogError(
+            f"numbers in the first line ({', '.join(cells[:3])}, ...)", file=file, line=1,
+            expected="a header: the names of the columns",
+            do="write one, t,q_<joint>,...,qd_<joint>,...,tau_<joint>,... for example",
+        )  # fmt: skip
+    decimal_commas = delimiter != "," and re.search(rf"(^|{delimiter}) *-?\d+,\d", rows, re.MULTILINE)
+    table = pa.csv.read_csv(
+        file,
+        pa.csv.ReadOptions(encoding=encoding),
+        pa.csv.ParseOptions(delimiter=delimiter),
+        pa.csv.ConvertOptions(decimal_point="," if decimal_commas else "."),
+    )
     return table.rename_columns([name.strip() for name in table.column_names])
 
 

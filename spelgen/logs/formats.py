@@ -15,7 +15,7 @@ from spelgen.logs.bags import BAG
 from spelgen.logs.csv_files import CSV
 from spelgen.logs.npz import NPZ
 from spelgen.logs.parquet_files import LEROBOT, PARQUET
-from spelgen.logs.tables import LogFormat, LogTable
+from spelgen.logs.tables import LogFormat, LogTable, reading
 from spelgen.settings.log_mapping import LogMapping
 
 FORMATS: list[LogFormat] = [PARQUET, CSV, NPZ, BAG, LEROBOT]
@@ -34,7 +34,8 @@ def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[
     """Return the tables of a log. Raises LogError, where columns are missing too."""
     log_format = format_of(path)
     assert log_format is not None, "log_files gives logs alone"
-    return log_format.read(path, joints, mapping)
+    with reading(path):
+        return log_format.read(path, joints, mapping)
 
 
 def log_files(

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError
-from spelgen.logs.tables import LogFormat, LogTable, missing_columns, reading, stored_columns, table_layout
+from spelgen.logs.tables import LogFormat, LogTable, missing_columns, stored_columns, table_layout
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.tuning.logs import TUNING
 
@@ -24,8 +24,7 @@ class NpzArrays:
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        with reading(file):
-            self._archive = ZipFile(file)
+        self._archive = ZipFile(file)
         self._members = {x.filename.removesuffix(".npy"): x for x in self._archive.infolist()}
         self.names = self._members.keys()
         self._arrays: dict[str, np.ndarray] = {}
@@ -41,7 +40,7 @@ class NpzArrays:
                     f"{self._bytes / 1e9:.3g} GB of arrays", file=self.file, element=f"array {member.filename}",
                     expected=f"at most {TUNING.npz_bytes / 1e9:.3g} GB", do="write larger logs as Parquet",
                 )  # fmt: skip
-            with reading(self.file), self._archive.open(member) as data:
+            with self._archive.open(member) as data:
                 try:
                     self._arrays[name] = np.lib.format.read_array(data, allow_pickle=False)
                 except MemoryError:
@@ -51,11 +50,10 @@ class NpzArrays:
     def column(self, name: str) -> pa.Array:
         """Return an array as a column, of a matrix a column of its rows."""
         array = self[name]
-        with reading(self.file):
-            # Arrow refuses half and extended precision, and the other byte order
-            wide = float if array.dtype.kind == "f" else array.dtype.newbyteorder("=")
-            values = pa.array(array.astype(wide).ravel())
-            return pa.FixedSizeListArray.from_arrays(values, array.shape[1]) if array.ndim == 2 else values
+        # Arrow refuses half and extended precision, and the other byte order
+        wide = float if array.dtype.kind == "f" else array.dtype.newbyteorder("=")
+        values = pa.array(array.astype(wide).ravel())
+        return pa.FixedSizeListArray.from_arrays(values, array.shape[1]) if array.ndim == 2 else values
 
 
 def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:

@@ -21,11 +21,9 @@ STATE, ACTION = "observation.state", "action"
 
 def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
     """Return the one table of a file. A file that spelgen wrote is read as such, whatever the mapping says."""
-    with reading(file):
-        schema = pa.parquet.read_schema(file)
+    schema = pa.parquet.read_schema(file)
     layout = table_layout(schema, joints, mapping, file)
-    with reading(file):
-        return [(layout, pa.parquet.read_table(file, columns=stored_columns(layout, schema.names)))]
+    return [(layout, pa.parquet.read_table(file, columns=stored_columns(layout, schema.names)))]
 
 
 def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
@@ -49,8 +47,9 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
     tables: list[LogTable] = []
     for file in sorted((folder / "data").rglob("*.parquet")):
         require_regular_file(file, LogError, "files of episodes")
-        for layout, table in read_parquet(file, joints, mapping):
-            tables.append((replace(layout, file=folder), table))
+        with reading(file):
+            for layout, table in read_parquet(file, joints, mapping):
+                tables.append((replace(layout, file=folder), table))
     if not tables:
         expected = "data/chunk-000/file-000.parquet"
         raise LogError("a data set without Parquet files", file=folder, expected=expected)

@@ -30,14 +30,6 @@ UNITS = {"ms": "ms", "millis": "ms", "us": "us", "ns": "ns", "mnm": "mNm", "ma":
 UNITS |= dict.fromkeys(("amps", "current", "currents", "curr"), "A")
 
 
-class Column(NamedTuple):
-    """Name a column, or an element of a column of lists. number: its place, or the last number in its name."""
-
-    name: str
-    words: frozenset[str]
-    number: int | None
-
-
 class Suggestion(NamedTuple):
     """Hold a mapping as YAML text, with comments on what was assumed. missing: what no column was found for."""
 
@@ -52,26 +44,27 @@ def suggest_mapping(file: Path, joints: Sequence[str]) -> Suggestion:
         suffixes = [x.suffixes[0] for x in FORMATS if x.columns is not None]
         raise LogError(f"a file of kind {file.suffix!r}", file=file, expected=" or ".join(suffixes))
     with reading(file):
-        columns = _columns(log_format.columns(file))
-    measured: dict[str, list[Column]] = {quantity: [] for quantity in WORDS}
-    for column in columns:
+        names = _names(log_format.columns(file))
+    measured: dict[str, list[str]] = {quantity: [] for quantity in WORDS}
+    for name in names:
+        said = _words(name)
         for quantity, words in WORDS.items():
-            if column.words & words and not column.words & NOT_MEASURED:
-                measured[quantity].append(column)
+            if said & words and not said & NOT_MEASURED:
+                measured[quantity].append(name)
                 break
     if not measured["t"]:
-        names = shortened([column.name for column in columns], TUNING.listed)
-        raise LogError(f"only the columns {names}", file=file, expected="one of times, called t or time")
+        got = f"only the columns {shortened(names, TUNING.listed)}"
+        raise LogError(got, file=file, expected="one of times, called t or time")
     # `time` before `timestamp_of_receipt`: what has the fewest words is the plain clock
-    clock = min(measured.pop("t"), key=lambda column: len(column.words))
-    by_joint = {quantity: _by_joint(named, joints) for quantity, named in measured.items()}
+    clock = min(measured.pop("t"), key=lambda name: len(_words(name)))
+    by_joint = {quantity: _by_joint(columns, joints) for quantity, columns in measured.items()}
     units = {"t": _unit([clock]) or "s"}
     torque_unit = _unit(by_joint["tau"].values())
     if torque_unit:
         units["tau"] = torque_unit
     lines = [
         f"# Drafted from the column names of {json.dumps(file.name)}: check it, and the order of the joints.",
-        f"columns: {{t: {json.dumps(clock.name)}}}",
+        f"columns: {{t: {json.dumps(clock)}}}",
         f"units: {json.dumps(units)}",
     ]
     if len(by_joint["qd"]) < len(joints):
@@ -80,7 +73,7 @@ def suggest_mapping(file: Path, joints: Sequence[str]) -> Suggestion:
     lines.append("joints:")
     missing = []
     for joint in joints:
-        entries = {quantity: named[joint].name for quantity, named in by_joint.items() if joint in named}
+        entries = {quantity: named[joint] for quantity, named in by_joint.items() if joint in named}
         missing += [f"{quantity} of {joint}" for quantity in by_joint if quantity not in entries]
         lines += [f"  {json.dumps(joint)}:", f"    columns: {json.dumps(entries)}"]
         if torque_unit in ("A", "mA"):
@@ -90,40 +83,42 @@ def suggest_mapping(file: Path, joints: Sequence[str]) -> Suggestion:
     return Suggestion("\n".join(lines) + "\n", tuple(missing))
 
 
-def _unit(columns: Iterable[Column]) -> str | None:
-    """Return the unit that the columns' names say, the last of several."""
+def _unit(names: Iterable[str]) -> str | None:
+    """Return the unit that columns' names say, the last of several."""
     unit = None
-    for column in columns:
+    for name in names:
         for word in reversed(UNITS):
-            if word in column.words:
+            if word in _words(name):
                 unit = UNITS[word]
     return unit
 
 
-def _columns(table: pa.Table) -> list[Column]:
-    """Return all columns, and of columns of lists the elements."""
-    columns: list[Column] = []
+def _words(name: str) -> set[str]:
+    """Return the words of a name: jointPos0 -> joint, pos."""
+    separated = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
+    return set(re.findall(r"[a-z]+", separated.lower()))
+
+
+def _names(table: pa.Table) -> list[str]:
+    """Return the names of all columns, and of columns of lists those of their elements."""
+    names: list[str] = []
     for name in table.column_names:
-        # jointPos0 -> joint, pos
-        separated = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
-        words = frozenset(re.findall(r"[a-z]+", separated.lower()))
         values = table[name].drop_null()
         if pa.types.is_nested(values.type) and len(values):
-            columns += [Column(f"{name}[{index}]", words, index) for index in range(len(values[0]))]
+            names += [f"{name}[{index}]" for index in range(len(values[0]))]
         else:
-            numbers = re.findall(r"\d+", name)
-            columns.append(Column(name, words, int(numbers[-1]) if numbers else None))
-    return columns
+            names.append(name)
+    return names
 
 
-def _by_joint(columns: Sequence[Column], joints: Sequence[str]) -> dict[str, Column]:
-    """Return the column of each joint: by its name, else by numbers in the URDF's order."""
-    named: dict[str, Column] = {}
-    for joint in joints:
-        for column in columns:
-            if names_joint(column.name, joint):
-                named[joint] = column
-    numbered = {column.number: column for column in columns if column.number is not None}
+def _by_joint(names: Sequence[str], joints: Sequence[str]) -> dict[str, str]:
+    """Return the column of each joint: by its name, else by the last number, in the URDF's order."""
+    named = {joint: name for joint in joints for name in names if names_joint(name, joint)}
+    numbered: dict[int, str] = {}
+    for name in names:
+        numbers = re.findall(r"\d+", name)
+        if numbers:
+            numbered[int(numbers[-1])] = name
     if named or len(numbered) < len(joints):
         return named
     return dict(zip(joints, map(numbered.__getitem__, sorted(numbered)), strict=False))
