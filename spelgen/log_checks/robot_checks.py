@@ -21,7 +21,7 @@ class JointEvidence(NamedTuple):
     """Hold a joint, and what all trajectories show of it: the subject of the checks against the robot."""
 
     coordinate: Coordinate
-    shown: JointReport
+    report: JointReport
 
     def limits(self) -> tuple[float, float]:
         """Return the lowest and the highest position, infinite where there is no limit."""
@@ -32,7 +32,7 @@ class JointEvidence(NamedTuple):
 
     def gravity_in_torque(self) -> tuple[float, float]:
         """Return factor and correlation of the URDF's gravity in the torque; NaN where it is too small to be seen."""
-        fit = self.shown.gravity
+        fit = self.report.gravity
         # of a joint that gravity hardly loads the factor is chance
         if fit.factor is None or fit.correlation is None or (fit.relative_deviation or 0.0) < TUNING.loaded:
             return nan, nan  # which no comparison takes for odd
@@ -44,7 +44,7 @@ def find_beyond_limits(joint: JointEvidence) -> str | None:
     findings = []
     (lower, upper), unit = joint.limits(), UNITS[joint.coordinate.kind].position
     for name in ("q", "u"):
-        low, high = joint.shown.low.get(name, inf), joint.shown.high.get(name, -inf)
+        low, high = joint.report.low.get(name, inf), joint.report.high.get(name, -inf)
         # a limit overrun by less is the rounding of a logger
         if low < lower - TUNING.limit_rounding:
             findings.append(f"{name} down to {low:.4g} {unit}, the limit is {lower:.4g}")
@@ -57,7 +57,7 @@ def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
     """Find a quantity above the joint's limit, "velocity" or "effort"."""
     bound: float | None = getattr(joint.coordinate, limit)
     unit = getattr(UNITS[joint.coordinate.kind], MEASURES[quantity])
-    largest = joint.shown.largest(quantity)
+    largest = joint.report.largest(quantity)
     if not bound or largest <= bound * (1 + TUNING.limit_noise):
         return None
     return f"{limit} up to {largest:.4g} {unit}, the limit is {bound:.4g}"
@@ -83,7 +83,7 @@ def find_scaled(seen: float, largest: float, message: str, joint: JointEvidence)
 def find_beyond_drive(joint: JointEvidence) -> str | None:
     """Find torques that no drive of the joint's effort limit gives."""
     # URDFs without knowledge of the drive write an effort of 0
-    limit, largest = joint.coordinate.effort or 0.0, joint.shown.largest("tau")
+    limit, largest = joint.coordinate.effort or 0.0, joint.report.largest("tau")
     if not 0 < TUNING.beyond_drives * limit < largest:
         return None
     return f"up to {largest:.4g}, {largest / limit:.3g} times what the drive can give"
@@ -93,7 +93,7 @@ def find_coarse(joint: JointEvidence) -> str | None:
     """Find signals that are quantised to steps of their own size."""
     for name in QUANTITIES:
         # a step alone says little: 0.01 Nm is fine for a shoulder and all there is for a wrist
-        step, width = joint.shown.steps[name], joint.shown.high[name] - joint.shown.low[name]
+        step, width = joint.report.steps[name], joint.report.high[name] - joint.report.low[name]
         if step is not None and width < TUNING.levels * step:
             return (
                 f"{name} has steps of {step:.3g} in a range of {width:.3g}: what is smaller than a step, friction and "
@@ -104,7 +104,7 @@ def find_coarse(joint: JointEvidence) -> str | None:
 
 def find_stop(joint: JointEvidence) -> str | None:
     """Find joints that reach a limit: the torque of a stop is none of the drive's."""
-    for limit, extreme in zip(joint.limits(), (joint.shown.low["q"], joint.shown.high["q"]), strict=True):
+    for limit, extreme in zip(joint.limits(), (joint.report.low["q"], joint.report.high["q"]), strict=True):
         if abs(extreme - limit) <= TUNING.limit_rounding:
             return f"q reaches its limit {limit:.4g}: contact with the stop changes the torque; remove such motion"
     return None
@@ -117,7 +117,7 @@ def find_no_gravity(joint: JointEvidence) -> str | None:
         return None
     return (
         f"tau does not move with gravity: their correlation is {correlation:.2g}, while the URDF's gravity torque "
-        f"varies {joint.shown.gravity.relative_deviation:.2g} times as much as tau; is it compensated in the log?"
+        f"varies {joint.report.gravity.relative_deviation:.2g} times as much as tau; is it compensated in the log?"
     )
 
 

@@ -42,13 +42,13 @@ def low_passed(t: np.ndarray, signals: np.ndarray, cutoff: float) -> np.ndarray:
     return interpolated(grid, low_pass_regular(interpolated(t, signals, grid), _mean_rate(t), cutoff), t)
 
 
-def interpolated(t: np.ndarray, signals: np.ndarray, at: np.ndarray) -> np.ndarray:
+def interpolated(t: np.ndarray, signals: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Return signals (T, ...) at times t at other times, on a cubic; as they are where these are the same times."""
-    if len(t) == len(at) and np.abs(t - at).max() < 1e-6 / _mean_rate(t):
+    if len(t) == len(times) and np.abs(t - times).max() < 1e-6 / _mean_rate(t):
         return signals
     from scipy.interpolate import CubicSpline
 
-    return np.asarray(CubicSpline(t, signals)(at))
+    return np.asarray(CubicSpline(t, signals)(times))
 
 
 def _mean_rate(t: np.ndarray) -> float:
@@ -78,14 +78,14 @@ def regular_times(t: np.ndarray, frequency: float) -> np.ndarray:
     return np.arange(t[0], t[-1], 1.0 / frequency)
 
 
-def resampled(t: np.ndarray, signals: np.ndarray, at: np.ndarray, rate: float) -> np.ndarray:
+def resampled(t: np.ndarray, signals: np.ndarray, times: np.ndarray, rate: float) -> np.ndarray:
     """Return signals (T, ...) of that rate [Hz] at other times: between dense samples on lines, else on a cubic."""
     from scipy.interpolate import interp1d
 
     # a line between samples that are far apart would cut off the peaks of the motion
     kind = "linear" if is_dense(rate) else "cubic"
     # by rounding the last time may lie just behind the last sample
-    return np.asarray(interp1d(t, signals, kind, axis=0, fill_value="extrapolate")(at))
+    return np.asarray(interp1d(t, signals, kind, axis=0, fill_value="extrapolate")(times))
 
 
 def velocities(trajectory: Trajectory) -> np.ndarray:

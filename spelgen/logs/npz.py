@@ -100,9 +100,9 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
         # a joint's column may be that of a matrix `q` (T, n)
         matrix = getattr(mapping.columns, quantity).replace("{joint}", "").rstrip("_")
         if matrix in arrays.names and arrays[matrix].ndim == 2:
-            places = _matrix_columns(arrays, matrix, [mapping.log_name(joint) for joint in joints])
-            for joint, place in zip(joints, places, strict=True):
-                mapping = mapping.with_joint_columns({joint: {quantity: f"{matrix}[{place}]"}})
+            indices = _matrix_columns(arrays, matrix, [mapping.log_name(joint) for joint in joints])
+            for joint, index in zip(joints, indices, strict=True):
+                mapping = mapping.with_joint_columns({joint: {quantity: f"{matrix}[{index}]"}})
     # names alone: to learn an array's type is to read it
     schema = pa.schema([(name, pa.null()) for name in arrays.names])
     layout = table_layout(schema, joints, mapping, arrays.file)

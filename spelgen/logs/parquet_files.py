@@ -40,8 +40,8 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
                     f"the motors {', '.join(names) or 'without names'}", file=folder / INFO, element=f"joint {joint}",
                     expected=f"{name} among them", do="write its name under 'logs', 'joints' in the robot's YAML",
                 )  # fmt: skip
-        places = {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
-        mapping = mapping.with_joint_columns({joint: places})
+        motors = {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
+        mapping = mapping.with_joint_columns({joint: motors})
     common = mapping.columns.model_copy(update={"t": "timestamp", "trajectory": "episode_index"})
     mapping = mapping.model_copy(update={"columns": common})
     tables: list[LogTable] = []

@@ -67,8 +67,8 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[n
 def _roughness(positions: np.ndarray) -> float:
     """Return the way that joints go from row to row, each relative to its range."""
     ranges = np.ptp(positions, axis=0)
-    way = np.abs(np.diff(positions, axis=0)).sum(axis=0)
-    return float((way / np.where(ranges > 0, ranges, 1.0)).sum())
+    length = np.abs(np.diff(positions, axis=0)).sum(axis=0)
+    return float((length / np.where(ranges > 0, ranges, 1.0)).sum())
 
 
 def require_increasing_times(t: np.ndarray, rows: Sequence[int] | np.ndarray, layout: Layout) -> None:

@@ -47,9 +47,9 @@ def suggest_mapping(file: Path, joints: Sequence[str]) -> Suggestion:
         names = _names(log_format.columns(file))
     measured: dict[str, list[str]] = {quantity: [] for quantity in WORDS}
     for name in names:
-        said = _words(name)
+        name_words = _words(name)
         for quantity, words in WORDS.items():
-            if said & words and not said & NOT_MEASURED:
+            if name_words & words and not name_words & NOT_MEASURED:
                 measured[quantity].append(name)
                 break
     if not measured["t"]:
