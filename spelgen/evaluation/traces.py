@@ -85,7 +85,7 @@ class FrictionTrace:
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """All curves; coverage: of the test logs, see `logs.coverage`."""
+    """All curves; coverage: of the test logs, see `coverage`."""
 
     coverage: dict[str, object]
     growth: Growth | None = None
