@@ -168,13 +168,13 @@ def test_noise_at_the_velocity_limit_is_no_finding(loaded, arm, log, over, codes
 def test_noise_and_steps_are_those_put_in(log):
     random = np.random.default_rng(2)
     noisy = replace(log, q=log.q + 1e-3 * random.standard_normal(log.q.shape))
-    np.testing.assert_allclose(statistics(noisy).noise["q"], 1e-3, rtol=0.1)
+    np.testing.assert_allclose(statistics(noisy).signals["q"][2], 1e-3, rtol=0.1)
     assert (noise_level(log.t, log.q) < 1e-5).all()
     for step in (1e-4, 2 * np.pi / 4096):
         assert quantisation_step(np.round(log.q[:, 0] / step) * step) == pytest.approx(step, rel=1e-6)
     assert np.isnan(quantisation_step(noisy.q[:, 0]))
     assert np.isnan(quantisation_step(np.ones(100)))
-    assert not statistics(log[::4]).noise
+    assert np.isnan(statistics(log[::4]).signals["q"][2]).all()
 
 
 def test_what_cannot_be_trained_on_is_an_error_not_the_end(loaded, arm, log):

@@ -21,7 +21,7 @@ from spelgen.logs.chunks import scan
 from spelgen.logs.formats import FORMATS
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.suggest import suggest_mapping
-from spelgen.logs.tables import LogFormat, LogTable, table_layout
+from spelgen.logs.tables import LogFormat, table_layout
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.log_mapping import LogMapping
 
@@ -347,7 +347,7 @@ def test_a_new_format_is_a_reader_and_its_name_among_the_formats(tmp_path, monke
 
     def read(file, joints, mapping):
         table = as_table(file)
-        return [LogTable(None, table, table_layout(table.schema, joints, mapping, file))]
+        return [(table_layout(table.schema, joints, mapping, file), table)]
 
     monkeypatch.setattr(formats, "FORMATS", [*FORMATS, LogFormat(read, suffixes=(".txt",), columns=as_table)])
     np.savetxt(tmp_path / "x.txt", np.stack(list(columns().values()), axis=1), fmt="%.17g")
@@ -651,29 +651,6 @@ def test_no_column_of_another_joint_is_offered(tmp_path):
         with pytest.raises(LogError, match="missing column effort_3") as caught:
             read_logs(path, asked, {"columns": names})
         assert "rename the column '" not in str(caught.value)
-
-
-def joint_states(order=("b", "a")):
-    """Lines as `ros2 topic echo --csv` writes them, at 100 Hz."""
-    lines = []
-    for k in range(50):
-        values = {"a": (0.01 * k, 1.0, 5.0 + 0.1 * k), "b": (-0.02 * k, -2.0, 7.0)}
-        cells = [str(1_700_000_000 + k // 100), str(10_000_000 * (k % 100)), "base", *order]
-        for field in range(3):
-            cells += [f"{values[joint][field]:.6f}" for joint in order]
-        lines.append(",".join(cells))
-    return lines
-
-
-def test_what_ros2_topic_echo_writes_is_read(tmp_path):
-    (tmp_path / "log.csv").write_text("\n".join(joint_states()) + "\n")
-    (log,) = read_logs([tmp_path / "log.csv"], ("a", "b"))
-    np.testing.assert_allclose(log.t - log.t[0], 0.01 * np.arange(50), atol=1e-9)
-    np.testing.assert_allclose(log.q[:, 1], -0.02 * np.arange(50), atol=1e-9)
-    np.testing.assert_allclose(log.tau[:, 0], 5.0 + 0.1 * np.arange(50), atol=1e-9)
-    # the gripper that is logged beside the arm is left out
-    (arm_alone,) = read_logs([tmp_path / "log.csv"], ("a",))
-    assert arm_alone.q.shape == (50, 1)
 
 
 def test_a_headerless_csv_is_called_that(tmp_path):

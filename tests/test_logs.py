@@ -1,5 +1,6 @@
 """Logs: read back exactly, refused clearly, filtered without delay, split and cut without leaking."""
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from time import process_time
@@ -11,12 +12,13 @@ import pytest
 import torch
 
 from spelgen.building import build
-from spelgen.errors import Diagnostic, LogError, SpelgenErrors
+from spelgen.errors import LogError, SpelgenErrors
 from spelgen.loaded_arm import load_arm
-from spelgen.logs.checks import check, once
+from spelgen.logs.checks import check
 from spelgen.logs.chunks import scan
-from spelgen.logs.filtering import low_pass, prepare, regular_times, resampled
-from spelgen.logs.rates import automatic_cutoff, automatic_decimation, shows_accelerations
+from spelgen.logs.filtering import low_pass, regular_times, resampled
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.trajectory import split_at_gaps
 from spelgen.logs.windows import cut_windows, split_validation
@@ -359,7 +361,7 @@ def test_gaps_split_and_are_said():
 
 
 def test_no_window_crosses_a_gap():
-    pieces = prepare([with_gap()], shortest=5, cutoff=None)
+    pieces = Preprocessing(cutoff=0.0).pieces([with_gap()], shortest=5)
     windows = cut_windows(pieces, 5, measured=False)
     assert len(windows) == (120 - 4) + (80 - 4)
     assert windows.dt.max() < 0.02
@@ -367,7 +369,7 @@ def test_no_window_crosses_a_gap():
 
 def test_a_trajectory_without_a_whole_window_is_refused():
     with pytest.raises(LogError) as caught:
-        prepare([with_gap()], shortest=121, cutoff=None)
+        Preprocessing(cutoff=0.0).pieces([with_gap()], shortest=121)
     assert str(caught.value) == (
         "trajectory gap: got 120 samples without a gap, expected at least 121, one window; "
         "record longer or train with a shorter window"
@@ -409,15 +411,16 @@ def test_the_filter_needs_more_than_two_samples_per_period():
 
 
 def test_only_dense_logs_are_filtered_unasked():
-    assert automatic_cutoff([100.0]) == 8.0
-    assert automatic_cutoff([100.0, 20.0]) is None
-    assert automatic_decimation([100.1], 8.0) == 4
-    assert automatic_decimation([1000.0], None) == 1
+    automatic, filtered = Preprocessing(), Preprocessing(cutoff=8.0)
+    assert automatic.resolved([100.0]).cutoff == 8.0
+    assert automatic.resolved([100.0, 20.0]).cutoff is None
+    assert filtered.resolved([100.1]).decimation == 4
+    assert Preprocessing(cutoff=0.0).resolved([1000.0]).decimation == 1
     # what a logger's clock is off decides nothing
     for nominal in (50.0, 60.0, 100.0, 120.0, 500.0):
         rates = nominal * np.array([0.999, 1.0, 1.001])
-        assert len({automatic_decimation([rate], 8.0) for rate in rates}) == 1
-        assert len({automatic_cutoff([rate]) for rate in rates}) == 1
+        assert len({filtered.resolved([rate]).decimation for rate in rates}) == 1
+        assert len({automatic.resolved([rate]).cutoff for rate in rates}) == 1
         assert all(map(shows_accelerations, rates))
 
 
@@ -461,7 +464,7 @@ def test_a_gap_does_not_leak_into_validation():
     trajectories = [with_gap(), swing("other")]
     split = split_validation(trajectories, 0.5, seed=0)
     names = [
-        {x.name for x in prepare(part, shortest=5, cutoff=None)}
+        {x.name for x in Preprocessing(cutoff=0.0).pieces(part, shortest=5)}
         for part in (split.training, split.validation)
     ]
     assert names[0].isdisjoint(names[1])
@@ -482,7 +485,7 @@ def test_real_logs_are_read(shared):
     assert trajectory.q.shape == (20544, 7)
     notes = check([trajectory], joints, ("revolute",) * 7)
     assert [x.code for x in notes] == ["gap"]
-    assert len(prepare([trajectory], shortest=5, cutoff=8.0)) == 5
+    assert len(Preprocessing(cutoff=8.0).pieces([trajectory], shortest=5)) == 5
 
 
 def test_a_models_logs_have_the_urdfs_names(tmp_path):
@@ -501,8 +504,7 @@ def test_a_models_logs_have_the_urdfs_names(tmp_path):
 
 
 def test_what_is_said_of_many_recordings_is_said_once():
-    slow, other = (Diagnostic("warning", "low-rate", f"trajectory {k}", None, "slow") for k in "ab")
-    gap = Diagnostic("info", "gap", "trajectory a", None, "1 gap in time")
-    first, second = once([slow, gap, other])
-    assert (first.where, first.message) == ("trajectory a", "slow (and in 1 more trajectory)")
-    assert second == gap
+    slow = swing("a", dt=0.05)
+    (note,) = check([slow, replace(slow, name="b")], JOINTS, ("revolute", "revolute"))
+    assert (note.code, note.where) == ("low-rate", "trajectory a")
+    assert note.message.startswith("20 Hz: ") and note.message.endswith(" (and in 1 more trajectory)")

@@ -41,11 +41,12 @@ def test_logs_of_a_servo_arm_are_told(arm, logs):
     shoulder, elbow = found.joints
     assert shoulder.steps["q"] == pytest.approx(2 * np.pi / 4096, rel=1e-6)
     assert shoulder.steps["u"] is None
-    assert shoulder.u == (min(x.u[:, 0].min() for x in logs), max(x.u[:, 0].max() for x in logs))
-    assert 0.05 < shoulder.lag < 0.15  # the delay, and kd/kp
-    assert shoulder.saturated < 0.02 and elbow.saturated is None
-    assert shoulder.steady_state_error is None  # its command never rests
-    for text in ("Positions and commands [rad]", "Following", "No findings."):
+    assert shoulder.low["u"] == min(x.u[:, 0].min() for x in logs)
+    assert shoulder.high["u"] == max(x.u[:, 0].max() for x in logs)
+    assert 0.05 < shoulder.following.lag < 0.15  # the delay, and kd/kp
+    assert shoulder.following.saturated < 0.02 and elbow.following.saturated is None
+    assert shoulder.following.steady_state_error is None  # its command never rests
+    for text in ("Ranges [rad]", "Following", "No findings."):
         assert text in found.text()
     told = json.loads(json.dumps(found.to_dict()))
     assert told["joints"][1]["name"] == "elbow"
@@ -103,14 +104,14 @@ def test_what_is_odd_about_commands_is_told(arm, logs, columns, code):
 def test_what_is_left_at_rest_is_told(arm):
     shoulder, elbow = spelgen.check_logs(servo_logs(2, 12.0, swing=0.0), arm).joints
     # dry friction and the links' weight hold that much, in ratio to kp
-    assert 0.3 * 0.15 / 14 < shoulder.steady_state_error < (0.15 + 0.9) / 14
-    assert 0.3 * 0.08 / 9 < elbow.steady_state_error < (0.08 + 0.16) / 9
+    assert 0.3 * 0.15 / 14 < shoulder.following.steady_state_error < (0.15 + 0.9) / 14
+    assert 0.3 * 0.08 / 9 < elbow.following.steady_state_error < (0.08 + 0.16) / 9
 
 
 def test_servos_that_give_all_they_can_are_counted(arm):
     far = [replace(x, u=x.u + np.array([6 / 14 + 0.2, 0.0])) for x in servo_logs(1, 8.0)]
     shoulder = spelgen.check_logs(far, arm).joints[0]
-    assert 0.5 < shoulder.saturated <= 1.0
+    assert 0.5 < shoulder.following.saturated <= 1.0
 
 
 def test_sparse_logs_are_told(arm, logs):

@@ -11,8 +11,7 @@ from spelgen.baselines.run_arm import run_logs
 from spelgen.files import write_json
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.streaming import LargeLogs
-from spelgen.logs.coverage import coverage
-from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.trajectory import Trajectory, coverage
 
 
 def keep_baseline(folder: Path | str, logs: Iterable[Path | str] | Sequence[Trajectory]) -> None:

@@ -14,7 +14,7 @@ from spelgen.baselines.names import MODEL
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import Diagnostic
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
-from spelgen.logs.smoothing import velocities
+from spelgen.logs.filtering import velocities
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.settings.tuning.evaluation import EvaluationTuning
 

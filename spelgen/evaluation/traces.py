@@ -30,8 +30,7 @@ from spelgen.evaluation.horizons import JudgedLogs, Predictions, TipPosition
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.replay import Missed
 from spelgen.fitting.rollout import AT_REST, loss_scales, position_difference
-from spelgen.logs.coverage import coverage
-from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.trajectory import Trajectory, coverage
 from spelgen.settings.tuning.evaluation import TraceTuning
 
 if TYPE_CHECKING:
@@ -86,7 +85,7 @@ class FrictionTrace:
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """All curves; coverage: of the test logs, see `logs.coverage`."""
+    """All curves; coverage: of the test logs, see `coverage`."""
 
     coverage: dict[str, object]
     growth: Growth | None = None

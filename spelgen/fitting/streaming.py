@@ -20,7 +20,7 @@ from spelgen.fitting.dataset import (
     numbers_of,
 )
 from spelgen.fitting.rollout import loss_scales
-from spelgen.logs.checks import Finding, clock_diagnostics, findings, summarised
+from spelgen.logs.checks import LogChecks
 from spelgen.logs.chunks import Chunk, scan
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import GAP, gap_ends
@@ -120,20 +120,18 @@ def _read_once(logs: LargeLogs) -> LogContents:
     chunks: list[Chunk] = []
     pieces: list[list[int]] = []
     rates: list[float] = []
-    problems: list[Finding] = []
-    clock_notes: list[Diagnostic] = []
+    checks = LogChecks(logs.joints, logs.joint_types)
     numbers = hashlib.sha256()
     for chunk, trajectory in scan(logs.files, logs.joints, logs.mapping, logs.joint_types):
         chunks.append(chunk)
         pieces.append(np.diff(gap_ends(trajectory.t, logs.gap)).tolist())
         rates.append(trajectory.sample_rate)
-        problems += findings(trajectory, logs.joints, logs.joint_types)
-        clock_notes += clock_diagnostics(trajectory)
+        checks.add(trajectory)
         for array in numbers_of(trajectory):
             numbers.update(array)
-    summary = summarised(problems, logs.joints, len(chunks))
+    summary = checks.findings()
     collect(summary.errors)
     # the last samples of a recording may be a chunk of their own, too short to tell a rate
     lengths = np.array(list(map(sum, pieces)))
     reliable = np.array(rates)[lengths > lengths.max() / 10].tolist()
-    return LogContents(chunks, reliable, [*clock_notes[:1], *summary.notes], numbers.hexdigest(), pieces)
+    return LogContents(chunks, reliable, summary.notes, numbers.hexdigest(), pieces)

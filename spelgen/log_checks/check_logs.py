@@ -14,16 +14,17 @@ from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.identification.drive_hints import Coupling, drive_problem, find_wrong_torques
 from spelgen.identification.drive_samples import DriveLog
 from spelgen.identification.torque_delay import delay_of
-from spelgen.listing import Listing
+from spelgen.listing import Listing, number
 from spelgen.log_checks.check_servo_logs import ServoLogs
 from spelgen.log_checks.gravity import find_opposed_inertia, fit_gravity, joined, state_samples
-from spelgen.log_checks.report import TUNING, JointReport, LogReport, joint_report, torque_tables
+from spelgen.log_checks.report import JointReport, LogReport, joint_report, percent, signal_tables
 from spelgen.log_checks.robot_checks import CHECKS, SENSE, JointEvidence
 from spelgen.log_checks.statistics import Statistics, statistics
-from spelgen.logs.checks import Finding, Findings, clock_diagnostics, findings, once, run_checks, summarised
+from spelgen.logs.checks import Findings, LogChecks, run_checks
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
-from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
+from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
+from spelgen.settings.tuning.log_checks import TUNING
 
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
@@ -45,33 +46,34 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
     the joints. Raises LogError without any trajectory, or with one of another number of joints, and
     where an arm's settings say 'input: position', without commands.
     """
-    joints, kinds = arm.arm.joint_names, arm.arm.joint_types
+    joints = arm.arm.joint_names
     checked: TorqueLogs | ServoLogs = TorqueLogs(arm, mapping or arm.settings.logs)
     if arm.settings.input == "position":
         checked = ServoLogs(arm)
+    log_checks = LogChecks(joints, arm.arm.joint_types)
     measured: list[Statistics] = []
     examples: list[Trajectory] = []
-    notes: list[Diagnostic] = []
-    odd: list[Finding] = []
     # one after another: a stream of logs may be larger than memory
     for trajectory in logs:
         require_joints(trajectory, joints)
         checked.add(trajectory)
+        log_checks.add(trajectory)
         measured.append(statistics(trajectory))
-        odd += findings(trajectory, joints, kinds, measured[-1].agreement)
-        notes += clock_diagnostics(trajectory)
         if len(examples) < TUNING.examples:
             examples.append(trajectory)
     if not measured:
         raise LogError("no trajectory", expected="at least one")
-    summary = summarised(odd, joints, len(measured))
-    reports, tables = checked.joints(measured, summary)
+    summary = log_checks.findings()
+    reports = []
+    for index, coordinate in enumerate(arm.arm.coordinates):
+        reports.append(joint_report(index, coordinate, measured, log_checks.products))
+    completed, tables = checked.check(reports, summary)
     return LogReport(
         robot=arm.arm.name,
         trajectories=tuple(x.clock for x in measured),
-        joints=reports,
+        joints=completed,
         tables=tables,
-        findings=(*once(notes), *summary.notes),
+        findings=tuple(summary.notes),
         errors=tuple(summary.errors),
         examples=tuple(examples),
     )
@@ -104,30 +106,28 @@ class TorqueLogs:
         self._moving.add(trajectory)
         self._declared.append(set(trajectory.accepted))
 
-    def joints(
-        self, measured: Sequence[Statistics], summary: Findings
+    def check(
+        self, reports: Sequence[JointReport], summary: Findings
     ) -> tuple[list[JointReport], tuple[Listing, ...]]:
-        """Return what all trajectories show of each joint, with its tables; add what is odd to the summary."""
+        """Return the reports with what gravity explains, and tables; add what is odd to the summary."""
         # what files declare by themselves holds where all of them do
         accepted = set(self._mapping.accept) | set.intersection(*self._declared)
         motion = joined(self._samples)
-        reports = []
+        completed = []
         fits = fit_gravity(self._arm.arm, motion)
-        for index, (coordinate, gravity) in enumerate(zip(self._arm.arm.coordinates, fits, strict=True)):
-            report = joint_report(index, coordinate, measured, gravity)
-            reports.append(report)
+        for coordinate, report, gravity in zip(self._arm.arm.coordinates, reports, fits, strict=True):
+            completed.append(replace(report, gravity=gravity))
             passed = accepted
             # a unit that somebody wrote down is taken as right
             if self._mapping.unit("tau", coordinate.name) is not None:
                 passed = accepted.union(UNIT_CODES)
             where = f"joint {coordinate.name!r}"
-            for check, message in run_checks(CHECKS, JointEvidence(coordinate, report), passed):
-                place = f"{where}, tau" if check.severity == "error" else where
-                summary.add(check, message, place)
+            for check, message in run_checks(CHECKS, JointEvidence(coordinate, completed[-1]), passed):
+                summary.add(check, message, f"{where}, tau" if check.severity == "error" else where)
         # beside wrong velocities friction is wrong too, and of wrong torques hints about drives would be wrong
         if not any(note.code == "velocity-is-no-derivative" for note in summary.notes):
             self._check_together(motion, accepted, summary)
-        return reports, torque_tables(reports)
+        return completed, (*signal_tables(completed, QUANTITIES), _physics_table(completed))
 
     def _check_together(self, motion: np.ndarray, accepted: set[str], summary: Findings) -> None:
         """Add what is wrong with the torques of all joints together, or else a coupling of motors, or else a delay.
@@ -171,3 +171,20 @@ def _coupling_hint(arm: LoadedArm, coupling: Coupling, remaining: float) -> Diag
         f"of both torques (mean square); say {setting} in the robot's YAML"
     )
     return Diagnostic("warning", COUPLED, f"joint {names[coupling.joint]!r}", None, message)
+
+
+def _physics_table(joints: Sequence[JointReport]) -> Listing:
+    head = ("joint", "dq/dt : qd", "agree", "gravity in tau", "x URDF")
+    rows = []
+    for joint in joints:
+        fit = joint.gravity
+        # beside a low correlation the factor means nothing
+        is_seen = abs(fit.correlation or 0) > TUNING.seen
+        velocity = number(joint.velocity_factor), number(joint.velocity_correlation)
+        rows.append((joint.name, *velocity, percent(fit.explained), number(fit.factor if is_seen else None)))
+    note = (
+        "dq/dt : qd and its correlation are 1 where qd is the derivative of q; gravity in tau: part of tau's "
+        "variance that gravity explains, beside friction and acceleration; x URDF: ratio to the URDF's gravity "
+        "torque."
+    )
+    return Listing("Physics", head, tuple(rows), note)

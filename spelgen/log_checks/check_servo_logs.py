@@ -2,26 +2,105 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from spelgen.errors import Diagnostic, LogError
-from spelgen.listing import Listing
-from spelgen.log_checks.following import DELAYS, NO_DELAY, TUNING, Following, measure_following
-from spelgen.log_checks.report import JointReport, joint_report
+from spelgen.listing import Listing, number
+from spelgen.log_checks.report import JointFollowing, JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
-from spelgen.log_checks.servo_report import ServoJointReport, servo_tables
-from spelgen.log_checks.statistics import Statistics
 from spelgen.logs.checks import DEGREES, Findings, is_factor, run_checks
-from spelgen.logs.trajectory import Trajectory, require_commands
-from spelgen.settings.tuning.log_checks import LogCheckTuning
+from spelgen.logs.commands import delayed_commands
+from spelgen.logs.filtering import derivative
+from spelgen.logs.trajectory import Trajectory, require_commands, split_at_gaps
+from spelgen.settings.tuning.identification import IdentificationTuning
+from spelgen.settings.tuning.log_checks import TUNING as CHECK_TUNING
+from spelgen.settings.tuning.servo import ServoLogTuning
 
 if TYPE_CHECKING:
     from spelgen.loaded_arm import LoadedArm
 
-FOLLOWS = LogCheckTuning().agreement
+TUNING = ServoLogTuning()
+MOVING = IdentificationTuning().moving
+DELAYS = np.arange(TUNING.earliest_delay, TUNING.latest_delay + 1e-9, TUNING.delay_step).round(9)
+NO_DELAY = int(np.argmin(np.abs(DELAYS)))
+FILTER_SAMPLES = 12  # the shortest piece that the derivative's polynomial has room in
+FOLLOWS = CHECK_TUNING.agreement
+
+
+class Following(NamedTuple):
+    """Hold how n joints follow their commands.
+
+    moves: (n,) whether the command moves. delay, correlation: (n, n) of the command of the row's joint with the
+    position of the column's, at the delay [s] at which the two are most alike. gain: (n,) how far a joint moves by its
+    own command. joints: by joint.
+    """
+
+    moves: np.ndarray
+    delay: np.ndarray
+    correlation: np.ndarray
+    gain: np.ndarray
+    joints: list[JointFollowing]
+
+
+def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Following | None:
+    """Measure n joints over recordings; None where none is long enough.
+
+    saturation: (n,) distances from the command at which torque is at its limit; infinite where that is not known.
+    """
+    pieces: list[Trajectory] = []
+    for log in logs:
+        pieces += split_at_gaps(log, shortest=FILTER_SAMPLES)
+    if not pieces:
+        return None
+    q = np.concatenate([_midpoints(piece.q) for piece in pieces])
+    commands = np.concatenate([require_commands(piece)[:-1] for piece in pieces])
+    q_std, u_std = q.std(axis=0), commands.std(axis=0)
+    correlations, tracking_rms = [], []
+    for delay in DELAYS.tolist():
+        u = np.concatenate([delayed_commands(x, slice(0, len(x)), delay, 1)[:, 0] for x in pieces])
+        # means differ by the static error, which is no matter of delay
+        covariance = (u - u.mean(axis=0)).T @ (q - q.mean(axis=0)) / len(u)
+        correlations.append(covariance / np.maximum(np.outer(u.std(axis=0), q_std), 1e-6))
+        tracking_rms.append(np.sqrt(np.mean((u - q) ** 2, axis=0)))
+    best = np.abs(correlations).argmax(axis=0)
+    correlation = np.take_along_axis(np.array(correlations), best[None], axis=0)[0]
+    moves = u_std > TUNING.idle_command
+    saturated = np.mean(np.abs(commands - q) > saturation, axis=0)
+    joints = []
+    for k, error in enumerate(_steady_state_errors(pieces)):
+        delay_index = best[k, k] if moves[k] else NO_DELAY
+        lag = float(DELAYS[delay_index]) + 0.0 if moves[k] else None  # no -0
+        fraction = float(saturated[k]) if np.isfinite(saturation[k]) else None
+        joints.append(JointFollowing(lag, float(tracking_rms[delay_index][k]), error, fraction))
+    gain = correlation.diagonal() * q_std / np.maximum(u_std, 1e-6)
+    return Following(moves, DELAYS[best], correlation, gain, joints)
+
+
+def _steady_state_errors(pieces: Sequence[Trajectory]) -> list[float | None]:
+    """Return by joint nine tenths of the distances from the command while both rest; None where they never do."""
+    distances, rests = [], []
+    for piece in pieces:
+        u = require_commands(piece)[:-1]
+        velocity = np.gradient(derivative(piece.q, piece.sample_rate, 0), piece.t, axis=0)[1:]
+        span = max(1, round(TUNING.rest_time * piece.sample_rate))
+        resting = (u == np.roll(u, span, axis=0)) & (np.abs(velocity) < MOVING)
+        resting[:span] = False
+        rests.append(resting)
+        distances.append(np.abs(u - _midpoints(piece.q)))
+    errors: list[float | None] = []
+    for distance, resting in zip(np.concatenate(distances).T, np.concatenate(rests).T, strict=True):
+        # not the largest: where an arm leans on something it may be anywhere
+        errors.append(float(np.quantile(distance[resting], 0.9)) if resting.any() else None)
+    return errors
+
+
+def _midpoints(x: np.ndarray) -> np.ndarray:
+    """Return values in the middle between samples, where delayed commands are."""
+    return np.asarray((x[1:] + x[:-1]) / 2)
 
 
 class ServoLogs:
@@ -36,118 +115,106 @@ class ServoLogs:
         require_commands(trajectory)
         self._logs.append(trajectory)
 
-    def joints(
-        self, measured: Sequence[Statistics], summary: Findings
-    ) -> tuple[list[ServoJointReport], tuple[Listing, ...]]:
-        """Return how each joint follows its commands, with tables; add what is odd to the summary."""
-        following = measure_following(self._logs, _saturation(self._arm))
-        reports = []
+    def check(
+        self, reports: Sequence[JointReport], summary: Findings
+    ) -> tuple[list[JointReport], tuple[Listing, ...]]:
+        """Return the reports with how joints follow their commands, and tables; add what is odd to the summary."""
+        names = self._arm.arm.joint_names
+        saturation = np.full(len(names), np.inf)
         for k, coordinate in enumerate(self._arm.arm.coordinates):
-            signals = joint_report(k, coordinate, measured)
-            report = _joint(self._arm, k, signals, following)
-            reports.append(report)
-            wrong = _wrong_command(k, self._arm.arm.joint_names, following)
-            if wrong is None:
+            kp = self._arm.settings.joint(coordinate.name).kp
+            if coordinate.effort and kp:
+                saturation[k] = coordinate.effort / kp
+        following = measure_following(self._logs, saturation)
+        completed = []
+        for k, (coordinate, report) in enumerate(zip(self._arm.arm.coordinates, reports, strict=True)):
+            odd = None
+            if following is not None:
+                report = replace(report, following=following.joints[k])
                 # some loggers write measured positions in place of commands
-                copied = all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in self._logs)
-                summary.notes.extend(_odd_command(k, report, following, copied=copied))
-                for check, message in run_checks(POSITION_CHECKS, JointEvidence(coordinate, signals)):
-                    summary.add(check, message, f"joint {coordinate.name!r}")
-            else:
-                summary.errors.append(wrong)
-        # said once: logs of one robot have one rate
-        sparse = [x.clock for x in measured if x.clock.sample_rate < TUNING.sparse_rate]
-        for clock in sparse[:1]:
-            message = (
-                f"{clock.sample_rate:.3g} Hz: delays and friction need {TUNING.sparse_rate:g} Hz or more"
-            )
-            summary.notes.append(Diagnostic("warning", "sparse", f"trajectory {clock.name}", None, message))
-        return reports, servo_tables(reports)
-
-
-def _saturation(arm: LoadedArm) -> np.ndarray:
-    """Return distances from the command (n,) at which servos give all they can; infinite where that is not known."""
-    distances = np.full(len(arm.arm.coordinates), np.inf)
-    for k, coordinate in enumerate(arm.arm.coordinates):
-        kp = arm.settings.joint(coordinate.name).kp
-        if coordinate.effort and kp:
-            distances[k] = coordinate.effort / kp
-    return distances
-
-
-def _joint(arm: LoadedArm, k: int, signals: JointReport, following: Following) -> ServoJointReport:
-    delay, lag = NO_DELAY, None
-    if following.moves[k]:
-        delay = following.best_delay(k, k)
-        lag = float(DELAYS[delay])
-    steady_state_error, saturated = None, None
-    if len(following.steady_state_errors[k]):
-        # nine tenths: where an arm leans on something it may be anywhere
-        steady_state_error = float(np.quantile(np.abs(following.steady_state_errors[k]), 0.9))
-    if arm.settings.joint(signals.name).kp is not None:
-        saturated = float(following.saturated[k])
-    return ServoJointReport(
-        name=signals.name,
-        kind=signals.kind,
-        q=(signals.low["q"], signals.high["q"]),
-        u=(signals.low["u"], signals.high["u"]),
-        range_fraction=signals.range_fraction,
-        noise=(signals.noise or {}).get("q"),
-        steps=signals.steps,
-        lag=lag,
-        tracking_rms=float(following.tracking_rms[delay, k]),
-        steady_state_error=steady_state_error,
-        saturated=saturated,
-    )
-
-
-def _wrong_command(k: int, joints: Sequence[str], following: Following) -> LogError | None:
-    """Return why a command cannot be that of its joint, None where it can."""
-    # what does not move follows nothing, and proves nothing wrong
-    if not following.moves[k]:
-        return None
-    # judged at the delay at which the two are most alike: a slow servo is no wrong one
-    where, delay = f"joint {joints[k]!r}", following.best_delay(k, k)
-    correlation, gain = float(following.correlation[delay, k, k]), float(following.gain[delay, k, k])
-    # a servo follows its command to a fifth, unless one of the two is in degrees
-    in_degrees = is_factor(gain, DEGREES) or is_factor(gain, 1 / DEGREES)
-    if correlation > FOLLOWS and in_degrees:
-        got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
-        do = "write 'units' of q and u under 'logs' in the robot's YAML"
-        return LogError(got, element=where, expected="both in radians", do=do)
-    if correlation < -FOLLOWS:
-        got = f"positions that move against commands (correlation {correlation:.2g})"
-        return LogError(got, element=where, expected="one sense", do="check the signs of q and u")
-    # swapped columns: another joint follows this command
-    if correlation < TUNING.ignores:
-        for other, name in enumerate(joints):
-            delay = following.best_delay(k, other)
-            if other != k and following.correlation[delay, k, other] > FOLLOWS:
-                got = f"a command that joint {name!r} follows, and this one does not"
-                do = "check the names of the columns"
-                return LogError(got, element=where, expected="its own command", do=do)
-    return None
+                is_copy = all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in self._logs)
+                odd = _odd_command(k, names, report, following, is_copy)
+            completed.append(report)
+            if isinstance(odd, LogError):
+                summary.errors.append(odd)
+                continue
+            if odd is not None:
+                summary.notes.append(odd)
+            for check, message in run_checks(POSITION_CHECKS, JointEvidence(coordinate, report)):
+                summary.add(check, message, f"joint {coordinate.name!r}")
+        for log in self._logs:
+            if log.sample_rate < TUNING.sparse_rate:
+                message = (
+                    f"{log.sample_rate:.3g} Hz: delays and friction need {TUNING.sparse_rate:g} Hz or more"
+                )
+                summary.notes.append(Diagnostic("warning", "sparse", f"trajectory {log.name}", None, message))
+                break  # said once: logs of one robot have one rate
+        return completed, (*signal_tables(completed, ("q", "u")), _following_table(completed))
 
 
 def _odd_command(
-    k: int, report: ServoJointReport, following: Following, *, copied: bool
-) -> Iterator[Diagnostic]:
-    """Yield what is odd about a joint's command; copied: it is the position itself."""
-    delay = following.best_delay(k, k)
-    correlation = following.correlation[delay, k, k]
-    if copied:
-        message = "u is q, to the last bit: are the commands those that were sent?"
-        yield _warning("commands-are-positions", report.name, message)
+    k: int, joints: Sequence[str], report: JointReport, following: Following, is_copy: bool
+) -> LogError | Diagnostic | None:
+    """Return what is odd about a joint's command: an error where it cannot be that of this joint.
+
+    is_copy: it is the position itself.
+    """
+    where = f"joint {joints[k]!r}"
+    # judged at the delay at which the two are most alike: a slow servo is no wrong one
+    correlation, gain = following.correlation[k, k], following.gain[k]
+    if is_copy:
+        code, message = (
+            "commands-are-positions",
+            "u is q, to the last bit: are the commands those that were sent?",
+        )
+    # what does not move follows nothing, and proves nothing wrong
     elif not following.moves[k]:
-        message = f"its command moves by {report.u[1] - report.u[0]:.3g} alone: its servo is not determined"
-        yield _warning("idle-command", report.name, message)
+        width = report.high["u"] - report.low["u"]
+        code, message = "idle-command", f"its command moves by {width:.3g} alone: its servo is not determined"
+    # a servo follows its command to a fifth, unless one of the two is in degrees
+    elif correlation > FOLLOWS and (is_factor(gain, DEGREES) or is_factor(gain, 1 / DEGREES)):
+        got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
+        do = "write 'units' of q and u under 'logs' in the robot's YAML"
+        return LogError(got, element=where, expected="both in radians", do=do)
+    elif correlation < -FOLLOWS:
+        got = f"positions that move against commands (correlation {correlation:.2g})"
+        return LogError(got, element=where, expected="one sense", do="check the signs of q and u")
     elif correlation < TUNING.ignores:
-        message = f"it does not follow its command (correlation {correlation:.2g})"
-        yield _warning("not-following", report.name, message)
-    elif DELAYS[delay] < 0:
-        message = f"positions come {-1000 * DELAYS[delay]:.0f} ms before commands: are rows shifted?"
-        yield _warning("ahead-of-command", report.name, message)
+        # swapped columns: another joint follows this command
+        for other, name in enumerate(joints):
+            if following.correlation[k, other] > FOLLOWS:
+                got = f"a command that joint {name!r} follows, and this one does not"
+                do = "check the names of the columns"
+                return LogError(got, element=where, expected="its own command", do=do)
+        code, message = "not-following", f"it does not follow its command (correlation {correlation:.2g})"
+    elif following.delay[k, k] < 0:
+        early = -1000 * following.delay[k, k]
+        code, message = (
+            "ahead-of-command",
+            f"positions come {early:.0f} ms before commands: are rows shifted?",
+        )
+    else:
+        return None
+    return Diagnostic("warning", code, where, None, message)
 
 
-def _warning(code: str, joint: str, message: str) -> Diagnostic:
-    return Diagnostic("warning", code, f"joint {joint!r}", None, message)
+def _following_table(joints: Sequence[JointReport]) -> Listing:
+    head = ("joint", "lag", "tracking RMS", "steady-state error", "saturated")
+    rows = []
+    for joint in joints:
+        cells: tuple[str, ...] = ("-",) * 4
+        if joint.following is not None:
+            lag, error = joint.following.lag, joint.following.steady_state_error
+            cells = (
+                "-" if lag is None else f"{1000 * lag:.0f} ms",
+                number(1000 * joint.following.tracking_rms),
+                "-" if error is None else number(1000 * error),
+                percent(joint.following.saturated, 1),
+            )
+        rows.append((joint.name, *cells))
+    note = (
+        "lag: delay of positions after commands; tracking RMS: delayed command minus position; steady-state error: "
+        "90th percentile of the distance from the command at rest [mrad, mm]; saturated: fraction of time with "
+        "kp (u - q) beyond the effort limit, if kp is set."
+    )
+    return Listing("Following", head, tuple(rows), note)

@@ -13,9 +13,8 @@ from spelgen.dynamics.regressor import body_chain, regressor, urdf_parameters
 from spelgen.identification.drive_hints import drive_rows
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.settings.tuning.identification import IdentificationTuning
-from spelgen.settings.tuning.log_checks import LogCheckTuning
+from spelgen.settings.tuning.log_checks import TUNING
 
-TUNING = LogCheckTuning()
 MOVING = IdentificationTuning().moving
 
 
@@ -27,7 +26,7 @@ class GravityFit:
     inertial values explain as gravity (0..1); None where gravity never loads the joint, where the torque never
     changes, or where there is too little to tell. factor: by what the URDF's gravity torque must be multiplied to
     fit best, correlation: of both, beside the same. relative_deviation: the standard deviation of the URDF's,
-    relative to that of the torque; all three None without inertials.
+    relative to that of the torque.
     """
 
     explained: float | None = None
@@ -66,15 +65,13 @@ def fit_gravity(arm: Arm, motion: np.ndarray) -> list[GravityFit]:
         return [GravityFit()] * q.shape[1]
     still = np.zeros_like(q)
     rows = regressor(arm, q, still, still)  # (S, n, 10 B)
-    has_inertials = any(body.inertia for body in arm.bodies)
-    load = rows @ urdf_parameters(arm) if has_inertials else None
+    load = rows @ urdf_parameters(arm)
     # beside friction and the joint's own inertia, which move with gravity in a slow swing
+    friction = np.stack([np.ones_like(q), qd, np.tanh(qd / MOVING), qdd], axis=2)
     fits = []
     for joint in range(q.shape[1]):
-        speed = qd[:, joint]
-        coulomb = np.tanh(speed / MOVING)
-        friction = np.stack([np.ones(len(q)), speed, coulomb, qdd[:, joint]], axis=1)
-        fits.append(_fit(tau[:, joint], friction, rows[:, joint], None if load is None else load[:, joint]))
+        signals = np.column_stack([tau[:, joint], load[:, joint], rows[:, joint]])
+        fits.append(_fit(signals, friction[:, joint]))
     return fits
 
 
@@ -102,34 +99,32 @@ def find_opposed_inertia(arm: Arm, motion: np.ndarray, speeds: np.ndarray) -> st
     return "torques of all joints that act against acceleration"
 
 
-def _fit(tau: np.ndarray, motion: np.ndarray, columns: np.ndarray, load: np.ndarray | None) -> GravityFit:
-    """Fit torques (S,) beside columns of motion by columns of gravity. load: the URDF's gravity torque, (S,)."""
-    remainder = _without(motion, tau)
-    gravity = _without(motion, columns)
-    largest = max(1.0, float(np.abs(columns).max(initial=0.0)))
-    gravity = gravity[:, np.linalg.norm(gravity, axis=0) > TUNING.dependent * largest * np.sqrt(len(tau))]
+def _fit(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
+    """Fit a torque beside columns of friction. signals: (S, 2 + K), it, the URDF's gravity torque, and its columns."""
+    remainders = _without(friction, signals)
+    lengths = np.linalg.norm(remainders, axis=0)
+    # what is left of a constant torque, say, is no more than rounding
+    is_rounding = lengths <= TUNING.dependent * np.linalg.norm(signals, axis=0)
+    largest = max(1.0, float(np.abs(signals[:, 2:]).max(initial=0.0)))
+    is_seen = lengths[2:] > TUNING.dependent * largest * np.sqrt(len(signals))
     # a vertical axis, or a motor that was off
-    if not gravity.shape[1] or _is_rounding(remainder, tau):
+    if is_rounding[0] or not is_seen.any():
         return GravityFit()
-    unexplained = _without(gravity, remainder)
-    explained = 1.0 - float(unexplained @ unexplained) / float(remainder @ remainder)
-    if load is None:
-        return GravityFit(explained)
-    own_load = _without(motion, load)
-    if _is_rounding(own_load, load):
+    torque, load = remainders[:, 0], remainders[:, 1]
+    unexplained = _without(remainders[:, 2:][:, is_seen], torque)
+    explained = 1.0 - float(unexplained @ unexplained) / float(torque @ torque)
+    if is_rounding[1]:
         return GravityFit(explained, relative_deviation=0.0)
-    product, square = float(own_load @ remainder), float(own_load @ own_load)
-    correlation = product / float(np.sqrt(square) * np.sqrt(remainder @ remainder))
-    return GravityFit(explained, product / square, correlation, float(load.std()) / float(tau.std()))
-
-
-def _is_rounding(remainder: np.ndarray, values: np.ndarray) -> bool:
-    """Whether what is left of values is no more than rounding: of a constant torque, say."""
-    return float(np.linalg.norm(remainder)) <= TUNING.dependent * float(np.linalg.norm(values))
+    product = float(load @ torque)
+    return GravityFit(
+        explained=explained,
+        factor=product / float(load @ load),
+        correlation=product / float(lengths[0] * lengths[1]),
+        relative_deviation=float(signals[:, 1].std() / signals[:, 0].std()),
+    )
 
 
 def _without(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return what of the values (S,) or (S, K) no combination of the columns (S, C) explains."""
     basis = orth(columns, rcond=TUNING.dependent)
-    remainder: np.ndarray = values - basis @ (basis.T @ values)
-    return remainder
+    return np.asarray(values - basis @ (basis.T @ values))

@@ -5,8 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from functools import reduce
-from operator import add
+from functools import partial
 
 import numpy as np
 
@@ -15,13 +14,28 @@ from spelgen.errors import Diagnostic, SpelgenError
 from spelgen.labels import UNITS, counted
 from spelgen.listing import WIDTH, Listing, number
 from spelgen.log_checks.gravity import GravityFit
-from spelgen.log_checks.servo_report import ServoJointReport, span
 from spelgen.log_checks.statistics import Clock, Statistics
-from spelgen.logs.trajectory import QUANTITIES, Trajectory
-from spelgen.settings.tuning.log_checks import LogCheckTuning
+from spelgen.logs.checks import velocity_agreement
+from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.tuning.log_checks import TUNING
 
-TUNING = LogCheckTuning()
 UNFITTED = GravityFit()
+MEASURES = {"q": "position", "qd": "velocity", "tau": "torque", "u": "position"}
+
+
+@dataclass(frozen=True)
+class JointFollowing:
+    """Say how a joint follows its command; None where it cannot be said.
+
+    lag: by which positions come after commands [s]. tracking_rms: root mean square of u, delayed by the lag, less q
+    [rad, m]. steady_state_error: nine tenths of the distances u - q are smaller while both rest. saturated: fraction of
+    the time that kp (u - q) is beyond the effort limit.
+    """
+
+    lag: float | None
+    tracking_rms: float
+    steady_state_error: float | None
+    saturated: float | None
 
 
 @dataclass(frozen=True)
@@ -29,8 +43,9 @@ class JointReport:
     """One joint over all trajectories; [rad, m], [rad/s, m/s], [Nm, N]; None where it cannot be told.
 
     low, high, noise, steps: of q, qd and tau, or of q, qd and commands u. range_fraction: of the joint's range that was
-    visited. noise: standard deviation of what changes from sample to sample. steps: of signals that are quantised in
-    most trajectories. velocity_factor, velocity_correlation: both 1 where qd is dq/dt.
+    visited. noise: standard deviation of what changes from sample to sample; None of sparse logs. steps: of signals
+    that are quantised in most trajectories. velocity_factor, velocity_correlation: both 1 where qd is dq/dt.
+    following: of a joint under a position servo.
     """
 
     name: str
@@ -38,23 +53,28 @@ class JointReport:
     low: dict[str, float]
     high: dict[str, float]
     range_fraction: float | None
-    noise: dict[str, float] | None
+    noise: dict[str, float | None]
     steps: dict[str, float | None]
     velocity_factor: float | None
     velocity_correlation: float | None
-    gravity: GravityFit
+    gravity: GravityFit = UNFITTED
+    following: JointFollowing | None = None
+
+    def largest(self, quantity: str) -> float:
+        """Return the largest size of "q", "qd", "tau" or "u"."""
+        return max(abs(self.low[quantity]), abs(self.high[quantity]))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LogReport:
     """What `check_logs` found. errors: why the logs cannot be trained on. examples: trajectories to be drawn.
 
-    joints: of an arm under position servos, how they follow their commands. tables: about the joints.
+    tables: about the joints.
     """
 
     robot: str
     trajectories: tuple[Clock, ...]
-    joints: Sequence[JointReport | ServoJointReport]
+    joints: Sequence[JointReport]
     tables: tuple[Listing, ...]
     findings: tuple[Diagnostic, ...]
     errors: tuple[SpelgenError, ...]
@@ -111,8 +131,10 @@ class LogReport:
     def text(self) -> str:
         """Return the report for a terminal, in 80 columns; the errors are not in it."""
         paragraphs = [self.heading(), *map(Listing.text, self.listings(TUNING.shown))]
-        if self.findings:
-            paragraphs.append("\n".join(["Findings", *map(_wrapped, self.findings)]))
+        wrapped = partial(textwrap.fill, width=WIDTH, initial_indent="  ", subsequent_indent="    ")
+        findings = list(map(wrapped, map(str, self.findings)))
+        if findings:
+            paragraphs.append("\n".join(["Findings", *findings]))
         elif not self.errors:
             paragraphs.append("No findings.")
         return "\n\n".join(paragraphs)
@@ -132,51 +154,38 @@ class LogReport:
 
 
 def joint_report(
-    index: int, coordinate: Coordinate, measured: Sequence[Statistics], gravity: GravityFit = UNFITTED
+    index: int, coordinate: Coordinate, measured: Sequence[Statistics], products: np.ndarray
 ) -> JointReport:
-    """Put together what all trajectories show of one joint."""
+    """Put together what all trajectories show of one joint. products: see `velocity_products`."""
     low, high, noise, steps = {}, {}, {}, {}
-    # the median, since one trajectory with contacts would set the noise of all
-    noisy = [x.noise for x in measured if x.noise]
-    for name in measured[0].low:
-        low[name] = min(float(x.low[name][index]) for x in measured)
-        high[name] = max(float(x.high[name][index]) for x in measured)
-        steps[name] = _common_step([x.steps[name][index] for x in measured])
-        if noisy:
-            noise[name] = float(np.median([x[name][index] for x in noisy]))
-    agreement = reduce(add, [x.agreement for x in measured])
+    for name in measured[0].signals:
+        lows, highs, noises, quanta = np.array([x.signals[name][:, index] for x in measured]).T
+        low[name], high[name] = float(lows.min()), float(highs.max())
+        # medians, since one trajectory with contacts would set the noise of all
+        noise[name], steps[name] = _median(noises, 0.0), _median(quanta, 0.5)
+    factors, correlations = velocity_agreement(products)
+    factor, correlation = factors[index], correlations[index, index]
+    visited = None
+    # limits of a URDF may be equal or swapped
+    if coordinate.limits is not None and coordinate.limits[0] < coordinate.limits[1]:
+        visited = (high["q"] - low["q"]) / (coordinate.limits[1] - coordinate.limits[0])
     return JointReport(
         name=coordinate.name,
         kind=coordinate.kind,
         low=low,
         high=high,
-        range_fraction=_range_fraction(coordinate, low["q"], high["q"]),
-        noise=noise or None,
+        range_fraction=visited,
+        noise=noise,
         steps=steps,
-        velocity_factor=agreement.factor(index) if agreement.xx[index] > 0 else None,
-        velocity_correlation=agreement.correlation(index),
-        gravity=gravity,
+        velocity_factor=float(factor) if np.isfinite(factor) else None,
+        velocity_correlation=float(correlation) if np.isfinite(correlation) else None,
     )
 
 
-def _common_step(steps: Sequence[float]) -> float | None:
-    """Return the step of most trajectories, where the signal is quantised in most of them."""
-    finite = [step for step in steps if np.isfinite(step)]
-    return float(np.median(finite)) if 2 * len(finite) > len(steps) else None
-
-
-def _range_fraction(coordinate: Coordinate, low: float, high: float) -> float | None:
-    """Return the part of a joint's range that lies between these positions; None where it has no range."""
-    if coordinate.limits is None:
-        return None
-    # limits of a URDF may be equal or swapped
-    width = coordinate.limits[1] - coordinate.limits[0]
-    return (high - low) / width if width > 0 else None
-
-
-def torque_tables(joints: Sequence[JointReport]) -> tuple[Listing, ...]:
-    """Return the tables of an arm under torques."""
-    return _ranges(joints), _signals(joints), _physics(joints)
+def _median(values: np.ndarray, share: float) -> float | None:
+    """Return the median of what is finite; None where that is no more than this share of all."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) > share * len(values) else None
 
 
 def _clock_table(trajectories: Sequence[Clock], limit: int | None) -> Listing:
@@ -187,58 +196,37 @@ def _clock_table(trajectories: Sequence[Clock], limit: int | None) -> Listing:
     for clock in trajectories[:limit]:
         longest = f"{clock.longest_gap:.3g} s" if clock.gaps else "-"
         duration, rate = f"{clock.duration:.4g} s", f"{clock.sample_rate:.4g} Hz"
-        rows.append((
-            clock.name, str(clock.samples), duration, rate, f"{clock.jitter:.1%}", str(clock.gaps), longest,
-        ))  # fmt: skip
+        rows.append(
+            (clock.name, str(clock.samples), duration, rate, f"{clock.jitter:.1%}", str(clock.gaps), longest)
+        )
     hidden = len(trajectories) - len(rows)
     return Listing("Clock", head, tuple(rows), f"and {hidden} more" if hidden else "")
 
 
-def _ranges(joints: Sequence[JointReport]) -> Listing:
-    head = ("joint", "q", "of its range", "qd", "tau")
-    rows = []
+def signal_tables(joints: Sequence[JointReport], quantities: Sequence[str]) -> tuple[Listing, Listing]:
+    """Return the ranges of these quantities, q and others, and what of them is noise or quantised."""
+    ranges, signals = [], []
     for joint in joints:
-        q, qd, tau = (span(joint.low[name], joint.high[name]) for name in QUANTITIES)
-        rows.append((joint.name, q, _percent(joint.range_fraction), qd, tau))
-    kinds = {joint.kind for joint in joints}
-    units = "; ".join(f"{x.position}, {x.velocity}, {x.torque}" for kind, x in UNITS.items() if kind in kinds)
-    return Listing(f"Ranges [{units}]", head, tuple(rows))
-
-
-def _signals(joints: Sequence[JointReport]) -> Listing:
-    head = ("joint", "q noise", "qd noise", "tau noise", "q step", "qd step", "tau step")
-    rows = []
-    for joint in joints:
-        noise = map((joint.noise or {}).get, QUANTITIES)
-        steps = map(joint.steps.get, QUANTITIES)
-        rows.append((joint.name, *map(number, noise), *map(number, steps)))
+        spans = [f"{number(joint.low[name])} .. {number(joint.high[name])}" for name in quantities]
+        ranges.append((joint.name, spans[0], percent(joint.range_fraction), *spans[1:]))
+        numbers = [*map(joint.noise.get, quantities), *map(joint.steps.get, quantities)]
+        signals.append((joint.name, *map(number, numbers)))
+    units = []
+    for kind, unit in UNITS.items():
+        if any(joint.kind == kind for joint in joints):
+            units.append(", ".join(dict.fromkeys(getattr(unit, MEASURES[name]) for name in quantities)))
+    head = ("joint", quantities[0], "of its range", *quantities[1:])
+    columns = [f"{name} {what}" for what in ("noise", "step") for name in quantities]
     note = (
         "noise: standard deviation between samples, for sample rates from 50 Hz; step: quantisation step; in the "
         "units above."
     )
-    return Listing("Signals", head, tuple(rows), note)
-
-
-def _physics(joints: Sequence[JointReport]) -> Listing:
-    head = ("joint", "dq/dt : qd", "agree", "gravity in tau", "x URDF")
-    rows = []
-    for joint in joints:
-        fit = joint.gravity
-        # beside a low correlation the factor means nothing
-        is_seen = abs(fit.correlation or 0) > TUNING.seen
-        velocity = number(joint.velocity_factor), number(joint.velocity_correlation)
-        rows.append((joint.name, *velocity, _percent(fit.explained), number(fit.factor if is_seen else None)))
-    note = (
-        "dq/dt : qd and its correlation are 1 where qd is the derivative of q; gravity in tau: part of tau's "
-        "variance that gravity explains, beside friction and acceleration; x URDF: ratio to the URDF's gravity "
-        "torque."
+    return (
+        Listing(f"Ranges [{'; '.join(units)}]", head, tuple(ranges)),
+        Listing("Signals", ("joint", *columns), tuple(signals), note),
     )
-    return Listing("Physics", head, tuple(rows), note)
 
 
-def _percent(fraction: float | None) -> str:
-    return "-" if fraction is None else f"{fraction:.0%}"
-
-
-def _wrapped(finding: Diagnostic) -> str:
-    return textwrap.fill(str(finding), WIDTH, initial_indent="  ", subsequent_indent="    ")
+def percent(fraction: float | None, digits: int = 0) -> str:
+    """Return a fraction in percent; a dash for None."""
+    return "-" if fraction is None else f"{fraction:.{digits}%}"

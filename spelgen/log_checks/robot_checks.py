@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from functools import partial
-from math import nan
-from typing import Literal, NamedTuple
+from math import inf, nan
+from typing import NamedTuple
 
 from spelgen.arm.arm import Coordinate
 from spelgen.labels import UNITS
-from spelgen.log_checks.report import JointReport
+from spelgen.log_checks.report import MEASURES, JointReport
 from spelgen.logs.checks import Check
 from spelgen.logs.trajectory import QUANTITIES
-from spelgen.settings.tuning.log_checks import LogCheckTuning
+from spelgen.settings.tuning.log_checks import TUNING
 
-TUNING = LogCheckTuning()
 SAY_UNIT = "write 'units: {tau: ...}' or a 'gain' under 'logs' in the robot's YAML; 'Nm' confirms the unit"
 TORQUE_ERRORS = ("torque-sense", "torque-unit", "torque-beyond-drive")
 
@@ -22,15 +21,18 @@ class JointEvidence(NamedTuple):
     """Hold a joint, and what all trajectories show of it: the subject of the checks against the robot."""
 
     coordinate: Coordinate
-    shown: JointReport
+    report: JointReport
 
-    def largest(self, quantity: str) -> float:
-        """Return the largest size of "q", "qd" or "tau"."""
-        return max(abs(self.shown.low[quantity]), abs(self.shown.high[quantity]))
+    def limits(self) -> tuple[float, float]:
+        """Return the lowest and the highest position, infinite where there is no limit."""
+        lower, upper = self.coordinate.lower, self.coordinate.upper
+        if self.coordinate.continuous:
+            lower = upper = None
+        return -inf if lower is None else lower, inf if upper is None else upper
 
     def gravity_in_torque(self) -> tuple[float, float]:
         """Return factor and correlation of the URDF's gravity in the torque; NaN where it is too small to be seen."""
-        fit = self.shown.gravity
+        fit = self.report.gravity
         # of a joint that gravity hardly loads the factor is chance
         if fit.factor is None or fit.correlation is None or (fit.relative_deviation or 0.0) < TUNING.loaded:
             return nan, nan  # which no comparison takes for odd
@@ -39,28 +41,23 @@ class JointEvidence(NamedTuple):
 
 def find_beyond_limits(joint: JointEvidence) -> str | None:
     """Find positions, measured or commanded, beyond the limits."""
-    coordinate, findings = joint.coordinate, []
-    if coordinate.continuous:
-        return None
-    unit = UNITS[coordinate.kind].position
+    findings = []
+    (lower, upper), unit = joint.limits(), UNITS[joint.coordinate.kind].position
     for name in ("q", "u"):
-        if name not in joint.shown.low:
-            continue
-        low, high = joint.shown.low[name], joint.shown.high[name]
+        low, high = joint.report.low.get(name, inf), joint.report.high.get(name, -inf)
         # a limit overrun by less is the rounding of a logger
-        if coordinate.lower is not None and low < coordinate.lower - TUNING.limit_rounding:
-            findings.append(f"{name} down to {low:.4g} {unit}, the limit is {coordinate.lower:.4g}")
-        if coordinate.upper is not None and high > coordinate.upper + TUNING.limit_rounding:
-            findings.append(f"{name} up to {high:.4g} {unit}, the limit is {coordinate.upper:.4g}")
+        if low < lower - TUNING.limit_rounding:
+            findings.append(f"{name} down to {low:.4g} {unit}, the limit is {lower:.4g}")
+        if high > upper + TUNING.limit_rounding:
+            findings.append(f"{name} up to {high:.4g} {unit}, the limit is {upper:.4g}")
     return "; ".join(findings) or None
 
 
-def find_above(limit: Literal["velocity", "effort"], joint: JointEvidence) -> str | None:
-    """Find speeds or torques above the limit."""
-    units, bound = UNITS[joint.coordinate.kind], joint.coordinate.effort
-    largest, unit = joint.largest("tau"), units.torque
-    if limit == "velocity":
-        largest, unit, bound = joint.largest("qd"), units.velocity, joint.coordinate.velocity
+def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
+    """Find a quantity above the joint's limit, "velocity" or "effort"."""
+    bound: float | None = getattr(joint.coordinate, limit)
+    unit = getattr(UNITS[joint.coordinate.kind], MEASURES[quantity])
+    largest = joint.report.largest(quantity)
     if not bound or largest <= bound * (1 + TUNING.limit_noise):
         return None
     return f"{limit} up to {largest:.4g} {unit}, the limit is {bound:.4g}"
@@ -86,8 +83,8 @@ def find_scaled(seen: float, largest: float, message: str, joint: JointEvidence)
 def find_beyond_drive(joint: JointEvidence) -> str | None:
     """Find torques that no drive of the joint's effort limit gives."""
     # URDFs without knowledge of the drive write an effort of 0
-    limit, largest = joint.coordinate.effort or 0.0, joint.largest("tau")
-    if limit <= 0 or largest <= TUNING.beyond_drives * limit:
+    limit, largest = joint.coordinate.effort or 0.0, joint.report.largest("tau")
+    if not 0 < TUNING.beyond_drives * limit < largest:
         return None
     return f"up to {largest:.4g}, {largest / limit:.3g} times what the drive can give"
 
@@ -96,7 +93,7 @@ def find_coarse(joint: JointEvidence) -> str | None:
     """Find signals that are quantised to steps of their own size."""
     for name in QUANTITIES:
         # a step alone says little: 0.01 Nm is fine for a shoulder and all there is for a wrist
-        step, width = joint.shown.steps[name], joint.shown.high[name] - joint.shown.low[name]
+        step, width = joint.report.steps[name], joint.report.high[name] - joint.report.low[name]
         if step is not None and width < TUNING.levels * step:
             return (
                 f"{name} has steps of {step:.3g} in a range of {width:.3g}: what is smaller than a step, friction and "
@@ -107,13 +104,8 @@ def find_coarse(joint: JointEvidence) -> str | None:
 
 def find_stop(joint: JointEvidence) -> str | None:
     """Find joints that reach a limit: the torque of a stop is none of the drive's."""
-    if joint.coordinate.continuous:
-        return None
-    for limit, reached in (
-        (joint.coordinate.lower, joint.shown.low["q"]),
-        (joint.coordinate.upper, joint.shown.high["q"]),
-    ):
-        if limit is not None and abs(reached - limit) <= TUNING.limit_rounding:
+    for limit, extreme in zip(joint.limits(), (joint.report.low["q"], joint.report.high["q"]), strict=True):
+        if abs(extreme - limit) <= TUNING.limit_rounding:
             return f"q reaches its limit {limit:.4g}: contact with the stop changes the torque; remove such motion"
     return None
 
@@ -121,12 +113,12 @@ def find_stop(joint: JointEvidence) -> str | None:
 def find_no_gravity(joint: JointEvidence) -> str | None:
     """Find torques without gravity in them."""
     correlation = joint.gravity_in_torque()[1]
-    if abs(correlation) < 1 - TUNING.seen:
-        return (
-            f"tau does not move with gravity: their correlation is {correlation:.2g}, while the URDF's gravity torque "
-            f"varies {joint.shown.gravity.relative_deviation:.2g} times as much as tau; is it compensated in the log?"
-        )
-    return None
+    if not abs(correlation) < 1 - TUNING.seen:  # NaN included
+        return None
+    return (
+        f"tau does not move with gravity: their correlation is {correlation:.2g}, while the URDF's gravity torque "
+        f"varies {joint.report.gravity.relative_deviation:.2g} times as much as tau; is it compensated in the log?"
+    )
 
 
 # these need no torques: of arms under position servos, too
@@ -153,8 +145,8 @@ CHECKS: list[Check[JointEvidence]] = [
         expected="Nm or N at the joint", do=SAY_UNIT,
     ),
     *POSITION_CHECKS,
-    Check("beyond-velocity-limit", "warning", partial(find_above, "velocity")),
-    Check("beyond-effort-limit", "warning", partial(find_above, "effort")),
+    Check("beyond-velocity-limit", "warning", partial(find_above, "velocity", "qd")),
+    Check("beyond-effort-limit", "warning", partial(find_above, "effort", "tau")),
     Check("at-a-stop", "warning", find_stop),
     Check("coarse", "warning", find_coarse),
     Check("torque-without-gravity", "warning", find_no_gravity, unless=TORQUE_ERRORS),

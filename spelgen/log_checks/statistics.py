@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from spelgen.logs.checks import VelocityAgreement, velocity_agreement
 from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import Trajectory
-from spelgen.settings.tuning.log_checks import LogCheckTuning
-
-TUNING = LogCheckTuning()
+from spelgen.settings.tuning.log_checks import TUNING
 
 
 @dataclass(frozen=True)
@@ -33,52 +31,41 @@ class Clock:
     longest_gap: float
 
 
-@dataclass(frozen=True, eq=False)
-class Statistics:
+class Statistics(NamedTuple):
     """One trajectory of n joints.
 
-    low, high: of its quantities (see `Trajectory`), each (n,). noise: of these (n,), standard deviation of what changes
-    from sample to sample; empty where the log is too sparse to tell. steps: of the quantised signals among them (n,),
-    NaN where a signal is not.
+    signals: of its quantities (see `Trajectory`), (4, n): the lowest and the highest value; the standard deviation of
+    what changes from sample to sample, NaN where the log is too sparse to tell; the step of a quantised signal, NaN of
+    others.
     """
 
     clock: Clock
-    low: dict[str, np.ndarray]
-    high: dict[str, np.ndarray]
-    noise: dict[str, np.ndarray]
-    steps: dict[str, np.ndarray]
-    agreement: VelocityAgreement
+    signals: dict[str, np.ndarray]
 
 
 def statistics(trajectory: Trajectory) -> Statistics:
     """Return the numbers of one trajectory."""
-    low, high, noise, steps = {}, {}, {}, {}
     # third differences of sparse motion are motion
     dense = is_dense(trajectory.sample_rate) and len(trajectory) > 8
+    signals = {}
     for name in trajectory.quantities:
-        signals: np.ndarray = getattr(trajectory, name)
-        low[name], high[name] = signals.min(axis=0), signals.max(axis=0)
-        steps[name] = np.array(list(map(quantisation_step, signals.T)))
-        if dense:
-            noise[name] = noise_level(trajectory.t, signals)
-    agreement = velocity_agreement(trajectory)
-    return Statistics(clock_of(trajectory), low, high, noise, steps, agreement)
-
-
-def clock_of(trajectory: Trajectory) -> Clock:
-    """Return when the samples of a trajectory were taken."""
-    steps = trajectory.regular_steps
-    gaps = len(trajectory) - 1 - len(steps)
-    return Clock(
+        values: np.ndarray = getattr(trajectory, name)
+        noise = noise_level(trajectory.t, values) if dense else np.full(values.shape[1], np.nan)
+        steps = list(map(quantisation_step, values.T))
+        signals[name] = np.array([values.min(axis=0), values.max(axis=0), noise, steps])
+    regular = trajectory.regular_steps
+    gaps = len(trajectory) - 1 - len(regular)
+    clock = Clock(
         name=trajectory.name,
         file=None if trajectory.file is None else str(trajectory.file),
         samples=len(trajectory),
         duration=trajectory.duration,
         sample_rate=trajectory.sample_rate,
-        jitter=float(steps.std() / steps.mean()) if steps.size else 0.0,
+        jitter=float(regular.std() / regular.mean()) if regular.size else 0.0,
         gaps=gaps,
         longest_gap=float(np.diff(trajectory.t).max()) if gaps else 0.0,
     )
+    return Statistics(clock, signals)
 
 
 def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -98,8 +85,6 @@ def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def quantisation_step(values: np.ndarray) -> float:
     """Return the step of a quantised signal (T,); NaN where it is not quantised, or never changes."""
-    if len(values) < 4:
-        return float("nan")
     differences = np.diff(np.unique(values))
     # two levels more or less say nothing of a grid
     if len(differences) < 3:
@@ -109,13 +94,8 @@ def quantisation_step(values: np.ndarray) -> float:
     # over a hundred steps rounding adds up to what whole steps are told by
     near = differences[differences < 100 * step] / step
     is_whole = np.abs(near - np.round(near)) < TUNING.step_tolerance
-    if len(near) < 3 or is_whole.mean() <= 1 - TUNING.step_tolerance or _is_commanded(values, step):
-        return float("nan")
-    return step
-
-
-def _is_commanded(values: np.ndarray, step: float) -> bool:
-    """Whether a signal (T,) of few levels jumps between them, as commands on round numbers do."""
+    is_grid = len(near) > 2 and is_whole.mean() > 1 - TUNING.step_tolerance
+    # a smooth signal passes wide levels one after the other, commands on round numbers jump between them
     changes = np.abs(np.diff(values))
-    # a smooth signal passes such wide levels one after the other
-    return bool(np.ptp(values) < TUNING.levels * step and changes[changes > 0].mean() > 1.5 * step)
+    is_command = np.ptp(values) < TUNING.levels * step and changes[changes > 0].mean() > 1.5 * step
+    return step if is_grid and not is_command else float("nan")

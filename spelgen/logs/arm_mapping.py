@@ -53,11 +53,9 @@ class LogSource(NamedTuple):
 def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
     """Return what `read_logs` was given. Raises LogError for what is no arm, SettingsError for a wrong mapping."""
     if isinstance(arm, DescribedArm):
-        if mapping is None:
-            mapping = arm.settings.logs
-        all_joints = [joint.name for joint in arm.robot.joints]
-        joints, joint_types = tuple(arm.arm.joint_names), tuple(arm.arm.joint_types)
-        return LogSource(joints, joint_types, _mapping(mapping, all_joints))
+        mapping = arm.settings.logs if mapping is None else mapping
+        log_mapping = _mapping(mapping, [joint.name for joint in arm.robot.joints])
+        return LogSource(tuple(arm.arm.joint_names), tuple(arm.arm.joint_types), log_mapping)
     if isinstance(arm, JointNames):
         joints = logged_joints(arm)
         log_mapping = _mapping(mapping, joints)
@@ -66,16 +64,13 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
         return LogSource(joints, tuple(arm.joint_types), log_mapping)
     if isinstance(arm, Sequence) and not isinstance(arm, str) and all(isinstance(x, str) for x in arm):
         return LogSource(tuple(arm), None, _mapping(mapping, arm))
-    raise LogError(
-        repr(arm), element="read_logs", expected="an arm of load_arm, a model, or joint names in a list"
-    )
+    expected = "an arm of load_arm, a model, or joint names in a list"
+    raise LogError(repr(arm), element="read_logs", expected=expected)
 
 
 def _mapping(mapping: GivenMapping, joints: Sequence[str]) -> LogMapping:
-    if mapping is None:
-        return LogMapping()
     if isinstance(mapping, LogMapping):
         return mapping
     if isinstance(mapping, str | Path):
         return load_mapping(mapping, joints)
-    return validated(LogMapping, dict(mapping), Document(Path("mapping"), None))
+    return validated(LogMapping, dict(mapping or {}), Document(Path("mapping"), None))

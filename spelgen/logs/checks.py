@@ -7,12 +7,12 @@ so that logs need not lie in memory together. `log_checks` has the checks that t
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.labels import counted
@@ -20,9 +20,8 @@ from spelgen.logs.rates import SLOWEST, is_dense, shows_accelerations
 from spelgen.logs.recording import is_dropout
 from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
 from spelgen.settings.log_mapping import TIMES
-from spelgen.settings.tuning.log_checks import LogCheckTuning
+from spelgen.settings.tuning.log_checks import TUNING
 
-TUNING = LogCheckTuning()
 DEGREES = 180.0 / np.pi
 TURNS = 4 * np.pi  # [rad] no revolute joint turns further, so what does is in degrees
 
@@ -54,7 +53,7 @@ class Findings:
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
 
-    def add(self, check: Check[Subject], message: str, where: str, file: Path | None = None) -> None:
+    def add(self, check: Check[Any], message: str, where: str, file: Path | None = None) -> None:
         """Add what a check says; of an error, how to have it accepted."""
         if check.severity == "error":
             do = f"{check.do}; --accept {check.code} if it is right"
@@ -68,78 +67,67 @@ def run_checks(
     checks: Iterable[Check[Subject]], subject: Subject, accepted: Collection[str] = ()
 ) -> list[tuple[Check[Subject], str]]:
     """Return the checks that find something odd, with their messages; accepted: codes that are passed over."""
-    results: list[tuple[Check[Subject], str]] = []
-    codes: set[str] = set()
+    results: dict[str, tuple[Check[Subject], str]] = {}
     for check in checks:
         # one cause, one message: degrees are no derivatives either
-        if check.code in accepted or not codes.isdisjoint(check.unless):
+        if check.code in accepted or not results.keys().isdisjoint(check.unless):
             continue
         message = check.find(subject)
         if message is not None:
-            results.append((check, message))
-            codes.add(check.code)
-    return results
+            results[check.code] = check, message
+    return list(results.values())
 
 
-@dataclass(frozen=True, eq=False)
-class VelocityAgreement:
-    """Hold sums over increments y of q and of the integral x of qd, over some steps, for n joints.
+def velocity_products(trajectory: Trajectory) -> np.ndarray:
+    """Return sums of products (2n, 2n) of increments over some steps: of the integrals of qd, then of q."""
+    products = np.zeros((2 * trajectory.q.shape[1],) * 2)
+    for piece in split_at_gaps(trajectory, shortest=2):
+        # over several steps: from one sample to the next quantisation of q is larger than its change
+        span = min(TUNING.increments, len(piece) - 1)
+        integral = cumulative_trapezoid(piece.qd, piece.t, axis=0, initial=0)
+        positions = np.concatenate([integral, piece.q], axis=1)
+        increments = positions[span:] - positions[:-span]
+        products += increments.T @ increments
+    return products
 
-    xx, yy: (n,). xy: (n, n), of qd of the joint of the row with q of that of the column.
+
+def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return factors (n,) by which qd must be multiplied to be dq/dt, and correlations (n, n).
+
+    These are 1 where qd of the row's joint is dq/dt of the column's, but for a factor. Both are NaN where one rests.
+    products: see `velocity_products`.
+    """
+    n = len(products) // 2
+    qd_squares, q_squares = np.split(products.diagonal(), 2)
+    sizes = np.outer(np.sqrt(qd_squares), np.sqrt(q_squares))
+    correlations = products[:n, n:] / np.where(sizes > 1e-12, sizes, np.nan)
+    return products[:n, n:].diagonal() / np.where(qd_squares > 0, qd_squares, np.nan), correlations
+
+
+class JointSignals(NamedTuple):
+    """Hold what one trajectory shows of one joint: the subject of the checks of logs alone.
+
+    q, qd: (T,). factor: by what qd must be multiplied to be dq/dt; NaN where it rests. correlations: of qd with dq/dt
+    of every joint; NaN where one rests.
     """
 
-    xx: np.ndarray
-    yy: np.ndarray
-    xy: np.ndarray
-
-    def __add__(self, sums: VelocityAgreement) -> VelocityAgreement:
-        return VelocityAgreement(self.xx + sums.xx, self.yy + sums.yy, self.xy + sums.xy)
-
-    def factor(self, joint: int) -> float:
-        """Return by what qd must be multiplied to be dq/dt; 1 where qd says nothing."""
-        if not self.xx[joint] > 0:
-            return 1.0
-        return float(self.xy[joint, joint] / self.xx[joint])
-
-    def correlation(self, joint: int, q_joint: int | None = None) -> float | None:
-        """Return 1 if qd of a joint is dq/dt, of the other one or its own, but for a factor; None where one rests."""
-        if q_joint is None:
-            q_joint = joint
-        size = float(np.sqrt(self.xx[joint]) * np.sqrt(self.yy[q_joint]))
-        if size < 1e-12:
-            return None
-        return float(self.xy[joint, q_joint]) / size
-
-
-@dataclass(frozen=True, eq=False)
-class JointSignals:
-    """Hold what one trajectory shows of one joint: the subject of the checks of logs alone."""
-
     trajectory: Trajectory
-    index: int
-    joints: Sequence[str]
+    number: int
     kind: str
-    agreement: VelocityAgreement
+    joints: Sequence[str]
+    q: np.ndarray
+    qd: np.ndarray
+    factor: float
+    correlations: Sequence[float]
 
     @property
-    def q(self) -> np.ndarray:
-        """(T,) [rad, m]."""
-        return self.trajectory.q[:, self.index]
-
-    @property
-    def qd(self) -> np.ndarray:
-        """(T,) [rad/s, m/s]."""
-        return self.trajectory.qd[:, self.index]
-
-    @cached_property
-    def factor(self) -> float:
-        """By what qd must be multiplied to be dq/dt."""
-        return self.agreement.factor(self.index)
-
-    @cached_property
-    def correlation(self) -> float | None:
+    def correlation(self) -> float:
         """Of qd and dq/dt."""
-        return self.agreement.correlation(self.index)
+        return self.correlations[self.number]
+
+    def changes_by(self, unit: float) -> bool:
+        """Whether q changes that many times as fast as qd says, as beside a wrong unit."""
+        return self.correlation > TUNING.agreement and is_factor(self.factor, unit)
 
 
 def is_factor(value: float, unit: float) -> bool:
@@ -151,26 +139,22 @@ def find_degrees(signals: JointSignals) -> str | None:
     """Find revolute joints that look recorded in degrees."""
     if signals.kind != "revolute":
         return None
-    factor, correlation = signals.factor, signals.correlation
-    if correlation is not None and correlation > TUNING.agreement:
-        if is_factor(factor, DEGREES):
-            return f"q that changes {factor:.3g} times as fast as qd says (180/pi is 57.3)"
-        if is_factor(factor, 1 / DEGREES):
-            return f"qd that is {1 / factor:.3g} times as large as q changes (180/pi is 57.3)"
-    q = signals.q
-    if np.ptp(q) > TURNS:
-        return f"q from {q.min():.3g} to {q.max():.3g}, more than two turns"
+    if signals.changes_by(DEGREES):
+        return f"q that changes {signals.factor:.3g} times as fast as qd says (180/pi is 57.3)"
+    if signals.changes_by(1 / DEGREES):
+        return f"qd that is {1 / signals.factor:.3g} times as large as q changes (180/pi is 57.3)"
+    if np.ptp(signals.q) > TURNS:
+        return f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
     return None
 
 
 def find_frozen(signals: JointSignals) -> str | None:
     """Find a position or a velocity that never changes while the other one does."""
     q, qd = signals.q, signals.qd
-    # the trapezoidal rule: a constant q with a noisy qd around zero stays where it is
-    moved = np.cumsum((qd[1:] + qd[:-1]) / 2 * np.diff(signals.trajectory.t))
-    drift = np.abs(moved).max(initial=0.0)
     if np.ptp(qd) == 0 and np.ptp(q) > TUNING.drift:
         return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
+    # the trapezoidal rule: a constant q with a noisy qd around zero stays where it is
+    drift = np.abs(cumulative_trapezoid(qd, signals.trajectory.t)).max(initial=0.0)
     if np.ptp(q) == 0 and drift > TUNING.drift:
         return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
     return None
@@ -181,25 +165,22 @@ def find_time_unit(signals: JointSignals) -> str | None:
     steps = np.diff(signals.trajectory.t)
     if steps.size and np.median(steps) > TUNING.slowest_step:
         # told once, and not of each joint
-        return None if signals.index else f"a sample every {np.median(steps):.3g} s"
-    if signals.correlation is None or signals.correlation <= TUNING.agreement:
-        return None
-    for unit, seconds in TIMES.items():
-        if unit != "s" and is_factor(signals.factor, seconds):
+        return None if signals.number else f"a sample every {np.median(steps):.3g} s"
+    for unit in ("ms", "us", "ns"):
+        if signals.changes_by(TIMES[unit]):
             return f"q that changes {signals.factor:.3g} times as fast as qd says: times in {unit}"
     return None
 
 
 def find_dropouts(signals: JointSignals) -> str | None:
     """Find moments at which the position or the torque falls to 0 and comes back."""
-    for name in ("q", "tau"):
-        values = getattr(signals.trajectory, name)
-        if not values.size:
-            continue
-        rows = np.flatnonzero(is_dropout(values[:, signals.index]))
-        if rows.size:
-            t = signals.trajectory.t[rows[0]]
-            return f"{name} that falls to 0 for a moment at t = {t:.4g} s ({rows.size} such samples)"
+    trajectory = signals.trajectory
+    for name, values in (("q", trajectory.q), ("tau", trajectory.tau)):
+        if values.size:
+            rows = np.flatnonzero(is_dropout(values[:, signals.number]))
+            if rows.size:
+                t = trajectory.t[rows[0]]
+                return f"{name} that falls to 0 for a moment at t = {t:.4g} s ({rows.size} such samples)"
     return None
 
 
@@ -207,40 +188,32 @@ def find_no_torques(signals: JointSignals) -> str | None:
     """Find recordings in which every joint's torque is 0 all the time."""
     trajectory = signals.trajectory
     # told once, and not of each joint
-    if signals.index or not trajectory.tau.size or trajectory.tau.any() or not np.ptp(trajectory.q):
+    if signals.number or not trajectory.tau.size or trajectory.tau.any() or not np.ptp(trajectory.q):
         return None
     return "torques that are all 0 while the arm moves"
 
 
 def find_wrong_velocity(signals: JointSignals) -> str | None:
     """Find velocities that are not the positions' derivative, and say what else they may be."""
-    factor, correlation = signals.factor, signals.correlation
-    if correlation is None:
+    factor, correlation, tolerance = signals.factor, signals.correlation, 1 - TUNING.agreement
+    if np.isnan(correlation) or (correlation >= TUNING.agreement and abs(factor - 1) <= tolerance):
         return None
-    if correlation >= TUNING.agreement and abs(factor - 1) <= 1 - TUNING.agreement:
-        return None
-    return (
-        f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}; "
-        f"{_velocity_advice(signals, correlation)}"
-    )
-
-
-def _velocity_advice(signals: JointSignals, correlation: float) -> str:
-    for index, joint in enumerate(signals.joints):
-        fit = signals.agreement.correlation(signals.index, index)
-        if index != signals.index and fit is not None and fit > max(TUNING.agreement, correlation):
-            return f"it fits q of joint {joint!r}"
-    if abs(signals.factor + 1) <= 1 - TUNING.agreement:
-        return "its sign is the opposite of that of q"
-    return "check units, signs and the order of the joints"
+    advice = "check units, signs and the order of the joints"
+    if abs(factor + 1) <= tolerance:
+        advice = "its sign is the opposite of that of q"
+    for joint, fit in zip(signals.joints, signals.correlations, strict=True):
+        if fit > max(TUNING.agreement, correlation):
+            advice = f"it fits q of joint {joint!r}"
+            break
+    return f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}; {advice}"
 
 
 def find_constant_torque(signals: JointSignals) -> str | None:
     """Find torques that never change; logs of commands have none."""
     tau = signals.trajectory.tau
-    if not tau.size or np.ptp(tau[:, signals.index]) > 0:
+    if not tau.size or np.ptp(tau[:, signals.number]) > 0:
         return None
-    return f"tau is always {tau[0, signals.index]:g}: right for a joint without a motor only"
+    return f"tau is always {tau[0, signals.number]:g}: right for a joint without a motor only"
 
 
 def find_rest(signals: JointSignals) -> str | None:
@@ -250,6 +223,31 @@ def find_rest(signals: JointSignals) -> str | None:
     return "does not move: the logs do not excite its dynamics"
 
 
+def find_gaps(trajectory: Trajectory) -> str | None:
+    """Find holes in time."""
+    gaps = len(gap_ends(trajectory.t)) - 2
+    if not gaps:
+        return None
+    return f"{counted(gaps, 'gap')} in time, up to {np.diff(trajectory.t).max():.3g} s long; no window crosses one"
+
+
+def find_low_rate(trajectory: Trajectory) -> str | None:
+    """Find a sample rate at which accelerations are hardly seen; arms under servos do without."""
+    rate = trajectory.sample_rate
+    if trajectory.u is not None or rate == 0 or is_dense(rate):
+        return None
+    use = f"too slow for fits to torques, which need {SLOWEST:g} Hz"
+    if shows_accelerations(rate):
+        use = "interpolated for fits to torques"
+    return (
+        f"{rate:.3g} Hz: {use}; motion faster than {rate / 2:.3g} Hz, delays below "
+        f"{1e3 / rate:.0f} ms and friction where a joint reverses are not visible at this rate"
+    )
+
+
+CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", find_low_rate)]
+# said when a log is read: each repair is a message of its own
+REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
     Check(
         "degrees", "error", find_degrees, expected="radians and rad/s",
@@ -280,15 +278,52 @@ CHECKS: list[Check[JointSignals]] = [
 ]  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Finding:
-    """Say what a check finds odd about one joint of one trajectory."""
+class LogChecks:
+    """Check logs by themselves, one trajectory after another: they need not lie in memory together.
 
-    check: Check[JointSignals]
-    trajectory: str
-    file: Path | None
-    joint: str
-    message: str
+    products: of all velocities and positions, see `velocity_products`.
+    """
+
+    def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
+        self.products = np.zeros((2 * len(joints),) * 2)
+        self._joints, self._kinds = joints, joint_types
+        self._results: dict[tuple[str, Check[Any]], list[tuple[str, str, Path | None]]] = {}
+        self._count = 0
+
+    def add(self, trajectory: Trajectory) -> None:
+        """Take in a trajectory."""
+        self._count += 1
+        where = f"trajectory {trajectory.name}"
+        for clock_check in CLOCK_CHECKS:
+            message = clock_check.find(trajectory)
+            if message is not None:
+                self._add(message, clock_check, message, where, trajectory)
+        for repair in trajectory.repairs:
+            self._add(repair, REPAIRED, repair, where, trajectory)
+        products = velocity_products(trajectory)
+        self.products += products
+        factors, correlations = map(np.ndarray.tolist, velocity_agreement(products))
+        for k, (joint, kind) in enumerate(zip(self._joints, self._kinds, strict=True)):
+            columns = trajectory.q[:, k], trajectory.qd[:, k]
+            signals = JointSignals(trajectory, k, kind, self._joints, *columns, factors[k], correlations[k])
+            for joint_check, message in run_checks(CHECKS, signals, trajectory.accepted):
+                self._add(joint, joint_check, message, f"{where}, joint {joint!r}", trajectory)
+
+    def _add(self, group: str, result: Check[Any], message: str, where: str, trajectory: Trajectory) -> None:
+        self._results.setdefault((group, result), []).append((message, where, trajectory.file))
+
+    def findings(self) -> Findings:
+        """Return what is odd: a sentence for each joint and check, of clocks for each message."""
+        summary = Findings()
+        for (_, result), occurrences in self._results.items():
+            # a joint that rests in one motion and moves in another is no oddity
+            if result.everywhere and len(occurrences) < self._count:
+                continue
+            message, where, file = occurrences[0]
+            if len(occurrences) > 1:
+                message += f" (and in {counted(len(occurrences) - 1, 'more trajectory')})"
+            summary.add(result, message, where, file)
+        return summary
 
 
 def check(
@@ -299,104 +334,9 @@ def check(
     Raises LogError when revolute joints look recorded in degrees, unless units are declared, and when a
     position or a velocity never changes while the other one does.
     """
-    notes: list[Diagnostic] = []
-    results: list[Finding] = []
-    count = 0
+    checks = LogChecks(joints, joint_types)
     for trajectory in trajectories:
-        notes += clock_diagnostics(trajectory)
-        results += findings(trajectory, joints, joint_types)
-        count += 1
-    summary = summarised(results, joints, count)
+        checks.add(trajectory)
+    summary = checks.findings()
     collect(summary.errors)
-    return [*once(notes), *summary.notes]
-
-
-def once(notes: Sequence[Diagnostic]) -> list[Diagnostic]:
-    """Return each message of trajectories once, with how many others it is about."""
-    groups: dict[tuple[str, str], list[Diagnostic]] = {}
-    for note in notes:
-        groups.setdefault((note.code, note.message), []).append(note)
-    merged = []
-    for first, *others in groups.values():
-        merged.append(replace(first, message=_with_others(first.message, len(others))))
-    return merged
-
-
-def _with_others(message: str, others: int) -> str:
-    """Return a message that is about so many other trajectories, too."""
-    if not others:
-        return message
-    return f"{message} (and in {counted(others, 'more trajectory')})"
-
-
-def clock_diagnostics(trajectory: Trajectory) -> list[Diagnostic]:
-    """Return what the times of a recording keep from being seen: holes, and a low sample rate."""
-    notes: list[Diagnostic] = []
-    where = f"trajectory {trajectory.name}"
-    gaps = len(gap_ends(trajectory.t)) - 2
-    if gaps:
-        longest = np.diff(trajectory.t).max()
-        message = f"{counted(gaps, 'gap')} in time, up to {longest:.3g} s long; no window crosses one"
-        notes.append(Diagnostic("info", "gap", where, None, message))
-    for repair in trajectory.repairs:
-        notes.append(Diagnostic("warning", "repaired", where, None, repair))
-    rate = trajectory.sample_rate
-    if trajectory.u is None and rate > 0 and not is_dense(rate):
-        use = f"too slow for fits to torques, which need {SLOWEST:g} Hz"
-        if shows_accelerations(rate):
-            use = "interpolated for fits to torques"
-        message = (
-            f"{rate:.3g} Hz: {use}; motion faster than {rate / 2:.3g} Hz, delays below "
-            f"{1e3 / rate:.0f} ms and friction where a joint reverses are not visible at this rate"
-        )
-        notes.append(Diagnostic("warning", "low-rate", where, None, message))
-    return notes
-
-
-def findings(
-    trajectory: Trajectory,
-    joints: Sequence[str],
-    joint_types: Sequence[str],
-    agreement: VelocityAgreement | None = None,
-) -> list[Finding]:
-    """Return what is odd about the joints of one trajectory. agreement: where it is known already."""
-    if agreement is None:
-        agreement = velocity_agreement(trajectory)
-    results = []
-    for index, (joint, kind) in enumerate(zip(joints, joint_types, strict=True)):
-        signals = JointSignals(trajectory, index, joints, kind, agreement)
-        for odd, message in run_checks(CHECKS, signals, trajectory.accepted):
-            results.append(Finding(odd, trajectory.name, trajectory.file, joint, message))
-    return results
-
-
-def summarised(results: Sequence[Finding], joints: Sequence[str], trajectories: int) -> Findings:
-    """Return notes and errors about so many trajectories: a sentence for each joint and check."""
-    groups: dict[tuple[str, str], list[Finding]] = {}
-    for finding in results:
-        groups.setdefault((finding.joint, finding.check.code), []).append(finding)
-    summary = Findings()
-    for joint in joints:
-        for odd in CHECKS:
-            alike = groups.get((joint, odd.code), [])
-            # a joint that rests in one motion and moves in another is no oddity
-            if not alike or (odd.everywhere and len(alike) < trajectories):
-                continue
-            message = _with_others(alike[0].message, len(alike) - 1)
-            summary.add(odd, message, f"trajectory {alike[0].trajectory}, joint {joint!r}", alike[0].file)
-    return summary
-
-
-def velocity_agreement(trajectory: Trajectory) -> VelocityAgreement:
-    """Return how far qd is dq/dt, within gap-free pieces."""
-    n = trajectory.q.shape[1]
-    total = VelocityAgreement(np.zeros(n), np.zeros(n), np.zeros((n, n)))
-    for piece in split_at_gaps(trajectory):
-        span = min(TUNING.increments, len(piece) - 1)
-        if span:
-            steps = (piece.qd[1:] + piece.qd[:-1]) / 2 * np.diff(piece.t)[:, None]
-            # over several steps: from one sample to the next quantisation of q is larger than its change
-            integral = np.concatenate([np.zeros((1, n)), np.cumsum(steps, axis=0)])
-            x, y = integral[span:] - integral[:-span], piece.q[span:] - piece.q[:-span]
-            total += VelocityAgreement((x * x).sum(axis=0), (y * y).sum(axis=0), x.T @ y)
-    return total
+    return summary.notes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,67 +15,56 @@ import pyarrow.parquet
 
 from spelgen.errors import LogError, collect
 from spelgen.logs.arm_mapping import GivenMapping, LoggedArm, log_source
-from spelgen.logs.clock import require_increasing_times
 from spelgen.logs.formats import log_files
 from spelgen.logs.parquet_files import PARQUET
 from spelgen.logs.read import read_logs
-from spelgen.logs.recording import make_trajectory
+from spelgen.logs.recording import make_trajectory, require_increasing_times
 from spelgen.logs.tables import Layout, reading, stored_columns, table_layout
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.values import clock_start, values_in_si
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.tuning.logs import LogTuning
-
-TUNING = LogTuning()
-
-
-@dataclass(frozen=True)
-class ParquetLog:
-    """Say how a file is read. stored: columns that are needed. start: of its clock. stamp: of its last change."""
-
-    file: Path
-    layout: Layout
-    stored: tuple[str, ...]
-    start: int
-    stamp: tuple[int, int]
+from spelgen.settings.tuning.logs import TUNING
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Name a stretch of one recording, rows first..stop of a file; `load` reads it."""
+    """Name a stretch of one recording, rows first..stop of a file; `load` reads it.
+
+    stored: columns that are needed. start: of the file's clock. stamp: of its last change.
+    """
 
     name: str
-    log: ParquetLog
+    layout: Layout
+    stored: list[str]
+    start: pa.Scalar | None
+    stamp: tuple[int, int]
     first: int
     stop: int
 
     def load(self) -> Trajectory:
         """Return the chunk's samples. Raises LogError where the file has changed, or times do not increase."""
-        file, layout = self.log.file, self.log.layout
+        file = self.layout.file
         # rows of another file under the same name would be fitted without a word
-        if _stamp(file) != self.log.stamp:
+        if _stamp(file) != self.stamp:
             raise LogError("a file that has changed since it was first read", file=file, do="start a new run")
-        source = _source(file)
-        groups, row = _row_groups(source, self.first, self.stop)
+        source = _opened(file)
+        starts = [0]
+        for group in range(source.num_row_groups):
+            starts.append(starts[-1] + source.metadata.row_group(group).num_rows)
+        groups = range(bisect_right(starts, self.first) - 1, bisect_left(starts, self.stop))
+        row = starts[groups[0]]
         stretches = []
-        for batch in source.iter_batches(
-            TUNING.chunk_samples, row_groups=groups, columns=list(self.log.stored)
-        ):
+        for batch in source.iter_batches(TUNING.chunk_samples, row_groups=list(groups), columns=self.stored):
             low, high = max(self.first - row, 0), min(self.stop - row, batch.num_rows)
             if low < high:
                 rows = batch.slice(low, high - low)
-                stretches.append(values_in_si(rows, layout, file, self.log.start, row + low))
+                stretches.append(values_in_si(rows, self.layout, self.start, row + low))
             row += batch.num_rows
             if row >= self.stop:
                 break
         data = np.concatenate(stretches)
-        self.require_increasing(data[:, 0], self.first)
-        return make_trajectory(data, layout, self.name, file)
-
-    def require_increasing(self, t: np.ndarray, first: int) -> None:
-        """Raise LogError unless times, of the rows from `first` on, increase."""
-        rows = np.arange(first, first + len(t))
-        require_increasing_times(t, rows, self.log.file, self.log.layout.columns[0])
+        require_increasing_times(data[:, 0], range(self.first, self.stop), self.layout)
+        return make_trajectory(data, self.layout, self.name)
 
 
 def large_files(
@@ -92,14 +82,12 @@ def large_files(
         with reading(file):
             rows += pa.parquet.read_metadata(file).num_rows
     # from metadata alone: to count by reading would take what streaming is to save
-    numbers = rows * (1 + 3 * len(joints))
-    if 8 * numbers <= TUNING.in_memory:
+    if 8 * rows * (1 + 3 * len(joints)) <= TUNING.in_memory:
         return []
     for file in files:
         if file not in parquet:
-            errors.append(
-                LogError("a log beside others too large for memory", file=file, expected="Parquet like them")
-            )
+            got = "a log beside others too large for memory"
+            errors.append(LogError(got, file=file, expected="Parquet like them"))
     collect(errors)
     return parquet
 
@@ -115,7 +103,6 @@ def stream_logs(
     large = large_files(paths, source.joints, role)
     if not large:
         yield from read_logs(paths, arm, mapping, role)
-        return
     for _, trajectory in scan(large, source.joints, source.mapping, source.joint_types):
         yield trajectory
 
@@ -135,76 +122,61 @@ def scan(
     # names as `read_logs` gives them, though not all files are known when the first is read
     stems = Counter(file.stem for file in files)
     for file in files:
-        log = _open_log(file, joints, mapping)
-        stem = file.stem if stems[file.stem] == 1 else str(file)
-        for recording in _recordings(log, stem, len(files) > 1):
+        uncut = _uncut_file(file, joints, mapping)
+        if stems[file.stem] > 1:
+            uncut = replace(uncut, name=str(file))
+        for recording in _recordings(uncut, len(files) > 1):
             latest = -np.inf
-            for chunk in _cut(recording):
+            starts = range(recording.first, recording.stop, TUNING.chunk_samples)
+            for number, first in enumerate(starts, start=1):
+                name = f"{recording.name} [{number}]" if len(starts) > 1 else recording.name
+                stop = min(first + TUNING.chunk_samples, recording.stop)
+                chunk = replace(recording, name=name, first=first, stop=stop)
                 trajectory = chunk.load()
                 # times must increase across the border between chunks, too
-                chunk.require_increasing(np.array([latest, trajectory.t[0]]), chunk.first - 1)
+                border = np.array([latest, trajectory.t[0]])
+                require_increasing_times(border, (first - 1, first), chunk.layout)
                 latest = trajectory.t[-1]
                 yield chunk, trajectory
 
 
-def _open_log(file: Path, joints: Sequence[str], mapping: LogMapping) -> ParquetLog:
+def _uncut_file(file: Path, joints: Sequence[str], mapping: LogMapping) -> Chunk:
     stamp = _stamp(file)
     with reading(file):
-        source = _source(file)
-    names = source.schema_arrow.names
+        source = _opened(file)
     layout = table_layout(source.schema_arrow, joints, mapping, file)
-    stored = stored_columns(replace(layout, labels=None), names)
-    head = next(source.iter_batches(1, columns=[layout.columns[0]]), None)
+    stored = stored_columns(replace(layout, labels=None), source.schema_arrow.names)
+    head = next(source.iter_batches(1, columns=stored), None)
     if head is None:
         raise LogError("no rows", file=file, expected="at least one window of samples")
-    return ParquetLog(file, layout, tuple(stored), clock_start(head.column(0)), stamp)
+    rows = source.metadata.num_rows
+    return Chunk(file.stem, layout, stored, clock_start(head, layout), stamp, 0, rows)
 
 
-def _cut(recording: Chunk) -> Iterator[Chunk]:
-    """Yield the chunks of a recording, numbered where there are several."""
-    size = TUNING.chunk_samples
-    if recording.stop - recording.first <= size:
-        yield recording
-        return
-    for number, first in enumerate(range(recording.first, recording.stop, size), start=1):
-        stop = min(first + size, recording.stop)
-        yield replace(recording, name=f"{recording.name} [{number}]", first=first, stop=stop)
-
-
-def _recordings(log: ParquetLog, stem: str, several_files: bool) -> list[Chunk]:
+def _recordings(uncut: Chunk, several_files: bool) -> list[Chunk]:
     """Return each recording of a file, uncut. Raises LogError where the rows of one do not lie together."""
-    if log.layout.labels is None:
-        return [Chunk(stem, log, 0, _source(log.file).metadata.num_rows)]
-    recordings: list[Chunk] = []
-    labels: set[str] = set()
-    start = 0
-    for label, stop in _label_runs(log.file, log.layout.labels):
-        if label in labels:
-            raise LogError(
-                f"trajectory {label} once more, after others", file=log.file,
-                element=f"row {start + 1}, column {log.layout.labels}",
-                expected="its rows together, in a log too large for memory", do="sort the rows",
-            )  # fmt: skip
-        labels.add(label)
-        recordings.append(Chunk(f"{stem}/{label}" if several_files else label, log, start, stop))
-        start = stop
-    return recordings
-
-
-def _label_runs(file: Path, column: str) -> list[tuple[str, int]]:
-    """Return each run of equal labels, in the rows' order, with the row at which it ends."""
-    runs: list[tuple[str, int]] = []
-    row = 0
-    for batch in _source(file).iter_batches(TUNING.chunk_samples, columns=[column]):
+    column = uncut.layout.labels
+    if column is None:
+        return [uncut]
+    stops: dict[str, int] = {}
+    latest, first_row, stop = None, 0, 0
+    for batch in _opened(uncut.layout.file).iter_batches(TUNING.chunk_samples, columns=[column]):
         # runs, and not rows: a label repeats a million times
-        encoded = pa.compute.run_end_encode(batch.column(0).cast(pa.string()))
-        for value, end in zip(encoded.values.to_pylist(), encoded.run_ends.to_pylist(), strict=True):
+        runs = pa.compute.run_end_encode(batch.column(0).cast(pa.string()))
+        for value, end in zip(runs.values.to_pylist(), runs.run_ends.to_pylist(), strict=True):
             label = str(value)
-            if runs and runs[-1][0] == label:
-                runs.pop()
-            runs.append((label, row + end))
-        row += batch.num_rows
-    return runs
+            if label != latest and label in stops:
+                got, do = f"trajectory {label} once more, after others", "sort the rows"
+                expected = "its rows together, in a log too large for memory"
+                raise uncut.layout.row_error(got, stop, column, expected, do)
+            latest, stop = label, first_row + end
+            stops[label] = stop
+        first_row += batch.num_rows
+    recordings = []
+    for (label, stop), first in zip(stops.items(), [0, *stops.values()], strict=False):
+        name = f"{uncut.name}/{label}" if several_files else label
+        recordings.append(replace(uncut, name=name, first=first, stop=stop))
+    return recordings
 
 
 def _stamp(file: Path) -> tuple[int, int]:
@@ -213,20 +185,6 @@ def _stamp(file: Path) -> tuple[int, int]:
     return status.st_mtime_ns, status.st_size
 
 
-def _source(file: Path) -> pa.parquet.ParquetFile:
+def _opened(file: Path) -> pa.parquet.ParquetFile:
     """Open a file to be read page by page: by default pyarrow keeps all row groups, and a row group at once."""
     return pa.parquet.ParquetFile(file, pre_buffer=False, buffer_size=2**16)
-
-
-def _row_groups(source: pa.parquet.ParquetFile, first: int, stop: int) -> tuple[list[int], int]:
-    """Return the row groups that hold these rows, and the first row of the first group."""
-    groups: list[int] = []
-    start = first_row = 0
-    for number in range(source.num_row_groups):
-        end = start + source.metadata.row_group(number).num_rows
-        if end > first and start < stop:
-            if not groups:
-                first_row = start
-            groups.append(number)
-        start = end
-    return groups, first_row

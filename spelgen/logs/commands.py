@@ -11,7 +11,7 @@ from spelgen.settings.tuning.servo import ServoRolloutTuning
 
 LogRows = tuple[Trajectory, slice]
 """A part of a log: rows from start to stop."""
-BEFORE = 1e3  # s before a recording, over which its first command is taken to have stood
+LEAD_IN = 1e3  # s before a recording, over which its first command is taken to have stood
 
 
 def steps_between(trajectory: Trajectory, longest: float = ServoRolloutTuning().step) -> int:
@@ -29,15 +29,12 @@ def delayed_commands(trajectory: Trajectory, rows: slice, delay: float, steps: i
     # from the command that stood then
     held_rows = slice(max(0, earliest - 1), latest + 1)
     t, u = trajectory.t[held_rows], require_commands(trajectory)[held_rows]
-    durations = np.diff(t, prepend=t[0] - BEFORE)
-    held = np.concatenate([u[:1], u[:-1]])  # until each sample
+    standing = np.concatenate([u[:1], u[:-1]])  # until each sample
+    corners = np.concatenate([t[:1] - LEAD_IN, t])
     integral = np.zeros((len(t) + 1, u.shape[1]))
-    integral[1:] = np.cumsum(durations[:, None] * held, axis=0)
-    corners = np.concatenate([t[:1] - BEFORE, t])
+    integral[1:] = np.cumsum(np.diff(corners)[:, None] * standing, axis=0)
     edges = samples[:-1, None] + np.diff(samples)[:, None] * np.arange(steps) / steps
     edges = np.append(edges.ravel(), samples[-1])
-    means = np.zeros((len(edges) - 1, u.shape[1]))
-    for joint in range(u.shape[1]):
-        values = np.interp(edges - delay, corners, integral[:, joint])
-        means[:, joint] = np.diff(values) / np.diff(edges)
-    return means.reshape(len(samples) - 1, steps, -1)
+    values = [np.interp(edges - delay, corners, column) for column in integral.T]
+    means = np.diff(values) / np.diff(edges)
+    return means.T.reshape(len(samples) - 1, steps, -1)

@@ -7,24 +7,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pyarrow as pa
-import pyarrow.compute
 import pyarrow.csv
 
 from spelgen.errors import LogError
-from spelgen.logs.bags import FIELDS
-from spelgen.logs.tables import LogFormat, LogTable, reading, table_layout
+from spelgen.logs.tables import LogFormat, LogTable, table_layout
 from spelgen.logs.values import is_number
-from spelgen.settings.log_mapping import PLAIN, LogMapping
-from spelgen.settings.tuning.logs import LogTuning
-
-STAMP = ("sec", "nanosec")  # of a message's header
-TUNING = LogTuning()
+from spelgen.settings.log_mapping import LogMapping
+from spelgen.settings.tuning.logs import TUNING
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
     """Return the one table of a file."""
     table = csv_columns(file)
-    return [LogTable(None, table, table_layout(table.schema, joints, mapping, file))]
+    return [(table_layout(table.schema, joints, mapping, file), table)]
 
 
 def csv_columns(file: Path) -> pa.Table:
@@ -32,50 +27,24 @@ def csv_columns(file: Path) -> pa.Table:
 
     Text may be UTF-8, UTF-16 or Latin-1.
     """
-    with reading(file):
-        encoding, head = _decoded_head(file)
-        names, _, rows = head.partition("\n")
-        delimiter = max(",;\t", key=names.count)
-        header = None
-        if is_number(names.split(delimiter)[0]):
-            header = _joint_state_header(names.split(delimiter), file)
-        decimal_point = "."
-        if delimiter != "," and re.search(rf"(^|{delimiter}) *-?\d+,\d", rows, re.MULTILINE):
-            decimal_point = ","
-        table = pa.csv.read_csv(
-            file,
-            pa.csv.ReadOptions(encoding=encoding, column_names=header),
-            pa.csv.ParseOptions(delimiter=delimiter),
-            pa.csv.ConvertOptions(decimal_point=decimal_point),
-        )
-    if header is None:
-        return table.rename_columns([name.strip() for name in table.column_names])
-    seconds, nanoseconds = (table[name].cast(pa.int64()) for name in STAMP)
-    times = pa.compute.add(pa.compute.multiply(seconds, 1_000_000_000), nanoseconds)
-    return table.append_column(PLAIN["t"], times.cast(pa.duration("ns")))
-
-
-def _joint_state_header(cells: Sequence[str], file: Path) -> list[str]:
-    """Return names for the columns of joint states as `ros2 topic echo --csv` writes them, which has no header.
-
-    Raises LogError for any other file that begins with numbers.
-    """
-    names: list[str] = []
-    for cell in cells[len(STAMP) + 1 :]:
-        if is_number(cell):
-            break
-        names.append(cell)
-    values = len(cells) - len(STAMP) - 1 - len(names)
-    if not names or values % len(names) or not 0 < values // len(names) <= len(FIELDS):
+    encoding, head = _decoded_head(file)
+    names, _, rows = head.partition("\n")
+    delimiter = max(",;\t", key=names.count)
+    cells = names.split(delimiter)
+    if is_number(cells[0]):
         raise LogError(
             f"numbers in the first line ({', '.join(cells[:3])}, ...)", file=file, line=1,
             expected="a header: the names of the columns",
             do="write one, t,q_<joint>,...,qd_<joint>,...,tau_<joint>,... for example",
         )  # fmt: skip
-    header = [*STAMP, "frame_id", *(f"name_{name}" for name in names)]
-    for quantity in list(FIELDS)[: values // len(names)]:
-        header += [PLAIN[quantity].replace("{joint}", name) for name in names]
-    return header
+    decimal_commas = delimiter != "," and re.search(rf"(^|{delimiter}) *-?\d+,\d", rows, re.MULTILINE)
+    table = pa.csv.read_csv(
+        file,
+        pa.csv.ReadOptions(encoding=encoding),
+        pa.csv.ParseOptions(delimiter=delimiter),
+        pa.csv.ConvertOptions(decimal_point="," if decimal_commas else "."),
+    )
+    return table.rename_columns([name.strip() for name in table.column_names])
 
 
 def _decoded_head(file: Path) -> tuple[str, str]:

@@ -13,12 +13,12 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.settings.tuning.identification import IdentificationTuning
-from spelgen.settings.tuning.logs import LogTuning
+from spelgen.settings.tuning.logs import TUNING as LOG_TUNING
 
 TUNING = IdentificationTuning()
 FREQUENCY = TUNING.sample_rate
 SHORTEST = TUNING.shortest_piece
-HOLE = 0.25 / LogTuning().automatic_cutoff  # [s] a shorter one loses nothing that the filter lets through
+HOLE = 0.25 / LOG_TUNING.automatic_cutoff  # [s] a shorter one loses nothing that the filter lets through
 AUTOMATIC = Preprocessing()
 
 
@@ -65,12 +65,10 @@ def dynamics_samples(
     """
     samples = []
     for trajectory in preprocessing.moved(trajectories):
-        if not shows_accelerations(trajectory.sample_rate):
-            continue
         pieces = long_pieces(trajectory, preprocessing.gap)
-        if not pieces:
+        if not pieces or not shows_accelerations(trajectory.sample_rate):
             continue
-        columns = [_columns(piece, pauses, preprocessing, reach) for piece in pieces]
+        columns = [_columns(piece, pauses, preprocessing.acceleration_cutoff, reach) for piece in pieces]
         joined = columns[0]  # hours of motion without a hole are not copied
         if len(columns) > 1:
             joined = list(map(np.concatenate, zip(*columns, strict=True)))
@@ -80,20 +78,28 @@ def dynamics_samples(
 
 def long_pieces(trajectory: Trajectory, gap: float) -> list[Trajectory]:
     """Return the pieces between holes of which a filter leaves something."""
-    pieces = split_at_gaps(trajectory, gap, HOLE)
-    return [piece for piece in pieces if piece.duration >= SHORTEST]
+    return [piece for piece in split_at_gaps(trajectory, gap, HOLE) if piece.duration >= SHORTEST]
 
 
 def _columns(
-    piece: Trajectory, pauses: bool, preprocessing: Preprocessing, reach: BristleReach | None
+    piece: Trajectory, pauses: bool, cutoff: float | None, reach: BristleReach | None
 ) -> list[np.ndarray]:
     """Return q, qd, qdd, tau, and z where a reach is given, of the selected samples of a piece."""
-    cutoff = preprocessing.acceleration_cutoff
+    rate, times, t = piece.sample_rate, piece.t, regular_times(piece.t, FREQUENCY)
+    is_denser = rate > 1.5 * FREQUENCY
+
+    def sampled(signals: np.ndarray) -> np.ndarray:
+        """Return signals at the piece's own times at regular times, through the filter."""
+        if cutoff is None:
+            return resampled(times, signals, t, rate)
+        # filtered at the higher of the two rates: what the lower one would fold back is gone by then
+        if is_denser:
+            return resampled(times, low_passed(times, signals, cutoff), t, rate)
+        return low_passed(t, resampled(times, signals, t, rate), cutoff)
+
     if cutoff is not None:
-        require_cutoff(piece, piece.sample_rate if _is_denser(piece) else FREQUENCY, cutoff)
-    t = regular_times(piece.t, FREQUENCY)
-    q, qd, tau = (_as_sampled(piece, x, t, cutoff) for x in (piece.q, piece.qd, piece.tau))
-    qdd = np.gradient(qd, t, axis=0)
+        require_cutoff(piece, rate if is_denser else FREQUENCY, cutoff)
+    q, qd, tau = sampled(piece.q), sampled(piece.qd), sampled(piece.tau)
     selected = is_moving(qd)
     if cutoff is not None:  # a filter that begins or ends within a motion makes up what it does not see
         unsettled = round(TUNING.unsettled * FREQUENCY / cutoff)
@@ -101,37 +107,21 @@ def _columns(
     if pauses and selected.any():
         moving = np.flatnonzero(selected)
         selected[moving[0] : moving[-1]] = True
-    columns = [q, qd, qdd, tau]
+    columns = [q, qd, np.gradient(qd, t, axis=0), tau]
     if reach is not None and reach.elements:
         # the torque steps where joints turn around, at the log's own times, and then went through filter and change of
         # rate: so must these, else a step is wrong by up to a sample's time, and passes for inertia
-        if cutoff is None:
-            path, speed = piece.q, piece.qd
-        else:
-            path, speed = interpolated(t, q, piece.t), interpolated(t, qd, piece.t)
+        path, speed = piece.q, piece.qd
+        if cutoff is not None:
+            path, speed = interpolated(t, q, times), interpolated(t, qd, times)
         z = np.moveaxis(bristles_along(path, reach), 2, 0)  # one element at a time: all are as many logs
-        columns.append(np.stack([_as_sampled(piece, x, t, cutoff) for x in z], axis=2))
+        columns.append(np.stack(list(map(sampled, z)), axis=2))
         direction = direction_along(speed, reach)
         if direction is not None:
-            columns.append(_as_sampled(piece, direction, t, cutoff))
+            columns.append(sampled(direction))
     return columns if selected.all() else [x[selected] for x in columns]
 
 
 def is_moving(qd: np.ndarray) -> np.ndarray:
     """Return in which samples some joint moves, (T,)."""
     return np.asarray((np.abs(qd) > TUNING.moving).any(axis=1))
-
-
-def _is_denser(piece: Trajectory) -> bool:
-    return piece.sample_rate > 1.5 * FREQUENCY
-
-
-def _as_sampled(piece: Trajectory, signals: np.ndarray, t: np.ndarray, cutoff: float | None) -> np.ndarray:
-    """Return signals at a piece's own times at these regular times, through the filter."""
-    rate = piece.sample_rate
-    if cutoff is None:
-        return resampled(piece.t, signals, t, rate)
-    # filtered at the higher of the two rates: what the lower one would fold back is gone by then
-    if _is_denser(piece):
-        return resampled(piece.t, low_passed(piece.t, signals, cutoff), t, rate)
-    return low_passed(t, resampled(piece.t, signals, t, rate), cutoff)

@@ -6,16 +6,16 @@ A new format is a file like `csv_files.py`, and its name in FORMATS.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import chain
 from pathlib import Path
 
 from spelgen.errors import LogError, SpelgenError
 from spelgen.files import local, require_regular_file
 from spelgen.logs.bags import BAG
 from spelgen.logs.csv_files import CSV
-from spelgen.logs.lerobot import LEROBOT
 from spelgen.logs.npz import NPZ
-from spelgen.logs.parquet_files import PARQUET
-from spelgen.logs.tables import LogFormat, LogTable
+from spelgen.logs.parquet_files import LEROBOT, PARQUET
+from spelgen.logs.tables import LogFormat, LogTable, reading
 from spelgen.settings.log_mapping import LogMapping
 
 FORMATS: list[LogFormat] = [PARQUET, CSV, NPZ, BAG, LEROBOT]
@@ -23,11 +23,9 @@ FORMATS: list[LogFormat] = [PARQUET, CSV, NPZ, BAG, LEROBOT]
 
 def format_of(path: Path) -> LogFormat | None:
     """Return the format of a file or folder; None of what is no log, such as a pipe that might never end."""
-    is_folder, is_file = path.is_dir(), path.is_file()
     for log_format in FORMATS:
-        if is_folder and log_format.is_folder is not None and log_format.is_folder(path):
-            return log_format
-        if is_file and path.suffix in log_format.suffixes:
+        is_folder = log_format.marker and (path / log_format.marker).is_file()
+        if is_folder or (path.suffix in log_format.suffixes and path.is_file()):
             return log_format
     return None
 
@@ -36,18 +34,8 @@ def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[
     """Return the tables of a log. Raises LogError, where columns are missing too."""
     log_format = format_of(path)
     assert log_format is not None, "log_files gives logs alone"
-    return log_format.read(path, joints, mapping)
-
-
-def describe_formats() -> str:
-    """Return what may be a log, as messages say it."""
-    suffixes: list[str] = []
-    folders: list[str] = []
-    for log_format in FORMATS:
-        suffixes += log_format.suffixes
-        if log_format.folder:
-            folders.append(log_format.folder)
-    return f"{', '.join(suffixes)}, the folder of {' or of '.join(folders)}"
+    with reading(path):
+        return log_format.read(path, joints, mapping)
 
 
 def log_files(
@@ -59,9 +47,7 @@ def log_files(
     """
     files: dict[Path, None] = {}
     errors: list[SpelgenError] = []
-    if isinstance(paths, str | Path):
-        paths = [paths]
-    for name in paths:
+    for name in [paths] if isinstance(paths, str | Path) else paths:
         path = local(name)
         try:
             if not path.exists():
@@ -75,24 +61,20 @@ def log_files(
 def _logs_at(path: Path, role: str | None) -> list[Path]:
     if format_of(path) is not None:
         return [path]
-    if path.is_dir():
-        return _folder_logs(path, role)
-    require_regular_file(path, LogError, f"a file: {describe_formats()}")
-    raise LogError(f"a file of kind {path.suffix!r}", file=path, expected=describe_formats())
-
-
-def _folder_logs(folder: Path, role: str | None) -> list[Path]:
+    suffixes = ", ".join(chain(*(log_format.suffixes for log_format in FORMATS)))
+    folders = " or of ".join(log_format.folder for log_format in FORMATS if log_format.folder)
+    formats = f"{suffixes}, the folder of {folders}"
+    if not path.is_dir():
+        require_regular_file(path, LogError, f"a file: {formats}")
+        raise LogError(f"a file of kind {path.suffix!r}", file=path, expected=formats)
     # hidden files are not recordings: macOS puts "._log.csv" beside log.csv on other file systems
-    visible = (path for path in folder.iterdir() if not path.name.startswith("."))
-    logs = sorted(path for path in visible if format_of(path) is not None)
+    logs = sorted(x for x in path.iterdir() if format_of(x) is not None and not x.name.startswith("."))
     if not logs:
-        raise LogError("a folder without logs", file=folder, expected=describe_formats())
-    has_roles = any(path.stem in ("train", "test") for path in logs)
-    if role is None or not has_roles:
+        raise LogError("a folder without logs", file=path, expected=formats)
+    if role is None or not any(log.stem in ("train", "test") for log in logs):
         return logs
-    selected = [path for path in logs if path.stem == role]
+    selected = [log for log in logs if log.stem == role]
     if not selected:
-        raise LogError(
-            f"a folder without {role}.* among its logs", file=folder, expected=f"{role}.*, or files by name"
-        )
+        got, expected = f"a folder without {role}.* among its logs", f"{role}.*, or files by name"
+        raise LogError(got, file=path, expected=expected)
     return selected

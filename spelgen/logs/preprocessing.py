@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from math import isfinite
+from math import inf
 
-from spelgen.errors import Diagnostic, SettingsError
-from spelgen.logs.filtering import prepare
-from spelgen.logs.rates import automatic_cutoff, automatic_decimation
+from spelgen.errors import Diagnostic, SettingsError, SpelgenError, collect
+from spelgen.logs.filtering import low_pass
+from spelgen.logs.rates import FAST
 from spelgen.logs.recording import earlier
-from spelgen.logs.trajectory import GAP, Trajectory
-from spelgen.settings.tuning.logs import LogTuning
-
-TUNING = LogTuning()
+from spelgen.logs.trajectory import GAP, Trajectory, split_at_gaps
+from spelgen.settings.tuning.logs import TUNING
 
 
 @dataclass(frozen=True)
@@ -21,9 +19,8 @@ class Preprocessing:
     """How logs are cut, filtered and thinned. Raises SettingsError for values that cannot be.
 
     cutoff: of the zero-phase low-pass on q, qd and tau [Hz]; 0: none; None: 8 Hz, and none for windows of logs of
-    which one is sampled at 50 Hz or less (see `automatic_cutoff`).
-    decimation: samples from one sample of a window to the next; None: as many as filtered logs can spare (see
-    `automatic_decimation`).
+    which one is sampled at 50 Hz or less.
+    decimation: samples from one sample of a window to the next; None: as many as filtered logs can spare.
     gap: a step longer than so many median steps is a hole in the recording, at which it is cut.
     torque_delay: how much later than positions the logs show torques [s]; None: found where torques are fitted.
     """
@@ -34,14 +31,14 @@ class Preprocessing:
     torque_delay: float | None = None
 
     def __post_init__(self) -> None:
-        if self.cutoff is not None and not (isfinite(self.cutoff) and self.cutoff >= 0):
-            raise SettingsError(
-                f"{self.cutoff!r}", element="cutoff", expected="a frequency [Hz], or 0 for none"
-            )
-        if self.decimation is not None and self.decimation < 1:
-            raise SettingsError(f"{self.decimation!r}", element="decimation", expected="1 or more samples")
-        if not self.gap > 1:
-            raise SettingsError(f"{self.gap!r}", element="gap", expected="more than 1 median step")
+        limits = [
+            ("cutoff", self.cutoff is None or 0 <= self.cutoff < inf, "a frequency [Hz], or 0 for none"),
+            ("decimation", self.decimation is None or self.decimation >= 1, "1 or more samples"),
+            ("gap", self.gap > 1, "more than 1 median step"),
+        ]
+        for name, is_possible, expected in limits:
+            if not is_possible:
+                raise SettingsError(repr(getattr(self, name)), element=name, expected=expected)
 
     def resolved(self, rates: Iterable[float]) -> Preprocessing:
         """Return the same with all decided for windows of logs with these sample rates [Hz], as it is kept with a run.
@@ -49,10 +46,13 @@ class Preprocessing:
         A cutoff that stays None is that of logs too slow to be filtered unasked.
         """
         rates = list(rates)
-        cutoff = automatic_cutoff(rates) if self.cutoff is None else self.cutoff
-        decimation = self.decimation or automatic_decimation(rates, cutoff or None)
-        delay = self.torque_delay or 0.0
-        return replace(self, cutoff=cutoff, decimation=decimation, torque_delay=delay)
+        cutoff, decimation = self.cutoff, self.decimation or 1
+        if cutoff is None and all(rate > TUNING.dense_rate * FAST for rate in rates):
+            cutoff = TUNING.automatic_cutoff
+        # every sample counts, unless filtered logs are denser than their filter needs
+        if self.decimation is None and cutoff:
+            decimation = max(1, int(min(rates) * FAST / (TUNING.samples_per_period * cutoff)))
+        return replace(self, cutoff=cutoff, decimation=decimation, torque_delay=self.torque_delay or 0.0)
 
     @property
     def acceleration_cutoff(self) -> float | None:
@@ -75,9 +75,23 @@ class Preprocessing:
         return [Diagnostic("info", "filter", "logs", None, message)]
 
     def pieces(self, trajectories: Sequence[Trajectory], *, shortest: int) -> list[Trajectory]:
-        """Return gap-free pieces of at least so many samples, filtered; of a ``resolved`` one. Raises LogError."""
-        moved = self.moved(trajectories)
-        return prepare(moved, shortest=shortest, cutoff=self.cutoff or None, gap=self.gap)
+        """Return gap-free pieces (see `gap_ends`) of at least so many samples, filtered; of a ``resolved`` one.
+
+        Raises LogError where a trajectory has no piece that long.
+        """
+        prepared: list[Trajectory] = []
+        errors: list[SpelgenError] = []
+        for trajectory in self.moved(trajectories):
+            pieces = split_at_gaps(trajectory, self.gap)
+            if max(map(len, pieces)) < shortest:
+                got = f"{max(map(len, pieces))} samples without a gap"
+                do = "record longer or train with a shorter window"
+                errors.append(trajectory.error(got, f"at least {shortest}, one window", do))
+            for piece in pieces:
+                if len(piece) >= shortest:
+                    prepared.append(low_pass(piece, self.cutoff) if self.cutoff else piece)
+        collect(errors)
+        return prepared
 
     def moved(self, trajectories: Sequence[Trajectory]) -> Sequence[Trajectory]:
         """Return trajectories with torques at the times at which they act."""

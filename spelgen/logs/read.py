@@ -14,15 +14,12 @@ import pyarrow.parquet
 from spelgen.errors import LogError, collect
 from spelgen.files import replacing
 from spelgen.logs.arm_mapping import GivenMapping, LoggedArm, log_source
-from spelgen.logs.clock import in_time_order
 from spelgen.logs.formats import log_files, read_tables
-from spelgen.logs.recording import make_trajectory
-from spelgen.logs.tables import UNITS, UNITS_KEY, LogTable
+from spelgen.logs.recording import in_time_order, make_trajectory
+from spelgen.logs.tables import UNITS, UNITS_KEY, Layout
 from spelgen.logs.trajectory import Trajectory, require_joints
 from spelgen.logs.values import clock_start, values_in_si
-from spelgen.settings.tuning.logs import LogTuning
-
-TUNING = LogTuning()
+from spelgen.settings.tuning.logs import TUNING
 
 
 def read_logs(
@@ -50,8 +47,8 @@ def read_logs(
     trajectories: list[Trajectory] = []
     for file in files:
         try:
-            for table in read_tables(file, source.joints, source.mapping):
-                trajectories += _trajectories(table, file)
+            for layout, table in read_tables(file, source.joints, source.mapping):
+                trajectories += _trajectories(layout, table)
         except LogError as error:  # all files are told of at once
             errors.append(error)
     collect(errors)
@@ -73,14 +70,10 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
     for trajectory in trajectories:
         require_joints(trajectory, joints)
         names += [trajectory.name] * len(trajectory)
-    columns: dict[str, np.ndarray | list[str]] = {
-        "trajectory": names,
-        "t": np.concatenate([x.t for x in trajectories]),
-    }
+    columns = {"trajectory": pa.array(names), "t": np.concatenate([x.t for x in trajectories])}
     for quantity in trajectories[0].quantities:
         values = np.concatenate([getattr(x, quantity) for x in trajectories])
-        for index, joint in enumerate(joints):
-            columns[f"{quantity}_{joint}"] = values[:, index]
+        columns |= {f"{quantity}_{joint}": column for joint, column in zip(joints, values.T, strict=True)}
     # the file says that it is in SI units, so that no mapping is applied when it is read back
     table = pa.table(columns).replace_schema_metadata({UNITS_KEY: UNITS})
     with replacing(path) as unfinished:
@@ -92,46 +85,36 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
     return path
 
 
-def _trajectories(log: LogTable, file: Path) -> list[Trajectory]:
+def _trajectories(layout: Layout, table: pa.Table) -> list[Trajectory]:
     """Return the trajectories of one table."""
-    if not log.table.num_rows:
-        raise LogError("no rows", file=file, expected="at least one window of samples")
-    times = log.layout.columns[0]
-    data = values_in_si(log.table, log.layout, file, clock_start(log.table[times]))
+    if not table.num_rows:
+        raise LogError("no rows", file=layout.file, expected="at least one window of samples")
+    data = values_in_si(table, layout, clock_start(table, layout))
     trajectories = []
-    for name, rows in _recordings(log, file.stem):
-        values, repairs = in_time_order(data[rows], rows, log.layout, file)
-        trajectories.append(make_trajectory(values, log.layout, name, file, repairs))
+    for name, rows in _recordings(layout, table):
+        values, repairs = in_time_order(data[rows], rows, layout)
+        trajectories.append(make_trajectory(values, layout, name, repairs))
     return trajectories
 
 
-def _recordings(log: LogTable, stem: str) -> list[tuple[str, np.ndarray]]:
+def _recordings(layout: Layout, table: pa.Table) -> list[tuple[str, np.ndarray]]:
     """Return name and rows of each recording of a table, in order of their first rows."""
-    if log.layout.labels is None:
-        return [(log.recording or stem, np.arange(log.table.num_rows))]
+    if layout.labels is None:
+        return [(layout.recording or layout.file.stem, np.arange(table.num_rows))]
     # each label once: a name of a megabyte on a million rows is a small file
-    labels = log.table[log.layout.labels].dictionary_encode("encode").combine_chunks()
-    codes: dict[str, int] = {}
-    code_of_label = []
-    for label in labels.dictionary.to_pylist():
-        code_of_label.append(codes.setdefault(str(label), len(codes)))
-    code_of_row = np.array(code_of_label)[labels.indices.to_numpy()]
+    labels = table[layout.labels].dictionary_encode("encode").combine_chunks()
+    numbers = labels.indices.to_numpy()
     # sorting keeps time and memory in proportion to the rows, however many recordings there are
-    rows = np.argsort(code_of_row, kind="stable")
-    ends = np.cumsum(np.bincount(code_of_row))
-    return list(zip(codes, np.split(rows, ends[:-1]), strict=True))
+    rows = np.argsort(numbers, kind="stable")
+    ends = np.cumsum(np.bincount(numbers))
+    return list(zip(map(str, labels.dictionary.to_pylist()), np.split(rows, ends[:-1]), strict=True))
 
 
 def _with_unique_names(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
     """Return the trajectories under the shortest names that tell all of them apart."""
-    short, with_stem, with_path = [], [], []
-    for trajectory in trajectories:
-        assert trajectory.file is not None
-        short.append(trajectory.name)
-        with_stem.append(f"{trajectory.file.stem}/{trajectory.name}")
-        with_path.append(f"{trajectory.file}/{trajectory.name}")
-    names = with_path
-    for candidates in (with_stem, short):
-        if len(set(candidates)) == len(candidates):
-            names = candidates
+    names: list[str] = []
+    for form in ("{0.name}", "{0.file.stem}/{0.name}", "{0.file}/{0.name}"):
+        names = list(map(form.format, trajectories))
+        if len(set(names)) == len(names):
+            break
     return [replace(x, name=name) for x, name in zip(trajectories, names, strict=True)]

@@ -6,18 +6,17 @@ import difflib
 import re
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from itertools import chain, starmap
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
-from spelgen.settings.log_mapping import TIMES, LogMapping
-from spelgen.settings.tuning.logs import LogTuning
+from spelgen.settings.log_mapping import LogMapping
+from spelgen.settings.tuning.logs import TUNING
 
 UNITS_KEY = b"units"  # in a Parquet file's metadata: the file declares its units
 UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")  # that a declared unit answers
@@ -33,33 +32,27 @@ UNREADABLE = (
 class Layout:
     """Say where the quantities of an arm stand in a log, and how they are measured.
 
-    columns: of t, then of q, qd and tau by joint; without qd where velocities are to be differentiated. labels: the
-    column that splits the log into recordings, None without. accepted: see `Trajectory`.
+    file: what errors and trajectories name. columns: of t, then of q, qd and tau by joint; without qd where velocities
+    are to be differentiated. labels: the column that splits the log into recordings, None without. accepted: see
+    `Trajectory`. recording: its name, where the format keeps recordings apart.
     """
 
+    file: Path
     columns: tuple[str, ...]
     labels: str | None
     joints: tuple[str, ...]
     mapping: LogMapping
     accepted: tuple[str, ...]
+    recording: str | None = None
 
-    @cached_property
-    def units(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return factors and offsets (C,) of the columns: a value in SI units is factor * logged value + offset."""
-        factors, offsets = [TIMES[self.mapping.units.t]], [0.0]
-        for quantity, joint in self.mapping.signals(self.joints):
-            factors.append(self.mapping.scale(quantity, joint))
-            offsets.append(self.mapping.offset(quantity, joint))
-        return np.array(factors), np.array(offsets)
+    def row_error(self, got: str, row: int, column: str, expected: str, do: str | None = None) -> LogError:
+        """Return an error about a column in a 0-based data row, with the line of a CSV, whose first is its header."""
+        line = int(row) + 2 if self.file.suffix == ".csv" else None
+        element = f"row {row + 1}, column {column}"
+        return LogError(got, file=self.file, line=line, element=element, expected=expected, do=do)
 
 
-@dataclass(frozen=True, eq=False)
-class LogTable:
-    """Hold one table of a log file. recording: its name, where the format keeps recordings apart."""
-
-    recording: str | None
-    table: pa.Table
-    layout: Layout
+LogTable = tuple[Layout, pa.Table]
 
 
 @dataclass(frozen=True)
@@ -68,13 +61,13 @@ class LogFormat:
 
     read: from a path, the joints and the mapping to tables; raises LogError. suffixes: of its files. columns: from a
     file to all its columns, of which `suggest` drafts a mapping; None where the format itself says what they are.
-    is_folder: whether a folder is a log of this format; folder: what such a folder is called.
+    marker: a file in each folder that is a log of this format; folder: what such a folder is called.
     """
 
     read: Callable[[Path, Sequence[str], LogMapping], list[LogTable]]
     suffixes: tuple[str, ...] = ()
     columns: Callable[[Path], pa.Table] | None = None
-    is_folder: Callable[[Path], bool] | None = None
+    marker: str = ""
     folder: str = ""
 
 
@@ -87,10 +80,18 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     # simulated logs of an arm whose settings describe its real logger
     if metadata.get(UNITS_KEY) == UNITS:
         mapping = LogMapping(input=mapping.input)
-    columns = [mapping.columns.t]
-    for quantity, joint in mapping.signals(joints):
-        columns.append(mapping.column(quantity, joint))
-    _require_columns(schema.names, columns, file, mapping, joints)
+    columns = [mapping.columns.t, *starmap(mapping.column, mapping.signals(joints))]
+    missing = []
+    for name in columns:
+        if columns.count(name) > 1:
+            got, expected = "one column for several joints", "'{joint}' in its name under 'logs'"
+            raise LogError(got, file=file, element=f"column {name}", expected=expected)
+        if schema.names.count(name) > 1:
+            raise LogError("the same column twice", file=file, element=f"column {name}", expected="it once")
+        if name not in schema.names and not list_element(name, schema.names):
+            missing.append(name)
+    if missing:
+        raise missing_columns(missing, schema.names, file, mapping, joints)
     labels = mapping.columns.trajectory if mapping.columns.trajectory in schema.names else None
     # a list has no text that names a recording
     if labels and pa.types.is_nested(schema.field(labels).type):
@@ -101,7 +102,7 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
         accepted += UNIT_CODES
     elif all(mapping.unit("q", joint) for joint in joints):
         accepted += ("degrees",)
-    return Layout(tuple(columns), labels, tuple(joints), mapping, accepted)
+    return Layout(file, tuple(columns), labels, tuple(joints), mapping, accepted)
 
 
 def list_element(name: str, columns: Collection[str]) -> tuple[str, int] | None:
@@ -123,63 +124,48 @@ def stored_columns(layout: Layout, columns: Collection[str]) -> list[str]:
     return list(stored)
 
 
-def _require_columns(
-    columns: Sequence[str], required: Sequence[str], file: Path, mapping: LogMapping, joints: Sequence[str]
-) -> None:
-    shared = sorted({name for name in required if required.count(name) > 1})
-    if shared:
-        raise LogError(
-            "one column for several joints", file=file, element=f"column {', '.join(shared)}",
-            expected="'{joint}' in its name under 'logs'",
-        )  # fmt: skip
-    repeated = sorted({name for name in required if columns.count(name) > 1})
-    if repeated:
-        raise LogError(
-            "the same column twice", file=file, element=f"column {', '.join(repeated)}", expected="it once"
-        )
-    missing = [name for name in required if name not in columns and not list_element(name, columns)]
-    if missing:
-        raise missing_columns(missing, columns, file, mapping, joints)
-
-
 def missing_columns(
     missing: Sequence[str], columns: Collection[str], file: Path, mapping: LogMapping, joints: Sequence[str]
 ) -> LogError:
-    """Return the error about columns that are not there."""
-    expected = [mapping.columns.t]
-    for quantity in mapping.quantities:
+    """Return the error about columns that are not there, with what to do."""
+    quantities, expected = mapping.quantities, [mapping.columns.t]
+    for quantity in quantities:
         expected.append(getattr(mapping.columns, quantity).replace("{joint}", "<joint>"))
+    of_quantity = {x: [mapping.column(x, joint) for joint in joints] for x in quantities}
+    unlogged = []
+    for joint, *names in zip(joints, *of_quantity.values(), strict=True):
+        if set(names) <= set(missing):
+            unlogged.append(joint)
+    if unlogged and len(unlogged) < len(joints):
+        do = (
+            f"nothing was logged of {', '.join(unlogged)}: say which joints are the arm's, by --tip, --joints, or "
+            "'tip' or 'moving_joints' in the robot's YAML, or map its columns under 'logs'"
+        )
+    # the usual gap of loggers, and the only one with a remedy of its own
+    elif set(missing) <= set(of_quantity.get("qd", ())):
+        do = "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
+    else:
+        do = _renaming(missing[0], columns, of_quantity, [mapping.log_name(joint) for joint in joints])
+    listed = TUNING.listed
     return LogError(
-        f"only the columns {shortened(list(columns), LogTuning().listed)}", file=file,
-        element=f"missing column{'s' * (len(missing) > 1)} {shortened(missing, LogTuning().listed)}",
-        expected=", ".join(expected), do=_advice(missing, columns, mapping, joints),
+        f"only the columns {shortened(list(columns), listed)}", file=file,
+        element=f"missing column{'s' * (len(missing) > 1)} {shortened(missing, listed)}",
+        expected=", ".join(expected), do=do,
     )  # fmt: skip
 
 
-def _advice(
-    missing: Sequence[str], columns: Collection[str], mapping: LogMapping, joints: Sequence[str]
+def _renaming(
+    name: str, columns: Collection[str], of_quantity: Mapping[str, Sequence[str]], joints: Sequence[str]
 ) -> str:
-    """Say what to do about missing columns: offer one that names the same joint and is no other quantity's."""
-    owners: dict[str, tuple[str, str]] = {}
-    for quantity, joint in mapping.signals(joints):
-        owners[mapping.column(quantity, joint)] = (quantity, joint)
-    bare = [joint for joint in joints if all(mapping.column(x, joint) in missing for x in mapping.quantities)]
-    if bare and len(bare) < len(joints):
-        return (
-            f"nothing was logged of {', '.join(bare)}: say which joints are the arm's, by --tip, --joints, or 'tip' or "
-            "'moving_joints' in the robot's YAML, or map its columns under 'logs'"
-        )
-    quantities = {owners.get(name, ("", ""))[0] for name in missing}
-    # the usual gap of loggers, and the only one with a remedy of its own
-    if quantities == {"qd"}:
-        return "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
-    joint = ""
-    if missing[0] in owners:
-        joint = mapping.log_name(owners[missing[0]][1])
-    unused = [name for name in columns if name not in owners]
-    for close in difflib.get_close_matches(missing[0], unused, n=5):
+    """Offer a column in place of one that is missing: one that names the same joint and is no other quantity's."""
+    joint, used = "", set(chain(*of_quantity.values()))
+    for names in of_quantity.values():
+        if name in names:
+            joint = joints[names.index(name)]
+    unused = [column for column in columns if column not in used]
+    for close in difflib.get_close_matches(name, unused, n=5):
         if names_joint(close, joint):
-            return f"rename the column {close!r} to {missing[0]!r}?"
+            return f"rename the column {close!r} to {name!r}?"
     return (
         "rename the columns, or write their names under 'logs' in the robot's YAML: "
         "`spelgen logs LOGS --robot ROBOT.urdf --suggest FILE` drafts them"

@@ -12,9 +12,8 @@ import numpy as np
 from spelgen.errors import LogError
 from spelgen.labels import counted
 from spelgen.listing import Listing
-from spelgen.settings.tuning.logs import LogTuning
+from spelgen.settings.tuning.logs import TUNING
 
-TUNING = LogTuning()
 QUANTITIES = ("q", "qd", "tau")
 GAP = TUNING.gap
 
@@ -50,10 +49,24 @@ class Trajectory:
         for column in ("t", *self.quantities):
             # frozen, and still from lists and tensors
             object.__setattr__(self, column, self._as_array(column))
-        self._require_shapes()
-        self._require_possible("t", np.abs(self.t) < TUNING.latest)
+        if self.t.ndim != 1 or not self.t.size:
+            raise self.error(f"an array of shape {self.t.shape}", "(T,), a time for each sample", column="t")
+        joints = self.q.shape[1] if self.q.ndim == 2 else "n"
         for column in self.quantities:
-            self._require_possible(column, np.abs(getattr(self, column)) < TUNING.largest_value)
+            shape = getattr(self, column).shape
+            if shape != (len(self), joints):
+                expected = f"({len(self)}, {joints}), a row for each time and a column for each joint"
+                raise self.error(f"an array of shape {shape}", expected, column=column)
+        for column in ("t", *self.quantities):
+            values = getattr(self, column)
+            largest = TUNING.latest if column == "t" else TUNING.largest_value
+            possible = np.abs(values) < largest  # NaN is not
+            if not possible.all():
+                row = int(np.argwhere(~possible)[0, 0])
+                expected = (
+                    f"numbers below {largest:g}" if np.isfinite(values[row]).all() else "finite numbers"
+                )
+                raise self.error(f"{values[row].tolist()} at sample {row}", expected, column=column)
         backward = np.flatnonzero(np.diff(self.t) < TUNING.shortest_step)
         if backward.size:
             k = backward[0]
@@ -91,9 +104,9 @@ class Trajectory:
         return steps[steps <= GAP * np.median(steps)] if steps.size else steps
 
     def __repr__(self) -> str:
+        _, samples, duration, rate, _ = _summary(self)
         joints = counted(self.q.shape[1], "joint")
-        summary = f"{len(self)} samples, {self.duration:.4g} s at {self.sample_rate:.4g} Hz"
-        return f"<Trajectory {self.name!r}: {summary}, {joints}>"
+        return f"<Trajectory {self.name!r}: {samples} samples, {duration} at {rate}, {joints}>"
 
     def _repr_html_(self) -> str:
         return trajectory_listing([self]).html()
@@ -107,28 +120,6 @@ class Trajectory:
         except (TypeError, ValueError) as error:
             got = f"{type(values).__name__} ({error})"
             raise self.error(got, "an array of numbers", column=column) from error
-
-    def _require_shapes(self) -> None:
-        if self.t.ndim != 1 or not self.t.size:
-            raise self.error(f"an array of shape {self.t.shape}", "(T,), a time for each sample", column="t")
-        samples = len(self.t)
-        joints = self.q.shape[1] if self.q.ndim == 2 else "n"
-        for column in self.quantities:
-            shape = getattr(self, column).shape
-            if len(shape) != 2 or shape != (samples, joints):
-                expected = f"({samples}, {joints}), a row for each time and a column for each joint"
-                raise self.error(f"an array of shape {shape}", expected, column=column)
-
-    def _require_possible(self, column: str, possible: np.ndarray) -> None:
-        """Raise LogError where a column holds a value that is not possible, both of one shape."""
-        if possible.all():
-            return
-        row = int(np.argwhere(~possible)[0, 0])
-        value = getattr(self, column)[row]
-        expected = "finite numbers"
-        if np.isfinite(value).all():
-            expected = f"numbers below {TUNING.latest if column == 't' else TUNING.largest_value:g}"
-        raise self.error(f"{value.tolist()} at sample {row}", expected, column=column)
 
     def error(self, got: str, expected: str, do: str | None = None, column: str = "") -> LogError:
         """Return an error about the recording, or about one of its columns."""
@@ -156,11 +147,12 @@ def require_commands(trajectory: Trajectory) -> np.ndarray:
 def trajectory_listing(trajectories: Sequence[Trajectory]) -> Listing:
     """Return trajectories as a table: samples, duration, sample rate, joints."""
     head = ("trajectory", "samples", "duration", "sample rate", "joints")
-    rows = []
-    for x in trajectories:
-        rate, joints = f"{x.sample_rate:.4g} Hz", str(x.q.shape[1])
-        rows.append((x.name, str(len(x)), f"{x.duration:.4g} s", rate, joints))
-    return Listing("Trajectories", head, tuple(rows))
+    return Listing("Trajectories", head, tuple(map(_summary, trajectories)))
+
+
+def _summary(x: Trajectory) -> tuple[str, ...]:
+    joints = str(x.q.shape[1])
+    return x.name, str(len(x)), f"{x.duration:.4g} s", f"{x.sample_rate:.4g} Hz", joints
 
 
 def require_joints(trajectory: Trajectory, joints: Sequence[str]) -> None:
@@ -188,3 +180,21 @@ def split_at_gaps(
     if len(ends) > 2:
         pieces = [trajectory[start:stop] for start, stop in pairwise(ends)]
     return [piece for piece in pieces if len(piece) >= shortest]
+
+
+def coverage(logs: Sequence[Trajectory]) -> dict[str, object]:
+    """Return `seconds` of all logs; by joint `q` and `qd`: their range, and the samples in equal bins of it."""
+    result: dict[str, object] = {"seconds": _rounded(sum(log.duration for log in logs))}
+    for name in ("q", "qd"):
+        values = np.concatenate([getattr(log, name) for log in logs])
+        joints = []
+        for column in values.T:
+            counts = np.histogram(column, TUNING.bins)[0].tolist()
+            joints.append({"low": _rounded(column.min()), "high": _rounded(column.max()), "counts": counts})
+        result[name] = joints
+    return result
+
+
+def _rounded(value: float) -> float:
+    """Return a value to five significant digits."""
+    return float(f"{value:.5g}")

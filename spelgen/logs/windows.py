@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -84,47 +85,34 @@ def cut_windows(
     whose states z are wanted, which begin straight with each piece. Raises LogError when there is no window.
     """
     span = (window - 1) * decimation
-    batches: list[list[np.ndarray]] = []
+    batches: list[Windows] = []
     for piece in pieces:
         if len(piece) > span:
-            batches.append(_cut(piece, window, stride, decimation, measured, reach))
+            tau = piece.tau[:-1]
+            if measured:
+                tau = (tau + piece.tau[1:]) / 2
+            # sums of impulses: steps of a jittered clock are not alike
+            impulses = tau * np.diff(piece.t)[:, None]
+            impulse = sliding_window_view(impulses, decimation, axis=0).sum(axis=-1)  # (T - decimation, n)
+            dt = (piece.t[decimation:] - piece.t[:-decimation])[:, None]
+            columns = [(dt, window - 1), (piece.q, window), (piece.qd, window), (impulse / dt, window - 1)]
+            steps, *motion = (_slide(values, size, stride, decimation) for values, size in columns)
+            tensors = [steps[..., 0], *motion]
+            if reach is not None and reach.elements:
+                tensors.append(torch.tensor(bristles_along(piece.q, reach)[: len(piece) - span : stride]))
+            batches.append(Windows(*tensors))
     if not batches:
         raise LogError(f"no trajectory of {span + 1} samples", expected="one window")
-    columns = map(np.concatenate, zip(*batches, strict=True))
-    return Windows(*map(torch.from_numpy, columns))
+    return joined(batches)
 
 
-def _cut(
-    piece: Trajectory, window: int, stride: int, decimation: int, measured: bool, reach: BristleReach | None
-) -> list[np.ndarray]:
-    """Return dt, q, qd, tau, and z where a reach is given, of the windows of one piece."""
-    tau = piece.tau[:-1]
-    if measured:
-        tau = (tau + piece.tau[1:]) / 2
-    # sums of impulses: steps of a jittered clock are not alike
-    impulses = tau * np.diff(piece.t)[:, None]
-    impulse = sliding_window_view(impulses, decimation, axis=0).sum(axis=-1)  # (T - decimation, n)
-    dt = (piece.t[decimation:] - piece.t[:-decimation])[:, None]
-    columns = [
-        _slide(dt, window - 1, stride, decimation)[..., 0],
-        _slide(piece.q, window, stride, decimation),
-        _slide(piece.qd, window, stride, decimation),
-        _slide(impulse / dt, window - 1, stride, decimation),
-    ]
-    if reach is not None and reach.elements:
-        starts = len(piece) - (window - 1) * decimation
-        columns.append(bristles_along(piece.q, reach)[:starts:stride])
-    return columns
-
-
-def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> np.ndarray:
+def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> torch.Tensor:
     """(T, n) -> (W, window, n)."""
-    windows = sliding_window_view(values, (window - 1) * decimation + 1, axis=0)[::stride, :, ::decimation]
-    return windows.transpose(0, 2, 1)
+    windows = torch.tensor(values).unfold(0, (window - 1) * decimation + 1, stride)
+    return windows[..., ::decimation].transpose(1, 2)
 
 
-@dataclass(frozen=True, eq=False)
-class Split:
+class Split(NamedTuple):
     """Hold training and validation pieces, which share no sample, and how they were chosen."""
 
     training: tuple[Trajectory, ...]
@@ -139,31 +127,21 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
     """
     total = len(trajectories)
     if total == 1:
-        return _split_in_time(trajectories[0], fraction)
+        (trajectory,) = trajectories
+        t = trajectory.t
+        cut = int(np.searchsorted(t, t[-1] - fraction * trajectory.duration))
+        message = (
+            f"only one trajectory: training on its first {t[cut - 1] - t[0]:.3g} s, "
+            f"validation on the last {t[-1] - t[cut]:.3g} s"
+        )
+        note = Diagnostic("warning", "validation-split", "logs", None, message)
+        last = replace(trajectory[cut:], name=f"{trajectory.name} (last part)")
+        return Split((trajectory[:cut],), (last,), note)
     # whole trajectories: neighbouring windows share samples, and would tell the answer
     count = min(max(1, round(fraction * total)), total - 1)
     chosen = set(np.random.default_rng(seed).permutation(total)[:count].tolist())
-    training: list[Trajectory] = []
-    validation: list[Trajectory] = []
-    for index, trajectory in enumerate(trajectories):
-        if index in chosen:
-            validation.append(trajectory)
-        else:
-            training.append(trajectory)
-    names = f"{count} of {total} trajectories"
-    if count <= 3:
-        names = ", ".join(x.name for x in validation)
+    validation = tuple(trajectories[k] for k in sorted(chosen))
+    training = tuple(x for k, x in enumerate(trajectories) if k not in chosen)
+    names = ", ".join(x.name for x in validation) if count <= 3 else f"{count} of {total} trajectories"
     note = Diagnostic("info", "validation-split", "logs", None, f"validation on whole trajectories: {names}")
-    return Split(tuple(training), tuple(validation), note)
-
-
-def _split_in_time(trajectory: Trajectory, fraction: float) -> Split:
-    t = trajectory.t
-    cut = int(np.searchsorted(t, t[-1] - fraction * (t[-1] - t[0])))
-    first, last = trajectory[:cut], replace(trajectory[cut:], name=f"{trajectory.name} (last part)")
-    message = (
-        f"only one trajectory: training on its first {t[cut - 1] - t[0]:.3g} s, "
-        f"validation on the last {t[-1] - t[cut]:.3g} s"
-    )
-    note = Diagnostic("warning", "validation-split", "logs", None, message)
-    return Split((first,), (last,), note)
+    return Split(training, validation, note)

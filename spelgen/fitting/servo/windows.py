@@ -17,8 +17,8 @@ import torch
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.errors import LogError
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
+from spelgen.logs.filtering import derivative, velocities
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.smoothing import smoothed, velocities
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.settings.tuning.servo import ServoWindowTuning
 
@@ -86,7 +86,8 @@ class ServoWindows:
         q, qd: predicted, of which only what they miss is smoothed: so fast motion stays.
         """
         missed = self.q if q is None else self.q - q
-        slow_qd, slow_qdd = map(torch.from_numpy, smoothed(missed.numpy(), self.rate))
+        slow = (derivative(missed.numpy(), self.rate, order) for order in (1, 2))
+        slow_qd, slow_qdd = map(torch.from_numpy, slow)
         path = Path(_midpoints(self.q), _midpoints(slow_qd), _midpoints(slow_qdd))
         if qd is None:
             return path

@@ -30,3 +30,6 @@ class LogCheckTuning:
     examples: int = 2  # trajectories that a page draws
     shown: int = 20  # trajectories that a terminal and a notebook show
     slowest_step: float = 0.5  # [s] no arm is sampled more slowly than at 2 Hz
+
+
+TUNING = LogCheckTuning()

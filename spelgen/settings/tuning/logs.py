@@ -29,3 +29,6 @@ class LogTuning:
     listed: int = 5  # columns that a message names: enough to see how they are named
     shortest_step: float = 1e-15  # [s] that a log can have: fourth powers of it are still numbers
     latest: float = 1e24  # [s] likewise, of a time
+
+
+TUNING = LogTuning()
