@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from spelgen.arm.arm import Arm
 from spelgen.runtime.body_chain import BodyChain
 from spelgen.runtime.parts import Row
@@ -17,6 +19,17 @@ def body_chain(arm: Arm) -> BodyChain:
         is_revolute, ratio = body.kind == "revolute", float(body.multiplier)
         rows.append((body.parent, body.coordinate, is_revolute, ratio, body.offset, *geometry))
     return BodyChain(len(arm.coordinates), _row(arm.gravity), *zip(*rows, strict=True))
+
+
+def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return mass, centre of mass and the tensor about it, (3, 3), of ten parameters about the joint, in its frame."""
+    mass = inertia[0]
+    center = inertia[1:4] / mass
+    xx, xy, xz, yy, yz, zz = inertia[4:]
+    about_joint = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    # the parallel axis theorem
+    shift = center @ center * np.eye(3) - np.outer(center, center)
+    return mass, center, about_joint - mass * shift
 
 
 def _row(values: tuple[object, object, object]) -> Row:

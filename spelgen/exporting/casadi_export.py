@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from spelgen.exporting.description import TrainedModel
-from spelgen.exporting.entry_points import ENTRY_POINTS, EntryPoint, entry_points
+from spelgen.exporting.entry_points import ENTRY_POINTS, EntryPoint
 from spelgen.exporting.exported import Exported, folder_export
 from spelgen.exporting.model_expressions import expression_function, residuals_needed
 from spelgen.exporting.parity import Called, Values, check_parity
@@ -22,7 +22,7 @@ from spelgen.settings.tuning.exporting import TUNING
 def export_casadi(trained: Trained) -> Exported:
     """Return a file for each entry point. Raises RunError where they differ from the model."""
     model = trained.described
-    functions = casadi_functions(model)
+    functions = casadi_functions(model, trained.entry_points)
     parity = check_parity(called_by_state(functions), trained, list(functions), TUNING.tolerance)
     checked = f"Checked when exported, by CasADi {ca.CasadiMeta.version()}: {parity.summary}."
     use = (
@@ -34,10 +34,10 @@ def export_casadi(trained: Trained) -> Exported:
     return folder_export(trained, "casadi", "in CasADi", files, use=use, about=about, checked=checked)
 
 
-def casadi_functions(model: TrainedModel) -> dict[str, ca.Function]:
-    """Return every entry point: rigid bodies and friction by scalars, residuals by matrices."""
+def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
+    """Return functions by name: rigid bodies and friction by scalars, residuals by matrices."""
     functions: dict[str, ca.Function] = {}
-    for name, entry in entry_points(model).items():
+    for name, entry in entries.items():
         if name.endswith("_derivatives") and model.residuals:
             function = _with_residuals(ENTRY_POINTS[name.removesuffix("_derivatives")], model)
             functions[name] = _derivatives(entry, function)

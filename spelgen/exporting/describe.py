@@ -13,21 +13,12 @@ from scipy.interpolate import BSpline
 from torch import Tensor
 
 from spelgen.arm.arm import make_arm
-from spelgen.dynamics.protocol import (
-    ResidualModel,
-    has_residuals,
-    has_rigid_bodies,
-    input_of,
-)
+from spelgen.arm.chain import choose_chain
+from spelgen.arm.lump_links import lump_links
+from spelgen.dynamics.protocol import ResidualModel, has_residuals, has_rigid_bodies, input_of
+from spelgen.dynamics.tip import last_link
 from spelgen.errors import RunError
-from spelgen.exporting.description import (
-    Harmonics,
-    Network,
-    Residuals,
-    Servos,
-    TrainedModel,
-)
-from spelgen.exporting.tip_frame import tip_frame
+from spelgen.exporting.description import Harmonics, Network, Residuals, Servos, Tip, TrainedModel
 from spelgen.loaded_arm import LoadedArm
 
 if TYPE_CHECKING:
@@ -96,6 +87,17 @@ def servos_of(model: EmittedModel) -> Servos | None:
     return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
 
 
+def tip_frame(loaded: LoadedArm) -> Tip:
+    """Return the frame of the tip's link behind the body that carries it, by the angles that the URDF has."""
+    names = loaded.arm.joint_names
+    link = loaded.tip or last_link(loaded.robot, names)
+    frame = lump_links(loaded.robot, choose_chain(loaded.robot, names, None), 0.0).frames[link]
+    pose = np.eye(4)
+    pose[:3, :3] = frame.rotation
+    pose[:3, 3] = frame.position
+    return Tip(link, frame.body, pose)
+
+
 def _unsupported(subject: str) -> RunError:
     return RunError(
         subject,
@@ -113,9 +115,9 @@ def _residuals(model: ResidualModel) -> Residuals:
     if mass is not None:
         reached = mass.weights[-1].any(axis=1).reshape(model.n, model.n)
         entries = np.argwhere(np.tril(reached))
-        mass = _with_outputs(mass, entries @ (model.n, 1))
-    if potential is not None:
-        potential = _with_outputs(potential, np.zeros(1, dtype=int))
+        used = entries @ (model.n, 1)
+        weights_used = (*mass.weights[:-1], mass.weights[-1][used])
+        mass = Network(weights_used, (*mass.biases[:-1], mass.biases[-1][used]))
     return Residuals(
         entries=tuple(map(tuple, entries.tolist())),
         mass=mass,
@@ -159,12 +161,6 @@ def _network(
         weights[k - 1], biases[k - 1] = 2 * weights[k - 1], 2 * biases[k - 1]
         weights[k], biases[k] = 2 * weights[k], biases[k] - weights[k].sum(axis=1)
     return Network(tuple(weights), tuple(biases))
-
-
-def _with_outputs(network: Network, rows: np.ndarray) -> Network:
-    """Return the network with these of its outputs alone."""
-    weights = (*network.weights[:-1], network.weights[-1][rows])
-    return Network(weights, (*network.biases[:-1], network.biases[-1][rows]))
 
 
 def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:

@@ -94,7 +94,7 @@ class TrainedModel:
     constants in M, (n, n). motors: (n, n), the drives' speeds by the joints', which friction follows. friction: the
     ``FrictionConstants`` of the runtime, as arrays. reach: of the bristles that are its memory, (n, K) [rad, m].
     inputs: G, (n, n); actuated: (n,), 0 for a passive joint. friction_compensation: (n,) torque that the drives add by
-    velocity, unseen. entries: names of the functions that are written; none for all.
+    velocity, unseen.
     """
 
     name: str
@@ -114,7 +114,6 @@ class TrainedModel:
     friction_compensation: np.ndarray
     tip: Tip
     servos: Servos | None = None
-    entries: tuple[str, ...] = ()
 
     @property
     def n(self) -> int:

@@ -84,24 +84,26 @@ _ENTRY_POINTS = (
         ("q", "qd", "tau", "z"),
         (("dqdd_dq", "1/s^2"), ("dqdd_dqd", "1/s"), ("dqdd_dtau", "1/(kg m^2)")),
     ),
+    EntryPoint(
+        "servo_torque",
+        "the torques of position servos under a command u, which the caller delays",
+        ("u", "q", "qd"),
+        (("tau", _TORQUE),),
+    ),
 )
 ENTRY_POINTS = {entry.name: entry for entry in _ENTRY_POINTS}
-"""The functions of every model, by name."""
-
-SERVO_TORQUE = EntryPoint(
-    "servo_torque",
-    "the torques of position servos under a command u, which the caller delays",
-    ("u", "q", "qd"),
-    (("tau", _TORQUE),),
-)
+"""All functions by name."""
 
 
-def entry_points(model: TrainedModel) -> dict[str, EntryPoint]:
-    """Return the functions of this model, by name: those that it is to have. Raises RunError for others."""
-    entries = ENTRY_POINTS
-    if model.servos is not None:
-        entries = ENTRY_POINTS | {SERVO_TORQUE.name: SERVO_TORQUE}
-    return {name: entries[name] for name in chosen(model.entries, entries)}
+def entry_points(model: TrainedModel, names: Sequence[str] = ()) -> dict[str, EntryPoint]:
+    """Return the functions of this model that are named, by default all but derivatives. Raises RunError for others."""
+    available = list(ENTRY_POINTS)
+    if model.servos is None:
+        available.remove("servo_torque")
+    if not names:
+        # derivatives are two thirds of the code, and few need them
+        names = [name for name in available if not name.endswith("_derivatives")]
+    return {name: ENTRY_POINTS[name] for name in chosen(names, available)}
 
 
 def chosen(names: Sequence[str], functions: Iterable[str]) -> list[str]:
@@ -115,8 +117,3 @@ def chosen(names: Sequence[str], functions: Iterable[str]) -> list[str]:
         return known
     # in their own order: the same choice gives the same files
     return [name for name in known if name in names]
-
-
-def without_derivatives(model: TrainedModel) -> tuple[str, ...]:
-    """Return the names of the functions of this model that are exported by default."""
-    return tuple(name for name in entry_points(model) if not name.endswith("_derivatives"))

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spelgen.errors import RunError, suggestion
-from spelgen.exporting.entry_points import without_derivatives
 from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
 from spelgen.exporting.trained import Trained
 from spelgen.fitting.fitted import Fit, load_run
@@ -54,11 +52,7 @@ def export(
     if entries and not exporter.choice:
         formats = [name for name, row in EXPORTERS.items() if row.choice]
         raise RunError(f"functions for --to {to}", expected=f"--to {listed(formats)}, which have a choice")
-    chosen = Trained(model, _loaded(model, arm), tuple(entries))
-    # derivatives are two thirds of the code, and few need them
-    if exporter.derivatives and not entries:
-        chosen = replace(chosen, entries=without_derivatives(chosen.described))
-    exported = exporter.function()(chosen)
+    exported = exporter.function()(Trained(model, _loaded(model, arm), tuple(entries)))
     if path is not None:
         exported.write(path, force=force)
     return exported

@@ -24,13 +24,12 @@ class Exporter:
 
     function_name: of what takes a ``Trained`` to an ``Exported``; it is imported when it is used, because the
     packages that most formats need are extras. suffix: of a format of one file; all others are folders. choice: whether
-    functions can be chosen. derivatives: whether these are among them, written where they are named.
+    functions can be chosen.
     """
 
     function_name: str
     suffix: str = ""
     choice: bool = False
-    derivatives: bool = False
 
     def function(self) -> Callable[[Trained], Exported]:
         """Return the function. Raises ModuleNotFoundError where an extra is not installed."""
@@ -42,8 +41,8 @@ class Exporter:
 EXPORTERS = {
     "urdf": Exporter("spelgen.exporting.urdf_export:export_urdf", suffix=".urdf"),
     "mjcf": Exporter("spelgen.exporting.mjcf_export:export_mjcf", suffix=".xml"),
-    "c": Exporter("spelgen.exporting.c_export:export_c", choice=True, derivatives=True),
-    "casadi": Exporter("spelgen.exporting.casadi_export:export_casadi", choice=True, derivatives=True),
+    "c": Exporter("spelgen.exporting.c_export:export_c", choice=True),
+    "casadi": Exporter("spelgen.exporting.casadi_export:export_casadi", choice=True),
     "onnx": Exporter("spelgen.exporting.onnx_export:export_onnx", choice=True),
     "torch": Exporter("spelgen.exporting.torch_export:export_torch", choice=True),
     "ros2": Exporter("spelgen.exporting.ros2_export:export_ros2"),

@@ -16,8 +16,13 @@ from spelgen.exporting.residual_expressions import (
     symbol_slopes,
     symmetric,
 )
-from spelgen.exporting.rigid_expressions import body_frames, constant, mass_and_potential, rigid_torque
-from spelgen.exporting.tip_expressions import tip_expressions
+from spelgen.exporting.rigid_expressions import (
+    body_frames,
+    constant,
+    mass_and_potential,
+    rigid_torque,
+    tip_kinematics,
+)
 
 RESIDUAL = "residual_"
 """Stands before the names of residuals among a function's inputs."""
@@ -154,11 +159,11 @@ class ModelExpressions:
 
     @property
     def tip_pose(self) -> ca.SX:
-        return tip_expressions(self.model, self.q)[0]
+        return tip_kinematics(self.model, self.q)[0]
 
     @property
     def tip_jacobian(self) -> ca.SX:
-        return tip_expressions(self.model, self.q)[1]
+        return tip_kinematics(self.model, self.q)[1]
 
     @property
     def servo_torque(self) -> ca.SX:

@@ -14,7 +14,7 @@ from torch import Tensor
 from spelgen.arm.arm import Coordinate
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import RunError
-from spelgen.exporting.entry_points import ENTRY_POINTS, SERVO_TORQUE
+from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.trained import Trained
 from spelgen.settings.tuning.exporting import TUNING
 from spelgen.structure.nominal import working_range
@@ -136,7 +136,7 @@ def relative(values: np.ndarray, expected: np.ndarray) -> float:
 
 def _expected(model: EmittedModel, trained: Trained, name: str, inputs: Values) -> Values:
     """Return an entry point's outputs by the model in float64, (states, ...), by name."""
-    entry = (ENTRY_POINTS | {SERVO_TORQUE.name: SERVO_TORQUE})[name]
+    entry = ENTRY_POINTS[name]
     tensors: list[Tensor] = []
     for key in entry.inputs:
         tensor = torch.from_numpy(inputs[key])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,6 +15,8 @@ from spelgen.arm.arm import Arm
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.dynamics.residuals import without_residuals
 from spelgen.emission.loading import load_module
+from spelgen.exporting.describe import array, servos_of
+from spelgen.exporting.description import Servos
 from spelgen.exporting.parity import usual_speeds
 from spelgen.fitting.optimizers import minimise
 from spelgen.loaded_arm import LoadedArm
@@ -33,7 +34,7 @@ class RigidBodyProjection:
 
     inertias: by body, ten parameters about the joint's frame as in ``Body``, (bodies, 10). armature: of the
     drives by their own speeds, (n,) [kg m^2, kg]; motors: these speeds by the joints', (n, n).
-    viscous, forward, backward: friction, (n,); backward is not positive.
+    viscous, forward, backward: friction, (n,); backward is not positive. inputs: G at zero, (n, n).
     own: whether the bodies are the model's own. mass_error, gravity_error: root mean square of the difference of
     M and of gravity torque, relative to the model's. friction_error: (n,) likewise, of friction.
     bodies: a model of these bodies alone, float64.
@@ -47,19 +48,12 @@ class RigidBodyProjection:
     forward: np.ndarray
     backward: np.ndarray
     friction_error: np.ndarray
+    inputs: np.ndarray
+    servos: Servos | None
     own: bool
     mass_error: float
     gravity_error: float
     bodies: EmittedModel
-
-    @property
-    def base_parameters(self) -> Mapping[str, float]:
-        """The bodies' base parameters by the names that ``inspect`` and ``identify`` give them."""
-        ten = self.inertias.ravel()
-        values: dict[str, float] = {}
-        for parameter in self.arm.base_parameters:
-            values[parameter.name] = sum(float(weight) * float(ten[k]) for k, weight in parameter.weights)
-        return values
 
     @property
     def summary(self) -> tuple[str, str]:
@@ -80,7 +74,7 @@ class RigidBodyProjection:
 
 def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProjection:
     """Return the bodies, armature and friction of a trained model of ``arm``."""
-    model = copy.deepcopy(model).double().requires_grad_(False)
+    model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     q = sampled_positions(arm.arm)
     own = has_rigid_bodies(model)
     bodies: EmittedModel = without_residuals(model) if own else _nearest_bodies(model, arm, q)
@@ -94,6 +88,8 @@ def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProje
         forward=forward,
         backward=backward,
         friction_error=friction_error,
+        inputs=array(model.input_matrix(torch.zeros(model.n, dtype=torch.float64))),
+        servos=servos_of(model),
         own=own,
         mass_error=_relative_rms(bodies.mass_matrix(q), model.mass_matrix(q)),
         gravity_error=_relative_rms(bodies.gravity(q), model.gravity(q)),

@@ -106,6 +106,29 @@ def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     return mass, ca.SX(result.potential)
 
 
+def tip_kinematics(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return the tip link's pose in the root link's frame, (4, 4), and its Jacobian, (6, n): linear, then angular."""
+    bodies = model.unrounded
+    frames = body_frames(bodies, q)
+    # poses of the root link, then of all bodies
+    poses = [ca.SX.eye(4)]
+    for body, frame in zip(bodies, frames, strict=True):
+        poses.append(poses[body.parent + 1] @ ca.vertcat(ca.horzcat(*frame), constant([[0, 0, 0, 1]])))
+    pose = poses[model.tip.carrier + 1] @ constant(model.tip.pose)
+    jacobian = ca.SX(6, model.n)
+    index = model.tip.carrier
+    while index >= 0:
+        body = bodies[index]
+        # the axis is z of the body's frame
+        axis, origin = poses[index + 1][:3, 2], poses[index + 1][:3, 3]
+        column = ca.vertcat(axis, ca.SX(3, 1))
+        if body.kind == "revolute":
+            column = ca.vertcat(ca.cross(axis, pose[:3, 3] - origin), axis)
+        jacobian[:, body.coordinate] += float(body.multiplier) * column
+        index = body.parent
+    return pose, jacobian
+
+
 def rotation_about_z(angle: ca.SX) -> ca.SX:
     """Return the rotation about z, (3, 3)."""
     c, s = ca.cos(angle), ca.sin(angle)

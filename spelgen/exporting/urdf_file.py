@@ -8,6 +8,7 @@ from lxml import etree
 
 from spelgen.arm.angle_rounding import AngleRounding
 from spelgen.arm.rational import alignment
+from spelgen.dynamics.rigid_bodies import about_center
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection
 from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.robot import Robot
@@ -60,17 +61,6 @@ def settings_text(projection: RigidBodyProjection) -> str:
         joint["coulomb"] = [rounded(projection.forward[index]), rounded(projection.backward[index])]
     text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
     return text
-
-
-def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return mass, centre of mass and the tensor about it, (3, 3), of ten parameters about the joint, in its frame."""
-    mass = inertia[0]
-    center = inertia[1:4] / mass
-    xx, xy, xz, yy, yz, zz = inertia[4:]
-    about_joint = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    # the parallel axis theorem
-    shift = center @ center * np.eye(3) - np.outer(center, center)
-    return mass, center, about_joint - mass * shift
 
 
 def rounded(value: float) -> float:

@@ -11,8 +11,8 @@ import torch
 from spelgen.dynamics.parameters import parameters_of_kind
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.dynamics.regressor import urdf_parameters
+from spelgen.dynamics.rigid_bodies import about_center
 from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
-from spelgen.exporting.urdf_file import about_center
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.friction import FrictionModel

@@ -22,6 +22,8 @@ class ExportTuning:
         1e-8  # [1] weight of the difference to the URDF's bodies, where M and gravity leave it open
     )
     friction_positions: int = 32  # [1] of these positions, for the nearest viscous and Coulomb friction
+    friction_impedance: tuple[float, ...] = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+    # [1] MuJoCo's solimpfriction, as hard as it has friction: by its default a loaded joint creeps at rest
     friction_speeds: int = 25  # [1] speeds each way, from 2 % to all of a joint's usual speed
 
 
