@@ -31,11 +31,11 @@ from spelgen.exporting.description import FrictionLaw, TrainedModel
 from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.mjcf_export import check_mjcf
 from spelgen.exporting.mjcf_file import mjcf_text
-from spelgen.exporting.model_expressions import expression_function
+from spelgen.exporting.model_expressions import expression_functions
 from spelgen.exporting.onnx_export import called_by_onnx, onnx_model, onnx_session
 from spelgen.exporting.parity import Called, Parity, check_parity
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
-from spelgen.exporting.torch_programs import PROGRAMS
+from spelgen.exporting.torch_export import PROGRAMS
 from spelgen.exporting.trained import Trained
 from spelgen.loaded_arm import load_arm
 
@@ -212,8 +212,9 @@ def time_c(model: TrainedModel, *, beside_casadi: bool) -> None:
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         if beside_casadi:
+            functions = expression_functions(model, ENTRIES)
             for entry in list(ENTRIES.values())[:2]:
-                function = expression_function(entry, model)
+                function = functions[entry.name]
                 (place / f"{entry.name}_casadi.c").write_text(_generated(function))
                 include += f"int {entry.name}(const double **, double **, long long *, double *, int);\n"
                 arguments = ", ".join(f"arg[{k}] = {given[each]}" for k, each in enumerate(entry.inputs))

@@ -23,7 +23,7 @@ from spelgen.exporting.casadi_export import called_by_state, export_casadi
 from spelgen.exporting.describe import identifier
 from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.export import export
-from spelgen.exporting.model_expressions import expression_function
+from spelgen.exporting.model_expressions import expression_functions
 from spelgen.exporting.parity import check_parity, random_inputs
 from spelgen.exporting.trained import Trained
 from spelgen.loaded_arm import load_arm
@@ -82,8 +82,8 @@ def test_derivatives_at_right_angles_are_the_models(monkeypatch):
     monkeypatch.setattr(parity, "random_inputs", at_right_angles)
     trained = Trained(moved_model("six_dof", "closed-form"), arm_of("six_dof"))
     name = "inverse_dynamics_derivatives"
-    function = expression_function(ENTRY_POINTS[name], trained.described)
-    check_parity(called_by_state({name: function}), trained, [name], 1e-9)
+    functions = expression_functions(trained.described, {name: ENTRY_POINTS[name]})
+    check_parity(called_by_state(functions), trained, [name], 1e-9)
 
 
 @needs_gcc

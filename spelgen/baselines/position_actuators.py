@@ -37,16 +37,14 @@ FARTHEST, OFFSET, LATEST = 4.0, 0.3, 0.4  # bounds: of logarithms from their sta
 
 @dataclass(frozen=True, eq=False)
 class PositionActuators:
-    """Predict an arm of n joints in MuJoCo, each of which moves one body.
+    """Predict an arm of n joints in MuJoCo, each of which moves one of the URDF's bodies.
 
-    inertias: of the bodies, as ``Body`` has them, (n, 10). limit: of torques, infinite where nothing limits, (n,).
-    drives: kp, kv, armature and frictionloss, (4, n). The actuators get the command of ``delay`` [s] ago, and
-    ``offset`` (n,).
+    untrained: a model of these bodies. drives: kp, kv, armature and frictionloss, (4, n). The actuators get the command
+    of ``delay`` [s] ago, and ``offset`` (n,).
     """
 
     arm: Arm
-    inertias: np.ndarray
-    limit: np.ndarray
+    untrained: EmittedModel
     drives: np.ndarray
     offset: np.ndarray
     delay: float
@@ -57,17 +55,11 @@ class PositionActuators:
 
     @classmethod
     def of_arm(cls, arm: LoadedArm, drives: object, offset: object, delay: float) -> PositionActuators:
-        """Return such actuators on the URDF's bodies. Raises TypeError or ValueError for numbers of other joints."""
+        """Return such actuators of an arm. Raises TypeError or ValueError for numbers of other joints."""
         n = len(arm.arm.coordinates)
         untrained = build(arm, "closed-form").requires_grad_(False)
-        return cls(
-            arm.arm,
-            untrained.inertial_parameters.numpy(),
-            untrained.servo.limit.numpy(),
-            np.reshape(np.array(drives, dtype=float), (4, n)),
-            np.reshape(np.array(offset, dtype=float), n),
-            float(delay),
-        )
+        rows = np.reshape(np.array(drives, dtype=float), (4, n))
+        return cls(arm.arm, untrained, rows, np.reshape(np.array(offset, dtype=float), n), float(delay))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form: what was fitted."""
@@ -91,33 +83,40 @@ class PositionActuators:
         spec.option.gravity = np.array(self.arm.gravity, dtype=float)
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         parents = [spec.worldbody]
-        for k, (body, inertia) in enumerate(zip(self.arm.bodies, self.inertias, strict=True)):
+        inertias = self.untrained.inertial_parameters.numpy()
+        # MuJoCo has zero where nothing limits
+        limits = np.nan_to_num(self.untrained.servo.limit.numpy(), posinf=0.0)
+        for k, (body, coordinate) in enumerate(zip(self.arm.bodies, self.arm.coordinates, strict=True)):
             kp, kv, armature, frictionloss = self.drives[:, k]
-            mass, center, tensor = about_center(inertia)
+            mass, center, tensor = about_center(inertias[k])
             rotation = Rotation.from_matrix(np.array(body.rotation, dtype=float))
             element = parents[body.parent + 1].add_body(
                 pos=np.array(body.translation, dtype=float),
-                quat=rotation.as_quat(scalar_first=True),
+                quat=np.roll(rotation.as_quat(), 1),  # MuJoCo has w first
                 explicitinertial=True,
                 mass=mass,
                 ipos=center,
                 # MuJoCo has xx, yy, zz, xy, xz, yz
                 fullinertia=tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]],
             )
-            kind = mujoco.mjtJoint.mjJNT_HINGE if body.kind == "revolute" else mujoco.mjtJoint.mjJNT_SLIDE
-            joint = element.add_joint(name=body.name, type=kind, axis=(0, 0, 1), armature=armature)
-            joint.frictionloss = frictionloss
-            # how soft frictionloss is goes by the inertia and by these
-            joint.solref_friction = 2 * TUNING.step, 1
-            joint.solimp_friction = EXPORT_TUNING.friction_impedance
-            limits = self.arm.coordinates[k].limits
-            if limits is not None:
-                joint.range = limits
-            actuator = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=body.name)
-            actuator.set_to_position(kp=kp, kv=kv)
-            if np.isfinite(self.limit[k]):
-                actuator.forcerange = -self.limit[k], self.limit[k]
             parents.append(element)
+            kind = mujoco.mjtJoint.mjJNT_HINGE if body.kind == "revolute" else mujoco.mjtJoint.mjJNT_SLIDE
+            element.add_joint(
+                name=body.name,
+                type=kind,
+                axis=(0, 0, 1),
+                range=coordinate.limits or (0, 0),
+                armature=armature,
+                frictionloss=frictionloss,
+                # how soft frictionloss is goes by the inertia and by these
+                solref_friction=(2 * TUNING.step, 1),
+                solimp_friction=EXPORT_TUNING.friction_impedance,
+            )
+            actuator = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=body.name)
+            actuator.gainprm[0] = kp
+            actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+            actuator.biasprm[1:3] = -kp, -kv
+            actuator.forcerange = -limits[k], limits[k]
         return spec.compile()
 
 
@@ -141,7 +140,7 @@ def fit_position_actuators(
     rows = servo.kp, servo.kd + friction.viscous, trained.armature, friction.coulomb
     start = np.stack([row.detach().numpy() for row in rows])
     is_known = trained.servo.trained.numpy() == 0
-    untrained = PositionActuators.of_arm(arm, start, np.zeros(n), float(trained.servo.delay))
+    initial = PositionActuators.of_arm(arm, start, np.zeros(n), float(trained.servo.delay))
     steps = max(steps_between(log, TUNING.step) for log, _ in windows.parts)
     windows = replace(windows, steps=steps)
     q, qd = windows.q.numpy(), windows.qd.numpy()
@@ -151,7 +150,7 @@ def fit_position_actuators(
         drives, offset = np.split(x[:-1].reshape(5, n), [4])
         drives = np.exp(drives)
         drives[0, is_known] = start[0, is_known]
-        return replace(untrained, drives=drives, offset=offset[0], delay=float(x[-1]))
+        return replace(initial, drives=drives, offset=offset[0], delay=float(x[-1]))
 
     def errors(x: np.ndarray) -> np.ndarray:
         """Return errors of positions behind each window's settling, (samples n,)."""
@@ -175,10 +174,10 @@ def fit_position_actuators(
             slopes[:, np.arange(n), columns] = change.reshape(-1, n)
         return slopes.reshape(len(residuals), -1)
 
-    first = np.concatenate([np.log(start).ravel(), np.zeros(n)])
+    first = np.append(np.log(start), np.zeros(n))
     reach = np.repeat([FARTHEST, OFFSET], [4 * n, n])
     x, _ = minimize.least_squares(
-        np.append(first, untrained.delay),
+        np.append(first, initial.delay),
         residuals,
         (np.append(first - reach, 0.0), np.append(first + reach, LATEST)),
         jacobian,

@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
 
+import casadi as ca
+
 from spelgen.exporting.c_residuals import joint_function_source, network_source, residual_calls
 from spelgen.exporting.c_statements import statements
 from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.entry_points import EntryPoint
-from spelgen.exporting.model_expressions import expression_function, residuals_needed
+from spelgen.exporting.model_expressions import expression_functions, residuals_needed
 from spelgen.templates import render
 
 _WIDTH = 118  # characters of a line
@@ -35,7 +37,8 @@ class CFunction:
 
 def c_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> list[CFunction]:
     """Return these entry points of the model in C."""
-    return [_c_function(model, entry) for entry in entries.values()]
+    expressions = expression_functions(model, entries)
+    return [_c_function(model, entry, expressions[name]) for name, entry in entries.items()]
 
 
 def write_c(model: TrainedModel, functions: Sequence[CFunction], folder: Path) -> Path:
@@ -61,7 +64,6 @@ def _c_header(model: TrainedModel, functions: Sequence[CFunction]) -> str:
         memory = f": joint by joint, {model.reach.shape[1]} each"
     return render(
         "model.h.jinja",
-        title=_title(model),
         facts=facts,
         joints=", ".join(model.identifiers),
         name=model.name,
@@ -77,7 +79,7 @@ def c_source(model: TrainedModel, functions: Sequence[CFunction]) -> str:
     """Return the source."""
     return render(
         "model.c.jinja",
-        title=_title(model),
+        n=model.n,
         name=model.name,
         upper=model.name.upper(),
         residuals=network_source(model) + joint_function_source(model),
@@ -85,12 +87,7 @@ def c_source(model: TrainedModel, functions: Sequence[CFunction]) -> str:
     )
 
 
-def _title(model: TrainedModel) -> str:
-    return f"{model.name}: the dynamics of an arm of {model.n} joints, by spelgen ({model.preset})"
-
-
-def _c_function(model: TrainedModel, entry: EntryPoint) -> CFunction:
-    function = expression_function(entry, model)
+def _c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -> CFunction:
     # residuals first, for the statements read them
     residuals, calls = residual_calls(model, residuals_needed(function))
     variables, lines = statements(function, entry.output_names)

@@ -12,7 +12,7 @@ import numpy as np
 from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.entry_points import ENTRY_POINTS, EntryPoint
 from spelgen.exporting.exported import Exported, folder_export
-from spelgen.exporting.model_expressions import expression_function, residuals_needed
+from spelgen.exporting.model_expressions import expression_functions, residuals_needed
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.residual_expressions import residual_values
 from spelgen.exporting.trained import Trained
@@ -36,18 +36,19 @@ def export_casadi(trained: Trained) -> Exported:
 
 def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
     """Return functions by name: rigid bodies and friction by scalars, residuals by matrices."""
+    if not model.residuals:
+        return expression_functions(model, entries)
+    bases = {name: ENTRY_POINTS[name.removesuffix("_derivatives")] for name in entries}
+    expressions = expression_functions(model, {base.name: base for base in bases.values()})
     functions: dict[str, ca.Function] = {}
     for name, entry in entries.items():
-        if name.endswith("_derivatives") and model.residuals:
-            function = _with_residuals(ENTRY_POINTS[name.removesuffix("_derivatives")], model)
-            functions[name] = _derivatives(entry, function)
-        else:
-            functions[name] = _with_residuals(entry, model)
+        base = bases[name]
+        function = _with_residuals(base, model, expressions[base.name])
+        functions[name] = function if base is entry else _derivatives(entry, function)
     return functions
 
 
-def _with_residuals(entry: EntryPoint, model: TrainedModel) -> ca.Function:
-    function = expression_function(entry, model)
+def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Function) -> ca.Function:
     needed = residuals_needed(function)
     if not needed:
         return function

@@ -32,11 +32,10 @@ _LONGEST_NAME = 40
 def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
     """Return the numbers of a trained model of this arm. Raises RunError for a preset without rigid bodies."""
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
-    preset = model.facts.options.preset
     if not has_rigid_bodies(exact):
+        preset = model.facts.options.preset
         raise _unsupported(f"the preset {preset}, which is not of rigid bodies")
     weights = exact.prepare()
-    unrounded = make_arm(loaded.robot, joints=loaded.arm.joint_names, angle_tolerance=0.0)
     # what does not depend on q is one matrix, whatever it comes from
     constant_mass = array(weights.armature)
     residuals = Residuals((), None, None, {}, (), {})
@@ -46,8 +45,6 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
     return TrainedModel(
         name=identifier(loaded.arm.name),
         arm=loaded.arm,
-        unrounded=unrounded.bodies,
-        preset=preset,
         identifiers=tuple(model.joint_names),
         inertias=array(exact.inertial_parameters),
         constant_mass=constant_mass,
@@ -95,7 +92,8 @@ def tip_frame(loaded: LoadedArm) -> Tip:
     pose = np.eye(4)
     pose[:3, :3] = frame.rotation
     pose[:3, 3] = frame.position
-    return Tip(link, frame.body, pose)
+    bodies = make_arm(loaded.robot, joints=names, angle_tolerance=0.0).bodies
+    return Tip(link, frame.body, pose, bodies)
 
 
 def _unsupported(subject: str) -> RunError:
@@ -144,12 +142,11 @@ def _network(
     for weight, bias in layers:
         weights.append(array(weight))
         biases.append(array(bias))
-    if encoding.slope.any():
-        # cos q, sin q and q in place of cos q or (q - center) slope, and sin q or zero
-        first, second = np.hsplit(weights[0], 2)
-        slopes, revolute = first * array(encoding.slope), array(encoding.revolute)
-        weights[0] = np.hstack([first * revolute, second * revolute, slopes])
-        biases[0] -= slopes @ array(encoding.center)
+    # of cos q, sin q and q in place of cos q or (q - center) slope, and sin q or zero
+    first, second = np.hsplit(weights[0], 2)
+    slopes, revolute = first * array(encoding.slope), array(encoding.revolute)
+    weights[0] = np.hstack([first * revolute, second * revolute, slopes])
+    biases[0] -= slopes @ array(encoding.center)
     if functions is not None:
         # outputs that are always zero would be units of the last hidden layer
         used = weights[-1].any(axis=1) | (biases[-1] != 0)

@@ -150,7 +150,7 @@ def _text(value: object) -> str:
 
 def _quaternion(rotation: object) -> np.ndarray:
     """Return (w, x, y, z)."""
-    matrix = Rotation.from_matrix(np.array(rotation, dtype=float))
-    quaternion: np.ndarray = matrix.as_quat(canonical=True, scalar_first=True)
+    matrix = np.array(rotation, dtype=float)
+    quaternion = np.roll(Rotation.from_matrix(matrix).as_quat(canonical=True), 1)
     quaternion[np.abs(quaternion) < 1e-16] = 0.0  # rounding
     return quaternion

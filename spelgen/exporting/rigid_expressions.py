@@ -108,7 +108,7 @@ def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 def tip_kinematics(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return the tip link's pose in the root link's frame, (4, 4), and its Jacobian, (6, n): linear, then angular."""
-    bodies = model.unrounded
+    bodies = model.tip.bodies
     frames = body_frames(bodies, q)
     # poses of the root link, then of all bodies
     poses = [ca.SX.eye(4)]

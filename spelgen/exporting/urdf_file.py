@@ -6,12 +6,11 @@ import numpy as np
 import yaml
 from lxml import etree
 
-from spelgen.arm.angle_rounding import AngleRounding
-from spelgen.arm.rational import alignment
+from spelgen.arm.chain import choose_chain
+from spelgen.arm.lump_links import lump_links
 from spelgen.dynamics.rigid_bodies import about_center
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection
 from spelgen.urdf.document import urdf_bytes
-from spelgen.urdf.robot import Robot
 
 
 def urdf_text(projection: RigidBodyProjection) -> bytes:
@@ -27,13 +26,15 @@ def urdf_text(projection: RigidBodyProjection) -> bytes:
     root = etree.fromstring(urdf_bytes(robot.path), parser)
     links = {element.get("name"): element for element in root.findall("link")}
     joints = {element.get("name"): element for element in root.findall("joint")}
-    moved = {robot.joint[body.name].child for body in arm.bodies}
-    for name in _carried_links(robot, moved):
-        _remove(links[name], "inertial")
-    rounding = AngleRounding(projection.arm.angle_tolerance)
-    for body, inertia in zip(arm.bodies, projection.inertias, strict=True):
-        joint = robot.joint[body.name]
-        _set_inertial(links[joint.child], inertia, alignment(rounding.axis(joint)))
+    chain = choose_chain(robot, arm.joint_names, None)
+    lumped = lump_links(robot, chain, projection.arm.angle_tolerance)
+    for body, inertia in zip(lumped.moved, projection.inertias, strict=True):
+        for link in body.links:
+            _remove(links[link.name], "inertial")
+        name = body.joint.child
+        # of the body's frame, whose z is the joint's axis, in the link's
+        rotation = np.array(lumped.frames[name].rotation.T, dtype=float)
+        _set_inertial(links[name], inertia, rotation)
     # a URDF has one Coulomb friction for both directions
     coulomb = (projection.forward - projection.backward) / 2
     for index, coordinate in enumerate(arm.coordinates):
@@ -68,22 +69,8 @@ def rounded(value: float) -> float:
     return float(_number(value))
 
 
-def _carried_links(robot: Robot, moved: set[str]) -> list[str]:
-    """Return the links with an inertial that move with another link."""
-    carried = []
-    for link in robot.links:
-        if link.inertial is None or link.name in moved:
-            continue
-        above = {joint.child for joint in robot.path_to(link.name)}
-        # links before the first joint stay as they are
-        if above & moved:
-            carried.append(link.name)
-    return carried
-
-
 def _set_inertial(link: etree._Element, inertia: np.ndarray, rotation: np.ndarray) -> None:
-    """Set a link's inertial; ``rotation`` takes +z, the joint's axis in its own frame, to the axis in the link's."""
-    _remove(link, "inertial")
+    """Set the inertial of a link in whose frame the body's stands at ``rotation``."""
     mass, center, tensor = about_center(inertia)
     center = rotation @ center
     tensor = rotation @ tensor @ rotation.T

@@ -15,7 +15,9 @@ class ExportTuning:
     )
     onnx_tolerance: float = 1e-10  # [1] of ONNX, likewise; looser where M is ill-conditioned
     mujoco_tolerance: float = 1e-9  # [1] of MuJoCo, likewise; docs/deploy.md: 9e-15
-    tip_tolerance: float = 3e-6  # [1] of the tip, likewise: pytorch-kinematics rounds offsets to float32
+    tip_tolerance: float = (
+        3e-6  # [1] more for the tip, likewise: pytorch-kinematics rounds offsets to float32
+    )
     positions: int = 512  # [1] random positions at which a model and the nearest bodies are compared
     steps: int = 400  # [1] of the optimiser towards the nearest bodies
     ridge: float = (
