@@ -24,7 +24,7 @@ import torch
 
 from spelgen.building import build
 from spelgen.dynamics.pinocchio_arm import pinocchio_model
-from spelgen.exporting.c_library import CLibrary, compile_library, compiler
+from spelgen.exporting.c_library import called_by_c, compile_library, compiler
 from spelgen.exporting.c_source import c_functions, write_c
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
 from spelgen.exporting.description import FrictionLaw, TrainedModel
@@ -94,14 +94,14 @@ def _largest(found: Parity) -> float:
     return max(found.differences.values())
 
 
-def library(model: TrainedModel, folder: Path, flag: str, kind: type) -> CLibrary:
+def library(model: TrainedModel, folder: Path, flag: str, kind: type) -> Called:
     """The model's C, compiled."""
     program, own_folder = compiler(), folder / kind.__name__
     assert program is not None
     own_folder.mkdir()
     functions = c_functions(model, ENTRIES)
     compiled = compile_library(write_c(model, functions, own_folder), program, *([flag] * bool(flag)))
-    return CLibrary(compiled, functions, kind)
+    return called_by_c(compiled, functions, kind)
 
 
 TIMED = r"""

@@ -95,7 +95,7 @@ def test_what_stands_beside_bodies_is_told(tmp_path):
     projection = rigid_body_projection(model, load_arm(ROBOTS / "two_link.urdf"))
     assert projection.mass_error > 1e-3
     assert projection.gravity_error > 1e-3
-    assert (projection.friction_error > 0.05).all()
+    assert (projection.friction.error > 0.05).all()
     law = yaml.safe_load(found.files[".urdf.friction.yaml"])["joints"]["joint1"]["law"]
     assert law["position_factor"][0] < 0.9 < 1.1 < law["position_factor"][1]
 

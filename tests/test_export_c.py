@@ -17,7 +17,7 @@ from spelgen.cli.main import app
 from spelgen.errors import RunError
 from spelgen.exporting import friction_expressions, parity
 from spelgen.exporting.c_export import c_files
-from spelgen.exporting.c_library import CLibrary, compile_library
+from spelgen.exporting.c_library import called_by_c, compile_library
 from spelgen.exporting.c_source import c_functions, write_c
 from spelgen.exporting.casadi_export import called_by_state, export_casadi
 from spelgen.exporting.describe import identifier
@@ -66,7 +66,7 @@ def test_c_gives_what_the_model_gives(case, program, flags, compiled):
     library = compile_library(source, program, *options)
     library = library.rename(folder / f"{program}{len(flags)}.so")  # ctypes keeps what it has loaded by name
     kind, tolerance = (np.float32, 1e-5) if flags else (np.float64, 1e-12)
-    called = CLibrary(library, c_functions(model, trained.entry_points), kind)
+    called = called_by_c(library, c_functions(model, trained.entry_points), kind)
     found = check_parity(called, trained, NAMES, tolerance, dtype=kind)
     assert set(found.differences) == set(NAMES)
 
@@ -242,7 +242,7 @@ def test_c_carries_frictions_memory(tmp_path):
     functions = c_functions(model, ENTRIES)
     source = write_c(model, functions, tmp_path)
     assert "#define TWO_LINK_NZ 4" in source.with_suffix(".h").read_text()
-    called = CLibrary(compile_library(source, "gcc"), functions)
+    called = called_by_c(compile_library(source, "gcc"), functions)
     given = random_inputs(model.arm.coordinates, 5, 4)
     law, qd = model.friction, given["qd"]
     relative = np.abs(qd) / law.stribeck_velocity
@@ -263,7 +263,7 @@ def test_in_single_precision_a_joint_that_creeps_moves_its_bristles(tmp_path):
     model = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
     functions = c_functions(model, ENTRIES)
     library = compile_library(write_c(model, functions, tmp_path), "gcc", f"-D{model.name.upper()}_FLOAT")
-    called = CLibrary(library, functions, np.float32)
+    called = called_by_c(library, functions, np.float32)
     assert model.memory
     z = start = 0.6 * model.reach.reshape(1, -1)
     given = {"q": np.zeros((1, 2)), "dq": np.full((1, 2), 1e-9)}

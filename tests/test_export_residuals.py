@@ -9,7 +9,7 @@ from exported_runs import arm_of, moved_model
 
 from spelgen.building import build
 from spelgen.errors import RunError
-from spelgen.exporting.c_library import CLibrary, compile_library
+from spelgen.exporting.c_library import called_by_c, compile_library
 from spelgen.exporting.c_source import c_functions, c_source, write_c
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
 from spelgen.exporting.describe import describe
@@ -53,7 +53,7 @@ def closed_form(model, robot):
 def c_library(model, folder):
     """The model's C, compiled."""
     functions = c_functions(model, ENTRIES)
-    return CLibrary(compile_library(write_c(model, functions, folder), "gcc"), functions)
+    return called_by_c(compile_library(write_c(model, functions, folder), "gcc"), functions)
 
 
 def test_what_is_zero_is_left_out():

@@ -10,12 +10,13 @@ of the dynamics.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.pose import Pose, PoseAt, poses
+from spelgen.dynamics.pose import Pose, poses
 from spelgen.dynamics.protocol import has_friction_state, has_momentum, memory_after, sliding_memory
 from spelgen.logs.windows import Windows
 from spelgen.settings.tuning.evaluation import EvaluationTuning
@@ -41,13 +42,13 @@ def roll_out_stiff(
     largest = torch.maximum(largest, 1e-3 * largest.max()).clamp(min=1e-2)
     if disturbance is None:
         disturbance = torch.zeros_like(q)
-    equations = _Equations(dynamics, TUNING.velocity_step * largest, disturbance)
+    advance = _stepper(dynamics, TUNING.velocity_step * largest, disturbance)
     positions = torch.full_like(windows.q[:, 1:], torch.nan)
     velocities = positions.clone()
     for k in range(windows.dt.shape[1]):
         step = windows.dt[:, k].unsqueeze(-1) / substeps  # (W, 1)
         for _ in range(substeps):
-            q, qd, z = equations.step((q, qd, z), windows.tau[:, k], step)
+            q, qd, z = advance((q, qd, z), windows.tau[:, k], step)
         inside = ((qd.abs() <= TUNING.bounds * largest) & q.isfinite()).all(dim=-1, keepdim=True)
         if not inside.any():
             break
@@ -57,22 +58,27 @@ def roll_out_stiff(
     return positions, velocities
 
 
-class _Equations:
-    """M qdd = force of some dynamics, and a step of them. width: (n,) of the differences by velocity."""
+def _stepper(dynamics: Any, width: Tensor, disturbance: Tensor) -> Callable[[State, Tensor, Tensor], State]:
+    """Return what takes a step of M qdd = force of some dynamics from a state, under tau.
 
-    def __init__(self, dynamics: Any, width: Tensor, disturbance: Tensor) -> None:
-        self.dynamics, self.width, self.disturbance = dynamics, width, disturbance
-        self.pose_at: PoseAt = poses(dynamics)
-        self.has_momentum = has_momentum(dynamics)
+    width: (n,) of the differences by velocity. disturbance: a force where momenta were observed, else an acceleration.
+    """
+    pose_at = poses(dynamics)
+    is_force = has_momentum(dynamics)
 
-    def step(self, state: State, tau: Tensor, step: Tensor) -> State:
+    def forces(pose: Pose, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
+        """Return M qdd, (W, n)."""
+        added = disturbance if is_force else (pose.mass @ disturbance.unsqueeze(-1)).squeeze(-1)
+        return pose.force(qd, tau, z) + added
+
+    def step(state: State, tau: Tensor, step: Tensor) -> State:
         """Take one step of (q, qd), with A = [[0, 1], [-M^-1 K, -M^-1 D]].
 
         D = d friction / d qd and, where friction has a state, K = d friction / d q by the way z follows.
         """
         q, qd, z = state
-        pose = self.pose_at(q)
-        damping, stiffness = self._friction_slopes(pose, qd, z)
+        pose = pose_at(q)
+        damping, stiffness = _friction_slopes(dynamics, pose, qd, z, width)
         h = GAMMA * step
         factors, pivots, _ = torch.linalg.lu_factor_ex(
             pose.mass + torch.diag_embed(h * damping + h * h * stiffness)
@@ -84,33 +90,31 @@ class _Equations:
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
             return velocity + h * solution, solution
 
-        v1, a1 = solve(qd, self._force(pose, qd, tau, z))
+        v1, a1 = solve(qd, forces(pose, qd, tau, z))
         q2, qd2 = q + step * v1, qd + step * a1
-        second = self.pose_at(q2)
-        force = self._force(second, qd2, tau, memory_after(self.dynamics, z, q2 - q))
+        second = pose_at(q2)
+        force = forces(second, qd2, tau, memory_after(dynamics, z, q2 - q))
         # one singular matrix must not stop the other windows
         a2 = torch.linalg.solve_ex(second.mass, force)[0] - 2 * a1
         v2, a2 = solve(qd2 - 2 * v1, (pose.mass @ a2.unsqueeze(-1)).squeeze(-1))
         end = q + step * (1.5 * v1 + 0.5 * v2)
         speed = qd + step * (1.5 * a1 + 0.5 * a2)
-        return end, speed, memory_after(self.dynamics, z, end - q)
+        return end, speed, memory_after(dynamics, z, end - q)
 
-    def _force(self, pose: Pose, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-        """Return M qdd, (W, n). A disturbance is a force where momenta were observed, else an acceleration."""
-        disturbance = self.disturbance
-        if not self.has_momentum:
-            disturbance = (pose.mass @ disturbance.unsqueeze(-1)).squeeze(-1)
-        return pose.force(qd, tau, z) + disturbance
+    return step
 
-    def _friction_slopes(self, pose: Pose, qd: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return D and K, (W, n): a joint's friction goes by its own motion."""
-        # central differences: dry friction jumps at standstill
-        slope = (pose.friction(qd + self.width, z) - pose.friction(qd - self.width, z)) / (2 * self.width)
-        # friction that falls with velocity is left to the explicit part: its damping would be negative
-        damping = slope.clamp(min=0)
-        if not has_friction_state(self.dynamics):
-            return damping, torch.zeros_like(damping)
-        # bristles load the way a joint goes
-        displacement = TUNING.displacement_step * torch.where(qd < 0, -1.0, 1.0).to(qd)
-        bent = pose.friction(qd, memory_after(self.dynamics, z, displacement))
-        return damping, ((bent - pose.friction(qd, z)) / displacement).clamp(min=0)
+
+def _friction_slopes(
+    dynamics: Any, pose: Pose, qd: Tensor, z: Tensor, width: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return D and K, (W, n): a joint's friction goes by its own motion."""
+    # central differences: dry friction jumps at standstill
+    slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
+    # friction that falls with velocity is left to the explicit part: its damping would be negative
+    damping = slope.clamp(min=0)
+    if not has_friction_state(dynamics):
+        return damping, torch.zeros_like(damping)
+    # bristles load the way a joint goes
+    displacement = TUNING.displacement_step * torch.where(qd < 0, -1.0, 1.0).to(qd)
+    bent = pose.friction(qd, memory_after(dynamics, z, displacement))
+    return damping, ((bent - pose.friction(qd, z)) / displacement).clamp(min=0)

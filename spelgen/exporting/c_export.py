@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from spelgen.exporting.c_library import CLibrary, compile_library, compiler
+from spelgen.exporting.c_library import called_by_c, compile_library, compiler
 from spelgen.exporting.c_source import c_functions, write_c
 from spelgen.exporting.exported import Exported, folder_export
 from spelgen.exporting.parity import check_parity
@@ -34,7 +34,7 @@ def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
         source = write_c(trained.described, functions, Path(folder))
         files = {path.name: path.read_bytes() for path in (source.with_suffix(".h"), source)}
         if program is not None:
-            library = CLibrary(compile_library(source, program), functions)
+            library = called_by_c(compile_library(source, program), functions)
             parity = check_parity(library, trained, list(trained.entry_points), TUNING.tolerance)
             checked = f"Checked when exported, compiled by {Path(program).name}: {parity.summary}."
     return files, checked

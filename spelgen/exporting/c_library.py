@@ -5,14 +5,14 @@ from __future__ import annotations
 import ctypes
 import shutil
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from spelgen.errors import RunError
 from spelgen.exporting.c_source import MEMORIES, CFunction
-from spelgen.exporting.parity import Values
+from spelgen.exporting.parity import Called, Values
 
 _FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared")
 
@@ -36,36 +36,32 @@ def compile_library(source: Path, program: str, *flags: str) -> Path:
     return library
 
 
-class CLibrary:
-    """The functions of a compiled export, for arrays of states."""
+def called_by_c(
+    library: Path, functions: Sequence[CFunction], dtype: type[np.floating] = np.float64
+) -> Called:
+    """Return what calls the functions of a compiled export, for arrays of states; outputs are float64."""
+    loaded = ctypes.CDLL(str(library))
+    by_name = {function.entry.name: function for function in functions}
 
-    def __init__(
-        self, library: Path, functions: Sequence[CFunction], dtype: type[np.floating] = np.float64
-    ) -> None:
-        self._library = ctypes.CDLL(str(library))
-        self._functions = {function.entry.name: function for function in functions}
-        self._dtype = dtype
+    def kind(name: str) -> type[np.floating]:
+        # friction's memory is double in any case
+        return np.float64 if name in MEMORIES else dtype
 
-    def __call__(self, name: str, inputs: Values) -> Mapping[str, np.ndarray]:
-        """Return an entry point's outputs, (states, ...), as float64."""
-        function = self._functions[name]
-        call = getattr(self._library, function.symbol)
+    def called(name: str, inputs: Values) -> Values:
+        function = by_name[name]
+        call = getattr(loaded, function.symbol)
         # all results are written to arrays
         call.restype = None
         states = len(inputs["q"])
-        arrays: list[np.ndarray] = []
-        for key in function.entry.inputs:
-            arrays.append(np.ascontiguousarray(inputs[key], dtype=self._kind(key)))
-        outputs: dict[str, np.ndarray] = {}
+        arguments = [np.ascontiguousarray(inputs[key], dtype=kind(key)) for key in function.entry.inputs]
+        outputs: Values = {}
         for key, shape in function.shapes.items():
             # NaN: what the function does not write is noticed
-            outputs[key] = np.full((states, *shape), np.nan, self._kind(key))
-        arrays += outputs.values()
+            outputs[key] = np.full((states, *shape), np.nan, kind(key))
+        arguments += outputs.values()
         for state in range(states):
-            rows = [array[state : state + 1] for array in arrays]
+            rows = [array[state : state + 1] for array in arguments]
             call(*(row.ctypes.data_as(ctypes.c_void_p) for row in rows))
         return {key: value.astype(np.float64) for key, value in outputs.items()}
 
-    def _kind(self, name: str) -> type[np.floating]:
-        """Return the type of an input or output: friction's memory is double in any case."""
-        return np.float64 if name in MEMORIES else self._dtype
+    return called

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,14 +90,13 @@ def _c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -
     # residuals first, for the statements read them
     residuals, calls = residual_calls(model, residuals_needed(function))
     variables, lines = statements(function, entry.output_names)
-    text = " ".join((*calls, *lines))
     # the compiler would refuse a parameter that is not used
-    unused = [name for name in (*entry.inputs, *entry.output_names) if not re.search(rf"\b{name}\b", text)]
-    body = [f"(void){name};" for name in unused] + calls + lines
+    body = [" ".join(f"(void){name};" for name in (*entry.inputs, *entry.output_names))]
     if residuals or variables:
         # in single precision a small displacement would be lost beside what z is already
         kind = "double" if entry.name == "friction_step" else "real"
-        body.insert(0, f"{kind} {', '.join((*residuals, *variables))};")
+        body.append(f"{kind} {', '.join((*residuals, *variables))};")
+    body += calls + lines
     real, size = f"{model.name}_real", f"{model.name.upper()}_N"
     parameters: list[str] = []
     for name in entry.inputs:

@@ -92,11 +92,10 @@ def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
         # one by one: a map over states would compile another function
         results = [function.call(list(map(ca.DM, state))) for state in states]
         outputs: Values = {}
-        for k, key in enumerate(function.name_out()):
-            values = np.array([result[k].full() for result in results])
-            if values.shape[-1] == 1:  # CasADi's vectors are columns
-                values = values[..., 0]
-            outputs[key] = values
+        for key, values in zip(function.name_out(), zip(*results, strict=True), strict=True):
+            array = np.array([value.full() for value in values])
+            # CasADi's vectors are columns
+            outputs[key] = array[..., 0] if array.shape[-1] == 1 else array
         return outputs
 
     return called

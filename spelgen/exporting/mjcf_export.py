@@ -9,7 +9,7 @@ import torch
 from spelgen.arm.arm import Arm
 from spelgen.exporting.exported import UNITS, Exported, readme
 from spelgen.exporting.mjcf_file import mjcf_text
-from spelgen.exporting.parity import Parity, Values, random_inputs, relative
+from spelgen.exporting.parity import Parity, Values, random_inputs, relative, require_parity
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection, rigid_body_projection
 from spelgen.exporting.trained import Trained
 from spelgen.settings.tuning.exporting import TUNING
@@ -64,7 +64,7 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
     differences: dict[str, float] = {}
     for name, values in _simulated(text, arm, random["q"], random["qd"], controls).items():
         differences[name] = relative(values, expected[name].numpy())
-    return Parity(differences, TUNING.mujoco_tolerance, states).require()
+    return require_parity(differences, TUNING.mujoco_tolerance, states)
 
 
 def _simulated(text: bytes, arm: Arm, q: np.ndarray, qd: np.ndarray, controls: np.ndarray) -> Values:
@@ -83,20 +83,17 @@ def _simulated(text: bytes, arm: Arm, q: np.ndarray, qd: np.ndarray, controls: n
     driven = [arm.joint_names.index(model.actuator(k).name) for k in range(model.nu)]
     data = mujoco.MjData(model)
     full = np.zeros((model.nv, model.nv))
-    masses: list[np.ndarray] = []
-    biases: list[np.ndarray] = []
-    accelerations: list[np.ndarray] = []
+    values: dict[str, list[np.ndarray]] = {"mass_matrix": [], "bias": [], "forward_dynamics": []}
     for position, velocity, control in zip(q, qd, controls, strict=True):
         data.qpos[:] = jacobian @ position + offset
         data.qvel[:] = jacobian @ velocity
         data.ctrl[:] = control[driven]
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, full)
-        masses.append(jacobian.T @ full @ jacobian)
-        biases.append(jacobian.T @ data.qfrc_bias)
-        accelerations.append(jacobian.T @ data.qacc)
-    values = {"mass_matrix": np.array(masses), "bias": np.array(biases)}
+        values["mass_matrix"].append(jacobian.T @ full @ jacobian)
+        values["bias"].append(jacobian.T @ data.qfrc_bias)
+        values["forward_dynamics"].append(jacobian.T @ data.qacc)
     # MuJoCo's constraint for followers is soft
-    if model.nv == len(arm.coordinates):
-        values["forward_dynamics"] = np.array(accelerations)
-    return values
+    if model.nv > len(arm.coordinates):
+        del values["forward_dynamics"]
+    return {name: np.array(rows) for name, rows in values.items()}

@@ -92,9 +92,9 @@ def _add_joint(
         axis=(0, 0, 1),
         type=kind,
         armature=rotors[k],
-        damping=projection.viscous[k],
+        damping=projection.friction.viscous[k],
         # MuJoCo has one Coulomb friction for both directions
-        frictionloss=(projection.forward[k] - projection.backward[k]) / 2,
+        frictionloss=(projection.friction.forward[k] - projection.friction.backward[k]) / 2,
         solimpfriction=TUNING.friction_impedance,
         range=leader.limits,
     )

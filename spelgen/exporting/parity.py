@@ -40,32 +40,28 @@ Called = Callable[[str, Values], Mapping[str, np.ndarray]]
 
 @dataclass(frozen=True)
 class Parity:
-    """The largest difference to the torch model by entry point, relative to the largest value, and what is allowed."""
+    """The largest difference to the torch model by entry point, relative to the largest value; a sentence on them."""
 
     differences: dict[str, float]
-    tolerance: float
-    states: int
+    summary: str
 
-    @property
-    def summary(self) -> str:
-        """One sentence."""
-        worst = max(self.differences, key=self.differences.__getitem__)
-        return (
-            f"{self.states} random states: at most {self.differences[worst]:.1e} ({worst}) from the torch module, "
-            f"relative to the largest value; {self.tolerance:.0e} is allowed"
-        )
 
-    def require(self) -> Parity:
-        """Return itself. Raises RunError where a difference is larger than allowed."""
-        for name, difference in self.differences.items():
-            if not difference <= self.tolerance:  # NaN is refused as well
-                raise RunError(
-                    f"{name} differs from the model by {difference:.1e}",
-                    element="parity check",
-                    expected=f"at most {self.tolerance:.0e} of the largest value",
-                    do="nothing was written; please report this with the run folder",
-                )
-        return self
+def require_parity(differences: dict[str, float], tolerance: float, states: int) -> Parity:
+    """Return the differences at so many states. Raises RunError where one is larger than allowed."""
+    for name, difference in differences.items():
+        if not difference <= tolerance:  # NaN is refused as well
+            raise RunError(
+                f"{name} differs from the model by {difference:.1e}",
+                element="parity check",
+                expected=f"at most {tolerance:.0e} of the largest value",
+                do="nothing was written; please report this with the run folder",
+            )
+    worst = max(differences, key=differences.__getitem__)
+    summary = (
+        f"{states} random states: at most {differences[worst]:.1e} ({worst}) from the torch module, "
+        f"relative to the largest value; {tolerance:.0e} is allowed"
+    )
+    return Parity(differences, summary)
 
 
 def check_parity(
@@ -97,7 +93,7 @@ def check_parity(
             # what it is compared with rounds
             error = np.maximum(error - TUNING.tip_tolerance, 0.0)
         differences[name] = float(error)
-    return Parity(differences, tolerance, count).require()
+    return require_parity(differences, tolerance, count)
 
 
 def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 0, seed: int = 0) -> Values:
@@ -146,7 +142,8 @@ def _expected(model: EmittedModel, trained: Trained, name: str, inputs: Values) 
             tensors.append(tensor.unflatten(-1, (model.n, -1)))
     if name.endswith("_derivatives"):
         function = getattr(model, name.removesuffix("_derivatives"))
-        outputs = _derivatives(function, tensors, len(entry.outputs))
+        variables = tuple(range(len(entry.outputs)))
+        outputs = torch.func.vmap(torch.func.jacrev(function, argnums=variables))(*tensors)
     elif name == "energy":
         q, qd = tensors
         kinetic = 0.5 * (model.momentum(q, qd) * qd).sum(dim=-1)
@@ -161,15 +158,3 @@ def _expected(model: EmittedModel, trained: Trained, name: str, inputs: Values) 
         outputs = [getattr(model, _METHODS.get(name, name))(*tensors)]
     arrays = [output.detach().numpy() for output in outputs]
     return dict(zip(entry.output_names, arrays, strict=True))
-
-
-def _derivatives(function: Callable[..., Tensor], inputs: list[Tensor], count: int) -> list[Tensor]:
-    """Return the derivatives by the first inputs, (states, n, n), by automatic differentiation of all states at once.
-
-    No state has a part in the outputs of another, so that a sum over the states has the derivatives of each.
-    """
-    variables = [tensor.clone().requires_grad_() for tensor in inputs[:count]]
-    rows = []
-    for output in function(*variables, *inputs[count:]).sum(dim=0):
-        rows.append(torch.autograd.grad(output, variables, retain_graph=True, materialize_grads=True))
-    return [torch.stack(columns, dim=-2) for columns in zip(*rows, strict=True)]

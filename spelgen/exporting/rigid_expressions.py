@@ -42,21 +42,18 @@ def body_frames(bodies: Sequence[Body], q: ca.SX) -> list[tuple[ca.SX, ca.SX]]:
 def rigid_torque(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.SX, qdd: ca.SX) -> ca.SX:
     """Return the torques of this motion of rigid bodies in gravity, without armature, (n, 1) [Nm, N]."""
     bodies = model.arm.bodies
-    # in the body's frame, the base first: in place of gravity it accelerates upwards
-    velocities = [ca.SX(3, 1)]
-    rates = [ca.SX(3, 1)]
-    accelerations = [ca.SX(-np.array(model.arm.gravity, dtype=float))]
-    spins = [ca.SX(3, 3)]
+    # of the base, then of the bodies, in their own frames; in place of gravity the base accelerates upwards
+    gravity = np.array(model.arm.gravity, dtype=float)
+    motions = [(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-gravity), ca.SX(3, 3))]
     forces: list[ca.SX] = []
     torques: list[ca.SX] = []
     for body, ten, (rotation, position) in zip(bodies, model.inertias, frames, strict=True):
-        carrier = body.parent + 1
+        w, rate, acceleration, spin = motions[body.parent + 1]
         ratio = float(body.multiplier)
         speed = ratio * qd[body.coordinate]
         added = ratio * qdd[body.coordinate]
-        w = rotation.T @ velocities[carrier]
-        rate = rotation.T @ rates[carrier]
-        acceleration = rotation.T @ (accelerations[carrier] + spins[carrier] @ position)
+        acceleration = rotation.T @ (acceleration + spin @ position)
+        w, rate = rotation.T @ w, rotation.T @ rate
         turning = ca.cross(w, _Z) * speed
         if body.kind == "revolute":
             w = w + _Z * speed
@@ -66,6 +63,7 @@ def rigid_torque(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.
             acceleration = acceleration + _Z * added + 2 * turning
         # takes points of the body to their accelerations
         spin = ca.skew(rate) + w @ w.T - ca.dot(w, w) * ca.SX.eye(3)
+        motions.append((w, rate, acceleration, spin))
         m, x, y, z, xx, xy, xz, yy, yz, zz = ten.tolist()
         moment = ca.SX(constant([x, y, z]))
         inertia = ca.SX(constant([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
@@ -73,10 +71,6 @@ def rigid_torque(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.
         forces.append(m * acceleration + spin @ moment)
         torque = ca.cross(moment, acceleration) + inertia @ rate
         torques.append(torque + ca.cross(w, inertia @ w))
-        velocities.append(w)
-        rates.append(rate)
-        accelerations.append(acceleration)
-        spins.append(spin)
     joint_torques = ca.SX(model.n, 1)
     # children stand behind their parents
     for index in reversed(range(len(bodies))):

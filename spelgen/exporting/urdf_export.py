@@ -55,9 +55,9 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
         "units": "Nm, Nm s/rad and rad/s of revolute joints; N, N s/m and m/s of prismatic ones",
         "viscous_coulomb": "viscous qd + coulomb[0] where qd > 0, + coulomb[1] where qd < 0",
     }
-    coulomb = np.stack([projection.forward, projection.backward], axis=1)
+    coulomb = np.stack([projection.friction.forward, projection.friction.backward], axis=1)
     # by section and name, (n, ...) each
-    sections = {"viscous_coulomb": {"viscous": projection.viscous, "coulomb": coulomb}}
+    sections = {"viscous_coulomb": {"viscous": projection.friction.viscous, "coulomb": coulomb}}
     # networks have no law with constants
     if projection.own:
         content["law"] = _LAW

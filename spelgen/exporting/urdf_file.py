@@ -36,11 +36,11 @@ def urdf_text(projection: RigidBodyProjection) -> bytes:
         rotation = np.array(lumped.frames[name].rotation.T, dtype=float)
         _set_inertial(links[name], inertia, rotation)
     # a URDF has one Coulomb friction for both directions
-    coulomb = (projection.forward - projection.backward) / 2
+    coulomb = (projection.friction.forward - projection.friction.backward) / 2
     for index, coordinate in enumerate(arm.coordinates):
         element = joints[coordinate.name]
         _remove(element, "dynamics")
-        values = {"damping": _number(projection.viscous[index]), "friction": _number(coulomb[index])}
+        values = {"damping": _number(projection.friction.viscous[index]), "friction": _number(coulomb[index])}
         etree.SubElement(element, "dynamics", values)
     text: bytes = etree.tostring(root, xml_declaration=True, encoding="utf-8")
     return text + b"\n"
@@ -58,8 +58,11 @@ def settings_text(projection: RigidBodyProjection) -> str:
         gear = projection.arm.settings.joint(coordinate.name).gear
         joint = joints.setdefault(coordinate.name, {})
         joint["rotor_inertia"] = rounded(projection.armature[index] / gear**2)
-        joint["viscous"] = rounded(projection.viscous[index])
-        joint["coulomb"] = [rounded(projection.forward[index]), rounded(projection.backward[index])]
+        joint["viscous"] = rounded(projection.friction.viscous[index])
+        joint["coulomb"] = [
+            rounded(projection.friction.forward[index]),
+            rounded(projection.friction.backward[index]),
+        ]
     text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
     return text
 

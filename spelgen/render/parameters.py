@@ -174,7 +174,7 @@ def _joint_table(model: EmittedModel, arm: LoadedArm | None) -> Listing | None:
         slope = f"{units.torque} s/{units.position}"
         cells = {"joint": f"joint {k + 1}", "armature": f"{model.armature[k]:.3g} {units.inertia}"}
         if friction is not None:
-            viscous, forward, backward, _ = friction[:, k]
+            viscous, forward, backward = friction.viscous[k], friction.forward[k], friction.backward[k]
             # the damping of a drive's control contains its joint's viscous friction
             if not damped:
                 cells["viscous"] = f"{viscous:.3g} {slope}"
