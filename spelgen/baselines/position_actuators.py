@@ -17,11 +17,10 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 from mujoco import minimize, rollout
-from scipy.spatial.transform import Rotation
 
 from spelgen.arm.arm import Arm
 from spelgen.building import build
-from spelgen.dynamics.rigid_bodies import about_center
+from spelgen.dynamics.rigid_bodies import about_center, quaternion
 from spelgen.fitting.servo.windows import ServoWindows
 from spelgen.loaded_arm import LoadedArm
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
@@ -89,10 +88,9 @@ class PositionActuators:
         for k, (body, coordinate) in enumerate(zip(self.arm.bodies, self.arm.coordinates, strict=True)):
             kp, kv, armature, frictionloss = self.drives[:, k]
             mass, center, tensor = about_center(inertias[k])
-            rotation = Rotation.from_matrix(np.array(body.rotation, dtype=float))
             element = parents[body.parent + 1].add_body(
                 pos=np.array(body.translation, dtype=float),
-                quat=np.roll(rotation.as_quat(), 1),  # MuJoCo has w first
+                quat=quaternion(body.rotation),
                 explicitinertial=True,
                 mass=mass,
                 ipos=center,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from spelgen.arm.arm import Arm
 from spelgen.runtime.body_chain import BodyChain
@@ -30,6 +31,14 @@ def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     # the parallel axis theorem
     shift = center @ center * np.eye(3) - np.outer(center, center)
     return mass, center, about_joint - mass * shift
+
+
+def quaternion(rotation: object) -> np.ndarray:
+    """Return (w, x, y, z) of a rotation, (3, 3), w not negative."""
+    matrix = np.array(rotation, dtype=float)
+    result = np.roll(Rotation.from_matrix(matrix).as_quat(canonical=True), 1)
+    result[np.abs(result) < 1e-16] = 0.0  # rounding
+    return result
 
 
 def _row(values: tuple[object, object, object]) -> Row:

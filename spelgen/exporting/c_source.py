@@ -89,9 +89,9 @@ def c_source(model: TrainedModel, functions: Sequence[CFunction]) -> str:
 def _c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -> CFunction:
     # residuals first, for the statements read them
     residuals, calls = residual_calls(model, residuals_needed(function))
-    variables, lines = statements(function, entry.output_names)
+    variables, lines = statements(function, list(entry.outputs))
     # the compiler would refuse a parameter that is not used
-    body = [" ".join(f"(void){name};" for name in (*entry.inputs, *entry.output_names))]
+    body = [" ".join(f"(void){name};" for name in (*entry.inputs, *entry.outputs))]
     if residuals or variables:
         # in single precision a small displacement would be lost beside what z is already
         kind = "double" if entry.name == "friction_step" else "real"
@@ -104,7 +104,7 @@ def _c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -
         parameters.append("const double *z" if name == "z" else f"const {real} {name}[{size}]")
     shapes: dict[str, tuple[int, ...]] = {}
     results: list[str] = []
-    for k, (name, unit) in enumerate(entry.outputs):
+    for k, (name, unit) in enumerate(entry.outputs.items()):
         rows, columns = function.size_out(k)
         shapes[name] = (rows, columns) if columns > 1 else (rows,)
         parameters.append(f"double *{name}" if name in MEMORIES else f"{real} {name}[{rows * columns}]")

@@ -58,7 +58,7 @@ def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Functio
     for name in needed:
         arguments.append(residuals[name])
     outputs = function.call(arguments)
-    names = list(entry.inputs), list(entry.output_names)
+    names = list(entry.inputs), list(entry.outputs)
     return ca.Function(entry.name, list(states.values()), outputs, *names)
 
 
@@ -71,7 +71,7 @@ def _derivatives(entry: EntryPoint, function: ca.Function) -> ca.Function:
         if name in inputs:
             # who calls it reads n x n numbers, whatever is zero
             derivatives.append(ca.densify(ca.jacobian(output, inputs[name])))
-    names = list(entry.inputs), list(entry.output_names)
+    names = list(entry.inputs), list(entry.outputs)
     return ca.Function(entry.name, arguments, derivatives, *names)
 
 

@@ -107,19 +107,15 @@ def _unsupported(subject: str) -> RunError:
 def _residuals(model: ResidualModel) -> Residuals:
     """Return the residuals without those that are zero. Raises RunError for Kolmogorov-Arnold networks."""
     terms, weights = model.residuals, model.prepare().residual
-    mass = _network(terms.mass, weights.mass, terms.encoding, array(weights.functions))
-    potential = _network(terms.potential, weights.potential, terms.encoding)
-    entries: np.ndarray = np.zeros((0, 2), dtype=int)
-    if mass is not None:
-        reached = mass.weights[-1].any(axis=1).reshape(model.n, model.n)
-        entries = np.argwhere(np.tril(reached))
-        used = entries @ (model.n, 1)
-        weights_used = (*mass.weights[:-1], mass.weights[-1][used])
-        mass = Network(weights_used, (*mass.biases[:-1], mass.biases[-1][used]))
+    functions = array(weights.functions)
+    entries = np.argwhere(np.tril(functions.any(axis=0).reshape(model.n, model.n)))
+    mass = _network(terms.mass, weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
+    if mass is None:
+        entries = entries[:0]
     return Residuals(
         entries=tuple(map(tuple, entries.tolist())),
         mass=mass,
-        potential=potential,
+        potential=_network(terms.potential, weights.potential, terms.encoding),
         torque=_splines(terms, terms.unit * terms.raw_torque_splines),
         ripple=_ripple(terms, weights.ripple),
         friction=_splines(terms, terms.friction_logarithms()),
@@ -148,10 +144,7 @@ def _network(
     weights[0] = np.hstack([first * revolute, second * revolute, slopes])
     biases[0] -= slopes @ array(encoding.center)
     if functions is not None:
-        # outputs that are always zero would be units of the last hidden layer
-        used = weights[-1].any(axis=1) | (biases[-1] != 0)
-        weights[-1], biases[-1] = weights[-1][used], biases[-1][used]
-        weights.append(functions[used].T)
+        weights.append(functions.T)
         biases.append(np.zeros(functions.shape[1]))
     # tanh x is 2 sigmoid(2 x) - 1
     for k in range(1, len(weights)):

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from lxml import etree
-from scipy.spatial.transform import Rotation
 
-from spelgen.arm.arm import Body, Coordinate
-from spelgen.dynamics.rigid_bodies import about_center
+from spelgen.arm.arm import Coordinate
+from spelgen.dynamics.rigid_bodies import about_center, quaternion
 from spelgen.exporting.describe import tip_frame
+from spelgen.exporting.description import Servos
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection
 from spelgen.settings.tuning.exporting import TUNING
 
@@ -29,24 +29,38 @@ def mjcf_text(projection: RigidBodyProjection) -> bytes:
     _add(root, "compiler", angle="radian", autolimits="true")
     _add(root, "option", gravity=arm.gravity)
     world, equality, tendons, actuators = (etree.SubElement(root, tag) for tag in SECTIONS)
-    # the rotor of a motor that several joints turn is a tendon's armature
     is_coupled = np.count_nonzero(projection.motors, axis=1) > 1
-    rotors = np.where(is_coupled, 0.0, projection.armature)
-    bodies = [world]
+    elements = [world]
     for body, inertia in zip(arm.bodies, projection.inertias, strict=True):
-        element = _add_body(bodies[body.parent + 1], projection, body, inertia)
-        _add_joint(element, equality, projection, body, rotors)
-        bodies.append(element)
+        name = projection.arm.robot.joint[body.name].child
+        pose = {"pos": body.translation, "quat": quaternion(body.rotation)}
+        element = _add(elements[body.parent + 1], "body", name=name, **pose)
+        elements.append(element)
+        mass, center, tensor = about_center(inertia)
+        # MuJoCo has xx, yy, zz, xy, xz, yz
+        moments = tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        _add(element, "inertial", mass=mass, pos=center, fullinertia=moments)
+        kind = "hinge" if body.kind == "revolute" else "slide"
+        joint = {"name": body.name, "axis": (0, 0, 1), "type": kind}
+        leader = arm.coordinates[body.coordinate]
+        if leader.name == body.name:
+            _add(element, "joint", **joint, **_drive(projection, body.coordinate, is_coupled))
+            continue
+        # a follower has no drive, no friction and no limits of its own; MuJoCo has it by soft constraints, polynomials
+        # of the leader's position
+        _add(element, "joint", **joint)
+        law = body.offset, body.multiplier, 0, 0, 0
+        _add(equality, "joint", joint1=body.name, joint2=leader.name, polycoef=law)
     tip = tip_frame(projection.arm)
-    position, quaternion = tip.pose[:3, 3], _quaternion(tip.pose[:3, :3])
-    _add(bodies[tip.carrier + 1], "site", name=tip.link, pos=position, quat=quaternion)
+    pose = {"pos": tip.pose[:3, 3], "quat": quaternion(tip.pose[:3, :3])}
+    _add(elements[tip.carrier + 1], "site", name=tip.link, **pose)
     for k in np.flatnonzero(is_coupled).tolist():
         rotor = _add_tendon(tendons, f"rotor{k + 1}", arm.coordinates, projection.motors[k])
         rotor.set("armature", _text(projection.armature[k]))
     if projection.servos is None:
         _add_motors(actuators, tendons, projection)
     else:
-        _add_servos(actuators, projection)
+        _add_servos(actuators, arm.coordinates, projection.servos)
     for section in (equality, tendons):
         if not len(section):
             root.remove(section)
@@ -56,48 +70,18 @@ def mjcf_text(projection: RigidBodyProjection) -> bytes:
     return text + b"\n"
 
 
-def _add_body(
-    parent: etree._Element, projection: RigidBodyProjection, body: Body, inertia: np.ndarray
-) -> etree._Element:
-    mass, center, tensor = about_center(inertia)
-    name = projection.arm.robot.joint[body.name].child
-    element = _add(parent, "body", name=name, pos=body.translation, quat=_quaternion(body.rotation))
-    # MuJoCo has xx, yy, zz, xy, xz, yz
-    moments = tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    _add(element, "inertial", mass=mass, pos=center, fullinertia=moments)
-    return element
-
-
-def _add_joint(
-    element: etree._Element,
-    equality: etree._Element,
-    projection: RigidBodyProjection,
-    body: Body,
-    rotors: np.ndarray,
-) -> None:
-    """Add a body's joint; a follower has no drive, no friction and no limits of its own."""
-    kind = "hinge" if body.kind == "revolute" else "slide"
-    k = body.coordinate
-    leader = projection.arm.arm.coordinates[k]
-    if leader.name != body.name:
-        _add(element, "joint", name=body.name, axis=(0, 0, 1), type=kind)
-        # MuJoCo has followers by soft constraints: polynomials of the leader's position
-        law = body.offset, body.multiplier, 0, 0, 0
-        _add(equality, "joint", joint1=body.name, joint2=leader.name, polycoef=law)
-        return
-    _add(
-        element,
-        "joint",
-        name=body.name,
-        axis=(0, 0, 1),
-        type=kind,
-        armature=rotors[k],
-        damping=projection.friction.viscous[k],
+def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> dict[str, object]:
+    """Return the attributes of a joint that is no follower."""
+    friction = projection.friction
+    return {
+        # the rotor of a motor that several joints turn is a tendon's armature
+        "armature": 0.0 if is_coupled[k] else projection.armature[k],
+        "damping": friction.viscous[k],
         # MuJoCo has one Coulomb friction for both directions
-        frictionloss=(projection.friction.forward[k] - projection.friction.backward[k]) / 2,
-        solimpfriction=TUNING.friction_impedance,
-        range=leader.limits,
-    )
+        "frictionloss": (friction.forward[k] - friction.backward[k]) / 2,
+        "solimpfriction": TUNING.friction_impedance,
+        "range": projection.arm.arm.coordinates[k].limits,
+    }
 
 
 def _add_motors(actuators: etree._Element, tendons: etree._Element, projection: RigidBodyProjection) -> None:
@@ -113,11 +97,9 @@ def _add_motors(actuators: etree._Element, tendons: etree._Element, projection: 
             _add(actuators, "motor", name=name, tendon=f"motor{k + 1}")
 
 
-def _add_servos(actuators: etree._Element, projection: RigidBodyProjection) -> None:
+def _add_servos(actuators: etree._Element, joints: Sequence[Coordinate], servos: Servos) -> None:
     """Add a position actuator for each joint; its control is the delayed command."""
-    servos = projection.servos
-    assert servos is not None
-    for k, joint in enumerate(projection.arm.arm.coordinates):
+    for k, joint in enumerate(joints):
         limit = servos.limit[k]
         force = (-limit, limit) if np.isfinite(limit) else None
         gains = {"kp": servos.kp[k], "kv": servos.kd[k]}
@@ -146,11 +128,3 @@ def _text(value: object) -> str:
     if isinstance(value, str):
         return value
     return " ".join(f"{float(number):.17g}" for number in np.ravel(value))  # type: ignore[call-overload]
-
-
-def _quaternion(rotation: object) -> np.ndarray:
-    """Return (w, x, y, z)."""
-    matrix = np.array(rotation, dtype=float)
-    quaternion = np.roll(Rotation.from_matrix(matrix).as_quat(canonical=True), 1)
-    quaternion[np.abs(quaternion) < 1e-16] = 0.0  # rounding
-    return quaternion

@@ -47,7 +47,7 @@ def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint])
         for key, symbols in residuals.items():
             if symbols.nnz() and ca.depends_on(ca.veccat(*outputs), symbols):
                 arguments[RESIDUAL + key] = symbols
-        labels = list(arguments), list(entry.output_names)
+        labels = list(arguments), list(entry.outputs)
         # what is computed twice becomes one step: by cse
         functions[name] = ca.Function(name, list(arguments.values()), outputs, *labels, {"cse": True})
     return functions
@@ -79,15 +79,12 @@ def _expressions(
     if model.residuals.mass is not None:
         added_bias = added_gravity + coriolis(model, residuals, qd, derivatives=derivatives)
     bias = rigid_torque(model, frames, qd, rest) + added_bias
-    load = rest
-    # gravity would be computed for nothing
-    if model.friction.load_dependence.any():
-        load = constant(np.linalg.inv(model.motors).T) @ rigid_gravity
+    load = constant(np.linalg.inv(model.motors).T) @ rigid_gravity
     drive_friction = friction_torque(model, motors @ qd, load, z)
     for k, joint in enumerate(model.residuals.friction):
         drive_friction[joint] *= ca.exp(residuals["factor"][k])
     friction = motors.T @ drive_friction
-    compensation = constant(np.diag(model.friction_compensation)) @ qd
+    compensation = constant(model.friction_compensation) * qd
     # one pass of Newton and Euler, where M qdd + h would take two
     force = rigid_torque(model, frames, qd, qdd) + added_mass @ qdd + added_bias + friction - compensation
     applied = constant(model.inputs) @ (tau - model.torque_offset)
@@ -119,16 +116,13 @@ def _expressions(
 def _inputs(model: TrainedModel, force: ca.SX) -> ca.SX:
     """Return the inputs that make these forces, (n, columns)."""
     # a passive joint's own torque is what it lacks
-    inputs = model.inputs + np.diag(1 - model.actuated)
-    if np.array_equal(inputs, np.eye(model.n)):
-        return force
-    return constant(np.linalg.inv(inputs)) @ force
+    return constant(np.linalg.inv(model.inputs + np.diag(1 - model.actuated))) @ force
 
 
 def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
     error = u - q
     if servos.dead_zone.any():
-        error = ca.fmax(error - servos.dead_zone, 0) - ca.fmax(-error - servos.dead_zone, 0)
+        error -= ca.fmin(ca.fmax(error, -servos.dead_zone), servos.dead_zone)
     torque: ca.SX = servos.kp * error - servos.kd * qd
     for joint in np.flatnonzero(np.isfinite(servos.limit)).tolist():
         limit = servos.limit[joint]

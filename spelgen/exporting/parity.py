@@ -157,4 +157,4 @@ def _expected(model: EmittedModel, trained: Trained, name: str, inputs: Values) 
     else:
         outputs = [getattr(model, _METHODS.get(name, name))(*tensors)]
     arrays = [output.detach().numpy() for output in outputs]
-    return dict(zip(entry.output_names, arrays, strict=True))
+    return dict(zip(entry.outputs, arrays, strict=True))

@@ -17,11 +17,10 @@ from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.dynamics.residuals import without_residuals
 from spelgen.exporting.describe import array, servos_of
 from spelgen.exporting.description import Servos
-from spelgen.exporting.parity import usual_speeds
+from spelgen.exporting.parity import random_inputs, usual_speeds
 from spelgen.fitting.optimizers import minimise
 from spelgen.loaded_arm import LoadedArm
 from spelgen.settings.tuning.exporting import TUNING
-from spelgen.structure.nominal import working_range
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -101,10 +100,7 @@ def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProje
 
 def sampled_positions(arm: Arm) -> Tensor:
     """Return positions over the joints' ranges, (positions, n), the same each time."""
-    # the same positions each time: an export is reproducible
-    random = np.random.default_rng(0)
-    columns = [random.uniform(*working_range(joint), TUNING.positions) for joint in arm.coordinates]
-    return torch.from_numpy(np.stack(columns, axis=-1))
+    return torch.from_numpy(random_inputs(arm.coordinates, TUNING.positions)["q"])
 
 
 def _nearest_bodies(model: EmittedModel, arm: LoadedArm, q: Tensor) -> EmittedModel:

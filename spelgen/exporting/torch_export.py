@@ -107,4 +107,5 @@ def program_inputs(model: PreparedModel, name: str) -> tuple[str, ...]:
 
 def program_output(name: str) -> str:
     """Return the name of an entry point's only output."""
-    return ENTRY_POINTS[name].outputs[0][0]
+    (output,) = ENTRY_POINTS[name].outputs
+    return output
