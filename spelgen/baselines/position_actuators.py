@@ -157,7 +157,8 @@ def fit_position_actuators(
         model.opt.timestep = 1 / windows.rate / steps
         commands = windows.commands(tried.delay).numpy() + tried.offset
         missed = _rollout(model, q[:, 0], qd[:, 0], commands) - q[:, 1:]
-        return missed[:, windows.settling :].ravel()
+        judged: np.ndarray = missed[:, windows.settling :].ravel()
+        return judged
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.stack([errors(column) for column in x.T], axis=1)

@@ -36,7 +36,7 @@ def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
 def quaternion(rotation: object) -> np.ndarray:
     """Return (w, x, y, z) of a rotation, (3, 3), w not negative."""
     matrix = np.array(rotation, dtype=float)
-    result = np.roll(Rotation.from_matrix(matrix).as_quat(canonical=True), 1)
+    result: np.ndarray = np.roll(Rotation.from_matrix(matrix).as_quat(canonical=True), 1)
     result[np.abs(result) < 1e-16] = 0.0  # rounding
     return result
 

@@ -89,9 +89,9 @@ def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
     packed: list[np.ndarray] = []
     for column in weight.T:
         # masked networks: an input reaches a block of the outputs
-        reached = np.flatnonzero(column).tolist() or [0, -1]
-        first.append(reached[0])
-        last.append(reached[-1] + 1)
+        nonzero = np.flatnonzero(column).tolist() or [0, -1]
+        first.append(nonzero[0])
+        last.append(nonzero[-1] + 1)
         packed.append(column[first[-1] : last[-1]])
     return [
         _table(f"{name}_bias", bias),

@@ -52,27 +52,22 @@ def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Functio
     needed = residuals_needed(function)
     if not needed:
         return function
-    states = {name: ca.MX.sym(name, function.size1_in(name)) for name in entry.inputs}
-    arguments = list(states.values())
+    arguments = function.mx_in()[: len(entry.inputs)]
+    states = dict(zip(entry.inputs, arguments, strict=True))
     residuals = residual_values(model, states["q"], states.get("qd"))
-    for name in needed:
-        arguments.append(residuals[name])
-    outputs = function.call(arguments)
-    names = list(entry.inputs), list(entry.outputs)
-    return ca.Function(entry.name, list(states.values()), outputs, *names)
+    outputs = function.call(arguments + [residuals[name] for name in needed])
+    return ca.Function(entry.name, arguments, outputs, list(entry.inputs), list(entry.outputs))
 
 
 def _derivatives(entry: EntryPoint, function: ca.Function) -> ca.Function:
-    inputs = dict(zip(entry.inputs, function.mx_in(), strict=True))
-    arguments = list(inputs.values())
+    arguments = function.mx_in()
     (output,) = function.call(arguments)
     derivatives: list[ca.MX] = []
-    for name in ("q", "qd", "tau"):
-        if name in inputs:
-            # who calls it reads n x n numbers, whatever is zero
-            derivatives.append(ca.densify(ca.jacobian(output, inputs[name])))
-    names = list(entry.inputs), list(entry.outputs)
-    return ca.Function(entry.name, arguments, derivatives, *names)
+    # by as many of the inputs as there are outputs
+    for argument, _ in zip(arguments, entry.outputs, strict=False):
+        # who calls it reads n x n numbers, whatever is zero
+        derivatives.append(ca.densify(ca.jacobian(output, argument)))
+    return ca.Function(entry.name, arguments, derivatives, list(entry.inputs), list(entry.outputs))
 
 
 def _saved(function: ca.Function) -> bytes:

@@ -80,8 +80,7 @@ def servos_of(model: EmittedModel) -> Servos | None:
     """Return the position servos of a model, None where it has none."""
     if input_of(model) == "torque":
         return None
-    kp, kd, limit, dead_zone = map(array, model.servo.prepare())
-    return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
+    return Servos(*map(array, model.servo.prepare()), delay=float(model.servo.delay))
 
 
 def tip_frame(loaded: LoadedArm) -> Tip:

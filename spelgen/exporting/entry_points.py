@@ -100,12 +100,12 @@ def entry_points(model: TrainedModel, names: Sequence[str] = ()) -> dict[str, En
 
 def chosen(names: Sequence[str], functions: Iterable[str]) -> list[str]:
     """Return which of the functions are named, all where none is. Raises RunError for other names."""
-    known = list(functions)
+    options = list(functions)
     for name in names:
-        if name not in known:
-            expected = f"one of {', '.join(known)}"
-            raise RunError(f"the function {name!r}", expected=expected, do=suggestion(name, known))
+        if name not in options:
+            expected = f"one of {', '.join(options)}"
+            raise RunError(f"the function {name!r}", expected=expected, do=suggestion(name, options))
     if not names:
-        return known
+        return options
     # in their own order: the same choice gives the same files
-    return [name for name in known if name in names]
+    return [name for name in options if name in names]

@@ -67,18 +67,18 @@ def _expressions(
     M qdd + h + friction, less what the drives add unseen, (n, 1).
     """
     q, qd, qdd, tau, dq, u, z = inputs.values()
-    rest = ca.SX(model.n, 1)
+    standstill = ca.SX(model.n, 1)
     motors = constant(model.motors)
     frames = body_frames(model.arm.bodies, q)
     rigid_mass, rigid_potential = mass_and_potential(model, q)
     # of drives and residuals
     added_mass = constant(model.constant_mass) + symmetric(model, residuals["mass"])
     mass = rigid_mass + added_mass
-    rigid_gravity = rigid_torque(model, frames, rest, rest)
+    rigid_gravity = rigid_torque(model, frames, standstill, standstill)
     added_gravity = added_bias = residuals["gravity"] + residuals["torque"]
     if model.residuals.mass is not None:
         added_bias = added_gravity + coriolis(model, residuals, qd, derivatives=derivatives)
-    bias = rigid_torque(model, frames, qd, rest) + added_bias
+    bias = rigid_torque(model, frames, qd, standstill) + added_bias
     load = constant(np.linalg.inv(model.motors).T) @ rigid_gravity
     drive_friction = friction_torque(model, motors @ qd, load, z)
     for k, joint in enumerate(model.residuals.friction):

@@ -70,15 +70,14 @@ def check_parity(
     names: Sequence[str],
     tolerance: float,
     *,
-    states: int | None = None,
+    states: int = TUNING.states,
     dtype: type = np.float64,
 ) -> Parity:
     """Compare ``called`` with the torch model at random states, at each of these entry points. Raises RunError.
 
     dtype: of the export, to which the states are rounded for both.
     """
-    count = TUNING.states if states is None else states
-    inputs = random_inputs(trained.arm.arm.coordinates, count, trained.memory)
+    inputs = random_inputs(trained.arm.arm.coordinates, states, trained.memory)
     inputs = {key: value.astype(dtype).astype(np.float64) for key, value in inputs.items()}
     # float32 of a model on another device would be the larger error
     exact = copy.deepcopy(trained.model).double().cpu().requires_grad_(False)
@@ -93,13 +92,13 @@ def check_parity(
             # what it is compared with rounds
             error = np.maximum(error - TUNING.tip_tolerance, 0.0)
         differences[name] = float(error)
-    return require_parity(differences, tolerance, count)
+    return require_parity(differences, tolerance, states)
 
 
-def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 0, seed: int = 0) -> Values:
+def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 0) -> Values:
     """Return states over the joints' ranges at their usual speeds, (states, n) each, and z, (states, memory)."""
     # the same states each time: an export is reproducible
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     speed = usual_speeds(coordinates)
     q = np.stack([random.uniform(*working_range(joint), states) for joint in coordinates], axis=-1)
     return {

@@ -36,11 +36,12 @@ def urdf_text(projection: RigidBodyProjection) -> bytes:
         rotation = np.array(lumped.frames[name].rotation.T, dtype=float)
         _set_inertial(links[name], inertia, rotation)
     # a URDF has one Coulomb friction for both directions
-    coulomb = (projection.friction.forward - projection.friction.backward) / 2
+    friction = projection.friction
+    coulomb = (friction.forward - friction.backward) / 2
     for index, coordinate in enumerate(arm.coordinates):
         element = joints[coordinate.name]
         _remove(element, "dynamics")
-        values = {"damping": _number(projection.friction.viscous[index]), "friction": _number(coulomb[index])}
+        values = {"damping": _number(friction.viscous[index]), "friction": _number(coulomb[index])}
         etree.SubElement(element, "dynamics", values)
     text: bytes = etree.tostring(root, xml_declaration=True, encoding="utf-8")
     return text + b"\n"
@@ -53,16 +54,14 @@ def settings_text(projection: RigidBodyProjection) -> str:
     if path.exists():
         content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     joints = content.setdefault("joints", {})
+    friction = projection.friction
     for index, coordinate in enumerate(projection.arm.arm.coordinates):
         # settings have the rotor's own inertia, the model that of the joint's side
         gear = projection.arm.settings.joint(coordinate.name).gear
         joint = joints.setdefault(coordinate.name, {})
         joint["rotor_inertia"] = rounded(projection.armature[index] / gear**2)
-        joint["viscous"] = rounded(projection.friction.viscous[index])
-        joint["coulomb"] = [
-            rounded(projection.friction.forward[index]),
-            rounded(projection.friction.backward[index]),
-        ]
+        joint["viscous"] = rounded(friction.viscous[index])
+        joint["coulomb"] = [rounded(friction.forward[index]), rounded(friction.backward[index])]
     text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
     return text
 
@@ -74,6 +73,7 @@ def rounded(value: float) -> float:
 
 def _set_inertial(link: etree._Element, inertia: np.ndarray, rotation: np.ndarray) -> None:
     """Set the inertial of a link in whose frame the body's stands at ``rotation``."""
+    _remove(link, "inertial")
     mass, center, tensor = about_center(inertia)
     center = rotation @ center
     tensor = rotation @ tensor @ rotation.T
