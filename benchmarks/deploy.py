@@ -24,19 +24,18 @@ import torch
 
 from spelgen.building import build
 from spelgen.dynamics.pinocchio_arm import pinocchio_model
-from spelgen.exporting.c_library import CLibrary, compile_object, compiler, link_library, write_c
-from spelgen.exporting.c_source import c_entries
+from spelgen.exporting.c_library import called_by_c, compile_library, compiler
+from spelgen.exporting.c_source import c_functions, write_c
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
 from spelgen.exporting.description import FrictionLaw, TrainedModel
 from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.mjcf_export import check_mjcf
 from spelgen.exporting.mjcf_file import mjcf_text
-from spelgen.exporting.model_expressions import expression_function
+from spelgen.exporting.model_expressions import expression_functions
 from spelgen.exporting.onnx_export import called_by_onnx, onnx_model, onnx_session
 from spelgen.exporting.parity import Called, Parity, check_parity
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
-from spelgen.exporting.tip_frame import tip_frame
-from spelgen.exporting.torch_programs import PROGRAMS
+from spelgen.exporting.torch_export import PROGRAMS
 from spelgen.exporting.trained import Trained
 from spelgen.loaded_arm import load_arm
 
@@ -45,6 +44,7 @@ ARMS = ("two_link", "rpr", "scara", "six_dof", "ur10e", "panda")
 PRESETS = ("closed-form", "hybrid")
 RESIDUALS = "residuals."
 STATES = 10_000
+ENTRIES = {name: entry for name, entry in ENTRY_POINTS.items() if name != "servo_torque"}
 CALLS = 50  # of which the clock sees the sum: it ticks in tens of nanoseconds
 FLAGS = ("-O2",)
 
@@ -62,7 +62,7 @@ def trained(robot: str, preset: str, size: float = 0.05, *, residuals: bool = Tr
 
 def parity() -> None:
     """The largest difference to the torch module at STATES states, relative to the largest value, by export."""
-    names = list(ENTRY_POINTS)
+    names = list(ENTRIES)
     print(f"{'':24s}{'C double':>12s}{'C float':>12s}{'CasADi':>12s}{'ONNX':>12s}{'MuJoCo':>12s}")
     for robot in ARMS:
         for preset in PRESETS:
@@ -77,14 +77,12 @@ def parity() -> None:
             with tempfile.TemporaryDirectory() as folder:
                 kinds = (("", np.float64), (f"-D{model.name.upper()}_FLOAT", np.float32))
                 c = [worst(library(model, Path(folder), flag, kind), dtype=kind) for flag, kind in kinds]
-            casadi = worst(called_by_state(casadi_functions(model)))
+            casadi = worst(called_by_state(casadi_functions(model, ENTRIES)))
             prepared = each.model.prepared()
             files = {name: onnx_model(prepared, name) for name in PROGRAMS}
             onnx = worst(called_by_onnx(files), list(PROGRAMS))
             projection = rigid_body_projection(each.model, each.arm)
-            gains = model.inputs
-            text = mjcf_text(projection, gains, tip_frame(each.arm))
-            mujoco = _largest(check_mjcf(text, projection, gains, states=STATES))
+            mujoco = _largest(check_mjcf(mjcf_text(projection), projection, states=STATES))
             print(
                 f"{robot:12s}{preset:12s}" + "".join(f"{x:12.1e}" for x in (*c, casadi, onnx, mujoco)),
                 flush=True,
@@ -96,13 +94,14 @@ def _largest(found: Parity) -> float:
     return max(found.differences.values())
 
 
-def library(model: TrainedModel, folder: Path, flag: str, kind: type) -> CLibrary:
+def library(model: TrainedModel, folder: Path, flag: str, kind: type) -> Called:
     """The model's C, compiled."""
     program, own_folder = compiler(), folder / kind.__name__
     assert program is not None
     own_folder.mkdir()
-    compiled = compile_object(write_c(model, c_entries(model), own_folder), program, *([flag] * bool(flag)))
-    return CLibrary(link_library(compiled, program), model, kind)
+    functions = c_functions(model, ENTRIES)
+    compiled = compile_library(write_c(model, functions, own_folder), program, *([flag] * bool(flag)))
+    return called_by_c(compiled, functions, kind)
 
 
 TIMED = r"""
@@ -205,7 +204,7 @@ def time_c(model: TrainedModel, *, beside_casadi: bool) -> None:
     """Compile a program that times the model's C, and CasADi's of the same expressions, and show what it prints."""
     name, runs, include, sources = model.name, [], "", [f"{model.name}.c", "timed.c"]
     given = {"q": "q", "qd": "qd", "qdd": "x", "tau": "x", "z": "z", "dq": "qd"}
-    for entry in ENTRY_POINTS.values():
+    for entry in ENTRIES.values():
         arguments = [*(given[each] for each in entry.inputs), *("out", "a", "b")[: len(entry.outputs)]]
         if entry.name.startswith("friction_"):
             arguments[-1] = "z2"
@@ -213,8 +212,9 @@ def time_c(model: TrainedModel, *, beside_casadi: bool) -> None:
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         if beside_casadi:
-            for entry in list(ENTRY_POINTS.values())[:2]:
-                function = expression_function(entry, model)
+            functions = expression_functions(model, ENTRIES)
+            for entry in list(ENTRIES.values())[:2]:
+                function = functions[entry.name]
                 (place / f"{entry.name}_casadi.c").write_text(_generated(function))
                 include += f"int {entry.name}(const double **, double **, long long *, double *, int);\n"
                 arguments = ", ".join(f"arg[{k}] = {given[each]}" for k, each in enumerate(entry.inputs))
@@ -223,7 +223,7 @@ def time_c(model: TrainedModel, *, beside_casadi: bool) -> None:
                     f'{{ const double *arg[20]; double *res[20]; RUN("CasADi\'s C of {entry.name}", {call}); }}'
                 )
                 sources.append(f"{entry.name}_casadi.c")
-        write_c(model, c_entries(model), place)
+        write_c(model, c_functions(model, ENTRIES), place)
         text = TIMED.format(
             name=name, include=include, n=model.n, nz=model.memory, square=max(6 * model.n, model.n**2, 16),
             calls=CALLS, runs="\n".join(runs),

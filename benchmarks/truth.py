@@ -47,7 +47,7 @@ from spelgen.dynamics.regressor import regressor
 from spelgen.errors import SpelgenError
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.objective import torque_delay
-from spelgen.identification.base_parameters import base_parameters
+from spelgen.dynamics.base_parameters import base_parameters
 from spelgen.logs.dynamics_samples import dynamics_samples
 
 FRICTIONS = ("none", "coulomb", "stribeck", "bristles", "load", "asymmetric")

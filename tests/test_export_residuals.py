@@ -9,8 +9,8 @@ from exported_runs import arm_of, moved_model
 
 from spelgen.building import build
 from spelgen.errors import RunError
-from spelgen.exporting.c_library import CLibrary, compile_object, link_library, write_c
-from spelgen.exporting.c_source import c_entries, c_source
+from spelgen.exporting.c_library import called_by_c, compile_library
+from spelgen.exporting.c_source import c_functions, c_source, write_c
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
 from spelgen.exporting.describe import describe
 from spelgen.exporting.entry_points import ENTRY_POINTS
@@ -18,6 +18,7 @@ from spelgen.exporting.parity import check_parity
 from spelgen.exporting.trained import Trained
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
+ENTRIES = {name: entry for name, entry in ENTRY_POINTS.items() if name != "servo_torque"}
 PARTS = {
     "springs": "residuals.raw_torque_splines",
     "ripple": "residuals.raw_torque_ripple",
@@ -51,9 +52,8 @@ def closed_form(model, robot):
 
 def c_library(model, folder):
     """The model's C, compiled."""
-    return CLibrary(
-        link_library(compile_object(write_c(model, c_entries(model), folder), "gcc"), "gcc"), model
-    )
+    functions = c_functions(model, ENTRIES)
+    return called_by_c(compile_library(write_c(model, functions, folder), "gcc"), functions)
 
 
 def test_what_is_zero_is_left_out():
@@ -62,7 +62,7 @@ def test_what_is_zero_is_left_out():
     ours = describe(model, arm_of("rpr"))
     other = describe(closed_form(model, "rpr"), arm_of("rpr"))
     assert not ours.residuals
-    text, plain = (c_source(each, c_entries(each)).split("\n", 1)[1] for each in (ours, other))
+    text, plain = (c_source(each, c_functions(each, ENTRIES)) for each in (ours, other))
     assert text == plain
 
 
@@ -81,10 +81,10 @@ def test_what_is_zero_is_left_out():
 def test_each_part_goes_alone(parts, tmp_path):
     """Unused functions and tables would be refused by the compiler."""
     trained = Trained(with_parts("scara", *parts), arm_of("scara"))
-    model, names = trained.described, list(ENTRY_POINTS)
+    model, names = trained.described, list(ENTRIES)
     check_parity(c_library(model, tmp_path), trained, names, 1e-12, states=20)
     values = [name for name in names if not name.endswith("derivatives")]
-    casadi = called_by_state(casadi_functions(model))
+    casadi = called_by_state(casadi_functions(model, ENTRIES))
     check_parity(casadi, trained, values, 1e-12, states=20)
 
 
@@ -116,7 +116,7 @@ def test_splines_at_their_ends_and_beyond(tmp_path):
     }
     expected = model.inverse_dynamics(q, 0 * q + 0.3, 0 * q + 0.3, torch.zeros(len(q), 2, 6)).numpy()
     still = model.gravity(q).numpy()
-    for called in (c_library(described, tmp_path), called_by_state(casadi_functions(described))):
+    for called in (c_library(described, tmp_path), called_by_state(casadi_functions(described, ENTRIES))):
         np.testing.assert_allclose(called("inverse_dynamics", inputs)["tau"], expected, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(called("gravity", inputs)["gravity"], still, rtol=1e-9, atol=1e-9)
         energy = called("energy", inputs)["energy"][:, 1]

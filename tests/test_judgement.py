@@ -11,7 +11,6 @@ import torch
 from spelgen.building import build
 from spelgen.evaluation import invariants
 from spelgen.evaluation.horizons import end_errors
-from spelgen.exporting.description import Tip
 from spelgen.exporting.mjcf_file import mjcf_text
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
 from spelgen.fitting.levenberg_marquardt import NormalEquations
@@ -337,8 +336,9 @@ def test_friction_of_two_directions_is_their_mean_in_mujoco(robots):
     """1 Nm forward and 3 Nm backward: a file that has one figure for both says 2."""
     arm = load_arm(robots / "two_link.urdf")
     learned = rigid_body_projection(build(arm, "closed-form"), arm)
-    learned = replace(learned, forward=np.array([1.0, 0.5]), backward=np.array([-3.0, -0.5]))
-    text = mjcf_text(learned, np.eye(2), Tip("tip", 1, np.eye(4))).decode()
+    friction = learned.friction._replace(forward=np.array([1.0, 0.5]), backward=np.array([-3.0, -0.5]))
+    learned = replace(learned, friction=friction)
+    text = mjcf_text(learned).decode()
     assert re.findall(r'frictionloss="([^"]*)"', text) == ["2", "0.5"]
 
 

@@ -89,11 +89,11 @@ def test_replay_of_another_motion_beats_the_baselines(fitted, logs):
 
 
 def test_actuators_of_mujoco_are_what_it_has_to_beat(fitted, logs, monkeypatch):
-    mujoco = pytest.importorskip("mujoco")
+    pytest.importorskip("mujoco")
     run = RunFolder(fitted.folder)
     spelgen.keep_baseline(run.path, logs[:1])
-    (found,) = kept_actuators(run).values()
-    simulated = mujoco.MjModel.from_xml_string(found.mjcf)
+    found = kept_actuators(run)
+    simulated = found.model()
     assert simulated.actuator_gainprm[:, 0] == pytest.approx(TRUTH.kp, rel=0.05)
     assert -simulated.actuator_biasprm[:, 2] == pytest.approx(TRUTH.kd, rel=0.05)
     # MuJoCo takes a servo's spring half a step late
@@ -109,7 +109,7 @@ def test_actuators_of_mujoco_are_what_it_has_to_beat(fitted, logs, monkeypatch):
     notes = " ".join(x.message for x in results.diagnostics if x.code == "baseline")
     assert "by mujoco.minimize, the least squares of mujoco.sysid" in notes
     monkeypatch.setitem(sys.modules, "mujoco", None)  # as if it were not installed
-    assert kept_actuators(run) == {}
+    assert kept_actuators(run) is None
     alone = spelgen.evaluate(run.path, logs[4][:40])
     assert "no-position-actuators" in {x.code for x in alone.diagnostics}
 
@@ -125,34 +125,34 @@ def test_actuators_of_mujoco_are_fitted_to_files_when_they_are_needed(
     read = spelgen.read_logs(path, arm, {"input": "position"})  # where no zero is negative
     write_json(run.config, run.read_config() | {"data_digest": digest(read)})
     spelgen.keep_baseline(run.path, [path])
-    assert kept_actuators(run) == {}
+    assert kept_actuators(run) is None
     assert run.read_json(run.baseline)["fitted to"] == 4
     spelgen.keep_baseline(run.path, [path])
     spelgen.write_logs(path, logs[:3], arm)
-    assert kept_actuators(run) == {}
+    assert kept_actuators(run) is None
     assert "fitted to" not in run.read_json(run.baseline)  # other logs than the model was fitted to
     path.unlink()
-    assert kept_actuators(run) == {}
+    assert kept_actuators(run) is None
 
 
 @pytest.mark.parametrize(
-    ("mjcf", "joints", "said"),
+    "record",
     [
-        ("<mujoco><include file='/etc/passwd'/></mujoco>", ["a"], "names other files"),
-        ("<mujoco><worldbody/></mujoco>", [], "another number of joints"),
-        ("<mujoco", ["a"], "XMLSyntaxError"),
-        ("<mujoco><worldbody/></mujoco>", ["a"], "KeyError"),
-        (None, None, "TypeError"),
+        None,
+        {"drives": [[1.0, 1.0]] * 4, "offset": [0.0, 0.0]},
+        {"drives": [[1.0]] * 4, "offset": [0.0], "delay": 0.1},
+        {"drives": [["x", "y"]] * 4, "offset": [0.0, 0.0], "delay": 0.1},
+        {"mjcf": "<mujoco><include file='/etc/passwd'/></mujoco>", "offset": [0.0, 0.0], "delay": 0.1},
     ],
+    ids=["nothing", "no delay", "another arm", "no numbers", "a file"],
 )
-def test_actuators_from_elsewhere_are_what_was_written_or_an_error(mjcf, joints, said, tmp_path):
-    record = {"mjcf": mjcf, "joints": joints, "offset": [0.0], "delay": 0.1}
-    (tmp_path / "least_squares.json").write_text(json.dumps({"position_actuators": record}))
-    with pytest.raises(
-        RunError, match=r"least_squares\.json: got actuators of MuJoCo that cannot be used"
-    ) as told:
-        kept_actuators(RunFolder(tmp_path))
-    assert said in f"{told.value} {type(told.value).__name__}"
+def test_actuators_from_elsewhere_are_what_was_written_or_an_error(record, fitted, tmp_path):
+    pytest.importorskip("mujoco")
+    run = RunFolder(tmp_path / "run")
+    shutil.copytree(fitted.folder, run.path)
+    write_json(run.baseline, {"position_actuators": record})
+    with pytest.raises(RunError, match=r"least_squares\.json: got actuators of MuJoCo that cannot be used"):
+        kept_actuators(run)
 
 
 def test_a_module_of_servos_stands_alone_and_says_so(arm, tmp_path):
@@ -324,7 +324,7 @@ def test_exports_hold_the_servos(fitted, arm, tmp_path, monkeypatch):
     files = spelgen.export(
         fitted, to="c"
     ).files  # checked against the module when exported, where there is a compiler
-    assert b"servo_arm_servo_torque(const servo_arm_real u[SERVO_ARM_N]" in files["servo_arm.h"]
+    assert b"servo_arm_servo_torque(\n    const servo_arm_real u[SERVO_ARM_N]" in files["servo_arm.h"]
 
 
 def dataset(folder, logs, motors):

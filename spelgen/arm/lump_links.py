@@ -9,7 +9,7 @@ import numpy as np
 
 from spelgen.arm.angle_rounding import AngleRounding
 from spelgen.arm.chain import Chain, Follow, follows
-from spelgen.arm.placement import Placement, Pose, TenVector
+from spelgen.arm.placement import Frame, Placement, Pose, TenVector
 from spelgen.arm.rational import bounded, rotation_from_rpy
 from spelgen.errors import Diagnostic
 from spelgen.settings.tuning.structure import GeometryTuning
@@ -31,10 +31,14 @@ class Moved:
 
 @dataclass(frozen=True)
 class LumpedLinks:
-    """Hold all joints: those that move, the chain's first, and those held still, fixed ones included."""
+    """Hold all joints: those that move, the chain's first, and those held still, fixed ones included.
+
+    frames: of all links, by name.
+    """
 
     moved: tuple[Moved, ...]
     held: tuple[Joint, ...]
+    frames: Mapping[str, Frame]
     diagnostics: tuple[Diagnostic, ...]
 
 
@@ -67,7 +71,7 @@ def lump_links(robot: Robot, chain: Chain, angle_tolerance: float) -> LumpedLink
         *_dependent_remarks(placement, moved, held),
     ]
     diagnostics.sort(key=lambda diagnostic: diagnostic.line or 0)
-    return LumpedLinks(tuple(moved), tuple(held), tuple(diagnostics))
+    return LumpedLinks(tuple(moved), tuple(held), placement.frames, tuple(diagnostics))
 
 
 def _chain_first(robot: Robot, chain: Chain) -> list[Joint]:

@@ -40,33 +40,34 @@ class MujocoActuators(Baseline):
 
     def followers(self, fit: Fit | None, notes: list[Diagnostic]) -> dict[str, CommandFollower]:
         """Return the actuators; none, and a note, where the training logs are gone or MuJoCo is not installed."""
-        found = {}
+        actuators = None
         if fit is not None and fit.folder is not None:
-            found = kept_actuators(RunFolder(fit.folder))
-        if not found:
+            actuators = kept_actuators(RunFolder(fit.folder))
+        if actuators is None:
             message = (
                 "no actuators of MuJoCo to compare with: they are fitted where MuJoCo is installed, to the training "
                 "logs as long as these stay where they are"
             )
             notes.append(Diagnostic("info", "no-position-actuators", "logs", None, message))
-        return found
+            return {}
+        return {POSITION_ACTUATORS: actuators}
 
 
-def kept_actuators(run: RunFolder) -> dict[str, CommandFollower]:
-    """Return by name the actuators that were fitted to the run's training logs, or are now. Raises RunError."""
+def kept_actuators(run: RunFolder) -> CommandFollower | None:
+    """Return the actuators that were fitted to the run's training logs, or are now. Raises RunError."""
     if not _has_mujoco() or not run.baseline.exists():
-        return {}
+        return None
     record = run.read_json(run.baseline)
     if FILES in record and KEPT not in record:
         record |= _fitted_to_files(run, record[FILES])
         write_json(run.baseline, record)
     if KEPT not in record:
-        return {}
+        return None
     from spelgen.baselines.position_actuators import PositionActuators
 
     try:
-        return {POSITION_ACTUATORS: PositionActuators.from_dict(record[KEPT])}
-    except (KeyError, TypeError, ValueError, SyntaxError) as error:
+        return PositionActuators.of_arm(run_arm(run), **record[KEPT])
+    except (TypeError, ValueError) as error:
         raise RunError(
             f"actuators of MuJoCo that cannot be used ({in_one_line(error)})",
             file=run.baseline,

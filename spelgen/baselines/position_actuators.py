@@ -10,24 +10,21 @@ needs none of that package's extra.
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
-from lxml import etree
 from mujoco import minimize, rollout
 
+from spelgen.arm.arm import Arm
 from spelgen.building import build
-from spelgen.exporting.describe import servos_of
-from spelgen.exporting.mjcf_file import mjcf_text
-from spelgen.exporting.rigid_body_projection import rigid_body_projection
-from spelgen.exporting.tip_frame import tip_frame
+from spelgen.dynamics.rigid_bodies import about_center, quaternion
 from spelgen.fitting.servo.windows import ServoWindows
 from spelgen.loaded_arm import LoadedArm
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
+from spelgen.settings.tuning.exporting import TUNING as EXPORT_TUNING
 from spelgen.settings.tuning.servo import PositionActuatorTuning
 
 if TYPE_CHECKING:
@@ -35,166 +32,156 @@ if TYPE_CHECKING:
 
 TUNING = PositionActuatorTuning()
 FARTHEST, OFFSET, LATEST = 4.0, 0.3, 0.4  # bounds: of logarithms from their start; rad, m; s
-OTHER_FILES = ("include", "asset", "extension", "plugin")  # what MuJoCo would read beside the text
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PositionActuators:
-    """Predict an arm of n joints in MuJoCo, whose actuators get the command of ``delay`` [s] ago, and ``offset`` (n,).
+    """Predict an arm of n joints in MuJoCo, each of which moves one of the URDF's bodies.
 
-    mjcf: the arm with its actuators. joints: (n,) their names, in the order of q.
+    untrained: a model of these bodies. drives: kp, kv, armature and frictionloss, (4, n). The actuators get the command
+    of ``delay`` [s] ago, and ``offset`` (n,).
     """
 
-    mjcf: str
-    joints: tuple[str, ...]
-    offset: tuple[float, ...]
+    arm: Arm
+    untrained: EmittedModel
+    drives: np.ndarray
+    offset: np.ndarray
     delay: float
     about = (
         "position actuators on the URDF's bodies; kp, kv, armature, frictionloss, offsets and delay fitted to windows "
         "of the training logs by mujoco.minimize, the least squares of mujoco.sysid"
     )
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form."""
-        return asdict(self)
-
     @classmethod
-    def from_dict(cls, record: Mapping[str, Any]) -> PositionActuators:
-        """Read what `to_dict` gave. Raises KeyError, TypeError or ValueError for something else, or other files."""
-        offset, joints = tuple(map(float, record["offset"])), tuple(map(str, record["joints"]))
-        actuators = cls(str(record["mjcf"]), joints, offset, float(record["delay"]))
-        parser = etree.XMLParser(resolve_entities=False, no_network=True)
-        for element in etree.fromstring(actuators.mjcf.encode(), parser).iter(*OTHER_FILES):
-            raise ValueError(f"MJCF that names other files: {element.tag}")
-        if not len(offset) == len(joints) == _Simulation(actuators.mjcf, joints).model.nq:
-            raise ValueError("another number of joints")
-        return actuators
+    def of_arm(cls, arm: LoadedArm, drives: object, offset: object, delay: float) -> PositionActuators:
+        """Return such actuators of an arm. Raises TypeError or ValueError for numbers of other joints."""
+        n = len(arm.arm.coordinates)
+        untrained = build(arm, "closed-form").requires_grad_(False)
+        rows = np.reshape(np.array(drives, dtype=float), (4, n))
+        return cls(arm.arm, untrained, rows, np.reshape(np.array(offset, dtype=float), n), float(delay))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON form: what was fitted."""
+        return {"drives": self.drives.tolist(), "offset": self.offset.tolist(), "delay": self.delay}
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return positions (K, n) after each interval of each part of a log, from q and qd (parts, n)."""
-        simulation, positions = _Simulation(self.mjcf, self.joints), []
+        model = self.model()
+        positions: list[np.ndarray] = []
         for k, (log, rows) in enumerate(parts):
             steps = steps_between(log, TUNING.step)
-            simulation.model.opt.timestep = float(np.diff(log.t[rows]).mean()) / steps
+            model.opt.timestep = float(np.diff(log.t[rows]).mean()) / steps
             commands = delayed_commands(log, rows, self.delay, steps) + self.offset
-            positions += [*simulation.rollout([simulation.model], q[[k]], qd[[k]], commands[None])]
+            positions += [*_rollout(model, q[[k]], qd[[k]], commands[None])]
         return positions
+
+    def model(self) -> mujoco.MjModel:
+        """Return the arm with its actuators as MuJoCo's model; joints and actuators in the order of q."""
+        spec = mujoco.MjSpec()
+        spec.compiler.degree = False
+        spec.option.gravity = np.array(self.arm.gravity, dtype=float)
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        parents = [spec.worldbody]
+        inertias = self.untrained.inertial_parameters.numpy()
+        # MuJoCo has zero where nothing limits
+        limits = np.nan_to_num(self.untrained.servo.limit.numpy(), posinf=0.0)
+        for k, (body, coordinate) in enumerate(zip(self.arm.bodies, self.arm.coordinates, strict=True)):
+            kp, kv, armature, frictionloss = self.drives[:, k]
+            mass, center, tensor = about_center(inertias[k])
+            element = parents[body.parent + 1].add_body(
+                pos=np.array(body.translation, dtype=float),
+                quat=quaternion(body.rotation),
+                explicitinertial=True,
+                mass=mass,
+                ipos=center,
+                # MuJoCo has xx, yy, zz, xy, xz, yz
+                fullinertia=tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]],
+            )
+            parents.append(element)
+            kind = mujoco.mjtJoint.mjJNT_HINGE if body.kind == "revolute" else mujoco.mjtJoint.mjJNT_SLIDE
+            element.add_joint(
+                name=body.name,
+                type=kind,
+                axis=(0, 0, 1),
+                range=coordinate.limits or (0, 0),
+                armature=armature,
+                frictionloss=frictionloss,
+                # how soft frictionloss is goes by the inertia and by these
+                solref_friction=(2 * TUNING.step, 1),
+                solimp_friction=EXPORT_TUNING.friction_impedance,
+            )
+            actuator = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=body.name)
+            actuator.gainprm[0] = kp
+            actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+            actuator.biasprm[1:3] = -kp, -kv
+            actuator.forcerange = -limits[k], limits[k]
+        return spec.compile()
+
+
+def _rollout(model: mujoco.MjModel, q: np.ndarray, qd: np.ndarray, commands: np.ndarray) -> np.ndarray:
+    """Return positions (W, K, n) after each interval, from q and qd (W, n), under commands (W, K, S, n)."""
+    count, _, steps, n = commands.shape
+    state = np.hstack([np.zeros((count, 1)), q, qd])  # MuJoCo's has the time first
+    states, _ = rollout.rollout(model, mujoco.MjData(model), state, commands.reshape(count, -1, n))
+    return np.asarray(states[:, steps - 1 :: steps, 1 : 1 + n])
 
 
 def fit_position_actuators(
     arm: LoadedArm, windows: ServoWindows, trained: EmittedModel
 ) -> PositionActuators | None:
     """Fit to windows, starting with the drives of a ``trained`` model of the arm; None where joints are coupled."""
-    n, servos = len(arm.arm.coordinates), servos_of(trained)
-    bodies, drives = (
-        rigid_body_projection(build(arm, "closed-form"), arm),
-        rigid_body_projection(trained, arm),
-    )
-    if servos is None or len(arm.arm.bodies) > n or (bodies.motors != np.eye(n)).any():
+    n = len(arm.arm.coordinates)
+    if len(arm.arm.bodies) > n or (trained.motors.numpy() != np.eye(n)).any():
         return None
-    names, tip = arm.arm.joint_names, tip_frame(arm)
-
-    def mjcf(kp: np.ndarray, kv: np.ndarray, armature: np.ndarray, dry: np.ndarray) -> str:
-        # kv takes a joint's damping too: they are one number but where the torque is limited
-        moved = replace(bodies, armature=armature, viscous=np.zeros(n), forward=dry, backward=-dry)
-        return mjcf_text(moved, np.eye(n), tip, replace(servos, kp=kp, kd=kv)).decode()
-
-    kv = trained.kd.detach().numpy() + drives.viscous
-    start = np.stack([servos.kp, kv, drives.armature, drives.forward])
+    servo, friction = trained.servo.prepare(), trained.friction.prepare()
+    # kv takes a joint's damping too: they are one number but where the torque is limited
+    rows = servo.kp, servo.kd + friction.viscous, trained.armature, friction.coulomb
+    start = np.stack([row.detach().numpy() for row in rows])
+    is_known = trained.servo.trained.numpy() == 0
+    initial = PositionActuators.of_arm(arm, start, np.zeros(n), float(trained.servo.delay))
     steps = max(steps_between(log, TUNING.step) for log, _ in windows.parts)
-    problem = _Problem(
-        _Simulation(mjcf(*start), names),
-        replace(windows, steps=steps),
-        start,
-        (trained.servo.trained == 0).numpy(),
-    )
-    fitted, offset, delay = problem.solve(servos.delay)
-    return PositionActuators(mjcf(*fitted), names, tuple(offset.tolist()), delay)
+    windows = replace(windows, steps=steps)
+    q, qd = windows.q.numpy(), windows.qd.numpy()
 
-
-class _Simulation:
-    """Roll out a model of MuJoCo, whose joints come in any order."""
-
-    def __init__(self, mjcf: str, joints: Sequence[str]) -> None:
-        self.model = mujoco.MjModel.from_xml_string(mjcf)
-        self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        self.model.dof_solref[:, 0] = 2 * TUNING.step
-        self._data = mujoco.MjData(self.model)
-        self._columns = np.array([int(self.model.joint(name).dofadr[0]) for name in joints])
-
-    def with_drives(self, drives: np.ndarray) -> mujoco.MjModel:
-        """Return the model with kp, kv, armature and frictionloss (4, n)."""
-        model = copy.copy(self.model)
-        kp, kv, armature, dry = drives
-        model.actuator_gainprm[:, 0] = kp
-        model.actuator_biasprm[:, 1:3] = -np.stack([kp, kv], axis=1)
-        model.dof_armature[self._columns] = armature
-        model.dof_frictionloss[self._columns] = dry
-        mujoco.mj_setConst(model, self._data)  # how soft frictionloss is goes by the inertia
-        return model
-
-    def rollout(
-        self, models: Sequence[mujoco.MjModel], q: np.ndarray, qd: np.ndarray, commands: np.ndarray
-    ) -> np.ndarray:
-        """Return positions (W, K, n) after each interval, from q and qd (W, n), under commands (W, K, S, n)."""
-        count, _, steps, n = commands.shape
-        state = np.zeros((count, 1 + 2 * n))  # time, q, qd
-        state[:, 1 + self._columns] = q
-        state[:, 1 + n + self._columns] = qd
-        states, _ = rollout.rollout(models, self._data, state, commands.reshape(count, -1, n))
-        return np.asarray(states[:, steps - 1 :: steps, 1 + self._columns])
-
-
-class _Problem:
-    """Fit logarithms of the drives and offsets of commands, (5, n), and the delay, all in one vector."""
-
-    def __init__(
-        self, simulation: _Simulation, windows: ServoWindows, start: np.ndarray, known: np.ndarray
-    ) -> None:
-        """start: drives (4, n); known: whose kp stays, (n,)."""
-        self._simulation, self._windows = simulation, windows
-        self._start, self._known = start, known
-        simulation.model.opt.timestep = 1 / windows.rate / windows.steps
-
-    def solve(self, delay: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return drives (4, n), offsets (n,) and the delay: least squares of what follows each window's settling."""
-        n = self._start.shape[1]
-        start = np.concatenate([np.log(self._start).ravel(), np.zeros(n)])
-        reach = np.repeat([FARTHEST, OFFSET], [4 * n, n])
-        x, _ = minimize.least_squares(
-            np.append(start, delay), self._residuals,
-            (np.append(start - reach, 0.0), np.append(start + reach, LATEST)), self._jacobian,
-            mu_factor=10.0, max_iter=TUNING.iterations, verbose=minimize.Verbosity.SILENT,
-        )  # fmt: skip
-        return self._split(x.ravel())
-
-    def _split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        drives, offset = np.split(x[:-1].reshape(5, -1), [4])
+    # unknowns: logarithms of the drives and offsets of commands, (5, n), and the delay, all in one vector
+    def actuators(x: np.ndarray) -> PositionActuators:
+        drives, offset = np.split(x[:-1].reshape(5, n), [4])
         drives = np.exp(drives)
-        drives[0, self._known] = self._start[0, self._known]
-        return drives, offset[0], float(x[-1])
+        drives[0, is_known] = start[0, is_known]
+        return replace(initial, drives=drives, offset=offset[0], delay=float(x[-1]))
 
-    def _residuals(self, x: np.ndarray) -> np.ndarray:
-        """Return those of the columns of x."""
-        return np.stack([self._errors(column).ravel() for column in x.T], axis=1)
+    def errors(x: np.ndarray) -> np.ndarray:
+        """Return errors of positions behind each window's settling, (samples n,)."""
+        tried = actuators(x)
+        model = tried.model()
+        model.opt.timestep = 1 / windows.rate / steps
+        commands = windows.commands(tried.delay).numpy() + tried.offset
+        missed = _rollout(model, q[:, 0], qd[:, 0], commands) - q[:, 1:]
+        judged: np.ndarray = missed[:, windows.settling :].ravel()
+        return judged
 
-    def _jacobian(self, x: np.ndarray, residuals: np.ndarray) -> np.ndarray:
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return np.stack([errors(column) for column in x.T], axis=1)
+
+    def jacobian(x: np.ndarray, residuals: np.ndarray) -> np.ndarray:
         """Return finite differences; one unknown of all joints is moved at once: it hardly moves other joints."""
-        n, nudge = self._start.shape[1], TUNING.nudge
-        jacobian = np.zeros((residuals.size, x.size))
-        for columns in [*np.arange(5 * n).reshape(5, n), np.array([5 * n])]:
+        slopes = np.zeros((len(residuals) // n, n, len(x)))
+        for columns in (*np.arange(5 * n).reshape(5, n), 5 * n):
             moved = x.ravel().copy()
-            moved[columns] += nudge
-            slopes = (self._errors(moved) - residuals.reshape(-1, n)) / nudge
-            for joint in range(n):
-                jacobian[joint::n, columns[joint % len(columns)]] = slopes[:, joint]
-        return jacobian
+            moved[columns] += TUNING.nudge
+            change = (errors(moved) - residuals.ravel()) / TUNING.nudge
+            slopes[:, np.arange(n), columns] = change.reshape(-1, n)
+        return slopes.reshape(len(residuals), -1)
 
-    def _errors(self, x: np.ndarray) -> np.ndarray:
-        """Return those of positions, (samples, n)."""
-        windows, (drives, offset, delay) = self._windows, self._split(x)
-        q, commands = windows.q.numpy(), windows.commands(delay).numpy() + offset
-        models = [self._simulation.with_drives(drives)] * len(q)
-        predicted = self._simulation.rollout(models, q[:, 0], windows.qd[:, 0].numpy(), commands)
-        errors: np.ndarray = (predicted - q[:, 1:])[:, windows.settling :]
-        return errors.reshape(-1, q.shape[2])
+    first = np.append(np.log(start), np.zeros(n))
+    reach = np.repeat([FARTHEST, OFFSET], [4 * n, n])
+    x, _ = minimize.least_squares(
+        np.append(first, initial.delay),
+        residuals,
+        (np.append(first - reach, 0.0), np.append(first + reach, LATEST)),
+        jacobian,
+        mu_factor=10.0,
+        max_iter=TUNING.iterations,
+        verbose=minimize.Verbosity.SILENT,
+    )
+    return actuators(x.ravel())

@@ -10,12 +10,13 @@ of the dynamics.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.equations import Pose, PoseAt, poses
+from spelgen.dynamics.equations import Pose, poses
 from spelgen.dynamics.protocol import has_friction_state, has_momentum, memory_after, sliding_memory
 from spelgen.logs.windows import Windows
 from spelgen.settings.tuning.evaluation import EvaluationTuning
@@ -24,14 +25,8 @@ TUNING = EvaluationTuning()
 GAMMA = 1 - 0.5**0.5  # makes the method L-stable
 
 
-class _States(NamedTuple):
-    """Windows that are still rolled out: which these are, and where they are."""
-
-    rows: Tensor  # (W',)
-    q: Tensor  # (W', n)
-    qd: Tensor
-    z: Tensor  # (W', n, K)
-    disturbance: Tensor  # (W', n)
+State = tuple[Tensor, Tensor, Tensor]
+"""q and qd, (W, n), and friction's memory z, (W, n, K)."""
 
 
 def roll_out_stiff(
@@ -39,50 +34,51 @@ def roll_out_stiff(
 ) -> tuple[Tensor, Tensor]:
     """Return positions and velocities (W, K-1, n) predicted for samples 1..K-1 of each window from its sample 0.
 
-    disturbance: (W, n), as `observe` finds it. A window whose velocity has left all bounds stops,
-    and is NaN from there.
+    disturbance: (W, n), as `observe` finds it. A window whose velocity has left all bounds is NaN from there.
     """
     q, qd = windows.q[:, 0], windows.qd[:, 0]
     z = sliding_memory(dynamics, qd) if windows.z is None else windows.z
     largest = windows.qd.abs().amax(dim=(0, 1))
     largest = torch.maximum(largest, 1e-3 * largest.max()).clamp(min=1e-2)
-    equations = _Equations(dynamics, TUNING.velocity_step * largest)
-    states = _States(
-        torch.arange(len(q)), q, qd, z, torch.zeros_like(q) if disturbance is None else disturbance
-    )
+    if disturbance is None:
+        disturbance = torch.zeros_like(q)
+    advance = _stepper(dynamics, TUNING.velocity_step * largest, disturbance)
     positions = torch.full_like(windows.q[:, 1:], torch.nan)
     velocities = positions.clone()
     for k in range(windows.dt.shape[1]):
-        step = windows.dt[states.rows, k].unsqueeze(-1) / substeps  # (W', 1)
-        tau = windows.tau[states.rows, k]
+        step = windows.dt[:, k].unsqueeze(-1) / substeps  # (W, 1)
         for _ in range(substeps):
-            states = equations.step(states, tau, step)
-        inside = (states.qd.abs() <= TUNING.bounds * largest).all(dim=-1) & states.q.isfinite().all(dim=-1)
-        if not inside.all():
-            states = _States(*(x[inside] for x in states))
-        if not len(states.rows):
+            q, qd, z = advance((q, qd, z), windows.tau[:, k], step)
+        inside = ((qd.abs() <= TUNING.bounds * largest) & q.isfinite()).all(dim=-1, keepdim=True)
+        if not inside.any():
             break
-        positions[states.rows, k] = states.q
-        velocities[states.rows, k] = states.qd
+        # NaN once is NaN from there on
+        q, qd = torch.where(inside, q, torch.nan), torch.where(inside, qd, torch.nan)
+        positions[:, k], velocities[:, k] = q, qd
     return positions, velocities
 
 
-class _Equations:
-    """M qdd = force of some dynamics, and a step of them. width: (n,) of the differences by velocity."""
+def _stepper(dynamics: Any, width: Tensor, disturbance: Tensor) -> Callable[[State, Tensor, Tensor], State]:
+    """Return what takes a step of M qdd = force of some dynamics from a state, under tau.
 
-    def __init__(self, dynamics: Any, width: Tensor) -> None:
-        self.dynamics, self.width = dynamics, width
-        self.pose_at: PoseAt = poses(dynamics)
-        self.has_momentum = has_momentum(dynamics)
+    width: (n,) of the differences by velocity. disturbance: a force where momenta were observed, else an acceleration.
+    """
+    pose_at = poses(dynamics)
+    is_force = has_momentum(dynamics)
 
-    def step(self, states: _States, tau: Tensor, step: Tensor) -> _States:
+    def forces(pose: Pose, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
+        """Return M qdd, (W, n)."""
+        added = disturbance if is_force else (pose.mass @ disturbance.unsqueeze(-1)).squeeze(-1)
+        return pose.force(qd, tau, z) + added
+
+    def step(state: State, tau: Tensor, step: Tensor) -> State:
         """Take one step of (q, qd), with A = [[0, 1], [-M^-1 K, -M^-1 D]].
 
         D = d friction / d qd and, where friction has a state, K = d friction / d q by the way z follows.
         """
-        _, q, qd, z, disturbance = states
-        pose = self.pose_at(q)
-        damping, stiffness = self._friction_slopes(pose, qd, z)
+        q, qd, z = state
+        pose = pose_at(q)
+        damping, stiffness = _friction_slopes(dynamics, pose, qd, z, width)
         h = GAMMA * step
         factors, pivots, _ = torch.linalg.lu_factor_ex(
             pose.mass + torch.diag_embed(h * damping + h * h * stiffness)
@@ -94,32 +90,31 @@ class _Equations:
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
             return velocity + h * solution, solution
 
-        v1, a1 = solve(qd, self._force(pose, qd, tau, z, disturbance))
+        v1, a1 = solve(qd, forces(pose, qd, tau, z))
         q2, qd2 = q + step * v1, qd + step * a1
-        second = self.pose_at(q2)
-        force = self._force(second, qd2, tau, memory_after(self.dynamics, z, q2 - q), disturbance)
+        second = pose_at(q2)
+        force = forces(second, qd2, tau, memory_after(dynamics, z, q2 - q))
         # one singular matrix must not stop the other windows
         a2 = torch.linalg.solve_ex(second.mass, force)[0] - 2 * a1
         v2, a2 = solve(qd2 - 2 * v1, (pose.mass @ a2.unsqueeze(-1)).squeeze(-1))
         end = q + step * (1.5 * v1 + 0.5 * v2)
         speed = qd + step * (1.5 * a1 + 0.5 * a2)
-        return _States(states.rows, end, speed, memory_after(self.dynamics, z, end - q), disturbance)
+        return end, speed, memory_after(dynamics, z, end - q)
 
-    def _force(self, pose: Pose, qd: Tensor, tau: Tensor, z: Tensor, disturbance: Tensor) -> Tensor:
-        """Return M qdd, (W, n). A disturbance is a force where momenta were observed, else an acceleration."""
-        if not self.has_momentum:
-            disturbance = (pose.mass @ disturbance.unsqueeze(-1)).squeeze(-1)
-        return pose.force(qd, tau, z) + disturbance
+    return step
 
-    def _friction_slopes(self, pose: Pose, qd: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return D and K, (W, n): a joint's friction goes by its own motion."""
-        # central differences: dry friction jumps at standstill
-        slope = (pose.friction(qd + self.width, z) - pose.friction(qd - self.width, z)) / (2 * self.width)
-        # friction that falls with velocity is left to the explicit part: its damping would be negative
-        damping = slope.clamp(min=0)
-        if not has_friction_state(self.dynamics):
-            return damping, torch.zeros_like(damping)
-        # bristles load the way a joint goes
-        displacement = TUNING.displacement_step * torch.where(qd < 0, -1.0, 1.0).to(qd)
-        bent = pose.friction(qd, memory_after(self.dynamics, z, displacement))
-        return damping, ((bent - pose.friction(qd, z)) / displacement).clamp(min=0)
+
+def _friction_slopes(
+    dynamics: Any, pose: Pose, qd: Tensor, z: Tensor, width: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return D and K, (W, n): a joint's friction goes by its own motion."""
+    # central differences: dry friction jumps at standstill
+    slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
+    # friction that falls with velocity is left to the explicit part: its damping would be negative
+    damping = slope.clamp(min=0)
+    if not has_friction_state(dynamics):
+        return damping, torch.zeros_like(damping)
+    # bristles load the way a joint goes
+    displacement = TUNING.displacement_step * torch.where(qd < 0, -1.0, 1.0).to(qd)
+    bent = pose.friction(qd, memory_after(dynamics, z, displacement))
+    return damping, ((bent - pose.friction(qd, z)) / displacement).clamp(min=0)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from spelgen.exporting.c_library import CLibrary, compile_object, compiler, link_library, measured, write_c
-from spelgen.exporting.c_source import c_entries, c_header
-from spelgen.exporting.entry_points import entry_points
+from spelgen.exporting.c_library import called_by_c, compile_library, compiler
+from spelgen.exporting.c_source import c_functions, write_c
 from spelgen.exporting.exported import Exported, folder_export
 from spelgen.exporting.parity import check_parity
 from spelgen.exporting.trained import Trained
@@ -28,21 +27,14 @@ def export_c(trained: Trained) -> Exported:
 
 def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
     """Return header and source by name, and a sentence on how they were checked."""
-    model, program = trained.described, compiler()
-    entries = c_entries(model)
-    sizes, checked = (
-        "Sizes were not measured: no C compiler was found",
-        "Not checked: no C compiler was there.",
-    )
+    functions = c_functions(trained.described, trained.entry_points)
+    checked = "Not checked: no C compiler was there."
+    program = compiler()
     with tempfile.TemporaryDirectory() as folder:
-        source = write_c(model, entries, Path(folder))
-        content = source.read_bytes()
+        source = write_c(trained.described, functions, Path(folder))
+        files = {path.name: path.read_bytes() for path in (source.with_suffix(".h"), source)}
         if program is not None:
-            compiled = compile_object(source, program)
-            sizes = measured(compiled, program, model)
-            library = CLibrary(link_library(compiled, program), model)
-            parity = check_parity(library, trained, list(entry_points(model)), TUNING.tolerance)
+            library = called_by_c(compile_library(source, program), functions)
+            parity = check_parity(library, trained, list(trained.entry_points), TUNING.tolerance)
             checked = f"Checked when exported, compiled by {Path(program).name}: {parity.summary}."
-    # again, for the sizes are known after it was compiled
-    header = c_header(model, entries, sizes)
-    return {f"{model.name}.h": header.encode(), f"{model.name}.c": content}, checked
+    return files, checked

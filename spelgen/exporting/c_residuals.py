@@ -56,38 +56,28 @@ def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str]
 
 def network_source(model: TrainedModel) -> list[str]:
     """Return the C text of all networks, nothing where there are none."""
-    n = model.n
-    residuals = model.residuals
+    n, residuals = model.n, model.residuals
     named = {"mass": residuals.mass, "potential": residuals.potential}
     networks = {name: network for name, network in named.items() if network is not None}
     if not networks:
         return []
     tables: list[str] = []
-    layers: dict[str, list[str]] = {}
-    # buffers are of one size, that of the widest layer
-    width = encoded = next(iter(networks.values())).weights[0].shape[1]
+    shapes: dict[str, list[tuple[int, ...]]] = {}
     for name, network in networks.items():
-        layers[name] = []
+        shapes[name] = [weight.shape for weight in network.weights]
         for k, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True), start=1):
-            layer = f"{name}_{k}"
-            tables += _layer_tables(layer, weight, bias)
-            outputs, inputs = weight.shape
-            fields = f"{layer}_bias, {layer}_weight, {layer}_first, {layer}_last"
-            layers[name].append(f"{inputs}, {outputs}, {fields}")
-            width = max(width, outputs)
+            tables += _layer_tables(f"{name}_{k}", weight, bias)
     text = render(
         "networks.c.jinja",
         n=n,
-        hidden=max(map(len, layers.values())) - 1,
-        width=width,
-        encoded=encoded,
+        hidden=max(map(len, shapes.values())) - 1,
+        # buffers are of one size, that of the widest layer
+        width=max(max(shape) for layers in shapes.values() for shape in layers),
+        encoded=3 * n,
         lanes=1 + n + n * (n + 1) // 2,
-        slides=encoded > 2 * n,
         tables=tables,
-        networks=layers,
-        entries=len(residuals.entries),
-        places=", ".join(f"{{{row}, {column}}}" for row, column in residuals.entries),
-        potential=residuals.potential is not None,
+        networks=shapes,
+        entries=residuals.entries,
     )
     return [text.rstrip()]
 
@@ -99,9 +89,9 @@ def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
     packed: list[np.ndarray] = []
     for column in weight.T:
         # masked networks: an input reaches a block of the outputs
-        reached = np.flatnonzero(column).tolist() or [0, -1]
-        first.append(reached[0])
-        last.append(reached[-1] + 1)
+        nonzero = np.flatnonzero(column).tolist() or [0, -1]
+        first.append(nonzero[0])
+        last.append(nonzero[-1] + 1)
         packed.append(column[first[-1] : last[-1]])
     return [
         _table(f"{name}_bias", bias),
@@ -114,8 +104,7 @@ def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
 def joint_function_source(model: TrainedModel) -> list[str]:
     """Return the C text of all functions of single joints, nothing where there are none."""
     residuals = model.residuals
-    torque = residuals.torque
-    factor = residuals.friction
+    torque, factor = residuals.torque, residuals.friction
     if not (residuals.has_torque or factor):
         return []
     tables: list[str] = []
@@ -129,10 +118,8 @@ def joint_function_source(model: TrainedModel) -> list[str]:
         # up to where each interval begins
         energies = [spline_energy(spline)(spline.t[3:-4]) for spline in torque.values()]
         tables.append(_table("torque_energy", np.concatenate(energies)))
-    ripples: list[str] = []
     for k, ripple in enumerate(residuals.ripple, start=1):
         tables.append(_table(f"ripple_{k}", np.stack([ripple.cosines, ripple.sines], axis=1)))
-        ripples.append(f"{ripple.joint}, {len(ripple.cosines)}, {ripple.frequency!r}, ripple_{k}")
     text = render(
         "joint_functions.c.jinja",
         n=model.n,
@@ -140,7 +127,7 @@ def joint_function_source(model: TrainedModel) -> list[str]:
         tables=tables,
         torque=_spline_fields(torque),
         factor=_spline_fields(factor),
-        ripple=ripples,
+        ripple=residuals.ripple,
     )
     return [text.rstrip()]
 
@@ -164,16 +151,12 @@ def _spline_fields(splines: Mapping[int, BSpline]) -> list[str]:
 
 def _table(name: str, values: np.ndarray) -> str:
     """Return a constant array of C, numbers with all their digits."""
-    kind = "real"
-    if values.dtype.kind == "i":
-        kind = "short"
-    if values.ndim == 1:
-        size = "[]"
-        numbers = ", ".join(map(repr, values.tolist()))
-        lines = wrap(numbers, _WIDTH, initial_indent="    ", subsequent_indent="    ")
-    else:
-        size = f"[][{values.shape[1]}]"
-        lines = []
-        for row in values.tolist():
-            lines.append(f"    {{{', '.join(map(repr, row))}}},")
-    return "\n".join([f"static const {kind} {name}{size} = {{", *lines, "};"])
+    kind = "short" if values.dtype.kind == "i" else "real"
+    size = ""
+    numbers = ", ".join(map(repr, values.tolist()))
+    if values.ndim == 2:
+        size = f"[{values.shape[1]}]"
+        # rows in braces of their own
+        numbers = numbers.replace("[", "{").replace("]", "}")
+    lines = wrap(numbers, _WIDTH, initial_indent="    ", subsequent_indent="    ")
+    return "\n".join([f"static const {kind} {name}[]{size} = {{", *lines, "};"])

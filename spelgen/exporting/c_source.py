@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from textwrap import wrap
 
 import casadi as ca
@@ -12,37 +12,46 @@ import casadi as ca
 from spelgen.exporting.c_residuals import joint_function_source, network_source, residual_calls
 from spelgen.exporting.c_statements import statements
 from spelgen.exporting.description import TrainedModel
-from spelgen.exporting.entry_points import EntryPoint, entry_points
-from spelgen.exporting.model_expressions import expression_function, residuals_needed
+from spelgen.exporting.entry_points import EntryPoint
+from spelgen.exporting.model_expressions import expression_functions, residuals_needed
 from spelgen.templates import render
 
 _WIDTH = 118  # characters of a line
+MEMORIES = ("z", "z_next", "z_start")
+"""Inputs and outputs that are friction's memory: double in any case, where all others are of the type ``real``."""
 
 
 @dataclass(frozen=True)
-class CEntry:
-    """An entry point in C."""
+class CFunction:
+    """An entry point in C. shapes: of its outputs, (rows,) or (rows, columns)."""
 
-    name: str
+    entry: EntryPoint
+    symbol: str
+    shapes: dict[str, tuple[int, ...]]
     about: str
     signature: str
     definition: str
     operations: int
 
 
-def c_entries(model: TrainedModel) -> tuple[CEntry, ...]:
-    """Return every entry point of the model in C."""
-    return tuple(_entry(model, entry) for entry in entry_points(model).values())
+def c_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> list[CFunction]:
+    """Return these entry points of the model in C."""
+    expressions = expression_functions(model, entries)
+    return [_c_function(model, entry, expressions[name]) for name, entry in entries.items()]
 
 
-def c_header(model: TrainedModel, entries: Sequence[CEntry], sizes: str) -> str:
-    """Return the header; ``sizes`` is a sentence on the sizes of code and stack."""
+def write_c(model: TrainedModel, functions: Sequence[CFunction], folder: Path) -> Path:
+    """Write header and source into a folder and return the source's path."""
+    source = folder / f"{model.name}.c"
+    source.write_text(c_source(model, functions))
+    source.with_suffix(".h").write_text(_c_header(model, functions))
+    return source
+
+
+def _c_header(model: TrainedModel, functions: Sequence[CFunction]) -> str:
     # a bound for control loops: no branch depends on data
-    longest = max(entries, key=lambda entry: entry.operations)
-    facts = wrap(
-        f"{sizes}; at most {longest.operations} operations, in {longest.name}, beside those of networks.",
-        _WIDTH - 4,
-    )
+    longest = max(functions, key=lambda function: function.operations)
+    facts = [f"At most {longest.operations} operations, in {longest.entry.name}, beside those of networks."]
     if model.servos is not None:
         facts += wrap(
             f"Joints are under position servos: tau of {model.name}_servo_torque goes into forward_dynamics, with the "
@@ -54,7 +63,6 @@ def c_header(model: TrainedModel, entries: Sequence[CEntry], sizes: str) -> str:
         memory = f": joint by joint, {model.reach.shape[1]} each"
     return render(
         "model.h.jinja",
-        title=_title(model),
         facts=facts,
         joints=", ".join(model.identifiers),
         name=model.name,
@@ -62,70 +70,58 @@ def c_header(model: TrainedModel, entries: Sequence[CEntry], sizes: str) -> str:
         n=model.n,
         memory=model.memory,
         memory_note=memory,
-        entries=entries,
+        functions=functions,
     )
 
 
-def c_source(model: TrainedModel, entries: Sequence[CEntry]) -> str:
+def c_source(model: TrainedModel, functions: Sequence[CFunction]) -> str:
     """Return the source."""
     return render(
         "model.c.jinja",
-        title=_title(model),
+        n=model.n,
         name=model.name,
         upper=model.name.upper(),
         residuals=network_source(model) + joint_function_source(model),
-        entries=entries,
+        functions=functions,
     )
 
 
-def _title(model: TrainedModel) -> str:
-    return f"{model.name}: the dynamics of an arm of {model.n} joints, by spelgen ({model.preset})"
-
-
-def _entry(model: TrainedModel, entry: EntryPoint) -> CEntry:
-    function = expression_function(entry, model)
-    signature = _signature(model, entry, function)
+def _c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -> CFunction:
     # residuals first, for the statements read them
     residuals, calls = residual_calls(model, residuals_needed(function))
-    variables, lines = statements(function, entry.output_names)
-    text = " ".join((*calls, *lines))
+    variables, lines = statements(function, list(entry.outputs))
     # the compiler would refuse a parameter that is not used
-    unused = [name for name in (*entry.inputs, *entry.output_names) if not re.search(rf"\b{name}\b", text)]
-    body = [f"(void){name};" for name in unused] + calls + lines
+    body = [" ".join(f"(void){name};" for name in (*entry.inputs, *entry.outputs))]
     if residuals or variables:
         # in single precision a small displacement would be lost beside what z is already
         kind = "double" if entry.name == "friction_step" else "real"
-        body.insert(0, f"{kind} {', '.join((*residuals, *variables))};")
-    # (rows) of a vector, (rows, columns) of a matrix
-    shapes = []
-    for k, (name, unit) in enumerate(entry.outputs):
+        body.append(f"{kind} {', '.join((*residuals, *variables))};")
+    body += calls + lines
+    real, size = f"{model.name}_real", f"{model.name.upper()}_N"
+    parameters: list[str] = []
+    for name in entry.inputs:
+        # NULL where friction has no memory: no array of C is empty
+        parameters.append("const double *z" if name == "z" else f"const {real} {name}[{size}]")
+    shapes: dict[str, tuple[int, ...]] = {}
+    results: list[str] = []
+    for k, (name, unit) in enumerate(entry.outputs.items()):
         rows, columns = function.size_out(k)
-        shape = f"({rows}, {columns})" if columns > 1 else f"({rows})"
-        shapes.append(f"{name} {shape} [{unit}]")
-    about = f"{entry.about[0].upper()}{entry.about[1:]}: {', '.join(shapes)}."
+        shapes[name] = (rows, columns) if columns > 1 else (rows,)
+        parameters.append(f"double *{name}" if name in MEMORIES else f"{real} {name}[{rows * columns}]")
+        results.append(f"{name} ({', '.join(map(str, shapes[name]))}) [{unit}]")
+    about = f"{entry.about[0].upper()}{entry.about[1:]}: {', '.join(results)}."
+    symbol = f"{model.name}_{entry.name}"
+    listed = ",\n    ".join(parameters)
+    signature = f"void {symbol}(\n    {listed})"
     written: list[str] = []
     for line in body:
         written += wrap(line, _WIDTH, initial_indent="    ", subsequent_indent="        ")
-    return CEntry(
-        name=entry.name,
+    return CFunction(
+        entry=entry,
+        symbol=symbol,
+        shapes=shapes,
         about="\n * ".join(wrap(about, _WIDTH - 6)),
         signature=signature,
         definition="\n".join([signature, "{", *written, "}"]),
         operations=len(lines) - function.nnz_out(),
     )
-
-
-def _signature(model: TrainedModel, entry: EntryPoint, function: ca.Function) -> str:
-    real, rows = f"{model.name}_real", f"{model.name.upper()}_N"
-    parameters: list[str] = []
-    for name in entry.inputs:
-        # NULL where friction has no memory: no array of C is empty
-        parameters.append("const double *z" if name == "z" else f"const {real} {name}[{rows}]")
-    for k, name in enumerate(entry.output_names):
-        size = function.numel_out(k)
-        parameters.append(f"double *{name}" if name.startswith("z_") else f"{real} {name}[{size}]")
-    text = f"void {model.name}_{entry.name}({', '.join(parameters)})"
-    # lines end after a parameter: other spaces do not break
-    text = text.replace(" ", "\xa0").replace(",\xa0", ", ")
-    lines = wrap(text, _WIDTH, subsequent_indent="    ", break_long_words=False)
-    return "\n".join(lines).replace("\xa0", " ")

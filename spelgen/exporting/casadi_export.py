@@ -10,9 +10,9 @@ import casadi as ca
 import numpy as np
 
 from spelgen.exporting.description import TrainedModel
-from spelgen.exporting.entry_points import ENTRY_POINTS, EntryPoint, entry_points
+from spelgen.exporting.entry_points import ENTRY_POINTS, EntryPoint
 from spelgen.exporting.exported import Exported, folder_export
-from spelgen.exporting.model_expressions import expression_function, residuals_needed
+from spelgen.exporting.model_expressions import expression_functions, residuals_needed
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.residual_expressions import residual_values
 from spelgen.exporting.trained import Trained
@@ -22,7 +22,7 @@ from spelgen.settings.tuning.exporting import TUNING
 def export_casadi(trained: Trained) -> Exported:
     """Return a file for each entry point. Raises RunError where they differ from the model."""
     model = trained.described
-    functions = casadi_functions(model)
+    functions = casadi_functions(model, trained.entry_points)
     parity = check_parity(called_by_state(functions), trained, list(functions), TUNING.tolerance)
     checked = f"Checked when exported, by CasADi {ca.CasadiMeta.version()}: {parity.summary}."
     use = (
@@ -34,44 +34,40 @@ def export_casadi(trained: Trained) -> Exported:
     return folder_export(trained, "casadi", "in CasADi", files, use=use, about=about, checked=checked)
 
 
-def casadi_functions(model: TrainedModel) -> dict[str, ca.Function]:
-    """Return every entry point: rigid bodies and friction by scalars, residuals by matrices."""
+def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
+    """Return functions by name: rigid bodies and friction by scalars, residuals by matrices."""
+    if not model.residuals:
+        return expression_functions(model, entries)
+    bases = {name: ENTRY_POINTS[name.removesuffix("_derivatives")] for name in entries}
+    expressions = expression_functions(model, {base.name: base for base in bases.values()})
     functions: dict[str, ca.Function] = {}
-    for name, entry in entry_points(model).items():
-        if name.endswith("_derivatives") and model.residuals:
-            function = _with_residuals(ENTRY_POINTS[name.removesuffix("_derivatives")], model)
-            functions[name] = _derivatives(entry, function)
-        else:
-            functions[name] = _with_residuals(entry, model)
+    for name, entry in entries.items():
+        base = bases[name]
+        function = _with_residuals(base, model, expressions[base.name])
+        functions[name] = function if base is entry else _derivatives(entry, function)
     return functions
 
 
-def _with_residuals(entry: EntryPoint, model: TrainedModel) -> ca.Function:
-    function = expression_function(entry, model)
+def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Function) -> ca.Function:
     needed = residuals_needed(function)
     if not needed:
         return function
-    states = {name: ca.MX.sym(name, function.size1_in(name)) for name in entry.inputs}
-    arguments = list(states.values())
+    arguments = function.mx_in()[: len(entry.inputs)]
+    states = dict(zip(entry.inputs, arguments, strict=True))
     residuals = residual_values(model, states["q"], states.get("qd"))
-    for name in needed:
-        arguments.append(residuals[name])
-    outputs = function.call(arguments)
-    names = list(entry.inputs), list(entry.output_names)
-    return ca.Function(entry.name, list(states.values()), outputs, *names)
+    outputs = function.call(arguments + [residuals[name] for name in needed])
+    return ca.Function(entry.name, arguments, outputs, list(entry.inputs), list(entry.outputs))
 
 
 def _derivatives(entry: EntryPoint, function: ca.Function) -> ca.Function:
-    inputs = dict(zip(entry.inputs, function.mx_in(), strict=True))
-    arguments = list(inputs.values())
+    arguments = function.mx_in()
     (output,) = function.call(arguments)
     derivatives: list[ca.MX] = []
-    for name in ("q", "qd", "tau"):
-        if name in inputs:
-            # who calls it reads n x n numbers, whatever is zero
-            derivatives.append(ca.densify(ca.jacobian(output, inputs[name])))
-    names = list(entry.inputs), list(entry.output_names)
-    return ca.Function(entry.name, arguments, derivatives, *names)
+    # by as many of the inputs as there are outputs
+    for argument, _ in zip(arguments, entry.outputs, strict=False):
+        # who calls it reads n x n numbers, whatever is zero
+        derivatives.append(ca.densify(ca.jacobian(output, argument)))
+    return ca.Function(entry.name, arguments, derivatives, list(entry.inputs), list(entry.outputs))
 
 
 def _saved(function: ca.Function) -> bytes:
@@ -91,11 +87,10 @@ def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
         # one by one: a map over states would compile another function
         results = [function.call(list(map(ca.DM, state))) for state in states]
         outputs: Values = {}
-        for k, key in enumerate(function.name_out()):
-            values = np.array([result[k].full() for result in results])
-            if values.shape[-1] == 1:  # CasADi's vectors are columns
-                values = values[..., 0]
-            outputs[key] = values
+        for key, values in zip(function.name_out(), zip(*results, strict=True), strict=True):
+            array = np.array([value.full() for value in values])
+            # CasADi's vectors are columns
+            outputs[key] = array[..., 0] if array.shape[-1] == 1 else array
         return outputs
 
     return called

@@ -13,21 +13,12 @@ from scipy.interpolate import BSpline
 from torch import Tensor
 
 from spelgen.arm.arm import make_arm
-from spelgen.dynamics.protocol import (
-    ResidualModel,
-    has_residuals,
-    has_rigid_bodies,
-    input_of,
-)
+from spelgen.arm.chain import choose_chain
+from spelgen.arm.lump_links import lump_links
+from spelgen.dynamics.protocol import ResidualModel, has_residuals, has_rigid_bodies, input_of
+from spelgen.dynamics.tip import last_link
 from spelgen.errors import RunError
-from spelgen.exporting.description import (
-    Harmonics,
-    Network,
-    Residuals,
-    Servos,
-    TrainedModel,
-)
-from spelgen.exporting.tip_frame import tip_frame
+from spelgen.exporting.description import Harmonics, Network, Residuals, Servos, Tip, TrainedModel
 from spelgen.loaded_arm import LoadedArm
 
 if TYPE_CHECKING:
@@ -41,11 +32,10 @@ _LONGEST_NAME = 40
 def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
     """Return the numbers of a trained model of this arm. Raises RunError for a preset without rigid bodies."""
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
-    preset = model.facts.options.preset
     if not has_rigid_bodies(exact):
+        preset = model.facts.options.preset
         raise _unsupported(f"the preset {preset}, which is not of rigid bodies")
     weights = exact.prepare()
-    unrounded = make_arm(loaded.robot, joints=loaded.arm.joint_names, angle_tolerance=0.0)
     # what does not depend on q is one matrix, whatever it comes from
     constant_mass = array(weights.armature)
     residuals = Residuals((), None, None, {}, (), {})
@@ -55,8 +45,6 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
     return TrainedModel(
         name=identifier(loaded.arm.name),
         arm=loaded.arm,
-        unrounded=unrounded.bodies,
-        preset=preset,
         identifiers=tuple(model.joint_names),
         inertias=array(exact.inertial_parameters),
         constant_mass=constant_mass,
@@ -92,8 +80,19 @@ def servos_of(model: EmittedModel) -> Servos | None:
     """Return the position servos of a model, None where it has none."""
     if input_of(model) == "torque":
         return None
-    kp, kd, limit, dead_zone = map(array, model.servo.prepare())
-    return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
+    return Servos(*map(array, model.servo.prepare()), delay=float(model.servo.delay))
+
+
+def tip_frame(loaded: LoadedArm) -> Tip:
+    """Return the frame of the tip's link behind the body that carries it, by the angles that the URDF has."""
+    names = loaded.arm.joint_names
+    link = loaded.tip or last_link(loaded.robot, names)
+    frame = lump_links(loaded.robot, choose_chain(loaded.robot, names, None), 0.0).frames[link]
+    pose = np.eye(4)
+    pose[:3, :3] = frame.rotation
+    pose[:3, 3] = frame.position
+    bodies = make_arm(loaded.robot, joints=names, angle_tolerance=0.0).bodies
+    return Tip(link, frame.body, pose, bodies)
 
 
 def _unsupported(subject: str) -> RunError:
@@ -107,19 +106,15 @@ def _unsupported(subject: str) -> RunError:
 def _residuals(model: ResidualModel) -> Residuals:
     """Return the residuals without those that are zero. Raises RunError for Kolmogorov-Arnold networks."""
     terms, weights = model.residuals, model.prepare().residual
-    mass = _network(terms.mass, weights.mass, terms.encoding, array(weights.functions))
-    potential = _network(terms.potential, weights.potential, terms.encoding)
-    entries: np.ndarray = np.zeros((0, 2), dtype=int)
-    if mass is not None:
-        reached = mass.weights[-1].any(axis=1).reshape(model.n, model.n)
-        entries = np.argwhere(np.tril(reached))
-        mass = _with_outputs(mass, entries @ (model.n, 1))
-    if potential is not None:
-        potential = _with_outputs(potential, np.zeros(1, dtype=int))
+    functions = array(weights.functions)
+    entries = np.argwhere(np.tril(functions.any(axis=0).reshape(model.n, model.n)))
+    mass = _network(terms.mass, weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
+    if mass is None:
+        entries = entries[:0]
     return Residuals(
         entries=tuple(map(tuple, entries.tolist())),
         mass=mass,
-        potential=potential,
+        potential=_network(terms.potential, weights.potential, terms.encoding),
         torque=_splines(terms, terms.unit * terms.raw_torque_splines),
         ripple=_ripple(terms, weights.ripple),
         friction=_splines(terms, terms.friction_logarithms()),
@@ -142,29 +137,19 @@ def _network(
     for weight, bias in layers:
         weights.append(array(weight))
         biases.append(array(bias))
-    if encoding.slope.any():
-        # cos q, sin q and q in place of cos q or (q - center) slope, and sin q or zero
-        first, second = np.hsplit(weights[0], 2)
-        slopes, revolute = first * array(encoding.slope), array(encoding.revolute)
-        weights[0] = np.hstack([first * revolute, second * revolute, slopes])
-        biases[0] -= slopes @ array(encoding.center)
+    # of cos q, sin q and q in place of cos q or (q - center) slope, and sin q or zero
+    first, second = np.hsplit(weights[0], 2)
+    slopes, revolute = first * array(encoding.slope), array(encoding.revolute)
+    weights[0] = np.hstack([first * revolute, second * revolute, slopes])
+    biases[0] -= slopes @ array(encoding.center)
     if functions is not None:
-        # outputs that are always zero would be units of the last hidden layer
-        used = weights[-1].any(axis=1) | (biases[-1] != 0)
-        weights[-1], biases[-1] = weights[-1][used], biases[-1][used]
-        weights.append(functions[used].T)
+        weights.append(functions.T)
         biases.append(np.zeros(functions.shape[1]))
     # tanh x is 2 sigmoid(2 x) - 1
     for k in range(1, len(weights)):
         weights[k - 1], biases[k - 1] = 2 * weights[k - 1], 2 * biases[k - 1]
         weights[k], biases[k] = 2 * weights[k], biases[k] - weights[k].sum(axis=1)
     return Network(tuple(weights), tuple(biases))
-
-
-def _with_outputs(network: Network, rows: np.ndarray) -> Network:
-    """Return the network with these of its outputs alone."""
-    weights = (*network.weights[:-1], network.weights[-1][rows])
-    return Network(weights, (*network.biases[:-1], network.biases[-1][rows]))
 
 
 def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:

@@ -13,16 +13,20 @@ from spelgen.arm.arm import Arm, Body
 
 @dataclass(frozen=True, eq=False)
 class Tip:
-    """The frame of a link: ``pose``, (4, 4), in the frame of the body ``carrier``, -1 for the root link."""
+    """The frame of a link: ``pose``, (4, 4), in the frame of the body ``carrier``, -1 for the root link.
+
+    bodies: those of the arm, by the angles that the URDF has: the tip is compared with other readers of the file.
+    """
 
     link: str
     carrier: int
     pose: np.ndarray
+    bodies: tuple[Body, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """A network of cos q, sin q and, where some joint is prismatic, q: layers of sigmoids, the last one linear.
+    """A network of cos q, sin q and q: layers of sigmoids, the last one linear.
 
     weights: by layer, (units, units below).
     """
@@ -89,18 +93,16 @@ class Servos:
 class TrainedModel:
     """A trained arm of n joints. Units: rad and Nm, or m and N.
 
-    name: for code. unrounded: the arm's bodies by the angles that the URDF has, for the tip alone, which is compared
-    with other readers of the file. inertias: (bodies, 10) about the joints' frames. constant_mass: of rotors and other
-    constants in M, (n, n). motors: (n, n), the drives' speeds by the joints', which friction follows. friction: the
-    ``FrictionConstants`` of the runtime, as arrays. reach: of the bristles that are its memory, (n, K) [rad, m].
+    name, identifiers: of robot and joints, for code. inertias: (bodies, 10) about the joints' frames. constant_mass: of
+    rotors and other constants in M, (n, n). motors: (n, n), the drives' speeds by the joints', which friction follows.
+    friction: the ``FrictionConstants`` of the runtime, as arrays. reach: of the bristles that are its memory, (n, K)
+    [rad, m].
     inputs: G, (n, n); actuated: (n,), 0 for a passive joint. friction_compensation: (n,) torque that the drives add by
-    velocity, unseen. entries: names of the functions that are written; none for all.
+    velocity, unseen.
     """
 
     name: str
     arm: Arm
-    unrounded: tuple[Body, ...]
-    preset: str
     identifiers: tuple[str, ...]
     inertias: np.ndarray
     constant_mass: np.ndarray
@@ -114,7 +116,6 @@ class TrainedModel:
     friction_compensation: np.ndarray
     tip: Tip
     servos: Servos | None = None
-    entries: tuple[str, ...] = ()
 
     @property
     def n(self) -> int:

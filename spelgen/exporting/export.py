@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spelgen.errors import RunError, suggestion
-from spelgen.exporting.entry_points import without_derivatives
 from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
 from spelgen.exporting.trained import Trained
 from spelgen.fitting.fitted import Fit, load_run
@@ -45,32 +44,19 @@ def export(
         require_fitting(to, Path(path))
     if isinstance(trained, str | Path):
         trained = load_run(trained)
-    model: EmittedModel
     if isinstance(trained, Fit):
-        model, arm = trained.model, arm or trained.urdf
-    else:
-        model = trained
+        trained, arm = trained.model, arm or trained.urdf
     exporter = EXPORTERS[to]
     if entries and not exporter.choice:
         formats = [name for name, row in EXPORTERS.items() if row.choice]
         raise RunError(f"functions for --to {to}", expected=f"--to {listed(formats)}, which have a choice")
-    chosen = Trained(model, _loaded(model, arm), tuple(entries))
-    # derivatives are two thirds of the code, and few need them
-    if exporter.derivatives and not entries:
-        chosen = replace(chosen, entries=without_derivatives(chosen.described))
-    exported = exporter.function()(chosen)
+    if arm is None:
+        expected = "a run of `spelgen train --robot FILE.urdf`, or an arm"
+        raise RunError("no robot.urdf", element="export", expected=expected)
+    if not isinstance(arm, LoadedArm):
+        arm = arm_of_module(trained.facts, arm)
+    # its module is imported now: what it needs may be an extra
+    exported: Exported = pkgutil.resolve_name(exporter.function_name)(Trained(trained, arm, tuple(entries)))
     if path is not None:
         exported.write(path, force=force)
     return exported
-
-
-def _loaded(model: EmittedModel, arm: LoadedArm | Path | str | None) -> LoadedArm:
-    if isinstance(arm, LoadedArm):
-        return arm
-    if arm is None:
-        raise RunError(
-            "no robot.urdf",
-            element="export",
-            expected="a run of `spelgen train --robot FILE.urdf`, or an arm",
-        )
-    return arm_of_module(model.facts, arm)

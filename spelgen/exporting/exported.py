@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import pkgutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -24,26 +23,19 @@ class Exporter:
 
     function_name: of what takes a ``Trained`` to an ``Exported``; it is imported when it is used, because the
     packages that most formats need are extras. suffix: of a format of one file; all others are folders. choice: whether
-    functions can be chosen. derivatives: whether these are among them, written where they are named.
+    functions can be chosen.
     """
 
     function_name: str
     suffix: str = ""
     choice: bool = False
-    derivatives: bool = False
-
-    def function(self) -> Callable[[Trained], Exported]:
-        """Return the function. Raises ModuleNotFoundError where an extra is not installed."""
-        # imports the module
-        function: Callable[[Trained], Exported] = pkgutil.resolve_name(self.function_name)
-        return function
 
 
 EXPORTERS = {
     "urdf": Exporter("spelgen.exporting.urdf_export:export_urdf", suffix=".urdf"),
     "mjcf": Exporter("spelgen.exporting.mjcf_export:export_mjcf", suffix=".xml"),
-    "c": Exporter("spelgen.exporting.c_export:export_c", choice=True, derivatives=True),
-    "casadi": Exporter("spelgen.exporting.casadi_export:export_casadi", choice=True, derivatives=True),
+    "c": Exporter("spelgen.exporting.c_export:export_c", choice=True),
+    "casadi": Exporter("spelgen.exporting.casadi_export:export_casadi", choice=True),
     "onnx": Exporter("spelgen.exporting.onnx_export:export_onnx", choice=True),
     "torch": Exporter("spelgen.exporting.torch_export:export_torch", choice=True),
     "ros2": Exporter("spelgen.exporting.ros2_export:export_ros2"),
@@ -95,27 +87,29 @@ class Exported:
 
 def format_by_extension(path: Path) -> str:
     """Return the format whose files have this extension. Raises RunError where there is none."""
-    for name, exporter in EXPORTERS.items():
-        if exporter.suffix and exporter.suffix == path.suffix:
-            return name
-    raise RunError(f"the name {path.name!r}", expected="FILE.urdf, FILE.xml or --to FORMAT")
+    name = _format_of(path)
+    if name is None:
+        raise RunError(f"the name {path.name!r}", expected="FILE.urdf, FILE.xml or --to FORMAT")
+    return name
 
 
 def require_fitting(to: str, path: Path) -> None:
     """Raise RunError for a path whose extension contradicts the format."""
-    expected = None
     suffix = EXPORTERS[to].suffix
-    if suffix and path.suffix != suffix:
-        expected = f"FILE{suffix}"
-    if not suffix and path.suffix and not path.is_dir():
-        expected = "a folder, named without an extension"
-    if expected is None:
+    if path.suffix == suffix or (not suffix and path.is_dir()):
         return
-    formats = {exporter.suffix: name for name, exporter in EXPORTERS.items() if exporter.suffix}
-    advice = None
-    if path.suffix in formats:
-        advice = f"--to {formats[path.suffix]} writes such a file"
+    expected = f"FILE{suffix}" if suffix else "a folder, named without an extension"
+    fitting = _format_of(path)
+    advice = None if fitting is None else f"--to {fitting} writes such a file"
     raise RunError(f"the name {path.name!r} for --to {to}", expected=expected, do=advice)
+
+
+def _format_of(path: Path) -> str | None:
+    """Return the format of one file with this extension."""
+    for name, exporter in EXPORTERS.items():
+        if exporter.suffix and exporter.suffix == path.suffix:
+            return name
+    return None
 
 
 def folder_export(

@@ -2,41 +2,37 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import casadi as ca
 import numpy as np
 
+from spelgen.exporting.description import TrainedModel
 
-def law_torque(law: Any, qd: ca.SX, gravity: ca.SX, direction: ca.SX) -> ca.SX:
-    """Return the torque of friction, (n, 1) [Nm, N], under this gravity torque.
 
-    law: ``FrictionConstants`` of arrays. direction: of dry friction, from -1 to 1.
+def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) -> ca.SX:
+    """Return the torque of friction of the drives at their speeds, (n, 1) [Nm, N], under this gravity torque.
+
+    z: of the bristles, joint by joint, (n K, 1).
     """
+    law = model.friction
+    # CasADi reshapes column by column: a joint's elements are a column
+    bent = ca.reshape(z * (law.bristle_fractions / model.reach).ravel(), model.reach.shape[1], model.n)
+    # from -1 to 1: a joint's dry friction follows velocity or bristles
+    direction = law.memoryless * _turned(qd, law.coulomb_smoothing_velocity) + ca.sum1(bent).T
     load = ca.sqrt(gravity**2 + law.least_load**2)
-    dry = law.coulomb + law.load_dependence * load
     speed = ca.fabs(qd) / law.stribeck_velocity
     rounding = law.stribeck_rounding
     slow = 1 / (1 + (1 + rounding) / 8 * speed**2 / (speed + rounding))
     for _ in range(3):  # to the power of 8
         slow = slow * slow
-    dry += law.stribeck * slow
-    torque: ca.SX = law.viscous * qd + law.saturation * turned(qd, law.saturation_velocity) + dry * direction
+    dry = law.coulomb + law.load_dependence * load + law.stribeck * slow
+    viscous = law.viscous * qd + law.saturation * _turned(qd, law.saturation_velocity)
+    torque: ca.SX = viscous + dry * direction
     return torque
 
 
-def turned(velocity: ca.SX, width: np.ndarray) -> ca.SX:
+def _turned(velocity: ca.SX, width: np.ndarray) -> ca.SX:
     """Return a direction from -1 to 1 that turns around over this width of velocities, (n, 1)."""
     return velocity / ca.sqrt(velocity**2 + width**2)
-
-
-def bristle_direction(fractions: np.ndarray, reach: np.ndarray, z: ca.SX) -> ca.SX:
-    """Return the sum of fraction z / reach over a joint's elements, (n, 1); z: joint by joint, (n K, 1)."""
-    n, count = reach.shape
-    bent = z * (fractions / reach).ravel()
-    # CasADi reshapes column by column: a joint's elements are a column
-    direction: ca.SX = ca.sum1(ca.reshape(bent, count, n)).T
-    return direction
 
 
 def sliding_bristles(reach: np.ndarray, width: np.ndarray, qd: ca.SX) -> ca.SX:

@@ -2,223 +2,156 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from collections.abc import Mapping
 
 import casadi as ca
 import numpy as np
 
-from spelgen.exporting import friction_expressions
-from spelgen.exporting.description import TrainedModel
+from spelgen.exporting.description import Servos, TrainedModel
 from spelgen.exporting.entry_points import EntryPoint
+from spelgen.exporting.friction_expressions import bristle_step, friction_torque, sliding_bristles
 from spelgen.exporting.residual_expressions import (
+    Symbols,
     coriolis,
     residual_symbols,
     symbol_slopes,
     symmetric,
 )
-from spelgen.exporting.rigid_expressions import body_frames, constant, mass_and_potential, rigid_torque
-from spelgen.exporting.tip_expressions import tip_expressions
+from spelgen.exporting.rigid_expressions import (
+    body_frames,
+    constant,
+    mass_and_potential,
+    rigid_torque,
+    tip_kinematics,
+)
 
 RESIDUAL = "residual_"
 """Stands before the names of residuals among a function's inputs."""
 
-
-class ModelExpressions:
-    """M(q) qdd + h(q, qd) + friction = G (tau - offset), in symbols q, qd, qdd, tau, u, z, dq of n or K n rows.
-
-    Each entry point is a property of its name: an expression, or one for each output. derivatives: whether residuals
-    come with their derivatives by q.
-    """
-
-    def __init__(self, model: TrainedModel, *, derivatives: bool = False) -> None:
-        self.model = model
-        self.n = model.n
-        self._derivatives = derivatives
-        names = ("q", "qd", "qdd", "tau", "dq", "u")
-        self.inputs = {name: ca.SX.sym(name, self.n) for name in names}
-        self.inputs["z"] = ca.SX.sym("z", model.memory)
-        self.q, self.qd, self.qdd, self.tau, self.dq, self.u, self.z = self.inputs.values()
-        self.residuals = residual_symbols(model)
-        self._frames = body_frames(model.arm.bodies, self.q)
-        self._rest = ca.SX(self.n, 1)
-
-    def _rigid_torque(self, qd: ca.SX, qdd: ca.SX) -> ca.SX:
-        return rigid_torque(self.model, self._frames, qd, qdd)
-
-    @cached_property
-    def _rigid_energies(self) -> tuple[ca.SX, ca.SX]:
-        return mass_and_potential(self.model, self.q)
-
-    @cached_property
-    def _added_mass(self) -> ca.SX:
-        """What drives and residuals add to M."""
-        network = symmetric(self.model, self.residuals["mass"])
-        return constant(self.model.constant_mass) + network
-
-    @cached_property
-    def mass_matrix(self) -> ca.SX:
-        return self._rigid_energies[0] + self._added_mass
-
-    @cached_property
-    def _rigid_gravity(self) -> ca.SX:
-        return self._rigid_torque(self._rest, self._rest)
-
-    @cached_property
-    def _residual_gravity(self) -> ca.SX:
-        return self.residuals["gravity"] + self.residuals["torque"]
-
-    @cached_property
-    def gravity(self) -> ca.SX:
-        return self._rigid_gravity + self._residual_gravity
-
-    @cached_property
-    def _residual_bias(self) -> ca.SX:
-        if self.model.residuals.mass is None:
-            return self._residual_gravity
-        moved = coriolis(self.model, self.residuals, self.qd, derivatives=self._derivatives)
-        return self._residual_gravity + moved
-
-    @cached_property
-    def bias(self) -> ca.SX:
-        return self._rigid_torque(self.qd, self._rest) + self._residual_bias
-
-    @cached_property
-    def friction(self) -> ca.SX:
-        """The torques of friction, which follows the speeds of the motors, (n, 1)."""
-        law = self.model.friction
-        motors = self.model.motors
-        speed = constant(motors) @ self.qd
-        load = self._rest
-        # gravity would be computed for nothing
-        if law.load_dependence.any():
-            load = constant(np.linalg.inv(motors).T) @ self._rigid_gravity
-        # a joint's dry friction follows velocity or bristles
-        sliding = friction_expressions.turned(speed, law.coulomb_smoothing_velocity)
-        direction = constant(law.memoryless) * sliding
-        direction += friction_expressions.bristle_direction(law.bristle_fractions, self.model.reach, self.z)
-        torque = friction_expressions.law_torque(law, speed, load, direction)
-        for k, joint in enumerate(self.model.residuals.friction):
-            torque[joint] *= ca.exp(self.residuals["factor"][k])
-        return constant(motors.T) @ torque
-
-    @property
-    def friction_step(self) -> ca.SX:
-        return friction_expressions.bristle_step(
-            self.model.reach, self.z, constant(self.model.motors) @ self.dq
-        )
-
-    @property
-    def friction_memory(self) -> ca.SX:
-        width = self.model.friction.coulomb_smoothing_velocity
-        speed = constant(self.model.motors) @ self.qd
-        return friction_expressions.sliding_bristles(self.model.reach, width, speed)
-
-    @cached_property
-    def _force(self) -> ca.SX:
-        """M qdd + h + friction, less what the drives add unseen, (n, 1)."""
-        # one pass of Newton and Euler, where M qdd + h would take two
-        rigid = self._rigid_torque(self.qd, self.qdd)
-        added = self._added_mass @ self.qdd + self._residual_bias
-        return rigid + added + self.friction - self._compensation
-
-    @property
-    def _compensation(self) -> ca.SX:
-        return constant(np.diag(self.model.friction_compensation)) @ self.qd
-
-    def _inputs(self, force: ca.SX) -> ca.SX:
-        """Return the inputs that make these forces, (n, columns)."""
-        # a passive joint's own torque is what it lacks
-        inputs = self.model.inputs + np.diag(1 - self.model.actuated)
-        if np.array_equal(inputs, np.eye(self.n)):
-            return force
-        return constant(np.linalg.inv(inputs)) @ force
-
-    @property
-    def inverse_dynamics(self) -> ca.SX:
-        return self._inputs(self._force) + self.model.torque_offset
-
-    @cached_property
-    def forward_dynamics(self) -> ca.SX:
-        force = constant(self.model.inputs) @ (self.tau - self.model.torque_offset)
-        force = force + self._compensation - self.bias - self.friction
-        return _solve(self.mass_matrix, force)
-
-    @property
-    def momentum(self) -> ca.SX:
-        return self.mass_matrix @ self.qd
-
-    @property
-    def energy(self) -> ca.SX:
-        potential = self._rigid_energies[1] + self.residuals["energy"] + self.residuals["torque_energy"]
-        return ca.vertcat(0.5 * ca.dot(self.qd, self.momentum), potential)
-
-    @property
-    def tip_pose(self) -> ca.SX:
-        return tip_expressions(self.model, self.q)[0]
-
-    @property
-    def tip_jacobian(self) -> ca.SX:
-        return tip_expressions(self.model, self.q)[1]
-
-    @property
-    def servo_torque(self) -> ca.SX:
-        servos = self.model.servos
-        assert servos is not None
-        error = self.u - self.q
-        if servos.dead_zone.any():
-            error = ca.fmax(error - servos.dead_zone, 0) - ca.fmax(-error - servos.dead_zone, 0)
-        torque: ca.SX = servos.kp * error - servos.kd * self.qd
-        for joint in np.flatnonzero(np.isfinite(servos.limit)).tolist():
-            limit = servos.limit[joint]
-            torque[joint] = ca.fmin(ca.fmax(torque[joint], -limit), limit)
-        return torque
-
-    def _force_derivatives(self) -> tuple[ca.SX, ca.SX]:
-        """Return the derivatives of the force by q and by qd, (n, n) each."""
-        symbols = [self.q]
-        slopes = [ca.SX.eye(self.n)]
-        # the chain rule through what the program computes by loops
-        for symbol, slope in symbol_slopes(self.model, self.residuals):
-            symbols.append(symbol)
-            slopes.append(slope)
-        by_position = ca.jtimes(self._force, ca.vertcat(*symbols), ca.vertcat(*slopes))
-        return by_position, ca.jacobian(self._force, self.qd)
-
-    @property
-    def inverse_dynamics_derivatives(self) -> tuple[ca.SX, ca.SX]:
-        by_position, by_velocity = self._force_derivatives()
-        return self._inputs(by_position), self._inputs(by_velocity)
-
-    @property
-    def forward_dynamics_derivatives(self) -> tuple[ca.SX, ...]:
-        """M^-1 times the derivatives of the force at this qdd (Carpentier and Mansard, RSS 2018)."""
-        by_position, by_velocity = self._force_derivatives()
-        right = ca.horzcat(-by_position, -by_velocity, constant(self.model.inputs))
-        # the derivatives at the acceleration that the torques give
-        right = ca.substitute(right, self.qdd, self.forward_dynamics)
-        return tuple(ca.horzsplit(_solve(self.mass_matrix, right), self.n))
+Outputs = dict[str, tuple[ca.SX, ...]]
 
 
-def expression_function(entry: EntryPoint, model: TrainedModel) -> ca.Function:
-    """Return the entry point as a function of its inputs, then of the residuals that it needs; outputs are dense."""
-    expressions = ModelExpressions(model, derivatives=entry.name.endswith("_derivatives"))
-    result = getattr(expressions, entry.name)
-    # most quantities have one output
-    if not isinstance(result, tuple):
-        result = (result,)
-    outputs = [ca.densify(output) for output in result]
-    inputs = {name: expressions.inputs[name] for name in entry.inputs}
-    for name, symbols in expressions.residuals.items():
-        if symbols.nnz() and ca.depends_on(ca.veccat(*outputs), symbols):
-            inputs[RESIDUAL + name] = symbols
-    names = list(inputs), list(entry.output_names)
-    # what is computed twice becomes one step: by cse
-    return ca.Function(entry.name, list(inputs.values()), outputs, *names, {"cse": True})
+def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
+    """Return entry points as functions of their inputs, then of the residuals that they need; outputs are dense."""
+    names = ("q", "qd", "qdd", "tau", "dq", "u")
+    inputs = {name: ca.SX.sym(name, model.n) for name in names}
+    inputs["z"] = ca.SX.sym("z", model.memory)
+    residuals = residual_symbols(model)
+    expressions = _expressions(model, inputs, residuals)
+    if any(name.endswith("_derivatives") for name in entries):
+        expressions |= _derivatives(model, inputs, residuals)
+    functions: dict[str, ca.Function] = {}
+    for name, entry in entries.items():
+        outputs = list(map(ca.densify, expressions[name]))
+        arguments = {key: inputs[key] for key in entry.inputs}
+        for key, symbols in residuals.items():
+            if symbols.nnz() and ca.depends_on(ca.veccat(*outputs), symbols):
+                arguments[RESIDUAL + key] = symbols
+        labels = list(arguments), list(entry.outputs)
+        # what is computed twice becomes one step: by cse
+        functions[name] = ca.Function(name, list(arguments.values()), outputs, *labels, {"cse": True})
+    return functions
 
 
 def residuals_needed(function: ca.Function) -> list[str]:
-    """Return the names of the residuals that an ``expression_function`` takes."""
+    """Return the names of the residuals that a function of ``expression_functions`` takes."""
     return [name.removeprefix(RESIDUAL) for name in function.name_in() if name.startswith(RESIDUAL)]
+
+
+def _expressions(
+    model: TrainedModel, inputs: Symbols, residuals: Symbols, *, derivatives: bool = False
+) -> Outputs:
+    """Return all but derivatives by name of the entry point, of M(q) qdd + h(q, qd) + friction = G (tau - offset).
+
+    inputs: symbols of n rows, z of K n. derivatives: whether residuals come with their derivatives by q. ``force`` is
+    M qdd + h + friction, less what the drives add unseen, (n, 1).
+    """
+    q, qd, qdd, tau, dq, u, z = inputs.values()
+    standstill = ca.SX(model.n, 1)
+    motors = constant(model.motors)
+    frames = body_frames(model.arm.bodies, q)
+    rigid_mass, rigid_potential = mass_and_potential(model, q)
+    # of drives and residuals
+    added_mass = constant(model.constant_mass) + symmetric(model, residuals["mass"])
+    mass = rigid_mass + added_mass
+    rigid_gravity = rigid_torque(model, frames, standstill, standstill)
+    added_gravity = added_bias = residuals["gravity"] + residuals["torque"]
+    if model.residuals.mass is not None:
+        added_bias = added_gravity + coriolis(model, residuals, qd, derivatives=derivatives)
+    bias = rigid_torque(model, frames, qd, standstill) + added_bias
+    load = constant(np.linalg.inv(model.motors).T) @ rigid_gravity
+    drive_friction = friction_torque(model, motors @ qd, load, z)
+    for k, joint in enumerate(model.residuals.friction):
+        drive_friction[joint] *= ca.exp(residuals["factor"][k])
+    friction = motors.T @ drive_friction
+    compensation = constant(model.friction_compensation) * qd
+    # one pass of Newton and Euler, where M qdd + h would take two
+    force = rigid_torque(model, frames, qd, qdd) + added_mass @ qdd + added_bias + friction - compensation
+    applied = constant(model.inputs) @ (tau - model.torque_offset)
+    momentum = mass @ qd
+    potential = rigid_potential + residuals["energy"] + residuals["torque_energy"]
+    pose, jacobian = tip_kinematics(model, q)
+    outputs = {
+        "force": force,
+        "inverse_dynamics": _inputs(model, force) + model.torque_offset,
+        "forward_dynamics": _solve(mass, applied + compensation - bias - friction),
+        "mass_matrix": mass,
+        "bias": bias,
+        "gravity": rigid_gravity + added_gravity,
+        "friction": friction,
+        "friction_step": bristle_step(model.reach, z, motors @ dq),
+        "friction_memory": sliding_bristles(
+            model.reach, model.friction.coulomb_smoothing_velocity, motors @ qd
+        ),
+        "momentum": momentum,
+        "energy": ca.vertcat(0.5 * ca.dot(qd, momentum), potential),
+        "tip_pose": pose,
+        "tip_jacobian": jacobian,
+    }
+    if model.servos is not None:
+        outputs["servo_torque"] = _servo_torque(model.servos, u, q, qd)
+    return {name: (output,) for name, output in outputs.items()}
+
+
+def _inputs(model: TrainedModel, force: ca.SX) -> ca.SX:
+    """Return the inputs that make these forces, (n, columns)."""
+    # a passive joint's own torque is what it lacks
+    return constant(np.linalg.inv(model.inputs + np.diag(1 - model.actuated))) @ force
+
+
+def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
+    error = u - q
+    if servos.dead_zone.any():
+        error -= ca.fmin(ca.fmax(error, -servos.dead_zone), servos.dead_zone)
+    torque: ca.SX = servos.kp * error - servos.kd * qd
+    for joint in np.flatnonzero(np.isfinite(servos.limit)).tolist():
+        limit = servos.limit[joint]
+        torque[joint] = ca.fmin(ca.fmax(torque[joint], -limit), limit)
+    return torque
+
+
+def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Outputs:
+    """Return derivatives of inverse and forward dynamics by q, qd and tau, (n, n) each.
+
+    Those of forward dynamics are M^-1 times those of the force at its qdd (Carpentier and Mansard, RSS 2018).
+    """
+    expressions = _expressions(model, inputs, residuals, derivatives=True)
+    (force,), (mass,) = expressions["force"], expressions["mass_matrix"]
+    symbols = [inputs["q"]]
+    slopes = [ca.SX.eye(model.n)]
+    # the chain rule through what the program computes by loops
+    for symbol, slope in symbol_slopes(model, residuals):
+        symbols.append(symbol)
+        slopes.append(slope)
+    by_position = ca.jtimes(force, ca.vertcat(*symbols), ca.vertcat(*slopes))
+    by_velocity = ca.jacobian(force, inputs["qd"])
+    right = ca.horzcat(-by_position, -by_velocity, constant(model.inputs))
+    # the derivatives at the acceleration that the torques give
+    right = ca.substitute(right, inputs["qdd"], *expressions["forward_dynamics"])
+    return {
+        "inverse_dynamics_derivatives": (_inputs(model, by_position), _inputs(model, by_velocity)),
+        "forward_dynamics_derivatives": tuple(ca.horzsplit(_solve(mass, right), model.n)),
+    }
 
 
 def _solve(matrix: ca.SX, right: ca.SX) -> ca.SX:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from typing import NamedTuple, cast
+from collections.abc import Mapping
+from typing import cast
 
 import numpy as np
 import onnx
@@ -14,13 +13,12 @@ import onnxruntime
 import onnxscript
 import torch
 from torch import Tensor
-from torch.overrides import TorchFunctionMode
 
 from spelgen.dynamics.prepared import PreparedModel
 from spelgen.exporting.entry_points import chosen
 from spelgen.exporting.exported import Exported, folder_export
 from spelgen.exporting.parity import Called, Values, check_parity
-from spelgen.exporting.torch_programs import PROGRAMS, export_program, program_inputs, program_output
+from spelgen.exporting.torch_export import PROGRAMS, export_program, program_inputs, program_output
 from spelgen.exporting.trained import Trained
 from spelgen.settings.tuning.exporting import TUNING
 
@@ -45,11 +43,14 @@ def export_onnx(trained: Trained) -> Exported:
 
 def onnx_model(model: PreparedModel, name: str) -> bytes:
     """Return the serialised ONNX model of an entry point."""
-    with _without_warnings(), _WrittenOut():
+    # torch tells that torchvision is absent, and that it uses what is deprecated
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings(action="ignore"):
         program = export_program(model, name, flat_memory=True)
-    with _without_warnings():
+        decompositions = torch.export.default_decompositions()
+        decompositions.update(_WRITTEN_OUT)
         exported = torch.onnx.export(
-            program,
+            program.run_decompositions(decompositions),
             dynamo=True,
             input_names=program_inputs(model, name),
             output_names=[program_output(name)],
@@ -58,24 +59,20 @@ def onnx_model(model: PreparedModel, name: str) -> bytes:
         )
     assert exported is not None
     content = exported.model_proto
-    content.ClearField("metadata_props")
-    content.graph.ClearField("metadata_props")
-    for node in content.graph.node:
-        # torch's own names for each node: two thirds of the file
-        node.ClearField("metadata_props")
+    # torch's own names for each node: two thirds of the file
+    for described in (content, content.graph, *content.graph.node):
+        described.ClearField("metadata_props")
     serialised: bytes = content.SerializeToString()
     return serialised
 
 
-def _solve(matrix: Tensor, right: Tensor, *, left: bool = True) -> Tensor:
+def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     """Return matrix^-1 right by Gauss and Jordan; M is positive definite and needs no pivoting."""
     n = matrix.shape[-1]  # a constant of the program, so that the loop is written out
     identity = torch.eye(n, dtype=matrix.dtype)
     # a matrix of inputs has no batch, nor has a right side that is the identity
     batch = torch.broadcast_shapes(matrix.shape[:-2], right.shape[:-2])
-    matrix = matrix.expand(*batch, n, n)
-    right = right.expand(*batch, *right.shape[-2:])
-    rows = torch.cat([matrix, right], dim=-1)
+    rows = torch.cat([matrix.expand(*batch, n, n), right.expand(*batch, *right.shape[-2:])], dim=-1)
     for k in range(n):
         pivot = rows[..., k : k + 1, :]
         pivot = pivot / pivot[..., k : k + 1]
@@ -83,33 +80,17 @@ def _solve(matrix: Tensor, right: Tensor, *, left: bool = True) -> Tensor:
     return rows[..., n:]
 
 
-def _solve_triangular(
-    matrix: Tensor, right: Tensor, *, upper: bool, left: bool = True, unitriangular: bool = False
-) -> Tensor:
-    """Return matrix^-1 right, of one triangle of the matrix."""
-    if unitriangular:
-        matrix = torch.eye(matrix.shape[-1], dtype=matrix.dtype) + (
-            matrix.triu(1) if upper else matrix.tril(-1)
-        )
-    else:
-        matrix = matrix.triu() if upper else matrix.tril()
-    return _solve(matrix, right)
+def _solve_triangular(matrix: Tensor, right: Tensor, *, upper: bool, unitriangular: bool) -> Tensor:
+    """Return matrix^-1 right, of a matrix whose other triangle is zero and whose diagonal stands for ones."""
+    identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype)
+    return _solve(matrix - matrix * identity + identity, right)
 
 
-def _softplus(x: Tensor, beta: float = 1.0, threshold: float = 20.0) -> Tensor:
-    """Return log(1 + exp(x)), which ONNX Runtime has in float32 alone."""
-    smooth = torch.relu(x) + torch.log(1 + torch.exp(-x.abs()))
-    return torch.where(x > threshold, x, smooth)
+def _cholesky_ex(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Return in place of a Cholesky factor the matrix, and 1 where it is not positive definite, else 0.
 
-
-class _Definiteness(NamedTuple):
-    """Hold 1 where a matrix is not positive definite, else 0: of a Cholesky factor networks of M use this alone."""
-
-    info: Tensor
-
-
-def _cholesky_ex(matrix: Tensor) -> _Definiteness:
-    """Return what the pivots of a Cholesky factor say, without the factor."""
+    Networks of M use the second alone.
+    """
     rows = matrix
     info = torch.zeros(matrix.shape[:-2], dtype=torch.int32)
     for k in range(matrix.shape[-1]):
@@ -117,56 +98,22 @@ def _cholesky_ex(matrix: Tensor) -> _Definiteness:
         # a pivot that is NaN counts as not positive
         info = torch.where(pivot[..., 0, 0] > 0, info, 1)
         rows = rows - rows[..., k : k + 1] * rows[..., k : k + 1, :] / pivot
-    return _Definiteness(info)
+    return matrix, info
 
 
-def _scalar_tensor(
-    s: float,
-    dtype: int = onnx.TensorProto.DOUBLE,
-    layout: str = "",
-    device: str = "",
-    pin_memory: bool = False,
-) -> onnxscript.ir.Value:
+def _scalar_tensor(s: float, dtype: int = onnx.TensorProto.DOUBLE, **options: object) -> onnxscript.ir.Value:
     """Return a constant: torch's own translation rounds it to float32 first, an error of 1e-8 in networks."""
     value = np.array(s, dtype=onnx.helper.tensor_dtype_to_np_dtype(dtype))
     constant = onnxscript.opset18.Constant(value=onnx.numpy_helper.from_array(value))
     return cast("onnxscript.ir.Value", constant)
 
 
-_WRITTEN_OUT: dict[object, Callable[..., object]] = {
-    torch.linalg.solve: _solve,
-    torch.linalg.solve_triangular: _solve_triangular,
-    torch.nn.functional.softplus: _softplus,
-    torch.linalg.cholesky_ex: _cholesky_ex,
+_WRITTEN_OUT = {
+    torch.ops.aten.linalg_solve.default: _solve,
+    torch.ops.aten.linalg_solve_triangular.default: _solve_triangular,
+    torch.ops.aten.linalg_cholesky_ex.default: _cholesky_ex,
 }
-
-
-class _WrittenOut(TorchFunctionMode):
-    """Write out, while a program is traced, the functions that ONNX has no operators for."""
-
-    def __torch_function__(
-        self,
-        func: Callable[..., object],
-        types: object,
-        args: tuple[object, ...] = (),
-        kwargs: dict[str, object] | None = None,
-    ) -> object:
-        """Call a function, or what stands for it."""
-        return _WRITTEN_OUT.get(func, func)(*args, **(kwargs or {}))
-
-
-@contextmanager
-def _without_warnings() -> Iterator[None]:
-    """Silence what torch's exporter says of itself: that torchvision is absent, that it uses what is deprecated."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(level)
+"""What ONNX has no operators for, written out by others."""
 
 
 def called_by_onnx(files: Mapping[str, bytes]) -> Called:

@@ -119,7 +119,7 @@ def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str
 
 
 def _network(network: Network, encoded: ca.MX) -> ca.MX:
-    layer = encoded[: network.weights[0].shape[1]]
+    layer = encoded
     for weight, bias in zip(network.weights[:-1], network.biases[:-1], strict=True):
         # CasADi has no sigmoid
         layer = 1 / (1 + ca.exp(-(constant(weight) @ layer + bias)))

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -13,18 +12,30 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from spelgen.arm.arm import Arm
+from spelgen.building import build
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.dynamics.residuals import without_residuals
-from spelgen.emission.loading import load_module
-from spelgen.exporting.parity import usual_speeds
+from spelgen.exporting.describe import array, servos_of
+from spelgen.exporting.description import Servos
+from spelgen.exporting.parity import random_inputs, usual_speeds
 from spelgen.fitting.optimizers import minimise
 from spelgen.loaded_arm import LoadedArm
-from spelgen.pipeline import generate
 from spelgen.settings.tuning.exporting import TUNING
-from spelgen.structure.nominal import working_range
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
+
+
+class NearestFriction(NamedTuple):
+    """Viscous and Coulomb friction forward and backward, (n,) each; backward is not positive.
+
+    error: root mean square of the difference to a model's friction, relative to that, over positions and speeds.
+    """
+
+    viscous: np.ndarray
+    forward: np.ndarray
+    backward: np.ndarray
+    error: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,33 +44,21 @@ class RigidBodyProjection:
 
     inertias: by body, ten parameters about the joint's frame as in ``Body``, (bodies, 10). armature: of the
     drives by their own speeds, (n,) [kg m^2, kg]; motors: these speeds by the joints', (n, n).
-    viscous, forward, backward: friction, (n,); backward is not positive.
-    own: whether the bodies are the model's own. mass_error, gravity_error: root mean square of the difference of
-    M and of gravity torque, relative to the model's. friction_error: (n,) likewise, of friction.
-    bodies: a model of these bodies alone, float64.
+    inputs: G at zero, (n, n). own: whether the bodies are the model's own. mass_error, gravity_error: root mean square
+    of the difference of M and of gravity torque, relative to the model's. bodies: a model of them alone, float64.
     """
 
     arm: LoadedArm
     inertias: np.ndarray
     armature: np.ndarray
     motors: np.ndarray
-    viscous: np.ndarray
-    forward: np.ndarray
-    backward: np.ndarray
-    friction_error: np.ndarray
+    friction: NearestFriction
+    inputs: np.ndarray
+    servos: Servos | None
     own: bool
     mass_error: float
     gravity_error: float
     bodies: EmittedModel
-
-    @property
-    def base_parameters(self) -> Mapping[str, float]:
-        """The bodies' base parameters by the names that ``inspect`` and ``identify`` give them."""
-        ten = self.inertias.ravel()
-        values: dict[str, float] = {}
-        for parameter in self.arm.base_parameters:
-            values[parameter.name] = sum(float(weight) * float(ten[k]) for k, weight in parameter.weights)
-        return values
 
     @property
     def summary(self) -> tuple[str, str]:
@@ -71,29 +70,27 @@ class RigidBodyProjection:
                 which = "those of the model without its residual terms"
             errors = f"M differs by {self.mass_error:.1%}, gravity by {self.gravity_error:.1%}"
             bodies = f"bodies are {which}; {errors}"
-        worst = int(np.argmax(self.friction_error))
+        worst = int(np.argmax(self.friction.error))
         joint = self.arm.arm.coordinates[worst]
         friction = "friction is written as viscous and Coulomb friction"
-        error = f"it differs from the model's by up to {self.friction_error[worst]:.0%} ({joint.name})"
+        error = f"it differs from the model's by up to {self.friction.error[worst]:.0%} ({joint.name})"
         return bodies, f"{friction}; {error}"
 
 
 def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProjection:
     """Return the bodies, armature and friction of a trained model of ``arm``."""
-    model = copy.deepcopy(model).double().requires_grad_(False)
+    model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     q = sampled_positions(arm.arm)
     own = has_rigid_bodies(model)
     bodies: EmittedModel = without_residuals(model) if own else _nearest_bodies(model, arm, q)
-    viscous, forward, backward, friction_error = nearest_friction(arm.arm, model, q)
     return RigidBodyProjection(
         arm=arm,
         inertias=bodies.inertial_parameters.numpy(),
         armature=bodies.armature.numpy(),
         motors=bodies.motors.numpy(),
-        viscous=viscous,
-        forward=forward,
-        backward=backward,
-        friction_error=friction_error,
+        friction=nearest_friction(arm.arm, model, q),
+        inputs=array(model.input_matrix(torch.zeros(model.n, dtype=torch.float64))),
+        servos=servos_of(model),
         own=own,
         mass_error=_relative_rms(bodies.mass_matrix(q), model.mass_matrix(q)),
         gravity_error=_relative_rms(bodies.gravity(q), model.gravity(q)),
@@ -103,10 +100,7 @@ def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProje
 
 def sampled_positions(arm: Arm) -> Tensor:
     """Return positions over the joints' ranges, (positions, n), the same each time."""
-    # the same positions each time: an export is reproducible
-    random = np.random.default_rng(0)
-    columns = [random.uniform(*working_range(joint), TUNING.positions) for joint in arm.coordinates]
-    return torch.from_numpy(np.stack(columns, axis=-1))
+    return torch.from_numpy(random_inputs(arm.coordinates, TUNING.positions)["q"])
 
 
 def _nearest_bodies(model: EmittedModel, arm: LoadedArm, q: Tensor) -> EmittedModel:
@@ -114,7 +108,7 @@ def _nearest_bodies(model: EmittedModel, arm: LoadedArm, q: Tensor) -> EmittedMo
 
     Where these leave a body's parameters open it keeps the URDF's.
     """
-    bodies = load_module(generate(arm, "closed-form"))
+    bodies = build(arm, "closed-form")
     # light joints at the tip count as much as heavy ones at the base
     whitening = torch.linalg.inv(torch.linalg.cholesky(model.mass_matrix(q).mean(dim=0)))
     mass = whitening @ model.mass_matrix(q) @ whitening.mT
@@ -124,13 +118,10 @@ def _nearest_bodies(model: EmittedModel, arm: LoadedArm, q: Tensor) -> EmittedMo
     def distance() -> Tensor:
         mass_error = whitening @ bodies.mass_matrix(q) @ whitening.mT - mass
         gravity_error = (bodies.gravity(q) - gravity) / load
-        mean_mass_error = mass_error.square().sum(dim=(-2, -1)).mean() / model.n
-        mean_gravity_error = gravity_error.square().sum(dim=-1).mean()
         # zero weights are the URDF's bodies
         weights = torch.cat([parameter.flatten() for parameter in bodies.parameters()])
-        ridge = 0.5 * TUNING.ridge * weights.square().sum()
-        distance: Tensor = mean_mass_error + mean_gravity_error + ridge
-        return distance
+        distance: Tensor = (mass_error.square().sum() / model.n + gravity_error.square().sum()) / len(q)
+        return distance + 0.5 * TUNING.ridge * weights.square().sum()
 
     minimise(bodies, lambda: [distance()], TUNING.steps)
     return bodies.requires_grad_(False)
@@ -141,11 +132,8 @@ def _relative_rms(values: Tensor, expected: Tensor) -> float:
     return float((values - expected).square().mean().sqrt() / size)
 
 
-def nearest_friction(arm: Arm, model: EmittedModel, q: Tensor) -> np.ndarray:
-    """Return viscous and Coulomb friction forward and backward nearest to the model's, and its relative error.
-
-    (4, n); the last is of all positions and speeds.
-    """
+def nearest_friction(arm: Arm, model: EmittedModel, q: Tensor) -> NearestFriction:
+    """Return the viscous and Coulomb friction nearest to the model's."""
     fractions = np.geomspace(0.02, 1.0, TUNING.friction_speeds)
     fractions = np.concatenate([-fractions[::-1], fractions])
     speeds = np.outer(fractions, usual_speeds(arm.coordinates))
@@ -155,15 +143,12 @@ def nearest_friction(arm: Arm, model: EmittedModel, q: Tensor) -> np.ndarray:
     torques = model.friction_torque(positions, qd).numpy()  # (positions, speeds, n)
     rows: list[tuple[float, float, float, float]] = []
     for joint, speed in enumerate(speeds.T):
-        torque = torques[..., joint]
-        direction = np.sign(speed)
         # against the motion, so that what friction may be is not negative
+        torque = torques[..., joint] * np.sign(speed)
         columns = np.stack([np.abs(speed), speed > 0, speed < 0], axis=-1)
-        (viscous, forward, backward), _ = nnls(columns, torque.mean(axis=0) * direction)
-        fitted = direction * (columns @ (viscous, forward, backward))
-        size = np.linalg.norm(torque)
-        error = 0.0
-        if size > 0:
-            error = float(np.linalg.norm(torque - fitted) / size)
-        rows.append((viscous, forward, -backward, error))
-    return np.array(rows).T
+        (viscous, forward, backward), _ = nnls(columns, torque.mean(axis=0))
+        missed = torque - columns @ (viscous, forward, backward)
+        # without friction nothing is missed either
+        error = np.linalg.norm(missed) / (np.linalg.norm(torque) or 1.0)
+        rows.append((viscous, forward, -backward, float(error)))
+    return NearestFriction(*np.array(rows).T)

@@ -42,21 +42,18 @@ def body_frames(bodies: Sequence[Body], q: ca.SX) -> list[tuple[ca.SX, ca.SX]]:
 def rigid_torque(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.SX, qdd: ca.SX) -> ca.SX:
     """Return the torques of this motion of rigid bodies in gravity, without armature, (n, 1) [Nm, N]."""
     bodies = model.arm.bodies
-    # in the body's frame, the base first: in place of gravity it accelerates upwards
-    velocities = [ca.SX(3, 1)]
-    rates = [ca.SX(3, 1)]
-    accelerations = [ca.SX(-np.array(model.arm.gravity, dtype=float))]
-    spins = [ca.SX(3, 3)]
+    # of the base, then of the bodies, in their own frames; in place of gravity the base accelerates upwards
+    gravity = np.array(model.arm.gravity, dtype=float)
+    motions = [(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-gravity), ca.SX(3, 3))]
     forces: list[ca.SX] = []
     torques: list[ca.SX] = []
     for body, ten, (rotation, position) in zip(bodies, model.inertias, frames, strict=True):
-        carrier = body.parent + 1
+        w, rate, acceleration, spin = motions[body.parent + 1]
         ratio = float(body.multiplier)
         speed = ratio * qd[body.coordinate]
         added = ratio * qdd[body.coordinate]
-        w = rotation.T @ velocities[carrier]
-        rate = rotation.T @ rates[carrier]
-        acceleration = rotation.T @ (accelerations[carrier] + spins[carrier] @ position)
+        acceleration = rotation.T @ (acceleration + spin @ position)
+        w, rate = rotation.T @ w, rotation.T @ rate
         turning = ca.cross(w, _Z) * speed
         if body.kind == "revolute":
             w = w + _Z * speed
@@ -66,6 +63,7 @@ def rigid_torque(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.
             acceleration = acceleration + _Z * added + 2 * turning
         # takes points of the body to their accelerations
         spin = ca.skew(rate) + w @ w.T - ca.dot(w, w) * ca.SX.eye(3)
+        motions.append((w, rate, acceleration, spin))
         m, x, y, z, xx, xy, xz, yy, yz, zz = ten.tolist()
         moment = ca.SX(constant([x, y, z]))
         inertia = ca.SX(constant([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
@@ -73,10 +71,6 @@ def rigid_torque(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.
         forces.append(m * acceleration + spin @ moment)
         torque = ca.cross(moment, acceleration) + inertia @ rate
         torques.append(torque + ca.cross(w, inertia @ w))
-        velocities.append(w)
-        rates.append(rate)
-        accelerations.append(acceleration)
-        spins.append(spin)
     joint_torques = ca.SX(model.n, 1)
     # children stand behind their parents
     for index in reversed(range(len(bodies))):
@@ -104,6 +98,29 @@ def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
         # one expression for both triangles: half of the work
         mass[row, column] = mass[column, row] = entry
     return mass, ca.SX(result.potential)
+
+
+def tip_kinematics(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return the tip link's pose in the root link's frame, (4, 4), and its Jacobian, (6, n): linear, then angular."""
+    bodies = model.tip.bodies
+    frames = body_frames(bodies, q)
+    # poses of the root link, then of all bodies
+    poses = [ca.SX.eye(4)]
+    for body, frame in zip(bodies, frames, strict=True):
+        poses.append(poses[body.parent + 1] @ ca.vertcat(ca.horzcat(*frame), constant([[0, 0, 0, 1]])))
+    pose = poses[model.tip.carrier + 1] @ constant(model.tip.pose)
+    jacobian = ca.SX(6, model.n)
+    index = model.tip.carrier
+    while index >= 0:
+        body = bodies[index]
+        # the axis is z of the body's frame
+        axis, origin = poses[index + 1][:3, 2], poses[index + 1][:3, 3]
+        column = ca.vertcat(axis, ca.SX(3, 1))
+        if body.kind == "revolute":
+            column = ca.vertcat(ca.cross(axis, pose[:3, 3] - origin), axis)
+        jacobian[:, body.coordinate] += float(body.multiplier) * column
+        index = body.parent
+    return pose, jacobian
 
 
 def rotation_about_z(angle: ca.SX) -> ca.SX:

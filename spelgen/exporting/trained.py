@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 from spelgen.exporting.describe import describe
 from spelgen.exporting.description import TrainedModel
+from spelgen.exporting.entry_points import EntryPoint, entry_points
 from spelgen.loaded_arm import LoadedArm
 
 if TYPE_CHECKING:
@@ -16,7 +17,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """A trained model of an arm. entries: names of the functions to export, for formats of functions; none for all."""
+    """A trained model of an arm.
+
+    entries: names of the functions to export, for formats of functions; by default all but derivatives.
+    """
 
     model: EmittedModel
     arm: LoadedArm
@@ -25,7 +29,12 @@ class Trained:
     @cached_property
     def described(self) -> TrainedModel:
         """The model as plain numbers. Raises RunError for a preset that has no such description."""
-        return replace(describe(self.model, self.arm), entries=self.entries)
+        return describe(self.model, self.arm)
+
+    @cached_property
+    def entry_points(self) -> dict[str, EntryPoint]:
+        """The functions to export from the description, by name. Raises RunError for names of others."""
+        return entry_points(self.described, self.entries)
 
     @property
     def robot(self) -> str:

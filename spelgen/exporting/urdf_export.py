@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import yaml
 
 from spelgen.dynamics.protocol import has_friction_state
 from spelgen.dynamics.residuals import friction_factor
-from spelgen.exporting.describe import array, servos_of
+from spelgen.exporting.describe import array
 from spelgen.exporting.exported import UNITS, Exported, readme
 from spelgen.exporting.rigid_body_projection import (
     RigidBodyProjection,
@@ -18,7 +16,6 @@ from spelgen.exporting.rigid_body_projection import (
 )
 from spelgen.exporting.trained import Trained
 from spelgen.exporting.urdf_file import rounded, settings_text, urdf_text
-from spelgen.listing import Listing, number
 
 _LAW = (
     "viscous qd + saturation turned(qd, saturation_velocity) + dry direction, with "
@@ -29,48 +26,27 @@ _LAW = (
     "all of it times a factor that goes with the joint's position, between the two numbers of "
     "position_factor, or one where there are none"
 )
-_SERVO = "clip(kp (u - q) - kd qd, -limit, limit), u commanded `delay` [s] before"
+_SERVO = (
+    "clip(kp d - kd qd, -limit, limit), d what u - q is beyond the dead zone, u commanded `delay` [s] before"
+)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class ExportedUrdf(Exported):
-    """A trained model as a URDF and the settings beside it, and the rigid bodies that these describe."""
-
-    projection: RigidBodyProjection
-
-    @property
-    def urdf(self) -> bytes:
-        """The URDF."""
-        return self.files[".urdf"]
-
-    @property
-    def settings(self) -> str:
-        """The settings that go beside it."""
-        return self.files[".yaml"].decode()
-
-    def _repr_html_(self) -> str:
-        rows = tuple((name, number(value)) for name, value in self.projection.base_parameters.items())
-        note = "; ".join(self.summary)
-        return Listing("Base parameters [kg, m]", ("parameter", "value"), rows, note).html()
-
-
-def export_urdf(trained: Trained) -> ExportedUrdf:
+def export_urdf(trained: Trained) -> Exported:
     """Return the URDF, its settings, and the friction of a trained model."""
     projection = rigid_body_projection(trained.model, trained.arm)
-    summary = projection.summary
     use = (
         "The .urdf contains inertials, viscous and Coulomb friction, which simulators ignore; the .yaml beside it, "
         "which spelgen reads, rotor inertia and friction in both directions; .urdf.friction.yaml the model's own law."
     )
     about = f"{UNITS}; inertials of a body stand with the link that its joint moves."
-    title, checked = f"{trained.robot} as a URDF", f"{summary[0]}; {summary[1]}."
+    title, checked = f"{trained.robot} as a URDF", f"{'; '.join(projection.summary)}."
     files = {
         ".urdf": urdf_text(projection),
         ".yaml": settings_text(projection).encode(),
         ".urdf.friction.yaml": _friction_text(trained, projection).encode(),
         ".urdf.README.md": readme(title, use, trained.joint_names, about, checked),
     }
-    return ExportedUrdf("urdf", trained.robot, files, summary, projection)
+    return Exported("urdf", trained.robot, files, projection.summary)
 
 
 def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
@@ -79,40 +55,31 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
         "units": "Nm, Nm s/rad and rad/s of revolute joints; N, N s/m and m/s of prismatic ones",
         "viscous_coulomb": "viscous qd + coulomb[0] where qd > 0, + coulomb[1] where qd < 0",
     }
-    constants = _law_constants(trained, projection)
-    if constants:
+    coulomb = np.stack([projection.friction.forward, projection.friction.backward], axis=1)
+    # by section and name, (n, ...) each
+    sections = {"viscous_coulomb": {"viscous": projection.friction.viscous, "coulomb": coulomb}}
+    # networks have no law with constants
+    if projection.own:
         content["law"] = _LAW
-    servos = servos_of(trained.model)
+        sections["law"] = _law_constants(trained, projection)
+    servos = projection.servos
     if servos is not None:
         content |= {"servo": _SERVO, "delay": rounded(servos.delay)}
+        gains = {"kp": servos.kp, "kd": servos.kd, "limit": servos.limit, "dead_zone": servos.dead_zone}
+        sections["servo"] = gains
     joints: dict[str, dict[str, object]] = {}
     for index, name in enumerate(trained.joint_names):
-        coulomb = [rounded(projection.forward[index]), rounded(projection.backward[index])]
-        joint: dict[str, object] = {
-            "viscous_coulomb": {"viscous": rounded(projection.viscous[index]), "coulomb": coulomb}
-        }
-        # a law of several constants has no place in a URDF
-        if constants:
-            joint["law"] = {key: _plain(values[index]) for key, values in constants.items()}
-        if servos is not None:
-            servo = {"kp": rounded(servos.kp[index]), "kd": rounded(servos.kd[index])}
-            if np.isfinite(servos.limit[index]):
-                servo["limit"] = rounded(servos.limit[index])
-            if servos.dead_zone[index]:
-                servo["dead_zone"] = rounded(servos.dead_zone[index])
-            joint["servo"] = servo
-        joints[name] = joint
+        joints[name] = {}
+        for section, constants in sections.items():
+            joints[name][section] = {key: _plain(values[index]) for key, values in constants.items()}
     content["joints"] = joints
     text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
     return text
 
 
 def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[str, np.ndarray]:
-    """Return the constants of the model's own law of friction by name, (n, ...) each; none for networks."""
+    """Return the constants of the model's own law of friction by name, (n, ...) each."""
     model = trained.model
-    # networks have no law with constants
-    if not projection.own:
-        return {}
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}
     factor = array(friction_factor(model, sampled_positions(projection.arm.arm)))
     if (factor != 1).any():

@@ -6,11 +6,11 @@ import numpy as np
 import yaml
 from lxml import etree
 
-from spelgen.arm.angle_rounding import AngleRounding
-from spelgen.arm.rational import alignment
+from spelgen.arm.chain import choose_chain
+from spelgen.arm.lump_links import lump_links
+from spelgen.dynamics.rigid_bodies import about_center
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection
 from spelgen.urdf.document import urdf_bytes
-from spelgen.urdf.robot import Robot
 
 
 def urdf_text(projection: RigidBodyProjection) -> bytes:
@@ -26,19 +26,22 @@ def urdf_text(projection: RigidBodyProjection) -> bytes:
     root = etree.fromstring(urdf_bytes(robot.path), parser)
     links = {element.get("name"): element for element in root.findall("link")}
     joints = {element.get("name"): element for element in root.findall("joint")}
-    moved = {robot.joint[body.name].child for body in arm.bodies}
-    for name in _carried_links(robot, moved):
-        _remove(links[name], "inertial")
-    rounding = AngleRounding(projection.arm.angle_tolerance)
-    for body, inertia in zip(arm.bodies, projection.inertias, strict=True):
-        joint = robot.joint[body.name]
-        _set_inertial(links[joint.child], inertia, alignment(rounding.axis(joint)))
+    chain = choose_chain(robot, arm.joint_names, None)
+    lumped = lump_links(robot, chain, projection.arm.angle_tolerance)
+    for body, inertia in zip(lumped.moved, projection.inertias, strict=True):
+        for link in body.links:
+            _remove(links[link.name], "inertial")
+        name = body.joint.child
+        # of the body's frame, whose z is the joint's axis, in the link's
+        rotation = np.array(lumped.frames[name].rotation.T, dtype=float)
+        _set_inertial(links[name], inertia, rotation)
     # a URDF has one Coulomb friction for both directions
-    coulomb = (projection.forward - projection.backward) / 2
+    friction = projection.friction
+    coulomb = (friction.forward - friction.backward) / 2
     for index, coordinate in enumerate(arm.coordinates):
         element = joints[coordinate.name]
         _remove(element, "dynamics")
-        values = {"damping": _number(projection.viscous[index]), "friction": _number(coulomb[index])}
+        values = {"damping": _number(friction.viscous[index]), "friction": _number(coulomb[index])}
         etree.SubElement(element, "dynamics", values)
     text: bytes = etree.tostring(root, xml_declaration=True, encoding="utf-8")
     return text + b"\n"
@@ -51,26 +54,16 @@ def settings_text(projection: RigidBodyProjection) -> str:
     if path.exists():
         content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     joints = content.setdefault("joints", {})
+    friction = projection.friction
     for index, coordinate in enumerate(projection.arm.arm.coordinates):
         # settings have the rotor's own inertia, the model that of the joint's side
         gear = projection.arm.settings.joint(coordinate.name).gear
         joint = joints.setdefault(coordinate.name, {})
         joint["rotor_inertia"] = rounded(projection.armature[index] / gear**2)
-        joint["viscous"] = rounded(projection.viscous[index])
-        joint["coulomb"] = [rounded(projection.forward[index]), rounded(projection.backward[index])]
+        joint["viscous"] = rounded(friction.viscous[index])
+        joint["coulomb"] = [rounded(friction.forward[index]), rounded(friction.backward[index])]
     text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
     return text
-
-
-def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return mass, centre of mass and the tensor about it, (3, 3), of ten parameters about the joint, in its frame."""
-    mass = inertia[0]
-    center = inertia[1:4] / mass
-    xx, xy, xz, yy, yz, zz = inertia[4:]
-    about_joint = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    # the parallel axis theorem
-    shift = center @ center * np.eye(3) - np.outer(center, center)
-    return mass, center, about_joint - mass * shift
 
 
 def rounded(value: float) -> float:
@@ -78,21 +71,8 @@ def rounded(value: float) -> float:
     return float(_number(value))
 
 
-def _carried_links(robot: Robot, moved: set[str]) -> list[str]:
-    """Return the links with an inertial that move with another link."""
-    carried = []
-    for link in robot.links:
-        if link.inertial is None or link.name in moved:
-            continue
-        above = {joint.child for joint in robot.path_to(link.name)}
-        # links before the first joint stay as they are
-        if above & moved:
-            carried.append(link.name)
-    return carried
-
-
 def _set_inertial(link: etree._Element, inertia: np.ndarray, rotation: np.ndarray) -> None:
-    """Set a link's inertial; ``rotation`` takes +z, the joint's axis in its own frame, to the axis in the link's."""
+    """Set the inertial of a link in whose frame the body's stands at ``rotation``."""
     _remove(link, "inertial")
     mass, center, tensor = about_center(inertia)
     center = rotation @ center

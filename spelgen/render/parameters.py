@@ -13,8 +13,8 @@ from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.parameters import parameters_of_kind
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.dynamics.regressor import urdf_parameters
+from spelgen.dynamics.rigid_bodies import about_center
 from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
-from spelgen.exporting.urdf_file import about_center
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.labels import UNITS, entry_name
 from spelgen.listing import Listing
@@ -174,7 +174,7 @@ def _joint_table(model: EmittedModel, arm: LoadedArm | None) -> Listing | None:
         slope = f"{units.torque} s/{units.position}"
         cells = {"joint": f"joint {k + 1}", "armature": f"{model.armature[k]:.3g} {units.inertia}"}
         if friction is not None:
-            viscous, forward, backward, _ = friction[:, k]
+            viscous, forward, backward = friction.viscous[k], friction.forward[k], friction.backward[k]
             # the damping of a drive's control contains its joint's viscous friction
             if not damped:
                 cells["viscous"] = f"{viscous:.3g} {slope}"
