@@ -8,7 +8,6 @@ from typing import Annotated, Literal
 
 import typer
 
-from spelgen.baselines.names import MODEL
 from spelgen.cli import options
 from spelgen.cli.console import deliver, note, progress_bar, say
 from spelgen.cli.options import Data, Filter, Mapping, MoreData, Output, Run, Trust
@@ -75,7 +74,7 @@ def evaluate(
         deliver(results.text() + "\n", output)
     # after the result, so that a script that failed still has the figures
     exceeded = False
-    values = {figure.name: figure.values[MODEL] for figure in figures(results)}
+    values = {figure.name: figure.value for figure in figures(results)}
     for name, largest in limits:
         value = values.get(name)
         if value is None or value > largest:

@@ -9,7 +9,6 @@ from dataclasses import replace
 
 from spelgen.comparison.metrics import RunResult
 from spelgen.evaluation.tables import Row, Table, table
-from spelgen.listing import number
 from spelgen.settings.comparison import PublishedFigures
 
 BASELINE = "phnode"
@@ -56,7 +55,7 @@ def comparison_tables(
     return [
         _sizes(runs, step_seconds, published),
         _losses(runs, published),
-        table("Prediction loss over 1 s of every run", list(losses), losses.values()),
+        table("Prediction loss over 1 s of every run", losses),
         Table(
             "Invariants, worst over seeds; a negative rise is a fall",
             tuple(replace(row, ranked=False) for row in invariants),
@@ -72,10 +71,10 @@ def _sizes(runs: Runs, step_seconds: Mapping[str, float], published: Published) 
         rows.append(Row(f"outputs of {matrix}", outputs, ranked=False))
     rows += [
         Row("inputs of M", {name: size.inputs for name, size in sizes.items()}, ranked=False),
-        Row("parameters", {name: size.parameters for name, size in sizes.items()}, "{:,.0f}".format),
-        Row("training step [ms]", {name: 1e3 * step_seconds[name] for name in runs}, "{:.1f}".format),
-        *_published(runs, published, "parameters", "parameters", "{:,.0f}".format),
-        *_published(runs, published, "training step [s]", "step_seconds", "{:.2f}".format),
+        Row("parameters", {name: size.parameters for name, size in sizes.items()}),
+        Row("training step [ms]", {name: 1e3 * step_seconds[name] for name in runs}),
+        *_published(runs, published, "parameters", "parameters"),
+        *_published(runs, published, "training step [s]", "step_seconds"),
     ]
     return Table("Sizes, and the time of a training step here; below, what is published", tuple(rows))
 
@@ -117,10 +116,8 @@ def _summary(
     return summaries
 
 
-def _published(
-    runs: Runs, published: Published, label: str, field: str, form: Callable[[float | None], str] = number
-) -> list[Row]:
+def _published(runs: Runs, published: Published, label: str, field: str) -> list[Row]:
     """Return a row of published figures, or none where there are none for this robot."""
     figures = {name: getattr(published[name], field) for name in runs if name in published}
     figures = {name: figure for name, figure in figures.items() if figure is not None}
-    return [Row(f"published: {label}", figures, form, ranked=False)] if figures else []
+    return [Row(f"published: {label}", figures, ranked=False)] if figures else []

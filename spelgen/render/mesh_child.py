@@ -1,4 +1,4 @@
-"""Reads meshes in a process that ``shapes`` starts, of bounded time and memory: FILE... -> NPZ on stdout.
+"""Reads what a URDF shows, in a process of bounded time and memory that ``shapes`` starts: URDF LINK... -> NPZ on stdout.
 
 Readers of a dozen formats unpack archives, follow names of other files and repeat parts as often as a file says.
 """
@@ -13,6 +13,7 @@ import numpy as np
 
 from spelgen.errors import SpelgenError
 from spelgen.files import read_bytes
+from spelgen.settings.tuning.render import TUNING
 
 MEMORY = 1_073_741_824  # bytes
 SECONDS = 8  # of processor time
@@ -33,27 +34,34 @@ class Neighbours:
     __getitem__ = get
 
 
-def main(paths: list[Path], output: IO[bytes]) -> None:
-    """Write the arrays v0, f0, v1, f1, ...: vertices (V, 3) and faces (F, 3) of each file."""
+def main(urdf: str, links: list[str], output: IO[bytes]) -> None:
+    """Write the arrays v0, f0, v1, f1, ...: vertices (V, 3) and faces (F, 3) of each link that the URDF shows.
+
+    Raises where a file is missing or is no mesh: an arm with holes is worse than tubes.
+    """
     with suppress(ImportError):  # not on Windows
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
     import trimesh
+    import yourdfpy
 
+    model = yourdfpy.URDF.load(urdf, build_scene_graph=False, load_meshes=False)
+    meshes: dict[int, Any] = {}
+    for link in model.robot.links:
+        if link.name in links and link.visuals:
+            shapes = [_shape(visual, model) for visual in link.visuals]
+            meshes[links.index(link.name)] = trimesh.util.concatenate(shapes)
+    area = sum(mesh.area for mesh in meshes.values()) or 1.0
+    if sum(len(mesh.faces) for mesh in meshes.values()) > FACES or not np.isfinite(area):
+        raise ValueError("too many triangles, or triangles without an area")
     arrays: dict[str, Any] = {}
-    faces = 0
-    for index, path in enumerate(paths):
-        kind = path.suffix.lower().lstrip(".")
-        content = io.BytesIO(read_bytes(path, SpelgenError, largest=LARGEST))
-        neighbours: Any = Neighbours(path.parent)
-        mesh: Any = trimesh.load(content, file_type=kind, resolver=neighbours, force="mesh")
-        # files give each triangle or patch corners of its own: apart, they would tear when they are simplified
-        mesh.merge_vertices(merge_tex=True, merge_norm=True)
-        faces += len(mesh.faces)
-        if not len(mesh.faces) or faces > FACES or not np.isfinite(mesh.vertices).all():
-            raise ValueError(f"{path}: none or too many triangles, or corners that are no numbers")
+    for index, mesh in meshes.items():
+        # by size: a fine mesh of a small screw gets no more faces than it shows
+        count = max(TUNING.least_faces, int(TUNING.faces * mesh.area / area))
+        if len(mesh.faces) > count:
+            mesh = mesh.simplify_quadric_decimation(face_count=count, aggression=3)
         arrays |= {f"v{index}": np.asarray(mesh.vertices), f"f{index}": np.asarray(mesh.faces)}
     # in memory first: NumPy writes an archive by going back in its file, which a pipe does not allow
     buffer = io.BytesIO()
@@ -61,5 +69,39 @@ def main(paths: list[Path], output: IO[bytes]) -> None:
     output.write(buffer.getbuffer())
 
 
+def _shape(visual: Any, model: Any) -> Any:
+    """Return a visual of the URDF as a mesh in its link's frame."""
+    from trimesh import creation
+
+    geometry = visual.geometry
+    if geometry.box is not None:
+        shape = creation.box(extents=geometry.box.size)
+    elif geometry.cylinder is not None:
+        shape = creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length, sections=12)
+    elif geometry.sphere is not None:
+        shape = creation.uv_sphere(geometry.sphere.radius, count=[8, 10])
+    else:
+        shape = _read(Path(model._filename_handler(geometry.mesh.filename)))
+        if geometry.mesh.scale is not None:
+            shape.apply_scale(geometry.mesh.scale)
+    if visual.origin is not None:
+        shape.apply_transform(visual.origin)
+    return shape
+
+
+def _read(path: Path) -> Any:
+    """Return the mesh in a file."""
+    import trimesh
+
+    content = io.BytesIO(read_bytes(path, SpelgenError, largest=LARGEST))
+    kind, neighbours = path.suffix.lower().lstrip("."), Neighbours(path.parent)
+    mesh: Any = trimesh.load(content, file_type=kind, resolver=neighbours, force="mesh")  # type: ignore[arg-type]
+    # files give each triangle or patch corners of its own: apart, they would tear when they are simplified
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
+        raise ValueError(f"{path}: no triangles, or corners that are no numbers")
+    return mesh
+
+
 if __name__ == "__main__":
-    main([Path(name) for name in sys.argv[1:]], sys.stdout.buffer)
+    main(sys.argv[1], sys.argv[2:], sys.stdout.buffer)

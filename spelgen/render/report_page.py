@@ -26,8 +26,15 @@ from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.curves import curves
 from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, parameter_tables
-from spelgen.render.plots import Record, coverage_panels
-from spelgen.render.run_facts import commands, files, head_numbers, training_facts
+from spelgen.render.plots import Record, coverage_panels, loss_chart
+from spelgen.render.run_facts import (
+    best_epoch,
+    commands,
+    files,
+    head_numbers,
+    settings,
+    training_facts,
+)
 from spelgen.spec import Facts, read_facts
 
 if TYPE_CHECKING:
@@ -91,7 +98,7 @@ class Run:
     @property
     def parameters(self) -> list[Listing]:
         """Return the tables of what is learned that is a number."""
-        return parameter_tables(self.folder, self.model, self.arm, self.identified)
+        return parameter_tables(self.model, self.arm, self.identified)
 
     @property
     def verdict(self) -> Verdict | None:
@@ -154,32 +161,30 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
 
 def _rendered(run: Run, robot: Path | str | None) -> str:
     facts, config, metrics = run.facts, run.config or {}, run.folder.read_metrics()
-    traces = Traces({}) if run.results is None else run.results.traces
-    arm, cells, training, tables = None, None, None, []
-    joints = named_joints(facts.joints, facts.joint_types)
-    if config:
-        training = training_facts(config, metrics, run.identified, run.model)
-    if run.results is not None:
-        tables = result_tables(run.results)
+    traces = run.results.traces if run.results else Traces({})
+    sections = dict.fromkeys(("arm", "cells", "training", "settings", "losses")) | curves(traces, facts)
     if run.arm is not None:
-        arm = arm_section(run.arm.arm, Path(robot or run.arm.robot.path), traces, run.identified)
-        cells = matrix(run.arm.arm, run.arm.structure_for(facts.options.assume))
+        sections["arm"] = arm_section(run.arm.arm, Path(robot or run.arm.robot.path), traces)
+        sections["cells"] = matrix(run.arm.arm, run.arm.structure_for(facts.options.assume))
+    if config:
+        sections["training"] = training_facts(config, metrics, run.identified, run.model)
+        sections["settings"] = settings(config)
+    if metrics:
+        sections["losses"] = loss_chart(metrics, best_epoch(metrics))
     # the sentences about the model
     docstring = ast.get_docstring(ast.parse(run.folder.module.read_bytes())) or ""
+    joints = named_joints(facts.joints, facts.joint_types)
     return render_page(
         "report.html.jinja",
+        **sections,
         facts=facts,
         about=" ".join(docstring.split("\n\n")[1].split()),
-        cells=cells,
-        arm=arm,
         units=UNITS,
         numbers=head_numbers(run.model, config, metrics, run.results),
         verdict=run.verdict,
         config=run.config,
-        training=training,
         evaluation=run.results,
-        tables=tables,
-        curves=curves(traces, facts),
+        tables=result_tables(run.results) if run.results else [],
         coverage=coverage_panels(traces, run.identified, joints, run.limits),
         trained=run.model is not None,
         under_servos=config.get("mapping", {}).get("input") == "position",

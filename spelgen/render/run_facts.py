@@ -5,13 +5,12 @@ from __future__ import annotations
 import hashlib
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.filesize import decimal
 
-from spelgen.baselines.names import MODEL
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import figures
 from spelgen.fitting.objectives import fit_summary
@@ -20,8 +19,7 @@ from spelgen.fitting.torque.report import terms_in_use
 from spelgen.labels import counted
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.render.charts import Chart
-from spelgen.render.plots import Record, loss_chart
+from spelgen.render.plots import Record
 from spelgen.settings.fits import CONFIGS
 from spelgen.settings.training import TrainingSettings
 from spelgen.spec import Facts, Options
@@ -33,50 +31,39 @@ if TYPE_CHECKING:
 HASHED = 1_000_000_000  # bytes of the largest file whose digest is computed, in some seconds
 
 
-@dataclass(frozen=True)
-class Number:
-    """One of the figures at the head of the page."""
-
-    value: str
-    label: str
-
-
-@dataclass(frozen=True)
-class Training:
-    """How the run went: its loss curves where it took epochs, what it was fitted to, and what it was set to."""
-
-    chart: Chart | None
-    facts: dict[str, str]
-    settings: dict[str, str]
-
-
 def head_numbers(
     model: EmittedModel | None, config: Record, metrics: Sequence[Record], results: Results | None
-) -> list[Number]:
-    """Return the figures a reader wants first, as far as the run has come; records are empty where there are none."""
+) -> list[tuple[str, str]]:
+    """Return the figures a reader wants first, with what they are, as far as the run has come.
+
+    Records are empty where there are none.
+    """
     numbers = []
     if results is not None:
-        for figure in figures(results):
-            value = figure.values[MODEL]
-            if value is not None:
-                numbers.append(Number(figure.text(value), figure.label))
+        numbers += [(figure.text(), figure.label) for figure in figures(results)]
     summary = fit_summary(config)
     if summary is not None:
-        numbers.append(Number(*summary.headline))
+        numbers.append(summary.headline)
     elif model is not None:
         count = sum(parameter.numel() for parameter in model.parameters())
-        numbers.append(Number(f"{count:,}", "trained parameters"))
+        numbers.append((f"{count:,}", "trained parameters"))
     if metrics:
         label = f"of training, {metrics[-1]['step']:,} steps"
-        numbers.append(Number(_duration(metrics[-1]["seconds"]), label))
+        numbers.append((_duration(metrics[-1]["seconds"]), label))
     return numbers
+
+
+def best_epoch(metrics: Sequence[Record]) -> int:
+    """Return the epoch of the model that was kept; 0: no epoch was better than the start."""
+    best = metrics[-1]["best"]
+    return next((record["epoch"] for record in metrics if record["validation"] == best), 0)
 
 
 def training_facts(
     config: Record, metrics: Sequence[Record], identified: Record | None, model: EmittedModel | None
-) -> Training:
+) -> dict[str, str]:
     """Return how the run was trained, from its config.json, metrics.jsonl and the model that came of it."""
-    preprocessing, options = Preprocessing(**config["preprocessing"]), config["config"]
+    preprocessing = Preprocessing(**config["preprocessing"])
     facts = {
         "objective": config["objective"],
         "training logs": _names(config["training"]),
@@ -89,25 +76,21 @@ def training_facts(
         facts["dense samples"] = f"{count} that move, from which least squares is fitted as well"
     if model is not None and hasattr(model, "residuals"):
         facts["beside rigid bodies"] = "; ".join(terms_in_use(model)) or "nothing selected"
-    chart = None
     # fits to torques have no epochs
     if metrics:
-        last = metrics[-1]
-        best_epoch, origin = 0, "the start: no epoch was better"
-        for record in metrics:
-            if record["validation"] == last["best"]:
-                best_epoch, origin = record["epoch"], f"epoch {record['epoch']}"
-                break
+        last, best = metrics[-1], best_epoch(metrics)
+        origin = f"epoch {best}" if best else "the start: no epoch was better"
         facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}"
         facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"
-        facts["setbacks"] = f"{last['rollbacks']} epochs undone" if last["rollbacks"] else "none"
-        if options.get("solver", "rk4") == "rk4":
-            facts["integrator"] = f"rk4, {last['substeps']} steps between samples"
-        chart = loss_chart(metrics, best_epoch)
-    if options.get("momentum_steps"):
-        facts["start"] = f"{options['momentum_steps']:,} steps on the momentum along the logs"
-    settings = {key.replace("_", " "): str(value) for key, value in options.items() if value is not None}
-    return Training(chart, facts, settings)
+    if config["config"].get("momentum_steps"):
+        facts["start"] = f"{config['config']['momentum_steps']:,} steps on the momentum along the logs"
+    return facts
+
+
+def settings(config: Record) -> dict[str, str]:
+    """Return what the objective was set to."""
+    options = config["config"].items()
+    return {key.replace("_", " "): str(value) for key, value in options if value is not None}
 
 
 def _names(trajectories: Sequence[str]) -> str:
@@ -159,13 +142,12 @@ def commands(run: RunFolder, facts: Facts, record: Record | None) -> list[str]:
         build += f" --{key.replace('_', '-')} {shlex.quote(words)}"
     lines.append(f"{build} -o module.py")
     if record:
-        defaults = CONFIGS[record["objective"]]().model_dump(mode="json") | asdict(Preprocessing())
-        defaults |= TrainingSettings().model_dump(include={"validation_fraction", "seed"})
-        options = {"validation_fraction": record["validation_fraction"], "seed": record["seed"]}
-        train = (
-            f"spelgen train module.py --robot {urdf} --data LOGS -o RUN2 --objective {record['objective']}"
-        )
-        for key, value in _changed(options | record["config"] | record["preprocessing"], defaults).items():
+        objective, chosen = record["objective"], ("validation_fraction", "seed")
+        defaults = CONFIGS[objective]().model_dump(mode="json") | asdict(Preprocessing())
+        defaults |= TrainingSettings().model_dump(include=set(chosen))
+        options = {key: record[key] for key in chosen} | record["config"] | record["preprocessing"]
+        train = f"spelgen train module.py --robot {urdf} --data LOGS -o RUN2 --objective {objective}"
+        for key, value in _changed(options, defaults).items():
             train += f" --set {shlex.quote(f'{key}={value}')}"
         lines.append(train)
     return [*lines, "spelgen evaluate RUN2 --data LOGS", "spelgen report RUN2"]

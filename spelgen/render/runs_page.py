@@ -61,9 +61,7 @@ def _verdict(runs: Mapping[str, Results]) -> str:
     errors: dict[str, list[tuple[float, str, str]]] = {}
     for run, results in runs.items():
         for figure in figures(results):
-            value = figure.values[MODEL]
-            if value is not None:
-                errors.setdefault(figure.label, []).append((value, run, figure.text(value)))
+            errors.setdefault(figure.label, []).append((figure.value, run, figure.text()))
     smallest: dict[str, list[str]] = {}
     for label, of_runs in errors.items():
         if len(of_runs) == len(runs):

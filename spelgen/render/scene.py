@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from spelgen.dynamics.constraint import Constraint, mimic_constraint
 from spelgen.evaluation.plain import Curve
-from spelgen.render.shapes import Shape, drum, joined, slide, tube, visual_shapes
+from spelgen.render.shapes import Shape, joined, tube, visual_shapes
 from spelgen.settings.tuning.render import TUNING
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Joint, Robot
@@ -101,19 +101,17 @@ def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
 
     What is fixed to these links is among them.
     """
-    visible = {robot.joint[name].child for name in joints}
-    # from the root on, so that whatever hangs on a carried link is carried, too
+    leading = {joint.name for name in joints for joint in robot.path_to(robot.joint[name].child)}
+    carried: set[str] = set()
+    visible = [robot.root]
     for joint in robot.joints_from_root:
-        if joint.parent in visible:
-            visible.add(joint.child)
-    for name in joints:
-        for joint in robot.path_to(robot.joint[name].child):
-            visible.add(joint.parent)
-    visible.add(robot.root)
-    for joint in robot.joints_from_root:
-        if joint.parent in visible and not joint.moves:
-            visible.add(joint.child)
-    return [robot.root, *(joint.child for joint in robot.joints_from_root if joint.child in visible)]
+        # whatever hangs on a carried link is carried, too
+        if joint.name in joints or joint.parent in carried:
+            carried.add(joint.child)
+        fixed = joint.parent in visible and not joint.moves
+        if fixed or joint.name in leading or joint.child in carried:
+            visible.append(joint.child)
+    return visible
 
 
 def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shape:
@@ -130,8 +128,9 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
     if not below and inertial is not None:
         meshes += tube(np.zeros(3), np.array(inertial.com, dtype=float), 0.7 * radius)
     if joint is not None and joint.moves:
-        shape = slide if joint.type == "prismatic" else drum
-        meshes += shape(_axis(joint), 1.5 * radius)
+        sides, width, half = (4, 1.8, 2.4) if joint.type == "prismatic" else (10, 1.5, 1.725)
+        ends = half * radius * _axis(joint)
+        meshes += tube(-ends, ends, width * radius, sides)
     return joined(meshes)
 
 
