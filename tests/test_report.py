@@ -38,7 +38,7 @@ def traces(name):
                      "predicted": both,
                      "parts": dict.fromkeys(("inertia", "Coriolis", "gravity", "friction"), wave),
                      "energy": dict.fromkeys(("work of the drives", "stored", "friction", "not explained"), one)}],
-        "mass": {"trajectory": name, "t": t, "by": {"model": {"entries": entries, "eigenvalues": [one] * 3}}},
+        "mass": {"trajectory": name, "t": t, "by": {"model": {"entries": entries}}},
         "friction": {"qd": [[-1, 0, 1]] * 3, "by": {"model": [[-2, 0, 2]] * 3}},
     }  # fmt: skip
 
@@ -105,9 +105,9 @@ def test_page_is_complete_and_self_contained(run):
     assert all(link.startswith("#") or link == "data:," for link in page.links)
     assert "url(" not in path.read_text(encoding="utf-8")
     charts = path.read_text(encoding="utf-8").count('<svg class="chart"')
-    loss, growth, torques, energy, states, eigenvalues, friction, coverage = 1, 1, 9, 1, 12, 1, 3, 6
+    loss, growth, torques, energy, states, friction, coverage = 1, 1, 9, 1, 12, 3, 6
     mass = 5  # entries that are not always zero
-    assert charts == loss + growth + torques + energy + states + mass + eigenvalues + friction + coverage
+    assert charts == loss + growth + torques + energy + states + mass + friction + coverage
     assert "default-src 'none'" in path.read_text(encoding="utf-8")
 
 

@@ -87,7 +87,7 @@ def evaluate(
             )
         return _judge_commands(judged, logs, notes)
     require_torques(logs)
-    used = _preprocessing(judged.preprocessing, preprocessing, logs)
+    used = _preprocessing(judged.fit and judged.fit.preprocessing, preprocessing, logs)
     return _judge_torques(judged, logs, notes, used, baselines or {}, (steps, seconds), progress)
 
 
@@ -164,7 +164,7 @@ def _results(
 ) -> Results:
     """Return results that name the arm and the logs, without figures."""
     return Results(
-        robot=judged.robot,
+        robot=judged.facts.robot if judged.facts else type(judged.model).__name__,
         joints=tuple(judged.joints),
         joint_types=tuple(judged.model.joint_types),
         trajectories=tuple(trajectory.name for trajectory in logs),
@@ -189,7 +189,8 @@ def _tip(judged: Subject, notes: list[Diagnostic]) -> TipPosition | None:
     if judged.urdf is None:
         return None
     try:
-        return tip_kinematics(judged.urdf, judged.tip, joints=judged.joints).position
+        tip = judged.facts.options.tip if judged.facts else None
+        return tip_kinematics(judged.urdf, tip, joints=judged.joints).position
     except Exception as error:  # pytorch-kinematics raises many kinds; the evaluation stands without
         message = f"no tip errors: {in_one_line(error)}"
         notes.append(Diagnostic("info", "no-tip", judged.urdf.name, None, message))

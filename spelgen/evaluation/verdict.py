@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, URDF_WITH_DRIVES, observed
+from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.errors import shortened
 from spelgen.evaluation.horizons import StateErrors
 from spelgen.evaluation.measurements import Measurements
@@ -177,10 +177,7 @@ def _better_baselines(results: Measurements) -> list[str]:
     if times:
         ahead = f"A constant velocity predicts better {listed(times)} ahead"
         statements.append(f"{ahead}: there, use the model for torques only.")
-    drives = [horizon.errors.get(URDF_WITH_DRIVES) for horizon in results.horizons]
-    if better and drives and _relative(drives[-1]) < TUNING.simulated:
-        statements.append(f"{URDF_WITH_DRIVES} reproduces these logs: it is the model that simulated them.")
-    elif better:
+    if better:
         reasons = [f"{name} is better {listed(occasions)}" for name, occasions in better.items()]
         statements.append(f"But {listed(reasons)}.")
     return statements

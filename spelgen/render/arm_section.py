@@ -135,11 +135,10 @@ def _motion(
 def _sweep(arm: Arm) -> Motion:
     """Return a motion of every joint through part of its range, at its own pace."""
     t = np.linspace(0, 12, 121)
-    q = np.zeros((len(t), len(arm.coordinates)))
-    for k, coordinate in enumerate(arm.coordinates):
-        low, high = working_range(coordinate)
-        # limits of a hundred turns, as some URDFs have them, would show a blur
-        swing = min(0.4 * (high - low), 1.2 if coordinate.kind == "revolute" else 0.3)
-        q[:, k] = (low + high) / 2 + swing * np.sin(2 * np.pi * t / 12 * (1 + k % 3) + k)
-    label = "a motion through the joints' ranges"
-    return Motion("sweep", label, t.round(3), q.round(4))
+    low, high = np.array(list(map(working_range, arm.coordinates))).T
+    # limits of a hundred turns, as some URDFs have them, would show a blur
+    widest = [1.2 if coordinate.kind == "revolute" else 0.3 for coordinate in arm.coordinates]
+    joint = np.arange(len(low))
+    phase = 2 * np.pi / 12 * t[:, None] * (1 + joint % 3) + joint
+    q = (low + high) / 2 + np.minimum(0.4 * (high - low), widest) * np.sin(phase)
+    return Motion("sweep", "a motion through the joints' ranges", t.round(3), q.round(4))

@@ -8,7 +8,6 @@ from spelgen.labels import named_joints, thousandths
 from spelgen.listing import number
 from spelgen.render.plots import (
     STYLES,
-    eigenvalue_chart,
     energy_chart,
     friction_panels,
     growth_panels,
@@ -22,7 +21,7 @@ from spelgen.spec import Facts
 def curves(traces: Traces, facts: Facts) -> dict[str, object]:
     """Return by section of a page what is drawn there, or None; of torques and trajectories by their titles."""
     joints = named_joints(facts.joints, facts.joint_types)
-    drawn: dict[str, object] = dict.fromkeys(("growth", "mass", "eigenvalues", "friction", "energy"))
+    drawn: dict[str, object] = dict.fromkeys(("growth", "mass", "friction", "energy"))
     growth, mass = traces.growth, traces.mass
     if growth is not None:
         growths = {name: (growth, name) for name in growth.relative}
@@ -31,7 +30,6 @@ def curves(traces: Traces, facts: Facts) -> dict[str, object]:
     if mass is not None and mass.by:
         entries = {name: curves.entries for name, curves in mass.by.items()}
         drawn["mass"] = mass_panels(mass.t, entries, STYLES, facts.joint_types)
-        drawn["eigenvalues"] = eigenvalue_chart(mass)
     if traces.friction is not None:
         drawn["friction"] = friction_panels(traces.friction, traces.torques, joints)
     if traces.torques:  # one trajectory is enough to see where energy goes

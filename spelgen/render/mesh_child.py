@@ -1,4 +1,4 @@
-"""Reads what a URDF shows, in a process of bounded time and memory that ``shapes`` starts: URDF LINK... -> NPZ on stdout.
+"""Reads what a URDF shows, in a process of bounded time and memory: URDF LINK... -> NPZ on stdout.
 
 Readers of a dozen formats unpack archives, follow names of other files and repeat parts as often as a file says.
 """
@@ -18,7 +18,7 @@ from spelgen.settings.tuning.render import TUNING
 MEMORY = 1_073_741_824  # bytes
 SECONDS = 8  # of processor time
 LARGEST = 50_000_000  # bytes of a file
-FACES = 2_000_000  # of all files together: more are an archive that unpacks to no end
+FACES = 2_000_000  # of a link: more are an archive that unpacks to no end
 
 
 class Neighbours:
@@ -48,20 +48,16 @@ def main(urdf: str, links: list[str], output: IO[bytes]) -> None:
     import yourdfpy
 
     model = yourdfpy.URDF.load(urdf, build_scene_graph=False, load_meshes=False)
-    meshes: dict[int, Any] = {}
-    for link in model.robot.links:
-        if link.name in links and link.visuals:
-            shapes = [_shape(visual, model) for visual in link.visuals]
-            meshes[links.index(link.name)] = trimesh.util.concatenate(shapes)
-    area = sum(mesh.area for mesh in meshes.values()) or 1.0
-    if sum(len(mesh.faces) for mesh in meshes.values()) > FACES or not np.isfinite(area):
-        raise ValueError("too many triangles, or triangles without an area")
     arrays: dict[str, Any] = {}
-    for index, mesh in meshes.items():
-        # by size: a fine mesh of a small screw gets no more faces than it shows
-        count = max(TUNING.least_faces, int(TUNING.faces * mesh.area / area))
-        if len(mesh.faces) > count:
-            mesh = mesh.simplify_quadric_decimation(face_count=count, aggression=3)
+    for link in model.robot.links:
+        if link.name not in links or not link.visuals:
+            continue
+        mesh: Any = trimesh.util.concatenate([_shape(visual, model) for visual in link.visuals])
+        if not 0 < mesh.area < np.inf or len(mesh.faces) > FACES:
+            raise ValueError(f"{link.name}: none or too many triangles, or corners that are no numbers")
+        if len(mesh.faces) > TUNING.faces // len(links):
+            mesh = mesh.simplify_quadric_decimation(face_count=TUNING.faces // len(links), aggression=3)
+        index = links.index(link.name)
         arrays |= {f"v{index}": np.asarray(mesh.vertices), f"f{index}": np.asarray(mesh.faces)}
     # in memory first: NumPy writes an archive by going back in its file, which a pipe does not allow
     buffer = io.BytesIO()
@@ -98,8 +94,6 @@ def _read(path: Path) -> Any:
     mesh: Any = trimesh.load(content, file_type=kind, resolver=neighbours, force="mesh")  # type: ignore[arg-type]
     # files give each triangle or patch corners of its own: apart, they would tear when they are simplified
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
-        raise ValueError(f"{path}: no triangles, or corners that are no numbers")
     return mesh
 
 

@@ -20,7 +20,7 @@ from spelgen.baselines.names import (
 )
 from spelgen.evaluation.drawn_motions import PredictedMotion, TorqueTrace
 from spelgen.evaluation.plain import array
-from spelgen.evaluation.traces import FrictionTrace, Growth, MassTrace, Quantiles, Traces
+from spelgen.evaluation.traces import FrictionTrace, Growth, Quantiles, Traces
 from spelgen.evaluation.verdict import Limits
 from spelgen.labels import UNITS, NamedJoint, entry_name
 from spelgen.render.charts import MARGINS, Band, Chart, Dots, Line, Mark, Values, line_chart
@@ -91,13 +91,6 @@ def stacks(
         charts.append(rows[-1].chart(t, joint, k, "t [s]", motion))
         panels.append(Panel(joint.name, tuple(charts)))
     return panels
-
-
-def inertia_unit(a: str, b: str) -> str:
-    """Return the unit of the entry of M between joints of these types."""
-    if a == b:
-        return UNITS[a].inertia
-    return "kg m"
 
 
 def loss_chart(metrics: Sequence[Record], best_epoch: int) -> Chart:
@@ -219,18 +212,10 @@ def mass_panels(
         if np.nanmax(np.abs(list(entries.values()))) > zero:
             lines = [Line(label, t, entry, styles[label]) for label, entry in entries.items()]
             name = entry_name(i, j)
-            unit = f"{name} [{inertia_unit(joint_types[i], joint_types[j])}]"
-            panels.append(Panel(name, (line_chart(lines, name, "t [s]", unit, width=width),)))
+            unit = UNITS[joint_types[i]].inertia if joint_types[i] == joint_types[j] else "kg m"
+            chart = line_chart(lines, name, "t [s]", f"{name} [{unit}]", width=width)
+            panels.append(Panel(name, (chart,)))
     return panels
-
-
-def eigenvalue_chart(mass: MassTrace) -> Chart:
-    """Return the smallest and the largest eigenvalue of M along a trajectory; what is not positive is not drawn."""
-    lines = []
-    for name, curves in mass.by.items():
-        for row, label in ((0, "least"), (-1, "largest")):
-            lines.append(Line(f"{name}, {label}", mass.t, curves.eigenvalues[row], STYLES[name]))
-    return line_chart(lines, "Eigenvalues of M", "t [s]", "eigenvalue of M", log=True, width=520, height=230)
 
 
 def friction_panels(

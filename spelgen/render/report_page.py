@@ -30,7 +30,6 @@ from spelgen.render.plots import Record, coverage_panels, loss_chart
 from spelgen.render.run_facts import (
     best_epoch,
     commands,
-    files,
     head_numbers,
     settings,
     training_facts,
@@ -190,6 +189,5 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         under_servos=config.get("mapping", {}).get("input") == "position",
         summary=fit_summary(config),
         parameters=run.parameters,
-        files=files(run.folder.path),
         commands=commands(run.folder, facts, run.config),
     )

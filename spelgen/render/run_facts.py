@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.filesize import decimal
-
+from spelgen.errors import shortened
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import figures
 from spelgen.fitting.objectives import fit_summary
@@ -26,9 +25,6 @@ from spelgen.spec import Facts, Options
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
-
-
-HASHED = 1_000_000_000  # bytes of the largest file whose digest is computed, in some seconds
 
 
 def head_numbers(
@@ -94,36 +90,15 @@ def settings(config: Record) -> dict[str, str]:
 
 
 def _names(trajectories: Sequence[str]) -> str:
-    count = len(trajectories)
-    if not count:
-        return "none"
-    names = ", ".join(trajectories)
-    if count > 6:
-        names = f"{', '.join(trajectories[:5])} and {count - 5} more"
-    return f"{counted(count, 'trajectory')}: {names}"
+    return (
+        f"{counted(len(trajectories), 'trajectory')}: {shortened(trajectories, 5)}"
+        if trajectories
+        else "none"
+    )
 
 
 def _duration(seconds: float) -> str:
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    minutes = seconds / 60
-    if minutes < 100:
-        return f"{minutes:.1f} min"
-    return f"{minutes / 60:.1f} h"
-
-
-def files(folder: Path) -> list[tuple[str, str, str]]:
-    """Return name, size and SHA-256 of every file of the folder but pages and what is being written."""
-    entries = []
-    for path in sorted(folder.iterdir()):
-        # pages are made from the folder and so are no part of what is reproduced
-        if path.is_file() and not path.name.startswith(".") and path.suffix != ".html":
-            size, digest = path.stat().st_size, "not computed of a file above 1 GB"
-            if size <= HASHED:
-                with path.open("rb") as content:
-                    digest = hashlib.file_digest(content, "sha256").hexdigest()
-            entries.append((path.name, decimal(size), digest))
-    return entries
+    return str(timedelta(seconds=round(seconds)))
 
 
 def commands(run: RunFolder, facts: Facts, record: Record | None) -> list[str]:

@@ -46,14 +46,10 @@ def render_runs(folders: Sequence[Path]) -> str:
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Return the folders' own names, with as many parents' as tell them apart."""
+    """Return the folders' own names, or their paths where names are alike."""
     paths = [folder.resolve() for folder in folders]
-    names: list[str] = []
-    for count in range(1, max(len(path.parts) for path in paths) + 1):
-        names = ["/".join(path.parts[-count:]) for path in paths]
-        if len(set(names)) == len(names):
-            break
-    return names
+    names = [path.name for path in paths]
+    return names if len(set(names)) == len(names) else list(map(str, paths))
 
 
 def _verdict(runs: Mapping[str, Results]) -> str:

@@ -63,8 +63,6 @@ class EvaluationTuning:
 
     headline: int = 20
     """[words] of a verdict's sentence: it is read at a glance."""
-    simulated: float = 1e-3
-    """[] relative error below which a URDF is the model that made the logs."""
     velocity_step: float = 1e-5
     """[] of a joint's largest velocity: differences that friction is differentiated by."""
     displacement_step: float = 1e-7
