@@ -50,7 +50,6 @@ def comparison_tables(
     invariants = (
         Row("least eigenvalue of M / mean", _summary(runs, lambda x: x.invariants.least_eigenvalue, min)),
         Row("rise of energy, no input", _summary(runs, lambda x: x.invariants.energy_rise, max)),
-        Row("energy drift, no friction", _summary(runs, lambda x: x.invariants.energy_drift, max)),
     )
     return [
         _sizes(runs, step_seconds, published),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -86,57 +87,47 @@ def _judge_torques(results: Measurements, uses: _Uses) -> None:
     torque = results.torque.get(MODEL)
     if torque is None or torque.mean_nmse is None:
         return
-    by_joint = _torque_errors(results)
-    unexplained = max(by_joint.values(), default=torque.mean_nmse)
+    joint, unexplained = _worst_torque(results)
+    if not joint:
+        unexplained = torque.mean_nmse
     for least, good, bad in TORQUE_USES:
         if 1 - unexplained >= least:  # coefficient of determination
             uses.good += good
             uses.bad += bad
             break
-    mean, worst = _explained(torque.mean_nmse), _explained(unexplained)
+    mean, worst = (share(max(0.0, 1 - nmse)) for nmse in (torque.mean_nmse, unexplained))
     proof = f"explains {mean} of the variance of the torques"
-    if worst != mean:
-        proof += f" ({worst} at {max(by_joint, key=by_joint.__getitem__)})"
-    uses.proofs.append(proof)
+    uses.proofs.append(proof if worst == mean else f"{proof} ({worst} at {joint})")
 
 
-def _explained(nmse: float) -> str:
-    return share(1 - nmse) if nmse < 1 else "none"
-
-
-def _torque_errors(results: Measurements) -> dict[str, float]:
-    """Return the model's nMSE of each joint whose torque is not logged in coarse steps."""
-    errors: dict[str, float] = {}
+def _worst_torque(results: Measurements) -> tuple[str, float]:
+    """Return the joint of the model's largest nMSE, of those whose torque is not logged in coarse steps, and this."""
+    worst = ("", -math.inf)
     if MODEL in results.torque:
         for joint, error in zip(results.joints, results.torque[MODEL].joint_nmse, strict=False):
             if error is not None and joint not in results.torque_steps:
-                errors[joint] = error
-    return errors
+                worst = max(worst, (joint, error), key=itemgetter(1))
+    return worst
 
 
 def _judge_motion(results: Measurements, uses: _Uses) -> None:
     # a long horizon may blow up where a short one tells something
     finite = [x for x in results.horizons if x.errors[MODEL].mean_relative_rms is not None]
-    if not finite:
-        if results.horizons:
-            uses.bad.append("simulation")
-            uses.proofs.append("predicts no finite motion")
-        return
-    last = finite[-1]
-    error = _relative(last.errors[MODEL])
-    if error <= TUNING.close_prediction:
-        uses.good.append(f"simulation {last.name} ahead")
-    elif error <= TUNING.rough_prediction:
-        uses.good.append(f"rough simulation {last.name} ahead")
-    else:
-        uses.bad.append(f"simulation {last.name} ahead")
-        if _relative(last.errors.get(observed(MODEL))) <= TUNING.rough_prediction:
-            uses.good.append(f"prediction {last.name} ahead with a momentum observer")
-    proof = f"is off by {share(error, 'the motion')} after {last.name}"
-    tip = last.errors[MODEL].tip_mm
-    if tip is not None:
-        proof += f", {number(tip)} mm at the tip"
-    uses.proofs.append(proof)
+    if results.horizons and not finite:
+        uses.bad.append("simulation")
+        uses.proofs.append("predicts no finite motion")
+    for last in finite[-1:]:
+        error = _relative(last.errors[MODEL])
+        if error <= TUNING.rough_prediction:
+            rough = "" if error <= TUNING.close_prediction else "rough "
+            uses.good.append(f"{rough}simulation {last.name} ahead")
+        else:
+            uses.bad.append(f"simulation {last.name} ahead")
+            if _relative(last.errors.get(observed(MODEL))) <= TUNING.rough_prediction:
+                uses.good.append(f"prediction {last.name} ahead with a momentum observer")
+        proof = f"is off by {share(error, 'the motion')} after {last.name}"
+        tip = last.errors[MODEL].tip_mm
+        uses.proofs.append(proof if tip is None else f"{proof}, {number(tip)} mm at the tip")
 
 
 def _judge_replays(results: Measurements, uses: _Uses) -> None:
@@ -185,10 +176,9 @@ def _better_baselines(results: Measurements) -> list[str]:
 
 def _worst_joint(results: Measurements) -> tuple[str, str, str]:
     """Return the joint whose torque is explained least, else that whose motion is; when; and a sentence about it."""
-    by_joint = _torque_errors(results)
-    if by_joint:
-        joint = max(by_joint, key=by_joint.__getitem__)
-        amount = share(math.sqrt(by_joint[joint]), "the torque's standard deviation")
+    joint, error = _worst_torque(results)
+    if joint:
+        amount = share(math.sqrt(error), "the torque's standard deviation")
         speed = _slow_or_fast(results, results.joints.index(joint))
         return joint, speed, f"At {joint} the torque residual is {amount}."
     for last in results.horizons[-1:]:

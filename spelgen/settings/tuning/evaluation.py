@@ -34,7 +34,7 @@ class EvaluationTuning:
     fewest_windows: int = 100
     """[] as far as there are so many."""
     probed_model_windows: int = 64
-    """[] of which the former are taken, and which the energy's drift starts from."""
+    """[] of which the former are taken."""
     explained_for_contacts: float = 0.99
     """[] of the torque's variance; convention of this package, as the next two."""
     explained_for_feed_forward: float = 0.95
@@ -58,8 +58,6 @@ class EvaluationTuning:
     """[] of 1 ms without input."""
     started_states: int = 8
     """[] that motion without input starts from."""
-    drift_calls: int = 30_000
-    """[] of the dynamics, after which they are too stiff to be integrated to thirteen digits."""
 
     headline: int = 20
     """[words] of a verdict's sentence: it is read at a glance."""
