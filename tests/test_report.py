@@ -219,7 +219,7 @@ def test_a_run_of_any_preset_has_its_page(run, robots, preset):
     assert "canvas" in page.tags and len(text) < 2_000_000
     told = " ".join(" ".join(page.text).split())
     assert ("Masses, centres of mass" in told) == (preset == "closed-form")
-    assert f"--preset {preset}" in told and "cp RUN/robot.yaml rpr.yaml" in told
+    assert f"Preset {preset} ," in told and "train RUN/module.py --robot RUN/robot.urdf" in told
     units = {"Nm": "joint1", "N": "joint2"}
     for unit, joint in units.items():
         assert f"Torque of {joint}" in text and f"torque [{unit}]" in text

@@ -6,7 +6,6 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import timedelta
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spelgen.errors import shortened
@@ -21,7 +20,6 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.render.plots import Record
 from spelgen.settings.fits import CONFIGS
 from spelgen.settings.training import TrainingSettings
-from spelgen.spec import Facts, Options
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -101,37 +99,18 @@ def _duration(seconds: float) -> str:
     return str(timedelta(seconds=round(seconds)))
 
 
-def commands(run: RunFolder, facts: Facts, record: Record | None) -> list[str]:
-    """Return what makes a run again, from its config.json; the logs' place is not known to the run."""
-    # the module may name a folder of another machine before its URDF, the run calls it robot.urdf
-    name = Path(facts.urdf).name
-    urdf = shlex.quote(name)
+def commands(run: RunFolder, record: Record | None) -> list[str]:
+    """Return what makes a run again, from its module and its config.json; the logs' place is not known to the run."""
     lines = []
-    if run.urdf.exists():  # under the name that the module knows it by
-        lines.append(f"cp RUN/{run.urdf.name} {urdf}")
-        if run.settings.exists():
-            lines.append(f"cp RUN/{run.settings.name} {shlex.quote(str(Path(name).with_suffix('.yaml')))}")
-    build = f"spelgen build {urdf}"
-    for key, value in _changed(asdict(facts.options), asdict(Options())).items():
-        words = ",".join(value) if isinstance(value, (list, tuple)) else str(value)
-        build += f" --{key.replace('_', '-')} {shlex.quote(words)}"
-    lines.append(f"{build} -o module.py")
     if record:
         objective, chosen = record["objective"], ("validation_fraction", "seed")
+        robot = f" --robot RUN/{run.urdf.name}" if run.urdf.exists() else ""
+        train = f"spelgen train RUN/{run.module.name}{robot} --data LOGS -o RUN2 --objective {objective}"
         defaults = CONFIGS[objective]().model_dump(mode="json") | asdict(Preprocessing())
         defaults |= TrainingSettings().model_dump(include=set(chosen))
         options = {key: record[key] for key in chosen} | record["config"] | record["preprocessing"]
-        train = f"spelgen train module.py --robot {urdf} --data LOGS -o RUN2 --objective {objective}"
-        for key, value in _changed(options, defaults).items():
-            train += f" --set {shlex.quote(f'{key}={value}')}"
+        for key, value in options.items():
+            if value is not None and value != defaults.get(key) and not isinstance(value, Mapping):
+                train += f" --set {shlex.quote(f'{key}={value}')}"
         lines.append(train)
     return [*lines, "spelgen evaluate RUN2 --data LOGS", "spelgen report RUN2"]
-
-
-def _changed(options: Mapping[str, object], defaults: Mapping[str, object]) -> dict[str, object]:
-    """Return the options that are set to something else than by default."""
-    changed = {}
-    for key, value in options.items():
-        if value is not None and value != defaults.get(key) and not isinstance(value, Mapping):
-            changed[key] = value
-    return changed
