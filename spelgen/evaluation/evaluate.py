@@ -125,8 +125,7 @@ def _judge_torques(
     predictors = [Predictor(MODEL, solver, model)]
     for baseline in BASELINES:
         predictors += baseline.predictors(JudgedArm(judged.joints, judged.urdf, judged.run, probe, notes))
-    for name, dynamics in baselines.items():
-        predictors.append(of_dynamics(name, dynamics, probe))
+    predictors += [of_dynamics(name, dynamics, probe) for name, dynamics in baselines.items()]
     tip = _tip(judged, notes)
     horizons: list[Horizon] = []
     longest: Predictions | None = None
@@ -134,14 +133,14 @@ def _judge_torques(
         if progress is not None:
             progress(len(horizons), len(lengths), f"predicting {name} ahead")
         horizon, predictions = predict(name, k, tests, predictors, tip, notes)
-        # the curves of the longest horizon show the shorter ones on their way
-        if all(k > shorter.steps for shorter in horizons):
-            longest = predictions
         horizons.append(horizon)
+        # the curves of the longest horizon show the shorter ones on their way
+        if k == max(lengths.values()):
+            longest = predictions
+    dynamics = {x.name: x.dynamics for x in predictors if x.dynamics is not None}
     torque: dict[str, TorqueErrors] = {}
-    for predictor in predictors:
-        if samples and predictor.dynamics is not None:
-            torque[predictor.name] = torque_errors(predictor.dynamics, samples)
+    if samples:
+        torque = {name: torque_errors(predictor, samples) for name, predictor in dynamics.items()}
     if not horizons and not torque:
         raise LogError(
             "no figure: no rollout is evaluated, and torques need accelerations, which these logs do not show",
@@ -150,7 +149,7 @@ def _judge_torques(
         )
     steps = coarse_torques(logs, judged.joints, notes) if torque else {}
     return replace(
-        _results(judged, logs, motion_traces(predictors, tests, longest, tip), notes),
+        _results(judged, logs, motion_traces(dynamics, tests, longest, tip), notes),
         cutoff=used.cutoff or None,
         substeps=solver.substeps,
         horizons=tuple(horizons),
@@ -168,7 +167,7 @@ def _results(
         joints=tuple(judged.joints),
         joint_types=tuple(judged.model.joint_types),
         trajectories=tuple(trajectory.name for trajectory in logs),
-        parameters=judged.parameters,
+        parameters=sum(parameter.numel() for parameter in judged.model.parameters()),
         diagnostics=tuple(notes),
         traces=traces,
     )

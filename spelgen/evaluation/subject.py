@@ -70,11 +70,6 @@ class Subject:
             return None
         return RunFolder(self.fit.folder)
 
-    @property
-    def parameters(self) -> int:
-        """How many numbers of the model are trained."""
-        return sum(parameter.numel() for parameter in self.model.parameters())
-
 
 def subject(judged: EmittedModel | Fit | Path | str, arm: LoadedArm | Path | str | None = None) -> Subject:
     """Return what is judged: a model, a fit or the folder of a run, on an arm or the URDF of this path."""

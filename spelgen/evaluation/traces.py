@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from spelgen.baselines.names import MODEL, is_drawn
-from spelgen.baselines.predictor import Predictor
 from spelgen.evaluation.drawn_motions import (
     DrawnMotion,
     PredictedMotion,
@@ -96,13 +95,12 @@ class Traces:
 
 
 def motion_traces(
-    predictors: Sequence[Predictor],
+    dynamics: Mapping[str, RigidDynamics],
     logs: JudgedLogs,
     predictions: Predictions | None,
     tip: TipPosition | None,
 ) -> Traces:
-    """Return all curves of an arm under torques. predictions: over the longest horizon."""
-    dynamics = {x.name: x.dynamics for x in predictors if x.dynamics is not None}
+    """Return all curves of an arm under torques. dynamics: by predictor. predictions: over the longest horizon."""
     growth: Growth | None = None
     predicted: tuple[PredictedMotion, ...] = ()
     # errors are relative to the motion: there is none at rest

@@ -21,11 +21,6 @@ from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Joint, Robot
 
 
-NOWHERE = (0.0, 0.0, 0.0)
-ROOT = Joint("", "fixed", "", "", NOWHERE, NOWHERE, (0.0, 0.0, 1.0), *[None] * 4, 0.0, 0.0, None, 0)
-"""What carries the first link."""
-
-
 @dataclass(frozen=True, eq=False)
 class SceneLink:
     """Hold a link, and the joint that carries it.
@@ -74,14 +69,19 @@ def scene(urdf: Path, joints: Sequence[str]) -> Scene:
 
 
 def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint, shape: Shape) -> SceneLink:
-    joint = robot.joint_above.get(name, ROOT)
+    joint = robot.joint_above.get(name)
+    if joint is None:
+        root = np.zeros(3)
+        return SceneLink(name, -1, np.eye(3), root, np.array([0.0, 0.0, 1.0]), False, -1, 0.0, 0.0, shape)
     driver, ratio, offset = -1, 0.0, 0.0
     if joint.moves:
+        # a mimic joint follows the joint that drives it; a locked one follows none
         row = constraint.names.index(joint.name)
         offset = float(constraint.offset[row])
-        # a mimic joint follows the joint that drives it; a locked one follows none
-        for column in np.flatnonzero(constraint.jacobian[row]).tolist():
-            driver, ratio = column, float(constraint.jacobian[row, column])
+        drivers = np.flatnonzero(constraint.jacobian[row])
+        if len(drivers):
+            driver = int(drivers[0])
+            ratio = float(constraint.jacobian[row, driver])
     return SceneLink(
         name=name,
         parent=names.index(joint.parent) if joint.parent in names else -1,
@@ -116,7 +116,7 @@ def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
 
 def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shape:
     """Return tubes from the link's origin to the joints that it carries; the last link ends at its centre of mass."""
-    joint, inertial = robot.joint_above.get(name, ROOT), robot.link[name].inertial
+    joint, inertial = robot.joint_above.get(name), robot.link[name].inertial
     below = [joint for joint in robot.joints_below[name] if joint.child in names]
     meshes = []
     for carried in below:
@@ -127,7 +127,7 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
             meshes += tube(end, end + travel * _rotation(carried) @ _axis(carried), 0.4 * radius)
     if not below and inertial is not None:
         meshes += tube(np.zeros(3), np.array(inertial.com, dtype=float), 0.7 * radius)
-    if joint.moves:
+    if joint is not None and joint.moves:
         sides, width, half = (4, 1.8, 2.4) if joint.type == "prismatic" else (10, 1.5, 1.725)
         ends = half * radius * _axis(joint)
         meshes += tube(-ends, ends, width * radius, sides)
