@@ -57,7 +57,6 @@ class ArmSection:
 
     data: Markup
     motions: tuple[str, ...]
-    has_meshes: bool
 
 
 def matrix(arm: Arm, structure: Structure) -> list[list[Cell]]:
@@ -101,11 +100,10 @@ def _explanations(arm: Arm, structure: Structure) -> dict[str, str]:
 
 def arm_section(arm: Arm, urdf: Path, traces: Traces | None = None) -> ArmSection:
     """Return the arm with the motions of an evaluation's traces, or, without, one through its ranges."""
-    drawn = scene(urdf, arm.joint_names)
     motions = _motions(traces) if traces else []
     motions = motions or [_sweep(arm)]
-    data = record(drawn) | {"motions": list(map(record, motions))}
-    return ArmSection(json_data(data), tuple(motion.label for motion in motions), drawn.has_meshes)
+    data = record(scene(urdf, arm.joint_names)) | {"motions": list(map(record, motions))}
+    return ArmSection(json_data(data), tuple(motion.label for motion in motions))
 
 
 def _motions(traces: Traces) -> list[Motion]:
