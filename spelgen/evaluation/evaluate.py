@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from spelgen.baselines.baseline import CommandFollower, JudgedArm
 from spelgen.baselines.names import MODEL
@@ -87,7 +87,7 @@ def evaluate(
             )
         return _judge_commands(judged, logs, notes)
     require_torques(logs)
-    used = _preprocessing(judged.fit and judged.fit.preprocessing, preprocessing, logs)
+    used = _preprocessing(judged.fit.preprocessing if judged.fit else None, preprocessing, logs)
     return _judge_torques(judged, logs, notes, used, baselines or {}, (steps, seconds), progress)
 
 
@@ -148,8 +148,11 @@ def _judge_torques(
             do="omit --quick",
         )
     steps = coarse_torques(logs, judged.joints, notes) if torque else {}
-    return replace(
-        _results(judged, logs, motion_traces(dynamics, tests, longest, tip), notes),
+    return _results(
+        judged,
+        logs,
+        notes,
+        motion_traces(dynamics, tests, longest, tip),
         cutoff=used.cutoff or None,
         substeps=solver.substeps,
         horizons=tuple(horizons),
@@ -159,9 +162,9 @@ def _judge_torques(
 
 
 def _results(
-    judged: Subject, logs: Sequence[Trajectory], traces: Traces, notes: Sequence[Diagnostic]
+    judged: Subject, logs: Sequence[Trajectory], notes: Sequence[Diagnostic], traces: Traces, **figures: Any
 ) -> Results:
-    """Return results that name the arm and the logs, without figures."""
+    """Return results that name the arm and the logs."""
     return Results(
         robot=judged.facts.robot if judged.facts else type(judged.model).__name__,
         joints=tuple(judged.joints),
@@ -170,6 +173,7 @@ def _results(
         parameters=sum(parameter.numel() for parameter in judged.model.parameters()),
         diagnostics=tuple(notes),
         traces=traces,
+        **figures,
     )
 
 
@@ -181,7 +185,7 @@ def _judge_commands(judged: Subject, logs: Sequence[Trajectory], notes: list[Dia
     for baseline in BASELINES:
         followers |= baseline.followers(judged.fit, notes)
     errors, missed = replays(judged.model, logs, followers, notes)
-    return replace(_results(judged, logs, replay_traces(missed), notes), replays=errors)
+    return _results(judged, logs, notes, replay_traces(missed), replays=errors)
 
 
 def _tip(judged: Subject, notes: list[Diagnostic]) -> TipPosition | None:

@@ -169,15 +169,15 @@ def _replay_tables(results: Measurements) -> list[Table]:
     """Return those of commands replayed: by trajectory and by joint."""
     tables, unit = [], thousandths(results.joint_types)
     for replay in results.replays:
-        logs, joints = {}, {}
-        for predictor, errors in replay.errors.items():
-            logs[predictor] = {name: 1000 * rms for name, rms in errors.trajectories.items()}
-            logs[predictor]["mean of all"] = 1000 * errors.mean
-            joints[predictor] = [1000 * rms for rms in errors.joints]
+        rows: dict[str, Numbers] = {}
+        for log in replay.errors[MODEL].trajectories:
+            rows[log] = {name: 1000 * errors.trajectories[log] for name, errors in replay.errors.items()}
+        rows["mean of all"] = {name: 1000 * errors.mean for name, errors in replay.errors.items()}
         title = f"Commands replayed, {replay.name}: RMS"
-        tables.append(table(f"{title} of positions over all joints [{unit}]", _transposed(logs)))
-        rows = _joint_rows(results.joints, joints)
-        tables.append(table(f"{title} by joint, over all trajectories [{unit}]", rows))
+        tables.append(table(f"{title} of positions over all joints [{unit}]", rows))
+        joints = {name: [1000 * rms for rms in errors.joints] for name, errors in replay.errors.items()}
+        title = f"{title} by joint, over all trajectories [{unit}]"
+        tables.append(table(title, _joint_rows(results.joints, joints)))
     return tables
 
 
@@ -194,16 +194,10 @@ def _by_joint(
 
 def _joint_rows(labels: Sequence[str], errors: Mapping[str, JointErrors]) -> dict[str, Numbers]:
     """Return by joint what the predictors' errors are there."""
-    return _transposed({name: dict(zip(labels, values, strict=True)) for name, values in errors.items()})
-
-
-def _transposed(columns: Mapping[str, Numbers]) -> dict[str, Numbers]:
-    """Return by row and column what stands by column and row."""
-    rows: dict[str, dict[str, float | None]] = {}
-    for column, values in columns.items():
-        for label, value in values.items():
-            rows.setdefault(label, {})[column] = value
-    return dict(rows)
+    rows: dict[str, Numbers] = {}
+    for k, label in enumerate(labels):
+        rows[label] = {name: values[k] for name, values in errors.items()}
+    return rows
 
 
 @dataclass(frozen=True)

@@ -269,7 +269,7 @@ def coverage_panels(
     traces: Traces, identified: Record | None, joints: Sequence[NamedJoint], limits: Limits
 ) -> list[Panel]:
     """Return by joint how often training and test logs have positions and velocities; the joint's limits are marked."""
-    logs = {"training": (identified or {}).get("coverage"), "test": traces.coverage}
+    logs: dict[str, Record | None] = {"training": (identified or {}).get("coverage"), "test": traces.coverage}
     panels = []
     for k, joint in enumerate(joints):
         charts = []
