@@ -92,12 +92,12 @@ def evaluate(
 
 
 def _preprocessing(
-    used: Preprocessing | None, wanted: Preprocessing | None, logs: Sequence[Trajectory]
+    used: Preprocessing | None, chosen: Preprocessing | None, logs: Sequence[Trajectory]
 ) -> Preprocessing:
-    """Return how logs are prepared: as is wanted, else as for the fit, if there was one."""
-    if wanted is None and used is not None:
+    """Return how logs are prepared: as is chosen, else as for the fit, if there was one."""
+    if chosen is None and used is not None:
         return used
-    preprocessing = wanted or Preprocessing()
+    preprocessing = chosen or Preprocessing()
     if used is not None and preprocessing.torque_delay is None:  # of the logger, whatever the filter
         preprocessing = replace(preprocessing, torque_delay=used.torque_delay)
     return preprocessing.resolved([trajectory.sample_rate for trajectory in logs])
@@ -125,7 +125,8 @@ def _judge_torques(
     predictors = [Predictor(MODEL, solver, model)]
     for baseline in BASELINES:
         predictors += baseline.predictors(JudgedArm(judged.joints, judged.urdf, judged.run, probe, notes))
-    predictors += [of_dynamics(name, dynamics, probe) for name, dynamics in baselines.items()]
+    for name, dynamics in baselines.items():
+        predictors.append(of_dynamics(name, dynamics, probe))
     tip = _tip(judged, notes)
     horizons: list[Horizon] = []
     longest: Predictions | None = None
@@ -137,10 +138,13 @@ def _judge_torques(
         # the curves of the longest horizon show the shorter ones on their way
         if k == max(lengths.values()):
             longest = predictions
-    dynamics = {x.name: x.dynamics for x in predictors if x.dynamics is not None}
+    judged_dynamics: dict[str, RigidDynamics] = {}
     torque: dict[str, TorqueErrors] = {}
-    if samples:
-        torque = {name: torque_errors(predictor, samples) for name, predictor in dynamics.items()}
+    for predictor in predictors:
+        if predictor.dynamics is not None:
+            judged_dynamics[predictor.name] = predictor.dynamics
+            if samples:
+                torque[predictor.name] = torque_errors(predictor.dynamics, samples)
     if not horizons and not torque:
         raise LogError(
             "no figure: no rollout is evaluated, and torques need accelerations, which these logs do not show",
@@ -152,7 +156,7 @@ def _judge_torques(
         judged,
         logs,
         notes,
-        motion_traces(dynamics, tests, longest, tip),
+        motion_traces(judged_dynamics, tests, longest, tip),
         cutoff=used.cutoff or None,
         substeps=solver.substeps,
         horizons=tuple(horizons),

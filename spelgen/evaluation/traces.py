@@ -167,7 +167,7 @@ def _quantiles(values: Tensor) -> Quantiles:
     """Return those over windows of (W, T); what is not finite counts as infinite."""
     ordered = values.nan_to_num(nan=torch.inf).sort(dim=0).values.numpy()
     last = len(ordered) - 1
-    return Quantiles(*(ordered[round(part * last)] for part in (0.1, 0.5, 0.9)))
+    return Quantiles(*(ordered[round(quantile * last)] for quantile in (0.1, 0.5, 0.9)))
 
 
 def _mass_trace(dynamics: Mapping[str, RigidDynamics], motion: DrawnMotion) -> MassTrace:

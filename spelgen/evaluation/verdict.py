@@ -68,8 +68,11 @@ def verdict(
     recommendations = _recommendations(results, identified or {}, limits)
     if speed == STANDSTILL:
         recommendations[f"slow reversals of {joint}"] = "Dry friction is learned from slow reversals."
-    details = [f"worst at {joint}{speed}"] if joint else []
-    details += [f"next, record {motion}" for motion in recommendations][:1]
+    details = []
+    if joint:
+        details.append(f"worst at {joint}{speed}")
+    if recommendations:
+        details.append(f"next, record {next(iter(recommendations))}")
     because = []
     for detail in details:
         # a headline is read at a glance
@@ -90,14 +93,16 @@ def _judge_torques(results: Measurements, uses: _Uses) -> None:
     joint, unexplained = _worst_torque(results)
     if not joint:
         unexplained = torque.mean_nmse
-    for least, good, bad in TORQUE_USES:
-        if 1 - unexplained >= least:  # coefficient of determination
+    for threshold, good, bad in TORQUE_USES:
+        if 1 - unexplained >= threshold:  # coefficient of determination
             uses.good += good
             uses.bad += bad
             break
     mean, worst = (share(max(0.0, 1 - nmse)) for nmse in (torque.mean_nmse, unexplained))
     proof = f"explains {mean} of the variance of the torques"
-    uses.proofs.append(proof if worst == mean else f"{proof} ({worst} at {joint})")
+    if worst != mean:
+        proof += f" ({worst} at {joint})"
+    uses.proofs.append(proof)
 
 
 def _worst_torque(results: Measurements) -> tuple[str, float]:
@@ -118,24 +123,29 @@ def _judge_motion(results: Measurements, uses: _Uses) -> None:
         uses.proofs.append("predicts no finite motion")
     for last in finite[-1:]:
         error = _relative(last.errors[MODEL])
-        if error <= TUNING.rough_prediction:
-            rough = "" if error <= TUNING.close_prediction else "rough "
-            uses.good.append(f"{rough}simulation {last.name} ahead")
+        if error <= TUNING.close_prediction:
+            uses.good.append(f"simulation {last.name} ahead")
+        elif error <= TUNING.rough_prediction:
+            uses.good.append(f"rough simulation {last.name} ahead")
         else:
             uses.bad.append(f"simulation {last.name} ahead")
             if _relative(last.errors.get(observed(MODEL))) <= TUNING.rough_prediction:
                 uses.good.append(f"prediction {last.name} ahead with a momentum observer")
         proof = f"is off by {share(error, 'the motion')} after {last.name}"
         tip = last.errors[MODEL].tip_mm
-        uses.proofs.append(proof if tip is None else f"{proof}, {number(tip)} mm at the tip")
+        if tip is not None:
+            proof += f", {number(tip)} mm at the tip"
+        uses.proofs.append(proof)
 
 
 def _judge_replays(results: Measurements, uses: _Uses) -> None:
     # whole logs stand first: windows forgive what drifts
     for replay in results.replays[:1]:
         error = replay.errors[MODEL].mean
-        best = error == min(errors.mean for errors in replay.errors.values())
-        (uses.good if best else uses.bad).append("simulation from commands")
+        if error == min(errors.mean for errors in replay.errors.values()):
+            uses.good.append("simulation from commands")
+        else:
+            uses.bad.append("simulation from commands")
         distance = f"{1000 * error:.3g} {thousandths(results.joint_types)}"
         uses.proofs.append(f"misses {distance} of the positions that follow commands, {replay.name}")
 

@@ -26,6 +26,8 @@ from spelgen.structure.nominal import working_range
 from spelgen.structure.structure import Structure
 
 KINDS = {"zero": "is always zero", "constant": "is constant"}
+WIDEST = {"revolute": 1.2, "prismatic": 0.3}
+"""Swings of joints that are shown without an evaluation [rad, m]."""
 ENTRY = re.compile(r"M\d+(?:,\d+)?")
 
 
@@ -100,8 +102,9 @@ def _explanations(arm: Arm, structure: Structure) -> dict[str, str]:
 
 def arm_section(arm: Arm, urdf: Path, traces: Traces | None = None) -> ArmSection:
     """Return the arm with the motions of an evaluation's traces, or, without, one through its ranges."""
-    motions = _motions(traces) if traces else []
-    motions = motions or [_sweep(arm)]
+    motions = [_sweep(arm)]
+    if traces is not None:
+        motions = _motions(traces) or motions
     data = record(scene(urdf, arm.joint_names)) | {"motions": list(map(record, motions))}
     return ArmSection(json_data(data), tuple(motion.label for motion in motions))
 
@@ -135,7 +138,7 @@ def _sweep(arm: Arm) -> Motion:
     t = np.linspace(0, 12, 121)
     low, high = np.array(list(map(working_range, arm.coordinates))).T
     # limits of a hundred turns, as some URDFs have them, would show a blur
-    widest = [1.2 if coordinate.kind == "revolute" else 0.3 for coordinate in arm.coordinates]
+    widest = [WIDEST[coordinate.kind] for coordinate in arm.coordinates]
     joint = np.arange(len(low))
     phase = 2 * np.pi / 12 * t[:, None] * (1 + joint % 3) + joint
     q = (low + high) / 2 + np.minimum(0.4 * (high - low), widest) * np.sin(phase)

@@ -229,8 +229,11 @@ def _spaced(pixels: np.ndarray) -> str:
 def _shown(columns: Sequence[np.ndarray], positive: bool) -> np.ndarray:
     """Return all finite values, or those that a logarithmic axis can show."""
     values = np.concatenate([np.zeros(0), *columns])
-    finite: np.ndarray = values[np.isfinite(values)]
-    return finite[finite > 0] if positive else finite
+    drawable = np.isfinite(values)
+    if positive:
+        drawable &= values > 0
+    finite: np.ndarray = values[drawable]
+    return finite
 
 
 def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool) -> Axis:

@@ -45,8 +45,8 @@ def charts(log: Trajectory, arm: Arm, inputs: np.ndarray) -> list[Panel]:
         columns = [("velocity", [("logged", _joined(pieces, "qd"), "truth"), ("dq/dt", slope, "predicted")])]
         torque = [("logged", _joined(pieces, "tau") @ inputs.T, "truth")]
         if any(body.inertia for body in arm.bodies):
-            rest = np.zeros_like(q)
-            gravity = regressor(arm, q, rest, rest) @ urdf_parameters(arm)  # (T, n)
+            still = np.zeros_like(q)
+            gravity = regressor(arm, q, still, still) @ urdf_parameters(arm)  # (T, n)
             torque.append(("gravity of the URDF", gravity, "predicted"))
         columns.append(("torque", torque))
     rows = [

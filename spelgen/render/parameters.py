@@ -43,18 +43,17 @@ def parameter_tables(
     tables: list[Listing] = []
     if arm is not None and identified and "base_parameters" in identified:
         tables.append(base_table(model, arm, identified))
-    if model is not None:
-        bodies = body_parameters(model)
-        if bodies is not None:
-            tables.append(_body_table(bodies, arm))
-        if hasattr(model, "armature"):
-            tables.append(_joint_table(model, arm))
+    bodies = body_parameters(model)
+    if bodies is not None:
+        tables.append(_body_table(bodies, arm))
+    if model is not None and hasattr(model, "armature"):
+        tables.append(_joint_table(model, arm))
     return tables
 
 
-def body_parameters(model: EmittedModel) -> np.ndarray | None:
-    """Return (bodies, 10) of a model of rigid bodies, as ``Body.inertia`` has them; None of another."""
-    if not has_rigid_bodies(model):
+def body_parameters(model: EmittedModel | None) -> np.ndarray | None:
+    """Return (bodies, 10) of a model of rigid bodies, as ``Body.inertia`` has them; None of another or of none."""
+    if model is None or not has_rigid_bodies(model):
         return None
     values: np.ndarray = model.inertial_parameters.detach().numpy()
     return values
@@ -67,13 +66,14 @@ def base_table(model: EmittedModel | None, arm: LoadedArm, identified: Record) -
     base = base_parameters(arm.arm, friction, arm.actuation.drives().speeds)
     parameters = identified["base_parameters"]
     names = [parameter["name"] for parameter in parameters]
-    formulas = ["" if x["formula"] == x["name"] else x["formula"] for x in parameters]
     nominal = base.combination[:, : 10 * len(arm.arm.bodies)] @ urdf_parameters(arm.arm)
-    # a file knows nothing of friction and drives, and some know nothing of bodies
-    nominal[base.bodies if arm.arm.has_inertials else 0 :] = np.nan
+    # a file says nothing of friction and drives, and some say nothing of bodies
+    nominal[base.bodies :] = np.nan
+    if not arm.arm.has_inertials:
+        nominal[:] = np.nan
     columns = {"parameter": names, "URDF": list(map(_number, nominal))}
     note = "The intervals are those of least squares on the training logs [kg, m, s]"
-    bodies = None if model is None else body_parameters(model)
+    bodies = body_parameters(model)
     if model is not None and bodies is not None:
         # ten a body, then those of drives, of which a model has the armature in common with least squares
         common = np.concatenate([bodies.ravel(), model.armature.detach().numpy()])
@@ -88,11 +88,14 @@ def base_table(model: EmittedModel | None, arm: LoadedArm, identified: Record) -
         )
     columns["least squares, 95 %"] = list(map(_interval, parameters))
     columns["determined"] = [parameter["determined"] for parameter in parameters]
-    columns["made of"] = formulas
+    columns["made of"] = [x["formula"] if x["formula"] != x["name"] else "" for x in parameters]
     sure: list[tuple[str, ...]] = []
     unsure: list[tuple[str, ...]] = []
-    for word, row in zip(columns["determined"], zip(*columns.values(), strict=True), strict=True):
-        (sure if word in DETERMINED else unsure).append(row)
+    for row in zip(*columns.values(), strict=True):
+        if row[-2] in DETERMINED:
+            sure.append(row)
+        else:
+            unsure.append(row)
     return ParameterTable(
         "Base parameters: identifiable combinations",
         tuple(columns),
@@ -105,7 +108,7 @@ def base_table(model: EmittedModel | None, arm: LoadedArm, identified: Record) -
 
 def _number(value: float) -> str:
     """Return four digits; nothing for NaN."""
-    return "" if np.isnan(value) else f"{value:.4g}"
+    return f"{value:.4g}".replace("nan", "")
 
 
 def _interval(parameter: Record) -> str:

@@ -149,16 +149,18 @@ def _error_limits(errors: Mapping[str, Quantiles]) -> tuple[float, float] | None
     model_errors = np.concatenate([errors[MODEL].low, errors[MODEL].high])
     values = np.concatenate([model_errors, *(error.median for error in errors.values())])
     values = values[(values > 0) & (values <= TUNING.outlier * np.nanmax(model_errors))]
-    return (float(values.min()) / 1.3, 1.3 * float(values.max())) if values.size else None
+    if not values.size:
+        return None
+    return float(values.min()) / 1.3, 1.3 * float(values.max())
 
 
 def torque_panels(trace: TorqueTrace, joints: Sequence[NamedJoint]) -> list[Panel]:
     """Return by joint measured and predicted torque, the residual, and the components of the prediction."""
     measured, predicted = trace.measured, trace.predicted[MODEL]
-    both = [("measured", measured, "truth"), ("predicted", predicted, "predicted")]
-    components = [(name, part, name.lower()) for name, part in trace.parts.items()]
+    curves = [("measured", measured, "truth"), ("predicted", predicted, "predicted")]
+    components = [(name, torque, name.lower()) for name, torque in trace.parts.items()]
     rows = [
-        JointRow("Torque", "torque", "torque", both, 160),
+        JointRow("Torque", "torque", "torque", curves, 160),
         JointRow("Residual", "residual", "torque", [("residual", measured - predicted, "model")], 100),
         JointRow("Components of the torque", "components", "torque", components, 162),
     ]
@@ -212,7 +214,9 @@ def mass_panels(
         if np.nanmax(np.abs(list(entries.values()))) > zero:
             lines = [Line(label, t, entry, styles[label]) for label, entry in entries.items()]
             name = entry_name(i, j)
-            unit = UNITS[joint_types[i]].inertia if joint_types[i] == joint_types[j] else "kg m"
+            unit = "kg m"
+            if joint_types[i] == joint_types[j]:
+                unit = UNITS[joint_types[i]].inertia
             chart = line_chart(lines, name, "t [s]", f"{name} [{unit}]", width=width)
             panels.append(Panel(name, (chart,)))
     return panels
@@ -279,8 +283,9 @@ def coverage_panels(
                 return []
             marks: list[Mark] = list(bands)
             top = max(float(np.max(band.high)) for band in bands)
-            bounds = (limits[k] or ()) if key == "q" else ()
-            marks += [Line("joint limits", (bound, bound), (0.0, top), "hold") for bound in bounds]
+            if key == "q":
+                for bound in limits[k] or ():
+                    marks.append(Line("joint limits", (bound, bound), (0.0, top), "hold"))
             title, height = f"{quantity} of {joint.name}", 130
             label = "fraction of samples"
             charts.append(line_chart(marks, title, joint.axis(quantity), label, width=300, height=height))

@@ -111,11 +111,13 @@ def report_data(folder: Path | str) -> Record:
     """Return all that the page shows, for programs: the verdict, the evaluation, least squares, the parameters."""
     run = open_run(folder)
     model = _trained(run)
-    bodies = None if model is None else body_parameters(model)
+    bodies = body_parameters(model)
+    if bodies is not None:
+        bodies = bodies.tolist()
     return {
         "schema": SCHEMA,
         "verdict": None if run.verdict is None else asdict(run.verdict),
-        "bodies": None if bodies is None else bodies.tolist(),
+        "bodies": bodies,
         "tables": list(map(asdict, parameter_tables(model, run.arm, run.identified))),
         "evaluation": _record(run.folder, run.folder.evaluation),
         "least_squares": run.identified,
@@ -151,7 +153,9 @@ def render_report(folder: Path | str) -> str:
 def _rendered(run: Run) -> str:
     facts, config, metrics = run.facts, run.config or {}, run.folder.read_metrics()
     model = _trained(run)
-    traces = run.results.traces if run.results else Traces({})
+    traces, tables = Traces({}), []
+    if run.results is not None:
+        traces, tables = run.results.traces, result_tables(run.results)
     sections = dict.fromkeys(("arm", "cells", "training", "settings", "losses")) | curves(traces, facts)
     if run.arm is not None:
         sections["arm"] = arm_section(run.arm.arm, run.arm.robot.path, traces)
@@ -174,7 +178,7 @@ def _rendered(run: Run) -> str:
         verdict=run.verdict,
         config=run.config,
         evaluation=run.results,
-        tables=result_tables(run.results) if run.results else [],
+        tables=tables,
         coverage=coverage_panels(traces, run.identified, joints, run.limits),
         trained=model is not None,
         under_servos=config.get("mapping", {}).get("input") == "position",

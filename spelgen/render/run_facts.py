@@ -34,7 +34,8 @@ def head_numbers(
     """
     numbers = []
     if results is not None:
-        numbers += [(figure.text(), figure.label) for figure in figures(results)]
+        for figure in figures(results):
+            numbers.append((figure.text(), figure.label))
     summary = fit_summary(config)
     if summary is not None:
         numbers.append(summary.headline)
@@ -73,7 +74,9 @@ def training_facts(
     # fits to torques have no epochs
     if metrics:
         last, best = metrics[-1], best_epoch(metrics)
-        origin = f"epoch {best}" if best else "the start: no epoch was better"
+        origin = f"epoch {best}"
+        if not best:
+            origin = "the start: no epoch was better"
         facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}"
         facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"
     if config["config"].get("momentum_steps"):

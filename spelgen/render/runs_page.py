@@ -50,7 +50,9 @@ def _names(folders: Sequence[Path]) -> list[str]:
     """Return the folders' own names, or their paths where names are alike."""
     paths = [folder.resolve() for folder in folders]
     names = [path.name for path in paths]
-    return names if len(set(names)) == len(names) else list(map(str, paths))
+    if len(set(names)) < len(names):
+        names = list(map(str, paths))
+    return names
 
 
 def _verdict(runs: Mapping[str, Results]) -> str:
