@@ -6,12 +6,14 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from spelgen.baselines.names import MODEL, observed
-from spelgen.evaluation.measurements import Measurements
 from spelgen.labels import UNITS, share, thousandths
 from spelgen.listing import Listing, number
+
+if TYPE_CHECKING:  # `spelgen --help` names figures, and loads no torch for it
+    from spelgen.evaluation.measurements import Measurements
 
 OBSERVER = (
     "+ observer: with the constant disturbance that a momentum observer estimates from the 0.1 s before; "

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from datetime import timedelta
 from typing import TYPE_CHECKING
 
 from spelgen.errors import shortened
@@ -44,7 +43,7 @@ def head_numbers(
         numbers.append((f"{count:,}", "trained parameters"))
     if metrics:
         label = f"of training, {metrics[-1]['step']:,} steps"
-        numbers.append((_duration(metrics[-1]["seconds"]), label))
+        numbers.append((f"{metrics[-1]['seconds']:,.0f} s", label))
     return numbers
 
 
@@ -77,7 +76,7 @@ def training_facts(
         origin = f"epoch {best}"
         if not best:
             origin = "the start: no epoch was better"
-        facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}"
+        facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {last['seconds']:,.0f} s"
         facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"
     if config["config"].get("momentum_steps"):
         facts["start"] = f"{config['config']['momentum_steps']:,} steps on the momentum along the logs"
@@ -96,10 +95,6 @@ def _names(trajectories: Sequence[str]) -> str:
         if trajectories
         else "none"
     )
-
-
-def _duration(seconds: float) -> str:
-    return str(timedelta(seconds=round(seconds)))
 
 
 def commands(run: RunFolder, record: Record | None) -> list[str]:
