@@ -65,9 +65,7 @@ def verdict(
     if uses.good and uses.bad:
         sentence += f", not for {listed(uses.bad)}"
     joint, speed, proof = _worst_joint(results)
-    recommendations = _recommendations(results, identified or {}, limits)
-    if speed == STANDSTILL:
-        recommendations[f"slow reversals of {joint}"] = "Dry friction is learned from slow reversals."
+    recommendations = _recommendations(results, identified or {}, limits, joint, speed)
     details = []
     if joint:
         details.append(f"worst at {joint}{speed}")
@@ -219,8 +217,10 @@ def _slow_or_fast(results: Measurements, k: int) -> str:
     return " at speed" if ratio < 1 / TUNING.uneven else ""
 
 
-def _recommendations(results: Measurements, identified: Mapping[str, Any], limits: Limits) -> dict[str, str]:
-    """Return which motions to record, the most useful first, and why."""
+def _recommendations(
+    results: Measurements, identified: Mapping[str, Any], limits: Limits, worst: str, speed: str
+) -> dict[str, str]:
+    """Return which motions to record, the most useful first, and why. worst: a joint, which fails at this speed."""
     recommendations = {}
     trained = identified.get("coverage") or {}
     unseen = identified.get("unseen_directions")
@@ -231,13 +231,18 @@ def _recommendations(results: Measurements, identified: Mapping[str, Any], limit
     if outside:
         reason = f"The test logs exceed the range of the training logs: {shortened(outside, 3)}."
         recommendations[f"motion with the {outside[0]} that the test logs have"] = reason
+    if speed == STANDSTILL:
+        recommendations[f"slow reversals of {worst}"] = "Dry friction is learned from slow reversals."
+    fractions = {}
     for joint, covered, bound in zip(results.joints, trained.get("q", ()), limits, strict=False):
         if bound is not None and bound[1] > bound[0]:
             # a turn shows all of a joint that can go on turning
-            fraction = (covered["high"] - covered["low"]) / min(bound[1] - bound[0], 2 * math.pi)
-            if fraction < TUNING.narrow_range:
-                reason = f"{joint} has moved over {share(fraction, 'its range')}."
-                recommendations[f"wider motion of {joint}"] = reason
+            fractions[joint] = (covered["high"] - covered["low"]) / min(bound[1] - bound[0], 2 * math.pi)
+    if fractions:
+        joint = min(fractions, key=fractions.__getitem__)
+        if fractions[joint] < TUNING.narrow_range:
+            reason = f"{joint} has moved over {share(fractions[joint], 'its range')}."
+            recommendations[f"wider motion of {joint}"] = reason
     return recommendations
 
 
