@@ -165,7 +165,7 @@ def _joint_table(model: EmittedModel, arm: LoadedArm | None) -> Listing:
     note = ""
     if arm is not None:
         joints = arm.arm.coordinates
-        columns["joint"] = [joint.name for joint in joints]
+        columns["joint"] = list(arm.arm.joint_names)
         if has_rigid_bodies(model):
             viscous, forward, backward, _ = nearest_friction(arm.arm, model, sampled_positions(arm.arm))
             note = "Viscous and Coulomb friction are fitted to the model's friction law, as in exports."
