@@ -11,7 +11,6 @@ const arm = (() => {
   });
   const context = canvas.getContext("2d");
   const state = { motion: 0, time: 0, playing: false, yaw: 2.3, pitch: 0.36, lit: null };
-  state.colour = scene.motions[0].error ? "error" : "known";
   const LIGHT = [-0.352, 0.624, 0.704];
   let ink = {};
   const readColours = () => {
@@ -129,7 +128,7 @@ const arm = (() => {
     }
     const size = motion.scale * Math.min(wide / 640, high / 420);
     const eye = camera();
-    const values = state.colour === "error" ? motion.error && at(motion, motion.error) : scene.identifiability;
+    const values = motion.error && at(motion, motion.error);
     const measured = (link, shade) => {
       const joint = carried(link);
       let base = ink.arm;
@@ -216,9 +215,8 @@ const arm = (() => {
   };
   play.addEventListener("click", () => run(!state.playing));
   slider.addEventListener("input", () => { state.time = Number(slider.value); run(false); });
-  const choose = document.getElementById("arm-motion"), colours = document.getElementById("arm-colour");
+  const choose = document.getElementById("arm-motion");
   choose?.addEventListener("change", () => { state.motion = Number(choose.value); state.time = 0; draw(); });
-  colours?.addEventListener("change", () => { state.colour = colours.value; draw(); });
   canvas.addEventListener("keydown", (event) => {
     const turns = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.08], ArrowDown: [0, -0.08] }[event.key];
     if (turns) { state.yaw += turns[0]; state.pitch = Math.min(1.5, Math.max(-1.5, state.pitch + turns[1])); draw(); }

@@ -20,7 +20,6 @@ from spelgen.dynamics.tip import tip_kinematics
 from spelgen.emission.loading import load_module
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.evaluation.evaluate import evaluate
-from spelgen.evaluation.invariants import energy_drift
 from spelgen.evaluation.rollout import rollout
 from spelgen.evaluation.subject import read_test_logs
 from spelgen.evaluation.torque import coarse_torques, torque_errors
@@ -241,17 +240,6 @@ def test_what_is_no_run_is_refused(run, tmp_path):
     )
     with pytest.raises(LogError, match="got no such file or folder, expected a log; check the path"):
         read_test_logs(run, [tmp_path / "none.parquet"])
-
-
-def test_energy_drift_is_seen():
-    model = load_module(STAND_IN)
-    with torch.no_grad():
-        model.weight.fill_(1.0)
-    windows = cut_windows(motions(model), 2, measured=False)
-    assert energy_drift(model, windows) < 1e-9
-    # a force that is not the potential's slope
-    model.gravity = lambda q: 1.001 * type(model).gravity(model, q)
-    assert energy_drift(model, windows) > 1e-5
 
 
 @pytest.mark.usefixtures("short_epochs")

@@ -126,11 +126,6 @@ def test_a_headline_has_twenty_words_at_most(errors):
     assert len(verdict(full).sentence.split()) <= 20
 
 
-def test_the_urdf_that_made_the_logs_is_called_that():
-    told = verdict(evaluation(0.05, 0.004, **{"URDF and drives": 1e-5})).because
-    assert "URDF and drives reproduces these logs" in told and "But" not in told
-
-
 def test_a_test_on_training_logs_is_no_proof():
     told = verdict(evaluation(seen=True)).sentence
     assert told.startswith("Evaluated on training logs: good enough for")

@@ -8,7 +8,6 @@ from typing import Annotated, Literal
 
 import typer
 
-from spelgen.baselines.names import MODEL
 from spelgen.cli import options
 from spelgen.cli.console import note, progress_bar, say
 from spelgen.cli.options import Data, Filter, MappingFile, MoreData, Output, Run, Trust
@@ -67,7 +66,7 @@ def evaluate(
     forms = {"text": results.text, "csv": lambda: csv_text(results).removesuffix("\n")}
     options.write_result(format, output, forms | {"json": lambda: json.dumps(record)})
     # after the result, so that a script that failed still has the figures
-    values = {figure.name: figure.values[MODEL] for figure in figures(results)}
+    values = {figure.name: figure.value for figure in figures(results)}
     exceeded = []
     for name, largest in limits:
         value = values.get(name)
@@ -103,10 +102,6 @@ def report(
             "HTML file, or .json for the data. Default: report.html in the run folder, runs.html for several.",
         ),
     ] = None,
-    robot: Annotated[
-        Path | None,
-        typer.Option(metavar="ROBOT.urdf", help="URDF with its meshes, for the picture of the arm."),
-    ] = None,
     trust: Trust = False,
 ) -> None:
     """Write an HTML page about one run or several."""
@@ -115,12 +110,10 @@ def report(
     if trust:
         for run in runs:
             RunFolder(run).load_module(trust=True)  # a module that ran once may run again
-    if robot is not None and len(runs) > 1:
-        raise typer.BadParameter("belongs to the page of one run", param_hint="'--robot'")
     if len(runs) == 1:
         from spelgen.render.report_page import write_report
 
-        say(f"wrote {write_report(runs[0], output, robot)}")
+        say(f"wrote {write_report(runs[0], output)}")
     else:
         from spelgen.render.runs_page import write_runs
 

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 
 from spelgen.comparison.metrics import RunResult
 from spelgen.evaluation.tables import Row, Table, table
-from spelgen.listing import number
 from spelgen.settings.comparison import PublishedFigures
 
 BASELINE = "phnode"
@@ -27,16 +26,16 @@ LOSSES: dict[str, Quantity] = {
 }
 RATIOS = {"prediction loss, 1 s": "prediction loss", "velocity, 1 s": "velocity"}
 """Of these the baseline's is told by that of each variant."""
-PUBLISHED: dict[str, tuple[str, Callable[[float | None], str]]] = {
-    "parameters": ("parameters", "{:,.0f}".format),
-    "training step [s]": ("step_seconds", "{:.2f}".format),
-    "training loss": ("train_loss", number),
-    "test loss": ("test_loss", number),
-    "prediction loss": ("prediction_loss", number),
-    "velocity": ("velocity", number),
-    "position": ("position", number),
+PUBLISHED = {
+    "parameters": "parameters",
+    "training step [s]": "step_seconds",
+    "training loss": "train_loss",
+    "test loss": "test_loss",
+    "prediction loss": "prediction_loss",
+    "velocity": "velocity",
+    "position": "position",
 }
-"""By label, fields of `PublishedFigures` and the form of their numbers."""
+"""By label, fields of `PublishedFigures`."""
 
 
 def comparison_tables(
@@ -49,17 +48,17 @@ def comparison_tables(
         runs.setdefault(result.variant, []).append(result)
     for result in sorted(results, key=lambda result: result.seed):
         losses.setdefault(f"seed {result.seed}", {})[result.variant] = result.prediction.loss
-    invariants = {
-        "least eigenvalue of M / mean": _summary(runs, lambda x: x.invariants.least_eigenvalue, min),
-        "rise of energy, no input": _summary(runs, lambda x: x.invariants.energy_rise, max),
-        "energy drift, no friction": _summary(runs, lambda x: x.invariants.energy_drift, max),
-    }
-    worst = tuple(Row(label, values, ranked=False) for label, values in invariants.items())
+    eigenvalue = _summary(runs, lambda x: x.invariants.least_eigenvalue, min)
+    rise = _summary(runs, lambda x: x.invariants.energy_rise, max)
+    invariants = (
+        Row("least eigenvalue of M / mean", eigenvalue, ranked=False),
+        Row("rise of energy, no input", rise, ranked=False),
+    )
     return [
         _sizes(runs, step_seconds),
         _losses(runs, published),
-        table("Prediction loss over 1 s of every run", list(losses), losses.values()),
-        Table("Invariants, worst over seeds; a negative rise is a fall", worst),
+        table("Prediction loss over 1 s of every run", losses),
+        Table("Invariants, worst over seeds; a negative rise is a fall", invariants),
     ]
 
 
@@ -71,8 +70,8 @@ def _sizes(runs: Runs, step_seconds: Mapping[str, float]) -> Table:
         rows.append(Row(f"outputs of {matrix}", outputs, ranked=False))
     rows += [
         Row("inputs of M", {name: size.inputs for name, size in sizes.items()}, ranked=False),
-        Row("parameters", {name: size.parameters for name, size in sizes.items()}, "{:,.0f}".format),
-        Row("training step [ms]", {name: 1e3 * step_seconds[name] for name in runs}, "{:.1f}".format),
+        Row("parameters", {name: size.parameters for name, size in sizes.items()}),
+        Row("training step [ms]", {name: 1e3 * step_seconds[name] for name in runs}),
     ]
     return Table("Sizes, and the time of a training step", tuple(rows))
 
@@ -86,11 +85,11 @@ def _losses(runs: Runs, published: Published) -> Table:
         if baseline is not None and label in RATIOS:
             ratios = {name: baseline / median if median else None for name, median in medians.items()}
             rows.append(Row(f"{BASELINE}'s {RATIOS[label]} / this", ratios, ranked=False))
-    for label, (field, form) in PUBLISHED.items():
+    for label, field in PUBLISHED.items():
         figures = {name: getattr(published[name], field) for name in runs if name in published}
         figures = {name: figure for name, figure in figures.items() if figure is not None}
         if figures:
-            rows.append(Row(f"published: {label}", figures, form, ranked=False))
+            rows.append(Row(f"published: {label}", figures, ranked=False))
     title = (
         "Squared errors summed over joints [rad, m, s], mean over samples and windows, and the error of M, "
         "relative to M; median over seeds; below, what is published"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from spelgen.baselines.baseline import CommandFollower, JudgedArm
 from spelgen.baselines.names import MODEL
@@ -87,17 +87,17 @@ def evaluate(
             )
         return _judge_commands(judged, logs, notes)
     require_torques(logs)
-    used = _preprocessing(judged.preprocessing, preprocessing, logs)
+    used = _preprocessing(judged.fit.preprocessing if judged.fit else None, preprocessing, logs)
     return _judge_torques(judged, logs, notes, used, baselines or {}, (steps, seconds), progress)
 
 
 def _preprocessing(
-    used: Preprocessing | None, wanted: Preprocessing | None, logs: Sequence[Trajectory]
+    used: Preprocessing | None, chosen: Preprocessing | None, logs: Sequence[Trajectory]
 ) -> Preprocessing:
-    """Return how logs are prepared: as is wanted, else as for the fit, if there was one."""
-    if wanted is None and used is not None:
+    """Return how logs are prepared: as is chosen, else as for the fit, if there was one."""
+    if chosen is None and used is not None:
         return used
-    preprocessing = wanted or Preprocessing()
+    preprocessing = chosen or Preprocessing()
     if used is not None and preprocessing.torque_delay is None:  # of the logger, whatever the filter
         preprocessing = replace(preprocessing, torque_delay=used.torque_delay)
     return preprocessing.resolved([trajectory.sample_rate for trajectory in logs])
@@ -134,14 +134,17 @@ def _judge_torques(
         if progress is not None:
             progress(len(horizons), len(lengths), f"predicting {name} ahead")
         horizon, predictions = predict(name, k, tests, predictors, tip, notes)
-        # the curves of the longest horizon show the shorter ones on their way
-        if all(k > shorter.steps for shorter in horizons):
-            longest = predictions
         horizons.append(horizon)
+        # the curves of the longest horizon show the shorter ones on their way
+        if k == max(lengths.values()):
+            longest = predictions
+    judged_dynamics: dict[str, RigidDynamics] = {}
     torque: dict[str, TorqueErrors] = {}
     for predictor in predictors:
-        if samples and predictor.dynamics is not None:
-            torque[predictor.name] = torque_errors(predictor.dynamics, samples)
+        if predictor.dynamics is not None:
+            judged_dynamics[predictor.name] = predictor.dynamics
+            if samples:
+                torque[predictor.name] = torque_errors(predictor.dynamics, samples)
     if not horizons and not torque:
         raise LogError(
             "no figure: no rollout is evaluated, and torques need accelerations, which these logs do not show",
@@ -149,8 +152,11 @@ def _judge_torques(
             do="omit --quick",
         )
     steps = coarse_torques(logs, judged.joints, notes) if torque else {}
-    return replace(
-        _results(judged, logs, motion_traces(predictors, tests, longest, tip), notes),
+    return _results(
+        judged,
+        logs,
+        notes,
+        motion_traces(judged_dynamics, tests, longest, tip),
         cutoff=used.cutoff or None,
         substeps=solver.substeps,
         horizons=tuple(horizons),
@@ -160,17 +166,18 @@ def _judge_torques(
 
 
 def _results(
-    judged: Subject, logs: Sequence[Trajectory], traces: Traces, notes: Sequence[Diagnostic]
+    judged: Subject, logs: Sequence[Trajectory], notes: Sequence[Diagnostic], traces: Traces, **figures: Any
 ) -> Results:
-    """Return results that name the arm and the logs, without figures."""
+    """Return results that name the arm and the logs."""
     return Results(
-        robot=judged.robot,
+        robot=judged.facts.robot if judged.facts else type(judged.model).__name__,
         joints=tuple(judged.joints),
         joint_types=tuple(judged.model.joint_types),
         trajectories=tuple(trajectory.name for trajectory in logs),
-        parameters=judged.parameters,
+        parameters=sum(parameter.numel() for parameter in judged.model.parameters()),
         diagnostics=tuple(notes),
         traces=traces,
+        **figures,
     )
 
 
@@ -182,14 +189,15 @@ def _judge_commands(judged: Subject, logs: Sequence[Trajectory], notes: list[Dia
     for baseline in BASELINES:
         followers |= baseline.followers(judged.fit, notes)
     errors, missed = replays(judged.model, logs, followers, notes)
-    return replace(_results(judged, logs, replay_traces(missed), notes), replays=errors)
+    return _results(judged, logs, notes, replay_traces(missed), replays=errors)
 
 
 def _tip(judged: Subject, notes: list[Diagnostic]) -> TipPosition | None:
     if judged.urdf is None:
         return None
     try:
-        return tip_kinematics(judged.urdf, judged.tip, joints=judged.joints).position
+        tip = judged.facts.options.tip if judged.facts else None
+        return tip_kinematics(judged.urdf, tip, joints=judged.joints).position
     except Exception as error:  # pytorch-kinematics raises many kinds; the evaluation stands without
         message = f"no tip errors: {in_one_line(error)}"
         notes.append(Diagnostic("info", "no-tip", judged.urdf.name, None, message))

@@ -23,13 +23,9 @@ def keep_baseline(folder: Path | str, logs: Iterable[Path | str] | Sequence[Traj
     as the fit.
     """
     run = RunFolder(folder)
-    trajectories: list[Trajectory] = []
-    files: list[str] = []
-    for log in logs:
-        if isinstance(log, Trajectory):
-            trajectories.append(log)
-        else:
-            files.append(os.fspath(log))
+    sources = list(logs)
+    trajectories = [log for log in sources if isinstance(log, Trajectory)]
+    files = [os.fspath(log) for log in sources if not isinstance(log, Trajectory)]
     only_files = not trajectories
     if files:
         opened = run_logs(run, files)

@@ -97,9 +97,9 @@ def replays(
     predictors = {MODEL: ServoModel(model), **baselines}
     # logs begin before the arm moves; within them windows begin in motion
     logs_from_rest: list[LogRows] = [(piece, slice(0, len(piece))) for piece in pieces]
-    rest = np.zeros((len(pieces), pieces[0].q.shape[1]))
-    whole, missed = _replay("whole log", predictors, logs_from_rest, rest)
-    results = [whole]
+    at_rest = np.zeros((len(pieces), pieces[0].q.shape[1]))
+    replay, missed = _replay("whole log", predictors, logs_from_rest, at_rest)
+    results = [replay]
     if windows:
         name = f"windows of {TUNING.replay_window:g} s"
         results.append(_replay(name, predictors, windows, np.stack(first_qd))[0])

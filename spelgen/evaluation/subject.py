@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 
-from spelgen.dynamics.bristles import NO_BRISTLES, BristleReach, bristle_reach, reach_of
+from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.arm_mapping import GivenMapping
-from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.settings import load_mapping
 from spelgen.settings.tuning.evaluation import EvaluationTuning
-from spelgen.spec import logged_joints, read_facts
+from spelgen.spec import Facts, logged_joints, read_facts
 from spelgen.urdf.read import read_urdf
 
 if TYPE_CHECKING:
@@ -33,22 +32,29 @@ TUNING = EvaluationTuning()
 
 @dataclass(frozen=True)
 class Subject:
-    """A model with its joints as the URDF and logs name them.
-
-    urdf: its robot's, where known; tip: the link there, None for the last. preprocessing, window: those of its fit.
-    reach: (n, K) of the bristles that friction remembers with, its own or the usual ones.
-    fit: what found it, where that is known.
-    """
+    """A model with its joints as the URDF and logs name them; urdf: its robot's, fit: what found it, where known."""
 
     model: EmittedModel
-    robot: str
     joints: Sequence[str]
-    urdf: Path | None = None
-    tip: str | None = None
-    preprocessing: Preprocessing | None = None
-    window: int = TUNING.model_window
-    reach: BristleReach = NO_BRISTLES
-    fit: Fit | None = None
+    urdf: Path | None
+    fit: Fit | None
+
+    @property
+    def facts(self) -> Facts | None:
+        """What the module was built from; None of something that has an arm's dynamics in another way."""
+        return getattr(self.model, "facts", None)
+
+    @property
+    def window(self) -> int:
+        """Samples of the windows that it was fitted to."""
+        return getattr(self.fit and self.fit.config, "window", TUNING.model_window)
+
+    @property
+    def reach(self) -> BristleReach:
+        """Reach (n, K) of the bristles that friction remembers with, its own or the usual ones."""
+        reach = bristle_reach(self.model)
+        # friction without a state is judged beside least squares with one: z is found for that
+        return reach if reach.elements else reach_of(self.model.joint_types)
 
     @property
     def trained_on(self) -> frozenset[str]:
@@ -64,44 +70,19 @@ class Subject:
             return None
         return RunFolder(self.fit.folder)
 
-    @property
-    def parameters(self) -> int:
-        """How many numbers of the model are trained."""
-        return sum(parameter.numel() for parameter in self.model.parameters())
-
 
 def subject(judged: EmittedModel | Fit | Path | str, arm: LoadedArm | Path | str | None = None) -> Subject:
     """Return what is judged: a model, a fit or the folder of a run, on an arm or the URDF of this path."""
     if isinstance(judged, str | Path):
         judged = load_run(judged)
-    urdf: Path | str | None = None
-    if isinstance(arm, str | Path):
-        urdf = arm
-    elif arm is not None:
-        urdf = arm.robot.path
-    if not isinstance(judged, Fit):
-        return _of_model(judged, urdf)
-    return replace(
-        _of_model(judged.model, urdf or judged.urdf),
-        preprocessing=judged.preprocessing,
-        window=getattr(judged.config, "window", TUNING.model_window),
-        fit=judged,
-    )
-
-
-def _of_model(model: EmittedModel, urdf: Path | str | None) -> Subject:
+    model, fit = (judged.model, judged) if isinstance(judged, Fit) else (judged, None)
+    urdf = None if fit is None else fit.urdf
+    if arm is not None:
+        urdf = Path(arm) if isinstance(arm, str | Path) else arm.robot.path
     weights = next(model.parameters(), None)
     if weights is not None and (weights.dtype != torch.float64 or not weights.is_cpu):  # as logs are
         model = copy.deepcopy(model).double().cpu()
-    # friction without a state is judged beside least squares with one: z is found for that
-    reach = bristle_reach(model)
-    if not reach.elements:
-        reach = reach_of(model.joint_types)
-    robot, tip = type(model).__name__, None
-    if hasattr(model, "facts"):  # else something that has an arm's dynamics in another way
-        robot, tip = model.facts.robot, model.facts.options.tip
-    path = None if urdf is None else Path(urdf)
-    return Subject(model, robot, logged_joints(model), path, tip, reach=reach)
+    return Subject(model, logged_joints(model), urdf, fit)
 
 
 def read_test_logs(

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from spelgen.baselines.names import MODEL, is_drawn
-from spelgen.baselines.predictor import Predictor
 from spelgen.evaluation.drawn_motions import (
     DrawnMotion,
     PredictedMotion,
@@ -60,10 +59,9 @@ class Growth:
 
 @dataclass(frozen=True, eq=False)
 class MassCurves:
-    """The lower triangle of M, row by row, and its eigenvalues along a trajectory; (entries, T) and (n, T)."""
+    """The lower triangle of M, row by row, along a trajectory, (entries, T)."""
 
     entries: Curve
-    eigenvalues: Curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +94,12 @@ class Traces:
 
 
 def motion_traces(
-    predictors: Sequence[Predictor],
+    dynamics: Mapping[str, RigidDynamics],
     logs: JudgedLogs,
     predictions: Predictions | None,
     tip: TipPosition | None,
 ) -> Traces:
-    """Return all curves of an arm under torques. predictions: over the longest horizon."""
-    dynamics = {x.name: x.dynamics for x in predictors if x.dynamics is not None}
+    """Return all curves of an arm under torques. dynamics: by predictor. predictions: over the longest horizon."""
     growth: Growth | None = None
     predicted: tuple[PredictedMotion, ...] = ()
     # errors are relative to the motion: there is none at rest
@@ -142,19 +139,17 @@ def _relative_errors(predictions: Predictions, joint_types: Sequence[str]) -> di
 
 def _growth(predictions: Predictions, errors: Mapping[str, Tensor], tip: TipPosition | None) -> Growth:
     windows = predictions.windows
-    steps = windows.dt.shape[1]
+    seconds = windows.dt.cumsum(dim=1).mean(dim=0).numpy()
     # errors grow by orders of magnitude: as many points for the first tenth as for the last
-    times = np.unique(np.geomspace(1, steps, TUNING.times).round().astype(int)) - 1
+    times = np.unique(np.geomspace(1, len(seconds), TUNING.times).round().astype(int)) - 1
     relative, tips = {}, {}
     for name, (q, _) in predictions.states.items():
-        if not is_drawn(name):
-            continue
-        relative[name] = _quantiles(errors[name][:, times])
-        if tip is not None:
-            measured = tip(windows.q[:, 1:][:, times])
-            tips[name] = _quantiles(1000 * (tip(q[:, times]) - measured).norm(dim=-1))
-    seconds = windows.dt.cumsum(dim=1).mean(dim=0)[times]
-    return Growth(seconds.numpy(), len(windows), relative, tips)
+        if is_drawn(name):
+            relative[name] = _quantiles(errors[name][:, times])
+            if tip is not None:
+                distance = tip(q[:, times]) - tip(windows.q[:, 1 + times])
+                tips[name] = _quantiles(1000 * distance.norm(dim=-1))
+    return Growth(seconds[times], len(windows), relative, tips)
 
 
 def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[PredictedMotion, ...]:
@@ -171,7 +166,7 @@ def _quantiles(values: Tensor) -> Quantiles:
     """Return those over windows of (W, T); what is not finite counts as infinite."""
     ordered = values.nan_to_num(nan=torch.inf).sort(dim=0).values.numpy()
     last = len(ordered) - 1
-    return Quantiles(*(ordered[round(part * last)] for part in (0.1, 0.5, 0.9)))
+    return Quantiles(*(ordered[round(quantile * last)] for quantile in (0.1, 0.5, 0.9)))
 
 
 def _mass_trace(dynamics: Mapping[str, RigidDynamics], motion: DrawnMotion) -> MassTrace:
@@ -182,23 +177,22 @@ def _mass_trace(dynamics: Mapping[str, RigidDynamics], motion: DrawnMotion) -> M
     for name, predictor in dynamics.items():
         with torch.no_grad():
             mass = torch.as_tensor(predictor.mass_matrix(q)).numpy()
-        if np.isfinite(mass).all():  # else it has no eigenvalues
-            curves[name] = MassCurves(mass[:, row, column].T, np.linalg.eigvalsh(mass).T)
+        if np.isfinite(mass).all():
+            curves[name] = MassCurves(mass[:, row, column].T)
     return MassTrace(motion.trajectory, motion.t, curves)
 
 
 def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Trajectory]) -> FrictionTrace:
     q = np.concatenate([piece.q for piece in pieces])
-    fast = np.quantile(np.abs(np.concatenate([piece.qd for piece in pieces])), 0.995, axis=0)
-    middle = torch.from_numpy(q.mean(axis=0))
-    n = len(middle)
-    grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)  # dense where friction turns around
     # the fastest samples are often spikes of differenced positions
+    fast = np.quantile(np.abs(np.concatenate([piece.qd for piece in pieces])), 0.995, axis=0)
+    grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)  # dense where friction turns around
     speeds = torch.from_numpy(grid[:, None] * fast)  # (81, n)
+    alone = torch.diag_embed(speeds)  # one joint at a time
+    positions = torch.from_numpy(q.mean(axis=0)).expand_as(alone)
     curves = {}
     for name, predictor in dynamics.items():
         with torch.no_grad():
-            alone = torch.diag_embed(speeds)  # one joint at a time
-            torque = torch.as_tensor(predictor.friction_torque(middle.expand(len(speeds), n, n), alone))
+            torque = torch.as_tensor(predictor.friction_torque(positions, alone))
         curves[name] = torch.diagonal(torque, dim1=-2, dim2=-1).mT.numpy()
     return FrictionTrace(speeds.mT.numpy(), curves)

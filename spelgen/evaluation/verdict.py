@@ -6,24 +6,21 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, URDF_WITH_DRIVES, observed
+from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.errors import shortened
+from spelgen.evaluation.horizons import StateErrors
+from spelgen.evaluation.measurements import Measurements
 from spelgen.labels import listed, share, thousandths
 from spelgen.listing import number
 from spelgen.settings.tuning.evaluation import EvaluationTuning
 
-if TYPE_CHECKING:
-    from spelgen.evaluation.horizons import StateErrors
-    from spelgen.evaluation.results import Results
-
 TUNING = EvaluationTuning()
 SEEN = "tested-on-training-data"
-STANDSTILL = "near standstill"
-EXCITE = "(as spelgen excite proposes)"
+STANDSTILL = " near standstill"
 TORQUE_USES: tuple[tuple[float, Sequence[str], Sequence[str]], ...] = (
     (TUNING.explained_for_contacts, ["feed-forward control", "contact detection"], []),
     (TUNING.explained_for_feed_forward, ["feed-forward control"], ["contact detection"]),
@@ -52,16 +49,9 @@ class _Uses:
     proofs: list[str] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class _Failure:
-    """Where a model fails most: a joint, when it does, and the figure that says so."""
-
-    joint: str = ""
-    when: str = ""
-    proof: str = ""
-
-
-def verdict(results: Results, identified: Mapping[str, Any] | None = None, limits: Limits = ()) -> Verdict:
+def verdict(
+    results: Measurements, identified: Mapping[str, Any] | None = None, limits: Limits = ()
+) -> Verdict:
     """Judge an evaluation. identified: least_squares.json, of the training logs. limits: of the joints."""
     uses = _Uses()
     _judge_torques(results, uses)
@@ -69,112 +59,93 @@ def verdict(results: Results, identified: Mapping[str, Any] | None = None, limit
     _judge_replays(results, uses)
     if not uses.proofs:
         return Verdict("No verdict: no horizon and no torque was evaluated.", "")
-    worst = _worst_joint(results)
-    recommendations = _recommendations(results, identified or {}, limits, worst)
-    sentence = "Not accurate enough yet"
-    if uses.good:
-        sentence = f"Good enough for {listed(uses.good)}"
+    sentence = f"Good enough for {listed(uses.good)}" if uses.good else "Not accurate enough yet"
     if any(diagnostic.code == SEEN for diagnostic in results.diagnostics):
-        sentence = sentence[0].lower() + sentence[1:]
-        sentence = f"Evaluated on training logs: {sentence}"
+        sentence = f"Evaluated on training logs: {sentence[0].lower()}{sentence[1:]}"
     if uses.good and uses.bad:
         sentence += f", not for {listed(uses.bad)}"
+    joint, speed, proof = _worst_joint(results)
+    recommendations = _recommendations(results, identified or {}, limits, joint, speed)
     details = []
-    if worst.joint:
-        details.append(f"worst at {worst.joint}{worst.when}")
+    if joint:
+        details.append(f"worst at {joint}{speed}")
     if recommendations:
         details.append(f"next, record {next(iter(recommendations))}")
     because = []
     for detail in details:
-        longer = f"{sentence}; {detail}"
         # a headline is read at a glance
-        if len(longer.split()) <= TUNING.headline:
-            sentence = longer
+        if len(f"{sentence}; {detail}".split()) <= TUNING.headline:
+            sentence += f"; {detail}"
         else:
             because.append(f"{detail[0].upper()}{detail[1:]}.")
-    because += [
-        f"The model {listed(uses.proofs)}.",
-        _constant_velocity(results),
-        worst.proof,
-        _better_baselines(results),
-    ]
-    because += [f"{reason}." for reason in recommendations.values()]
-    return Verdict(f"{sentence}.", " ".join(statement for statement in because if statement))
+    because += [f"The model {listed(uses.proofs)}.", proof, *_better_baselines(results)]
+    because += recommendations.values()
+    return Verdict(f"{sentence}.", " ".join(filter(None, because)))
 
 
-def _judge_torques(results: Results, uses: _Uses) -> None:
+def _judge_torques(results: Measurements, uses: _Uses) -> None:
     """Judge by the joint whose torque is explained least: a mean hides it."""
     torque = results.torque.get(MODEL)
     if torque is None or torque.mean_nmse is None:
         return
-    worst = _worst_torque(results)
-    unexplained = torque.mean_nmse if worst is None else worst[1]
-    explained = 1 - unexplained  # coefficient of determination
-    for least, good, bad in TORQUE_USES:
-        if explained >= least:
+    joint, unexplained = _worst_torque(results)
+    if not joint:
+        unexplained = torque.mean_nmse
+    for threshold, good, bad in TORQUE_USES:
+        if 1 - unexplained >= threshold:  # coefficient of determination
             uses.good += good
             uses.bad += bad
             break
-    proof = f"explains {_explained(torque.mean_nmse)} of the variance of the torques"
-    if worst is not None and _explained(worst[1]) != _explained(torque.mean_nmse):
-        proof += f" ({_explained(worst[1])} at {worst[0]})"
+    mean, worst = (share(max(0.0, 1 - nmse)) for nmse in (torque.mean_nmse, unexplained))
+    proof = f"explains {mean} of the variance of the torques"
+    if worst != mean:
+        proof += f" ({worst} at {joint})"
     uses.proofs.append(proof)
 
 
-def _explained(nmse: float) -> str:
-    return share(1 - nmse) if nmse < 1 else "none"
-
-
-def _worst_torque(results: Results) -> tuple[str, float] | None:
-    """Return the joint of the model's largest nMSE, and this; of joints whose torque is not logged in coarse steps."""
-    torque = results.torque.get(MODEL)
-    errors: dict[str, float] = {}
-    if torque is not None:
-        for joint, error in zip(results.joints, torque.joint_nmse, strict=False):
+def _worst_torque(results: Measurements) -> tuple[str, float]:
+    """Return the joint of the model's largest nMSE, of those whose torque is not logged in coarse steps, and this."""
+    worst = ("", -math.inf)
+    if MODEL in results.torque:
+        for joint, error in zip(results.joints, results.torque[MODEL].joint_nmse, strict=False):
             if error is not None and joint not in results.torque_steps:
-                errors[joint] = error
-    return max(errors.items(), key=itemgetter(1), default=None)
+                worst = max(worst, (joint, error), key=itemgetter(1))
+    return worst
 
 
-def _judge_motion(results: Results, uses: _Uses) -> None:
+def _judge_motion(results: Measurements, uses: _Uses) -> None:
     # a long horizon may blow up where a short one tells something
     finite = [x for x in results.horizons if x.errors[MODEL].mean_relative_rms is not None]
-    if not finite:
-        if results.horizons:
-            uses.bad.append("simulation")
-            uses.proofs.append("predicts no finite motion")
-        return
-    last = finite[-1]
-    error = _relative(last.errors[MODEL])
-    holding = _relative(last.errors.get(observed(MODEL)))
-    if error <= TUNING.close_prediction:
-        uses.good.append(f"simulation {last.name} ahead")
-    elif error <= TUNING.rough_prediction:
-        uses.good.append(f"rough simulation {last.name} ahead")
-    else:
-        uses.bad.append(f"simulation {last.name} ahead")
-        if holding <= TUNING.rough_prediction:
-            uses.good.append(f"prediction {last.name} ahead with a momentum observer")
-    proof = f"is off by {share(error, 'the motion')} after {last.name}"
-    tip = last.errors[MODEL].tip_mm
-    if tip is not None:
-        proof += f", {number(tip)} mm at the tip"
-    uses.proofs.append(proof)
+    if results.horizons and not finite:
+        uses.bad.append("simulation")
+        uses.proofs.append("predicts no finite motion")
+    for last in finite[-1:]:
+        error = _relative(last.errors[MODEL])
+        if error <= TUNING.close_prediction:
+            uses.good.append(f"simulation {last.name} ahead")
+        elif error <= TUNING.rough_prediction:
+            uses.good.append(f"rough simulation {last.name} ahead")
+        else:
+            uses.bad.append(f"simulation {last.name} ahead")
+            if _relative(last.errors.get(observed(MODEL))) <= TUNING.rough_prediction:
+                uses.good.append(f"prediction {last.name} ahead with a momentum observer")
+        proof = f"is off by {share(error, 'the motion')} after {last.name}"
+        tip = last.errors[MODEL].tip_mm
+        if tip is not None:
+            proof += f", {number(tip)} mm at the tip"
+        uses.proofs.append(proof)
 
 
-def _judge_replays(results: Results, uses: _Uses) -> None:
-    if not results.replays:
-        return
-    replay = results.replays[0]
-    model_error = replay.errors[MODEL].mean  # of whole logs: windows forgive what drifts
-    if model_error == min(errors.mean for errors in replay.errors.values()):
-        uses.good.append("simulation from commands")
-    else:
-        uses.bad.append("simulation from commands")
-    unit = thousandths(results.joint_types)
-    uses.proofs.append(
-        f"misses {1000 * model_error:.3g} {unit} of the positions that follow commands, {replay.name}"
-    )
+def _judge_replays(results: Measurements, uses: _Uses) -> None:
+    # whole logs stand first: windows forgive what drifts
+    for replay in results.replays[:1]:
+        error = replay.errors[MODEL].mean
+        if error == min(errors.mean for errors in replay.errors.values()):
+            uses.good.append("simulation from commands")
+        else:
+            uses.bad.append("simulation from commands")
+        distance = f"{1000 * error:.3g} {thousandths(results.joint_types)}"
+        uses.proofs.append(f"misses {distance} of the positions that follow commands, {replay.name}")
 
 
 def _relative(errors: StateErrors | None) -> float:
@@ -184,119 +155,95 @@ def _relative(errors: StateErrors | None) -> float:
     return errors.mean_relative_rms
 
 
-def _constant_velocity(results: Results) -> str:
-    """Say at which times ahead a constant velocity is better than the model, with an observer and without."""
-    times = []
-    for horizon in results.horizons:
-        model_error = min(_relative(horizon.errors.get(name)) for name in (MODEL, observed(MODEL)))
-        if _relative(horizon.errors.get(CONSTANT_VELOCITY)) < model_error:
-            times.append(horizon.name)
-    if not times:
-        return ""
-    return (
-        f"A constant velocity predicts better {listed(times)} ahead: there, use the model for torques only."
-    )
-
-
-def _better_baselines(results: Results) -> str:
-    """Say which other baselines are better, at what."""
+def _better_baselines(results: Measurements) -> list[str]:
+    """Say at which times ahead a constant velocity is better than the model, and which other baseline is, at what."""
+    times: list[str] = []
     better: dict[str, list[str]] = {}
-    errors = {
-        f"after {x.name}": {name: _relative(e) for name, e in x.errors.items()} for x in results.horizons
-    }
-    errors["in torque"] = {name: x.mean_nmse for name, x in results.torque.items() if x.mean_nmse is not None}
-    for occasion, by_predictor in errors.items():
-        by_predictor.pop(CONSTANT_VELOCITY, None)
-        best = min(by_predictor, key=by_predictor.__getitem__, default=MODEL)
-        if MODEL in by_predictor and best not in (MODEL, observed(MODEL)):
-            better.setdefault(best, []).append(occasion)
-    if not better:
-        return ""
-    drives = [results.horizons[-1].errors.get(URDF_WITH_DRIVES)] if results.horizons else []
-    if any(_relative(errors) < TUNING.simulated for errors in drives):
-        return f"{URDF_WITH_DRIVES} reproduces these logs: it is the model that simulated them."
+    for horizon in results.horizons:
+        errors = {name: _relative(of_predictor) for name, of_predictor in horizon.errors.items()}
+        constant_velocity = errors.pop(CONSTANT_VELOCITY, math.inf)
+        model_error = min(errors[MODEL], errors.get(observed(MODEL), math.inf))
+        best = min(errors, key=errors.__getitem__)
+        if constant_velocity < model_error:
+            times.append(horizon.name)
+        if errors[best] < model_error:
+            better.setdefault(best, []).append(f"after {horizon.name}")
+    torque = {name: x.mean_nmse for name, x in results.torque.items() if x.mean_nmse is not None}
+    best = min(torque, key=torque.__getitem__, default=MODEL)
+    if MODEL in torque and best != MODEL:
+        better.setdefault(best, []).append("in torque")
     statements = []
-    for name, occasions in better.items():
-        statements.append(f"{name} is better {listed(occasions)}")
-    return f"But {listed(statements)}."
+    if times:
+        ahead = f"A constant velocity predicts better {listed(times)} ahead"
+        statements.append(f"{ahead}: there, use the model for torques only.")
+    if better:
+        reasons = [f"{name} is better {listed(occasions)}" for name, occasions in better.items()]
+        statements.append(f"But {listed(reasons)}.")
+    return statements
 
 
-def _worst_joint(results: Results) -> _Failure:
-    """Return the joint whose torque is explained least, else the one whose motion is."""
-    worst = _worst_torque(results)
-    if worst is not None:
-        joint, error = worst
+def _worst_joint(results: Measurements) -> tuple[str, str, str]:
+    """Return the joint whose torque is explained least, else that whose motion is; when; and a sentence about it."""
+    joint, error = _worst_torque(results)
+    if joint:
         amount = share(math.sqrt(error), "the torque's standard deviation")
-        proof = f"At {joint} the torque residual is {amount}."
-        return _Failure(joint, _slow_or_fast(results, results.joints.index(joint)), proof)
-    if not results.horizons:
-        return _Failure()
-    last = results.horizons[-1]
-    errors = last.errors[MODEL].q_relative_rms
-    if not errors or None in errors:
-        return _Failure()
-    k = int(np.argmax(np.array(errors, dtype=float)))
-    amount = share(float(errors[k] or 0), "the motion")
-    joint = results.joints[k]
-    return _Failure(joint, "", f"At {joint} the error after {last.name} is {amount}.")
+        speed = _slow_or_fast(results, results.joints.index(joint))
+        return joint, speed, f"At {joint} the torque residual is {amount}."
+    for last in results.horizons[-1:]:
+        errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # NaN of None
+        if np.isfinite(errors).all():
+            joint = results.joints[errors.argmax()]
+            amount = share(errors.max(), "the motion")
+            return joint, "", f"At {joint} the error after {last.name} is {amount}."
+    return "", "", ""
 
 
-def _slow_or_fast(results: Results, k: int) -> str:
+def _slow_or_fast(results: Measurements, k: int) -> str:
     """Return at which speed of joint k the residuals of its torque are larger, where they differ."""
-    residuals, speeds = [np.zeros(0)], [np.zeros(0)]
+    if not results.traces.torques:
+        return ""
+    residuals, speeds = [], []
     for trace in results.traces.torques:
         residuals.append(trace.measured[:, k] - trace.predicted[MODEL][:, k])
         speeds.append(np.abs(trace.qd[:, k]))
-    residual, speed = np.concatenate(residuals), np.concatenate(speeds)
-    slow = speed < TUNING.slow * np.nanmax(speed, initial=0.0)
+    squares, speed = np.square(np.concatenate(residuals)), np.concatenate(speeds)
+    slow = speed < TUNING.slow * np.nanmax(speed)
     # a handful of samples tells no root mean square
     if not 5 < slow.sum() < len(slow) - 5:
         return ""
-    size_slow, size_fast = (np.sqrt(np.nanmean(residual[rows] ** 2)) for rows in (slow, ~slow))
-    if size_slow > TUNING.uneven * size_fast:
-        return f" {STANDSTILL}"
-    return " at speed" if size_fast > TUNING.uneven * size_slow else ""
+    ratio = np.sqrt(np.nanmean(squares[slow]) / np.nanmean(squares[~slow]))
+    if ratio > TUNING.uneven:
+        return STANDSTILL
+    return " at speed" if ratio < 1 / TUNING.uneven else ""
 
 
 def _recommendations(
-    results: Results, identified: Mapping[str, Any], limits: Limits, worst: _Failure
+    results: Measurements, identified: Mapping[str, Any], limits: Limits, worst: str, speed: str
 ) -> dict[str, str]:
-    """Return which motions to record, the most useful first, and why."""
+    """Return which motions to record, the most useful first, and why. worst: a joint, which fails at this speed."""
     recommendations = {}
     trained = identified.get("coverage") or {}
     unseen = identified.get("unseen_directions")
     if unseen:
-        reason = f"The training logs do not excite {unseen} directions of the base parameters"
-        recommendations[f"a richer motion {EXCITE}"] = reason
+        reason = f"The training logs do not excite {unseen} directions of the base parameters."
+        recommendations["a richer motion (as spelgen excite proposes)"] = reason
     outside = _outside(trained, results.traces.coverage, results.joints)
     if outside:
-        reason = f"The test logs exceed the range of the training logs: {shortened(outside, 3)}"
+        reason = f"The test logs exceed the range of the training logs: {shortened(outside, 3)}."
         recommendations[f"motion with the {outside[0]} that the test logs have"] = reason
-    if worst.when.endswith(STANDSTILL):
-        recommendations[f"slow reversals of {worst.joint}"] = "Dry friction is learned from slow reversals"
-    fractions = _range_fractions(trained, results.joints, limits)
+    if speed == STANDSTILL:
+        recommendations[f"slow reversals of {worst}"] = "Dry friction is learned from slow reversals."
+    fractions = {}
+    for joint, covered, bound in zip(results.joints, trained.get("q", ()), limits, strict=False):
+        if bound is not None and bound[1] > bound[0]:
+            # a turn shows all of a joint that can go on turning
+            fractions[joint] = (covered["high"] - covered["low"]) / min(bound[1] - bound[0], 2 * math.pi)
     if fractions:
         joint = min(fractions, key=fractions.__getitem__)
         if fractions[joint] < TUNING.narrow_range:
-            reason = f"{joint} has moved over {share(fractions[joint], 'its range')}"
+            reason = f"{joint} has moved over {share(fractions[joint], 'its range')}."
             recommendations[f"wider motion of {joint}"] = reason
-    base = identified.get("base_parameters", ())
-    weak = [parameter for parameter in base if parameter["determined"] in ("weak", "may be zero")]
-    if weak:
-        reason = f"{len(weak)} of {len(base)} base parameters are not significantly different from zero"
-        recommendations[f"faster motion of all joints together {EXCITE}"] = reason
     return recommendations
-
-
-def _range_fractions(trained: Mapping[str, Any], joints: Sequence[str], limits: Limits) -> dict[str, float]:
-    """Return the fraction of its range that each joint has moved over, a turn at most."""
-    fractions = {}
-    for name, covered, bound in zip(joints, trained.get("q", ()), limits, strict=False):
-        if bound is not None and bound[1] > bound[0]:
-            # a turn shows all of a joint that can go on turning
-            room = min(bound[1] - bound[0], 2 * math.pi)
-            fractions[name] = (covered["high"] - covered["low"]) / room
-    return fractions
 
 
 def _outside(trained: Mapping[str, Any], tested: Mapping[str, Any], joints: Sequence[str]) -> list[str]:

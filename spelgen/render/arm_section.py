@@ -15,18 +15,19 @@ from spelgen.certificate.facts import facts
 from spelgen.certificate.formulas import formulas
 from spelgen.certificate.inspection import LETTERS
 from spelgen.certificate.printing import text
+from spelgen.evaluation.drawn_motions import DrawnMotion
 from spelgen.evaluation.plain import Curve, record
 from spelgen.evaluation.traces import Traces
 from spelgen.labels import entry_name, joint_ranges, joints_in_ranges
 from spelgen.render.page import json_data
-from spelgen.render.plots import Record
 from spelgen.render.scene import scene
 from spelgen.settings.tuning.render import TUNING
 from spelgen.structure.nominal import working_range
 from spelgen.structure.structure import Structure
 
 KINDS = {"zero": "is always zero", "constant": "is constant"}
-IDENTIFIED = ("never", "in combination", "alone")
+WIDEST = {"revolute": 1.2, "prismatic": 0.3}
+"""Swings of joints that are shown without an evaluation [rad, m]."""
 ENTRY = re.compile(r"M\d+(?:,\d+)?")
 
 
@@ -54,12 +55,10 @@ class Motion:
 
 @dataclass(frozen=True)
 class ArmSection:
-    """data: for the script. motions: their names. colours: what the links can be coloured by."""
+    """data: for the script. motions: their names."""
 
     data: Markup
     motions: tuple[str, ...]
-    colours: tuple[str, ...]
-    has_meshes: bool
 
 
 def matrix(arm: Arm, structure: Structure) -> list[list[Cell]]:
@@ -101,21 +100,13 @@ def _explanations(arm: Arm, structure: Structure) -> dict[str, str]:
     return explanations
 
 
-def arm_section(
-    arm: Arm, urdf: Path, traces: Traces | None = None, identified: Record | None = None
-) -> ArmSection:
+def arm_section(arm: Arm, urdf: Path, traces: Traces | None = None) -> ArmSection:
     """Return the arm with the motions of an evaluation's traces, or, without, one through its ranges."""
-    drawn = scene(urdf, arm.joint_names)
-    motions = [_sweep(arm)] if traces is None else _motions(traces) or [_sweep(arm)]
-    unseen = _unseen(arm, identified or {})
-    colours = []
-    if motions[0].error is not None:
-        colours.append("error")
-    if unseen is not None:
-        colours.append("known")
-    data = record(drawn) | {"motions": list(map(record, motions)), "identifiability": unseen}
-    labels = tuple(motion.label for motion in motions)
-    return ArmSection(json_data(data), labels, tuple(colours), drawn.has_meshes)
+    motions = [_sweep(arm)]
+    if traces is not None:
+        motions = _motions(traces) or motions
+    data = record(scene(urdf, arm.joint_names)) | {"motions": list(map(record, motions))}
+    return ArmSection(json_data(data), tuple(motion.label for motion in motions))
 
 
 def _motions(traces: Traces) -> list[Motion]:
@@ -124,47 +115,31 @@ def _motions(traces: Traces) -> list[Motion]:
     for example in traces.trajectories:
         extent = np.ptp(example.q, axis=0)
         # a joint that hardly moved is measured by the motion of the others
-        size = np.maximum(extent, 1e-2 * extent.max() + 1e-9)
-        colour = _colour(example.predicted_q - example.q, size)
-        name = f"prediction {example.which}"
+        error = (example.predicted_q - example.q) / np.maximum(extent, 1e-2 * extent.max() + 1e-9)
         label = f"{example.which} prediction beside what was measured ({example.trajectory})"
-        motions.append(Motion(name, label, example.t, example.q, colour, example.predicted_q))
+        motions.append(_motion(f"prediction {example.which}", label, example, error, example.predicted_q))
     for trace in traces.torques:
-        size = np.maximum(trace.measured.std(axis=0), 1e-9)
-        colour = _colour(trace.measured - trace.predicted[MODEL], size)
-        name = f"torque {trace.which}"
+        error = (trace.measured - trace.predicted[MODEL]) / np.maximum(trace.measured.std(axis=0), 1e-9)
         label = f"residual torque, {trace.which} trajectory ({trace.trajectory})"
-        motions.append(Motion(name, label, trace.t, trace.q, colour))
+        motions.append(_motion(f"torque {trace.which}", label, trace, error))
     return motions
 
 
-def _colour(error: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Return errors, (T, n), relative to the motion or to the torque, by the one of the worst colour."""
-    return np.asarray((np.abs(error) / size / TUNING.worst_error).round(3))
+def _motion(
+    name: str, label: str, drawn: DrawnMotion, error: np.ndarray, predicted: np.ndarray | None = None
+) -> Motion:
+    """Return a motion coloured by errors relative to the motion or to the torque, 1 for the worst colour."""
+    colour = np.abs(error) / TUNING.worst_error
+    return Motion(name, label, drawn.t, drawn.q, colour.round(3), predicted)
 
 
 def _sweep(arm: Arm) -> Motion:
     """Return a motion of every joint through part of its range, at its own pace."""
     t = np.linspace(0, 12, 121)
-    q = np.zeros((len(t), len(arm.coordinates)))
-    for k, coordinate in enumerate(arm.coordinates):
-        low, high = working_range(coordinate)
-        # limits of a hundred turns, as some URDFs have them, would show a blur
-        swing = min(0.4 * (high - low), 1.2 if coordinate.kind == "revolute" else 0.3)
-        q[:, k] = (low + high) / 2 + swing * np.sin(2 * np.pi * t / 12 * (1 + k % 3) + k)
-    label = "a motion through the joints' ranges"
-    return Motion("sweep", label, t.round(3), q.round(4))
-
-
-def _unseen(arm: Arm, identified: Record) -> list[float] | None:
-    """Return by joint, 0..1, which part of its bodies' ten parameters motion cannot show; the worst body counts."""
-    identifiability = identified.get("identifiability")
-    if not identifiability:
-        return None
-    # drives' parameters stand behind those of the bodies, ten each
-    of_bodies = list(identifiability.values())[: 10 * len(arm.bodies)]
-    levels = np.array([IDENTIFIED.index(visibility) for visibility in of_bodies])
-    unseen = 1 - (levels / 2).reshape(-1, 10).mean(axis=1)
-    worst = np.zeros(len(arm.coordinates))
-    np.maximum.at(worst, [body.coordinate for body in arm.bodies], unseen)
-    return list(worst.round(3).tolist())
+    low, high = np.array(list(map(working_range, arm.coordinates))).T
+    # limits of a hundred turns, as some URDFs have them, would show a blur
+    widest = [WIDEST[coordinate.kind] for coordinate in arm.coordinates]
+    joint = np.arange(len(low))
+    phase = 2 * np.pi / 12 * t[:, None] * (1 + joint % 3) + joint
+    q = (low + high) / 2 + np.minimum(0.4 * (high - low), widest) * np.sin(phase)
+    return Motion("sweep", "a motion through the joints' ranges", t.round(3), q.round(4))

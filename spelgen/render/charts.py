@@ -7,9 +7,8 @@ tell values from pixels stands in `data-` attributes.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
 
@@ -46,12 +45,10 @@ class Axis:
 
     def pixels(self, values: np.ndarray) -> np.ndarray:
         """Return where values lie; a value outside the axis lies on its edge."""
-        clipped = np.clip(values, self.low, self.high)
+        clipped, low, high = np.clip(values, self.low, self.high), self.low, self.high
         if self.log:
-            fraction = np.log(clipped / self.low) / math.log(self.high / self.low)
-        else:
-            fraction = (clipped - self.low) / (self.high - self.low)
-        pixels: np.ndarray = self.start + fraction * (self.end - self.start)
+            clipped, low, high = np.log(clipped), math.log(low), math.log(high)
+        pixels: np.ndarray = self.start + (clipped - low) / (high - low) * (self.end - self.start)
         return pixels
 
     def contains(self, values: np.ndarray) -> np.ndarray:
@@ -63,7 +60,7 @@ class Axis:
         """Return about five round values within the axis, as pixel and label."""
         steps = _log_steps if self.log else _steps
         values, labels = steps(self.low, self.high)
-        return list(zip(self.pixels(np.array(values)).tolist(), labels, strict=True))
+        return list(zip(self.pixels(values).tolist(), labels, strict=True))
 
     def data(self) -> str:
         """Return first and last pixel, their values and whether it is logarithmic, for a script."""
@@ -81,27 +78,26 @@ class Line:
     kind = "line"
 
     @property
-    def heights(self) -> tuple[Values, ...]:
+    def heights(self) -> np.ndarray:
         """Return what the axis of y has to show."""
-        return (self.y,)
+        return _floats(self.y)
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return a path in tenths of a pixel, relative steps being shorter."""
+        """Return pieces of line, in steps of tenths of a pixel from corner to corner."""
         x, y = _floats(self.x), _floats(self.y)
-        # every so many samples, and the last one, so that the line ends where the data do
-        stride = max(1, math.ceil(len(x) / TUNING.points))
-        rows = np.unique([*range(0, len(x), stride), max(len(x) - 1, 0)])[: len(x)]
-        drawable = np.isfinite(x[rows]) & np.isfinite(y[rows])
+        # samples that are evenly spread, the last one among them: the line ends where the data do
+        rows = np.linspace(0, len(x) - 1, min(len(x), TUNING.points)).round().astype(int)
+        x, y = x[rows], y[rows]
+        gaps = ~(np.isfinite(x) & np.isfinite(y))
         if y_axis.log:
-            drawable &= y[rows] > 0
-        gaps = np.flatnonzero(np.diff(np.flatnonzero(drawable)) > 1) + 1
-        rows = rows[drawable]
-        points = np.stack([x_axis.pixels(x[rows]), y_axis.pixels(y[rows])], axis=1)
+            gaps |= y <= 0
+        corners = np.stack([x_axis.pixels(x), y_axis.pixels(y)], axis=1)
+        corners[gaps] = np.nan
         pieces = []
-        for piece in np.split(np.round(10 * points), gaps):
-            for command, numbers in (("M", piece[:1]), ("l", np.diff(piece, axis=0))):
-                if numbers.size:
-                    pieces.append(command + " ".join(f"{number / 10:g}" for number in numbers.ravel()))
+        for piece in np.split(np.round(corners, 1), np.flatnonzero(gaps)):
+            drawn = piece[np.isfinite(piece[:, 0])]
+            if len(drawn) > 1:
+                pieces.append(f"M{_spaced(drawn[0])}l{_spaced(np.diff(drawn, axis=0))}")
         return "".join(pieces)
 
 
@@ -115,10 +111,8 @@ class Dots(Line):
         """Return lines without length, whose round ends are the dots; those outside are left out."""
         x, y = _floats(self.x), _floats(self.y)
         inside = x_axis.contains(x) & y_axis.contains(y)
-        dots = []
-        for column, height in zip(x_axis.pixels(x[inside]), y_axis.pixels(y[inside]), strict=True):
-            dots.append(f"M{column:.1f} {height:.1f}h0")
-        return "".join(dots)
+        dots = np.stack([x_axis.pixels(x[inside]), y_axis.pixels(y[inside])], axis=1)
+        return "".join(f"M{_spaced(dot)}h0" for dot in dots)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,25 +127,19 @@ class Band:
     kind = "band"
 
     @property
-    def heights(self) -> tuple[Values, ...]:
+    def heights(self) -> np.ndarray:
         """Return what the axis of y has to show."""
-        return self.low, self.high
+        return np.concatenate([_floats(self.low), _floats(self.high)])
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return the outline up to the first value that is not finite; what exceeds the axis ends at its edge."""
-        x, low = _floats(self.x), _floats(self.low)
+        """Return the outline; what exceeds the axis ends at its edge, and so does what is not finite."""
         # a prediction that left all bounds has no upper end, but still a lower one
-        high = np.nan_to_num(_floats(self.high), nan=y_axis.high, posinf=y_axis.high)
-        finite = np.isfinite(x) & np.isfinite(low)
-        count = len(x) if finite.all() else int(np.argmin(finite))
-        columns = x_axis.pixels(x[:count])
+        low, high = (np.nan_to_num(_floats(y), nan=np.inf) for y in (self.low, self.high))
         # along the lower curve, and back along the upper one
-        columns = np.concatenate([columns, columns[::-1]])
-        heights = np.concatenate([y_axis.pixels(low[:count]), y_axis.pixels(high[:count])[::-1]])
-        corners = []
-        for column, height in zip(columns, heights, strict=True):
-            corners.append(f"{column:.1f},{height:.1f}")
-        return f"M{' '.join(corners)}Z"
+        x = x_axis.pixels(_floats(self.x))
+        columns = np.concatenate([x, x[::-1]])
+        rows = y_axis.pixels(np.concatenate([low, high[::-1]]))
+        return f"M{_spaced(np.stack([columns, rows], axis=1))}Z"
 
 
 Mark = Line | Band
@@ -197,27 +185,23 @@ def line_chart(
     of the chart below are its own. Without a finite value the chart says so.
     """
     size = {"title": title, "width": width, "height": height}
-    x_values = _finite([mark.x for mark in marks], log_x)
+    x_values = _shown([_floats(mark.x) for mark in marks], log_x)
     y_values = np.array(limits)
     if limits is None:
-        y_values = _finite(chain.from_iterable(mark.heights for mark in marks), log)
+        y_values = _shown([mark.heights for mark in marks], log)
     if not x_values.size or not y_values.size:
         return Chart(render("chart.html.jinja", **size, x=None), ())
     bottom = height - (MARGINS.bottom if x_label else MARGINS.bare)
     x_axis = _axis(x_values, MARGINS.start, width - MARGINS.end, pad=0.0, log=log_x)
     # SVG counts pixels downwards: the axis of y starts at the bottom
     y_axis = _axis(y_values, bottom, MARGINS.top, pad=0.0 if limits else 0.06, log=log)
-    drawn, legend, beyond = [], [], []
+    legend, beyond = [], []
     for mark in marks:
-        entry = Entry(f"{mark.kind} {mark.style}", mark.label)
-        drawn.append((entry, mark.path(x_axis, y_axis)))
-        inside = y_axis.contains(_finite(mark.heights, log))
+        inside = y_axis.contains(_shown([mark.heights], log))
         if inside.any():
-            legend.append(entry)
+            legend.append(Entry(f"{mark.kind} {mark.style}", mark.label))
         if mark.kind == "line" and not inside.all():
             beyond.append(mark.label)
-    # lines are drawn above bands and dots, the model's above those of baselines that it agrees with
-    drawn.sort(key=lambda mark: (mark[0].style.startswith("line"), mark[0].style == "line model"))
     svg = render(
         "chart.html.jinja",
         **size,
@@ -226,7 +210,8 @@ def line_chart(
         x_label=x_label,
         y_label=y_label,
         motion=motion,
-        marks=drawn,
+        # lines are drawn above bands and dots, the model's above those of baselines that it agrees with
+        marks=sorted(marks, key=lambda mark: (mark.kind == "line", mark.style == "model")),
         beyond=beyond,
     )
     return Chart(svg, tuple(legend))
@@ -236,13 +221,19 @@ def _floats(values: Values) -> np.ndarray:
     return np.asarray(values, dtype=float)
 
 
-def _finite(columns: Iterable[Values], positive: bool) -> np.ndarray:
+def _spaced(pixels: np.ndarray) -> str:
+    """Return numbers in tenths."""
+    return " ".join(f"{round(pixel, 1):g}" for pixel in pixels.ravel().tolist())
+
+
+def _shown(columns: Sequence[np.ndarray], positive: bool) -> np.ndarray:
     """Return all finite values, or those that a logarithmic axis can show."""
-    values: np.ndarray = np.concatenate([np.zeros(0), *map(_floats, columns)])
-    values = values[np.isfinite(values)]
+    values = np.concatenate([np.zeros(0), *columns])
+    drawable = np.isfinite(values)
     if positive:
-        values = values[values > 0]
-    return values
+        drawable &= values > 0
+    finite: np.ndarray = values[drawable]
+    return finite
 
 
 def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool) -> Axis:
@@ -259,29 +250,24 @@ def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool
     return Axis(low - room, high + room, start, end)
 
 
-def _log_steps(low: float, high: float) -> tuple[list[float], list[str]]:
-    """Return powers of ten, or 1, 2 and 5 times these where there are fewer than three."""
+def _log_steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
+    """Return powers of ten; 1, 2 and 5 times these, or linear steps, where there are fewer than three."""
     first, last = math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9)
     powers = range(first, last + 1, max(1, (last - first) // 5 + 1))
     if len(powers) >= 3:
         labels = [f"10{str(power).translate(_SUPERSCRIPTS)}" for power in powers]
-        return (10.0 ** np.array(powers)).tolist(), labels
+        return 10.0 ** np.array(powers), labels
     values = np.outer(10.0 ** np.arange(first - 1, last + 1), [1, 2, 5]).ravel()
     values = values[(values >= low) & (values <= high)]
     if len(values) < 3:
-        values = np.geomspace(low, high, 4)
-    return values.tolist(), [f"{value:.3g}" for value in values]
+        return _steps(low, high)
+    return values, [f"{value:.3g}" for value in values]
 
 
-def _steps(low: float, high: float) -> tuple[list[float], list[str]]:
-    """Return multiples of 1, 2 or 5 times a power of ten, with as many decimals as they need."""
+def _steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
+    """Return multiples of 1, 2 or 5 times a power of ten."""
     rough = (high - low) / 5
-    power = math.floor(math.log10(rough))
-    fine = 10.0**power * np.array([1, 2, 5, 10])
-    step = float(fine[fine >= rough * (1 - 1e-9)][0])  # rounding must not skip a step that just fits
-    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-    values: list[float] = (step * np.arange(first, last + 1)).tolist()
-    decimals = max(0, -math.floor(math.log10(step) + 1e-9))
-    if decimals > 4 or max(abs(low), abs(high)) >= 1e5:
-        return values, [f"{value:.2g}" for value in values]
-    return values, [f"{value:.{decimals}f}" for value in values]
+    fine = 10.0 ** math.floor(math.log10(rough)) * np.array([1, 2, 5, 10])
+    step = fine[fine >= rough * (1 - 1e-9)][0]  # rounding must not skip a step that just fits
+    values = step * np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
+    return values, [f"{value:.6g}" for value in values]

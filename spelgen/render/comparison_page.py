@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -40,26 +39,11 @@ def write_comparison(study: Study, tables: Sequence[Table]) -> Path:
         "comparison.html.jinja",
         study=study,
         tables=tables,
-        verdict=_verdict(tables),
         losses=_losses(study, styles),
         panels=panels,
         entries=entries,
     )
     return write_text(study.folder / "comparison.html", text)
-
-
-def _verdict(tables: Sequence[Table]) -> str:
-    """Say which model is best in most rows of the tables."""
-    wins: Counter[str] = Counter()
-    rows = 0
-    for table in tables:
-        for row in table.rows:
-            wins.update(row.best)
-            rows += bool(row.best)
-    if not wins:
-        return "Nothing was compared."
-    ((name, count),) = wins.most_common(1)
-    return f"{name} is the best in {count} of {rows} rows."
 
 
 def _losses(study: Study, styles: Mapping[str, str]) -> Chart:

@@ -25,7 +25,7 @@ def page(identification: Identification, arm: LoadedArm) -> str:
         residuals=identification.listings()[0],
         parameters=base_table(None, arm, record),
         cells=matrix(arm.arm, arm.structure),
-        arm=arm_section(arm.arm, arm.robot.path, identified=record),
+        arm=arm_section(arm.arm, arm.robot.path),
         heading=identification.heading(),
         notes=identification.diagnostics,
     )

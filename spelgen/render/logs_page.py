@@ -37,22 +37,20 @@ def charts(log: Trajectory, arm: Arm, inputs: np.ndarray) -> list[Panel]:
     # gaps are kept: no line is drawn over one by a slope across it
     pieces = [piece[:: -(-len(log.t) // TUNING.points)] for piece in split_at_gaps(log)]
     t, q = _joined(pieces, "t"), _joined(pieces, "q")
-    position, columns = [("logged", q, "truth")], []
+    position = [("logged", q, "truth")]
+    rows = [JointRow("position", "position", "position", position)]
     if log.u is not None:
         position.append(("commanded", _joined(pieces, "u"), "predicted"))
     else:
         slope = np.concatenate(list(map(_slope, pieces)))
-        columns = [("velocity", [("logged", _joined(pieces, "qd"), "truth"), ("dq/dt", slope, "predicted")])]
+        velocity = [("logged", _joined(pieces, "qd"), "truth"), ("dq/dt", slope, "predicted")]
         torque = [("logged", _joined(pieces, "tau") @ inputs.T, "truth")]
         if any(body.inertia for body in arm.bodies):
-            rest = np.zeros_like(q)
-            gravity = regressor(arm, q, rest, rest) @ urdf_parameters(arm)  # (T, n)
+            still = np.zeros_like(q)
+            gravity = regressor(arm, q, still, still) @ urdf_parameters(arm)  # (T, n)
             torque.append(("gravity of the URDF", gravity, "predicted"))
-        columns.append(("torque", torque))
-    rows = [
-        JointRow(quantity, quantity, quantity, lines)
-        for quantity, lines in [("position", position), *columns]
-    ]
+        rows.append(JointRow("velocity", "velocity", "velocity", velocity))
+        rows.append(JointRow("torque", "torque", "torque", torque))
     return stacks(t, rows, named_joints(arm.joint_names, arm.joint_types))
 
 

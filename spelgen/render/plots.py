@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from spelgen.baselines.names import (
 )
 from spelgen.evaluation.drawn_motions import PredictedMotion, TorqueTrace
 from spelgen.evaluation.plain import array
-from spelgen.evaluation.traces import FrictionTrace, Growth, MassTrace, Quantiles, Traces
+from spelgen.evaluation.traces import FrictionTrace, Growth, Quantiles, Traces
 from spelgen.evaluation.verdict import Limits
 from spelgen.labels import UNITS, NamedJoint, entry_name
 from spelgen.render.charts import MARGINS, Band, Chart, Dots, Line, Mark, Values, line_chart
@@ -71,6 +70,13 @@ class JointRow:
     columns: Sequence[tuple[str, np.ndarray, str]]
     height: int = 130
 
+    def chart(self, t: Values, joint: NamedJoint, k: int, time: str = "", motion: str = "") -> Chart:
+        """Return that of joint k; time: label of the time, without which its numbers are left out."""
+        lines = [Line(label, t, values[:, k], style) for label, values, style in self.columns]
+        height = self.height + (MARGINS.bottom - MARGINS.bare if time else 0)
+        title, axis = f"{self.title} of {joint.name}", f"{self.axis} [{getattr(joint.units, self.unit)}]"
+        return line_chart(lines, title, time, axis, motion=motion, height=height)
+
 
 def stacks(
     t: Values, rows: Sequence[JointRow], joints: Sequence[NamedJoint], motion: str = ""
@@ -81,36 +87,22 @@ def stacks(
     """
     panels = []
     for k, joint in enumerate(joints):
-        charts = []
-        for number, row in enumerate(rows, start=1):
-            time, height = "", row.height
-            if number == len(rows):
-                time, height = "t [s]", row.height + MARGINS.bottom - MARGINS.bare
-            lines = [Line(label, t, values[:, k], style) for label, values, style in row.columns]
-            title, axis = f"{row.title} of {joint.name}", f"{row.axis} [{getattr(joint.units, row.unit)}]"
-            charts.append(line_chart(lines, title, time, axis, motion=motion, height=height))
+        charts = [row.chart(t, joint, k, motion=motion) for row in rows[:-1]]
+        charts.append(rows[-1].chart(t, joint, k, "t [s]", motion))
         panels.append(Panel(joint.name, tuple(charts)))
     return panels
-
-
-def inertia_unit(a: str, b: str) -> str:
-    """Return the unit of the entry of M between joints of these types."""
-    if a == b:
-        return UNITS[a].inertia
-    return "kg m"
 
 
 def loss_chart(metrics: Sequence[Record], best_epoch: int) -> Chart:
     """Return training and validation loss by epoch, with the epoch of the model that was kept."""
     columns = [(record["epoch"], record["loss"], record["validation"]) for record in metrics]
-    epochs, training, validation = array(columns).T
-    lines = [
-        Line("training loss", epochs, training, "train"),
-        Line("validation loss", epochs, validation, "model"),
-    ]
-    losses = np.concatenate([training, validation])
+    epochs, *losses = array(columns).T
     ends = (np.nanmin(losses), np.nanmax(losses))
-    lines.append(Line("epoch of the best model", (best_epoch, best_epoch), ends, "hold"))
+    lines = [
+        Line("training loss", epochs, losses[0], "train"),
+        Line("validation loss", epochs, losses[1], "model"),
+        Line("epoch of the best model", (best_epoch, best_epoch), ends, "hold"),
+    ]
     return line_chart(lines, "Loss by epoch", "epoch", "loss", log=True, width=560, height=240)
 
 
@@ -155,21 +147,20 @@ def _error_limits(errors: Mapping[str, Quantiles]) -> tuple[float, float] | None
     if MODEL not in errors:
         return None
     model_errors = np.concatenate([errors[MODEL].low, errors[MODEL].high])
-    medians = np.concatenate([error.median for error in errors.values()])
-    model_errors, medians = model_errors[model_errors > 0], medians[medians > 0]
-    if not model_errors.size or not medians.size:
+    values = np.concatenate([model_errors, *(error.median for error in errors.values())])
+    values = values[(values > 0) & (values <= TUNING.outlier * np.nanmax(model_errors))]
+    if not values.size:
         return None
-    high = max(model_errors.max(), medians[medians < TUNING.outlier * model_errors.max()].max(initial=0.0))
-    return float(min(model_errors.min(), medians.min())) / 1.3, 1.3 * float(high)
+    return float(values.min()) / 1.3, 1.3 * float(values.max())
 
 
 def torque_panels(trace: TorqueTrace, joints: Sequence[NamedJoint]) -> list[Panel]:
     """Return by joint measured and predicted torque, the residual, and the components of the prediction."""
     measured, predicted = trace.measured, trace.predicted[MODEL]
-    both = [("measured", measured, "truth"), ("predicted", predicted, "predicted")]
-    components = [(name, part, name.lower()) for name, part in trace.parts.items()]
+    curves = [("measured", measured, "truth"), ("predicted", predicted, "predicted")]
+    components = [(name, torque, name.lower()) for name, torque in trace.parts.items()]
     rows = [
-        JointRow("Torque", "torque", "torque", both, 160),
+        JointRow("Torque", "torque", "torque", curves, 160),
         JointRow("Residual", "residual", "torque", [("residual", measured - predicted, "model")], 100),
         JointRow("Components of the torque", "components", "torque", components, 162),
     ]
@@ -216,26 +207,19 @@ def mass_panels(
     masses: by the name of a line, the lower triangle of M, row by row, (entries, T). styles: by the same names.
     """
     panels = []
-    rows, columns = np.tril_indices(len(joint_types))
     # rounding leaves some of what is always zero
     zero = TUNING.zero * max(np.nanmax(np.abs(mass)) for mass in masses.values())
-    for number, (i, j) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True)):
-        if not any((np.abs(mass[number]) > zero).any() for mass in masses.values()):
-            continue
-        name = entry_name(i, j)
-        lines = [Line(label, t, mass[number], styles[label]) for label, mass in masses.items()]
-        unit = f"{name} [{inertia_unit(joint_types[i], joint_types[j])}]"
-        panels.append(Panel(name, (line_chart(lines, name, "t [s]", unit, width=width),)))
+    for number, (i, j) in enumerate(np.argwhere(np.tri(len(joint_types))).tolist()):
+        entries = {label: mass[number] for label, mass in masses.items()}
+        if np.nanmax(np.abs(list(entries.values()))) > zero:
+            lines = [Line(label, t, entry, styles[label]) for label, entry in entries.items()]
+            name = entry_name(i, j)
+            unit = "kg m"
+            if joint_types[i] == joint_types[j]:
+                unit = UNITS[joint_types[i]].inertia
+            chart = line_chart(lines, name, "t [s]", f"{name} [{unit}]", width=width)
+            panels.append(Panel(name, (chart,)))
     return panels
-
-
-def eigenvalue_chart(mass: MassTrace) -> Chart:
-    """Return the smallest and the largest eigenvalue of M along a trajectory; what is not positive is not drawn."""
-    lines = []
-    for name, curves in mass.by.items():
-        for row, label in ((0, "least"), (-1, "largest")):
-            lines.append(Line(f"{name}, {label}", mass.t, curves.eigenvalues[row], STYLES[name]))
-    return line_chart(lines, "Eigenvalues of M", "t [s]", "eigenvalue of M", log=True, width=520, height=230)
 
 
 def friction_panels(
@@ -246,20 +230,20 @@ def friction_panels(
     Measured friction is the torque less that of the model's rigid bodies. A model whose friction has no state makes no
     loop but for load.
     """
-    speeds, measured = [np.zeros((0, len(joints)))], [np.zeros((0, len(joints)))]
-    for trace in torques:
-        speeds.append(trace.qd)
-        measured.append(trace.parts["friction"] + trace.measured - trace.predicted[MODEL])
-    all_speeds, all_torques = np.concatenate(speeds), np.concatenate(measured)
     panels = []
     for k, joint in enumerate(joints):
-        marks: list[Mark] = [Dots("measured", all_speeds[:, k], all_torques[:, k], "truth")]
-        # one trajectory is enough: loops of two would cover each other
-        for trace in torques[:1]:
-            marks.append(Line("measured, over time", speeds[1][:, k], measured[1][:, k], "loop"))
-            marks.append(
-                Line("model, over time", speeds[1][:, k], trace.parts["friction"][:, k], "loop model")
-            )
+        marks: list[Mark] = []
+        curve = friction.by[MODEL][k]
+        values = [curve]
+        for trace in torques:
+            qd, modelled = trace.qd[:, k], trace.parts["friction"][:, k]
+            measured = modelled + trace.measured[:, k] - trace.predicted[MODEL][:, k]
+            values.append(measured)
+            marks.append(Dots("measured", qd, measured, "truth"))
+            # one trajectory is enough: loops of two would cover each other
+            if trace is torques[0]:
+                marks.append(Line("measured, over time", qd, measured, "loop"))
+                marks.append(Line("model, over time", qd, modelled, "loop model"))
         for name, curves in friction.by.items():
             marks.append(Line(name, friction.qd[k], curves[k], STYLES[name]))
         chart = line_chart(
@@ -267,23 +251,22 @@ def friction_panels(
             f"Friction of {joint.name}",
             joint.axis("velocity"),
             f"friction [{joint.units.torque}]",
-            limits=_friction_limits(all_torques[:, k], friction.by[MODEL][k]),
+            limits=_friction_limits(np.concatenate(values), curve),
             height=220,
         )
         panels.append(Panel(joint.name, (chart,)))
     return panels
 
 
-def _friction_limits(measured: np.ndarray, curve: np.ndarray) -> tuple[float, float] | None:
-    """Return limits that hold the model's curve and all but the outliers of what was measured."""
-    values = np.concatenate([measured, curve])
+def _friction_limits(values: np.ndarray, curve: np.ndarray) -> tuple[float, float] | None:
+    """Return limits that hold the model's curve and all values but outliers."""
     values = values[np.isfinite(values)]
     if not values.size:
         return None
     # samples at reversals are far off where friction was smoothed or delayed
     low, high = np.quantile(values, [1 - TUNING.bulk, TUNING.bulk])
     room = 0.15 * (high - low) or 1.0
-    return float(min(low, np.nanmin(curve)) - room), float(max(high, np.nanmax(curve)) + room)
+    return float(np.fmin(low, np.nanmin(curve)) - room), float(np.fmax(high, np.nanmax(curve)) + room)
 
 
 def coverage_panels(
@@ -291,31 +274,21 @@ def coverage_panels(
 ) -> list[Panel]:
     """Return by joint how often training and test logs have positions and velocities; the joint's limits are marked."""
     logs: dict[str, Record | None] = {"training": (identified or {}).get("coverage"), "test": traces.coverage}
-    by_logs = {name: covered for name, covered in logs.items() if covered}
-    if not by_logs:
-        return []
     panels = []
     for k, joint in enumerate(joints):
         charts = []
         for key, quantity in QUANTITIES.items():
-            bands = [_histogram(name, logs[key][k]) for name, logs in by_logs.items()]
+            bands = [_histogram(name, covered[key][k]) for name, covered in logs.items() if covered]
+            if not bands:  # nor of any other joint
+                return []
             marks: list[Mark] = list(bands)
-            bounds = limits[k]
-            if key == "q" and bounds is not None:
-                top = max(float(np.max(band.high)) for band in bands)
-                low, high = bounds
-                x, y = (low, low, high, high, high), (0.0, top, math.nan, 0.0, top)
-                marks.append(Line("joint limits", x, y, "hold"))
-            charts.append(
-                line_chart(
-                    marks,
-                    f"{quantity} of {joint.name}",
-                    joint.axis(quantity),
-                    "fraction of samples",
-                    width=300,
-                    height=130,
-                )
-            )
+            top = max(float(np.max(band.high)) for band in bands)
+            if key == "q":
+                for bound in limits[k] or ():
+                    marks.append(Line("joint limits", (bound, bound), (0.0, top), "hold"))
+            title, height = f"{quantity} of {joint.name}", 130
+            label = "fraction of samples"
+            charts.append(line_chart(marks, title, joint.axis(quantity), label, width=300, height=height))
         panels.append(Panel(joint.name, tuple(charts)))
     return panels
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import ast
-from dataclasses import asdict
-from functools import cached_property
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,14 +20,19 @@ from spelgen.files import write_json, write_text
 from spelgen.fitting.objectives import fit_summary
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.labels import UNITS, named_joints
-from spelgen.listing import Listing
 from spelgen.loaded_arm import LoadedArm
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.curves import curves
 from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, parameter_tables
-from spelgen.render.plots import Record, coverage_panels
-from spelgen.render.run_facts import commands, files, head_numbers, training_facts
+from spelgen.render.plots import Record, coverage_panels, loss_chart
+from spelgen.render.run_facts import (
+    best_epoch,
+    commands,
+    head_numbers,
+    settings,
+    training_facts,
+)
 from spelgen.spec import Facts, read_facts
 
 if TYPE_CHECKING:
@@ -37,49 +42,20 @@ SCHEMA = 1
 """Of the page as data."""
 
 
+@dataclass(frozen=True)
 class Run:
-    """Read what a run folder holds, each file when it is first needed; None stands for what the folder lacks."""
+    """Hold what lies in a run folder; None stands for what it lacks.
 
-    def __init__(self, folder: Path | str) -> None:
-        self.folder = RunFolder(folder)
+    config: how the run was trained. identified: what least squares found. arm: None also where its URDF is one that
+    this version refuses: the page stands without.
+    """
 
-    @cached_property
-    def facts(self) -> Facts:
-        """Return the facts of the run's module."""
-        return read_facts(self.folder.module)
-
-    @cached_property
-    def config(self) -> Record | None:
-        """Return how the run was trained."""
-        return self.folder.read_config() if self.folder.config.is_file() else None
-
-    @cached_property
-    def results(self) -> Results | None:
-        """Return the evaluation."""
-        record = self.record(self.folder.evaluation)
-        return None if record is None else Results.from_dict(record)
-
-    @cached_property
-    def identified(self) -> Record | None:
-        """Return what least squares found."""
-        return self.record(self.folder.baseline)
-
-    @cached_property
-    def arm(self) -> LoadedArm | None:
-        """Return the arm; None also where its URDF is one that this version refuses: the page stands without."""
-        try:
-            return run_arm(self.folder)
-        except SpelgenError:
-            return None
-
-    @cached_property
-    def model(self) -> EmittedModel | None:
-        """Return the trained model."""
-        return trained_model(self.folder) if self.folder.weights.is_file() else None
-
-    def record(self, path: Path) -> Record | None:
-        """Return what a file of JSON holds."""
-        return self.folder.read_json(path) if path.is_file() else None
+    folder: RunFolder
+    facts: Facts
+    config: Record | None
+    results: Results | None
+    identified: Record | None
+    arm: LoadedArm | None
 
     @property
     def limits(self) -> Limits:
@@ -89,11 +65,6 @@ class Run:
         return [joint.limits for joint in self.arm.arm.coordinates]
 
     @property
-    def parameters(self) -> list[Listing]:
-        """Return the tables of what is learned that is a number."""
-        return parameter_tables(self.folder, self.model, self.arm, self.identified)
-
-    @property
     def verdict(self) -> Verdict | None:
         """Return what the model is good for; None before it is evaluated."""
         if self.results is None:
@@ -101,12 +72,31 @@ class Run:
         return verdict(self.results, self.identified, self.limits)
 
 
-def write_report(
-    folder: Path | str, output: Path | str | None = None, robot: Path | str | None = None
-) -> Path:
+def open_run(path: Path | str) -> Run:
+    """Return what a run folder holds. Raises RunError or ModuleError."""
+    folder = RunFolder(path)
+    evaluation = _record(folder, folder.evaluation)
+    arm = None
+    with suppress(SpelgenError):
+        arm = run_arm(folder)
+    return Run(
+        folder,
+        read_facts(folder.module),
+        folder.read_config() if folder.config.is_file() else None,
+        None if evaluation is None else Results.from_dict(evaluation),
+        _record(folder, folder.baseline),
+        arm,
+    )
+
+
+def _record(folder: RunFolder, path: Path) -> Record | None:
+    return folder.read_json(path) if path.is_file() else None
+
+
+def write_report(folder: Path | str, output: Path | str | None = None) -> Path:
     """Write the page about a run, by default as report.html in its folder; return its path.
 
-    A name that ends with .json: the same as data. robot: the run's URDF where its meshes lie beside it.
+    A name that ends with .json: the same as data.
 
     Raises RunError or ModuleError when the folder is no run, or a file of it cannot be read.
     """
@@ -114,77 +104,85 @@ def write_report(
     path = Path(output or folder / "report.html")
     if path.suffix == ".json":
         return write_json(path, report_data(folder))
-    return write_text(path, render_report(folder, robot))
+    return write_text(path, render_report(folder))
 
 
 def report_data(folder: Path | str) -> Record:
     """Return all that the page shows, for programs: the verdict, the evaluation, least squares, the parameters."""
-    run = Run(folder)
-    data: dict[str, object] = {"schema": SCHEMA, "verdict": None, "bodies": None}
-    if run.verdict is not None:
-        data["verdict"] = asdict(run.verdict)
-    if run.model is not None:
-        bodies = body_parameters(run.model)
-        if bodies is not None:
-            data["bodies"] = bodies.tolist()
-    data["tables"] = list(map(asdict, run.parameters))
-    return data | {"evaluation": run.record(run.folder.evaluation), "least_squares": run.identified}
+    run = open_run(folder)
+    model = _trained(run)
+    bodies = body_parameters(model)
+    if bodies is not None:
+        bodies = bodies.tolist()
+    return {
+        "schema": SCHEMA,
+        "verdict": None if run.verdict is None else asdict(run.verdict),
+        "bodies": bodies,
+        "tables": list(map(asdict, parameter_tables(model, run.arm, run.identified))),
+        "evaluation": _record(run.folder, run.folder.evaluation),
+        "least_squares": run.identified,
+    }
 
 
-def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
-    """Return the page about a run as HTML; the same folder gives the same text. robot: see ``write_report``."""
-    run = Run(folder)
-    if not run.folder.module.is_file():
+def _trained(run: Run) -> EmittedModel | None:
+    """Return the trained model."""
+    return trained_model(run.folder) if run.folder.weights.is_file() else None
+
+
+def render_report(folder: Path | str) -> str:
+    """Return the page about a run as HTML; the same folder gives the same text."""
+    folder = Path(folder)
+    if not RunFolder(folder).module.is_file():
         raise RunError(
             "no run",
-            file=run.folder.path,
+            file=folder,
             expected="a folder with module.py",
             do="make one with `spelgen train`",
         )
     # files of a run folder may come from anywhere and hold anything
     try:
-        return _rendered(run, robot)
+        return _rendered(open_run(folder))
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, TemplateError) as error:
         raise RunError(
             f"files without the data of a report ({in_one_line(error)})",
-            file=run.folder.path,
+            file=folder,
             do="run `spelgen evaluate` again",
         ) from error
 
 
-def _rendered(run: Run, robot: Path | str | None) -> str:
+def _rendered(run: Run) -> str:
     facts, config, metrics = run.facts, run.config or {}, run.folder.read_metrics()
-    traces = Traces({}) if run.results is None else run.results.traces
-    arm, cells, training, tables = None, None, None, []
-    joints = named_joints(facts.joints, facts.joint_types)
-    if config:
-        training = training_facts(config, metrics, run.identified, run.model)
+    model = _trained(run)
+    traces, tables = Traces({}), []
     if run.results is not None:
-        tables = result_tables(run.results)
+        traces, tables = run.results.traces, result_tables(run.results)
+    sections = dict.fromkeys(("arm", "cells", "training", "settings", "losses")) | curves(traces, facts)
     if run.arm is not None:
-        arm = arm_section(run.arm.arm, Path(robot or run.arm.robot.path), traces, run.identified)
-        cells = matrix(run.arm.arm, run.arm.structure_for(facts.options.assume))
+        sections["arm"] = arm_section(run.arm.arm, run.arm.robot.path, traces)
+        sections["cells"] = matrix(run.arm.arm, run.arm.structure_for(facts.options.assume))
+    if config:
+        sections["training"] = training_facts(config, metrics, run.identified, model)
+        sections["settings"] = settings(config)
+    if metrics:
+        sections["losses"] = loss_chart(metrics, best_epoch(metrics))
     # the sentences about the model
     docstring = ast.get_docstring(ast.parse(run.folder.module.read_bytes())) or ""
+    joints = named_joints(facts.joints, facts.joint_types)
     return render_page(
         "report.html.jinja",
+        **sections,
         facts=facts,
         about=" ".join(docstring.split("\n\n")[1].split()),
-        cells=cells,
-        arm=arm,
         units=UNITS,
-        numbers=head_numbers(run.model, config, metrics, run.results),
+        numbers=head_numbers(model, config, metrics, run.results),
         verdict=run.verdict,
         config=run.config,
-        training=training,
         evaluation=run.results,
         tables=tables,
-        curves=curves(traces, facts),
         coverage=coverage_panels(traces, run.identified, joints, run.limits),
-        trained=run.model is not None,
+        trained=model is not None,
         under_servos=config.get("mapping", {}).get("input") == "position",
         summary=fit_summary(config),
-        parameters=run.parameters,
-        files=files(run.folder.path),
-        commands=commands(run.folder, facts, run.config),
+        parameters=parameter_tables(model, run.arm, run.identified),
+        commands=commands(run.folder, run.config),
     )

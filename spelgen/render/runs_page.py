@@ -10,10 +10,11 @@ from spelgen.errors import RunError
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import figures, joined
 from spelgen.files import write_text
+from spelgen.fitting.run_folder import RunFolder
 from spelgen.labels import listed
 from spelgen.render.page import render_page
 from spelgen.render.plots import growth_panels
-from spelgen.render.report_page import Run
+from spelgen.render.report_page import Run, open_run
 
 STYLES = ("model", "train", "gravity", "coriolis", "friction", "hold")
 
@@ -25,14 +26,14 @@ def write_runs(folders: Sequence[Path], output: Path) -> Path:
 
 def render_runs(folders: Sequence[Path]) -> str:
     """Return the page as HTML."""
-    names = _names(folders)
-    runs = dict(zip(names, map(Run, folders), strict=True))
+    runs: dict[str, Run] = {}
     results: dict[str, Results] = {}
-    for name, run in runs.items():
-        run.folder.read_config()  # where there is no run, this says so
+    for name, folder in zip(_names(folders), folders, strict=True):
+        RunFolder(folder).read_config()  # where there is no run, this says so
+        run = open_run(folder)
         if run.results is None:
-            raise RunError("a run that is not evaluated", file=run.folder.path, do="spelgen evaluate")
-        results[name] = run.results
+            raise RunError("a run that is not evaluated", file=folder, do="spelgen evaluate")
+        runs[name], results[name] = run, run.results
     growths = {name: (x.traces.growth, MODEL) for name, x in results.items() if x.traces.growth}
     return render_page(
         "runs.html.jinja",
@@ -41,18 +42,16 @@ def render_runs(folders: Sequence[Path]) -> str:
         robots=sorted({run.facts.robot for run in runs.values()}),
         tables=joined(results),
         # a seventh run has the style of the first again
-        growth=growth_panels(growths, dict(zip(names, STYLES * len(names), strict=False)), names),
+        growth=growth_panels(growths, dict(zip(runs, STYLES * len(runs), strict=False)), runs),
     )
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Return the folders' own names, with as many parents' as tell them apart."""
+    """Return the folders' own names, or their paths where names are alike."""
     paths = [folder.resolve() for folder in folders]
-    names: list[str] = []
-    for count in range(1, max(len(path.parts) for path in paths) + 1):
-        names = ["/".join(path.parts[-count:]) for path in paths]
-        if len(set(names)) == len(names):
-            break
+    names = [path.name for path in paths]
+    if len(set(names)) < len(names):
+        names = list(map(str, paths))
     return names
 
 
@@ -61,9 +60,7 @@ def _verdict(runs: Mapping[str, Results]) -> str:
     errors: dict[str, list[tuple[float, str, str]]] = {}
     for run, results in runs.items():
         for figure in figures(results):
-            value = figure.values[MODEL]
-            if value is not None:
-                errors.setdefault(figure.label, []).append((value, run, figure.text(value)))
+            errors.setdefault(figure.label, []).append((figure.value, run, figure.text()))
     smallest: dict[str, list[str]] = {}
     for label, of_runs in errors.items():
         if len(of_runs) == len(runs):

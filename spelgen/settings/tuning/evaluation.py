@@ -26,7 +26,7 @@ class EvaluationTuning:
     # of a predictor over a horizon: fewer windows where they are long, but not fewer than the next
     most_predicted_steps: int = 10_000
     fewest_windows: int = 100  # as far as there are so many
-    probed_model_windows: int = 64  # of which the former are taken, and which the energy's drift starts from
+    probed_model_windows: int = 64  # of which the former are taken
     # of the torque's variance; convention of this package, as the next two
     explained_for_contacts: float = 0.99
     explained_for_feed_forward: float = 0.95  # likewise
@@ -40,11 +40,8 @@ class EvaluationTuning:
     sampled_positions: int = 100_000  # at which M must be positive definite
     free_steps: int = 10_000  # of 1 ms without input
     started_states: int = 8  # that motion without input starts from
-    # of the dynamics, after which they are too stiff to be integrated to thirteen digits
-    drift_calls: int = 30_000
 
     headline: int = 20  # [words] of a verdict's sentence: it is read at a glance
-    simulated: float = 1e-3  # relative error below which a URDF is the model that made the logs
     # of a joint's largest velocity: differences that friction is differentiated by
     velocity_step: float = 1e-5
     displacement_step: float = 1e-7  # [rad, m] likewise, of bristles
