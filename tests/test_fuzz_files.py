@@ -26,6 +26,7 @@ from spelgen.logs.chunks import scan
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.render.report_page import render_report
+from spelgen.render.scene import scene
 from spelgen.settings.fits import TorqueFit
 from spelgen.settings.settings import OF_A_STEP
 from spelgen.simulation.protocol import make_friction
@@ -177,6 +178,27 @@ def test_settings(tmp_path, robots):
         loaded.actuation.matrix()
 
     fuzz(st.tuples(st.integers(0, 10**9), changes(plain)), 250, use)
+
+
+def test_meshes(tmp_path):
+    """Files of every format with bytes changed: drawn, or the arm is drawn without them."""
+    ball = pytest.importorskip("trimesh").creation.icosphere(subdivisions=1)
+    kinds = ("stl", "obj", "ply", "glb", "dae", "off")
+    whole = {kind: ball.export(file_type=kind) for kind in kinds}
+    text = (
+        '<robot name="r"><link name="a"/><link name="b"><visual><geometry><mesh filename="m.KIND"/></geometry></visual>'
+        '</link><joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint></robot>'
+    )
+
+    def use(drawn):
+        kind, number = drawn
+        content = whole[kind]
+        content = content.encode() if isinstance(content, str) else content
+        (tmp_path / f"m.{kind}").write_bytes(mutated(content, random.Random(number)))
+        (tmp_path / "r.urdf").write_text(text.replace("KIND", kind))
+        assert scene(tmp_path / "r.urdf", ["j"]).links
+
+    fuzz(st.tuples(st.sampled_from(kinds), st.integers(0, 10**9)), 3, use)
 
 
 @pytest.fixture(scope="module")

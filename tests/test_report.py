@@ -230,3 +230,17 @@ def test_what_the_page_shows_is_there_as_data(run, robots):
     found = json.loads(write_report(run, run / "report.json").read_text(encoding="utf-8"))
     assert found["evaluation"] == EVALUATION and found["least_squares"] is None
     assert found["verdict"]["sentence"] in " ".join(Page(render_report(run)).text)
+
+
+def test_meshes_are_drawn_where_the_robot_is_named(run, robots, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
+    trimesh.creation.icosphere(subdivisions=5, radius=0.1).export(tmp_path / "ball.stl")  # 20480 faces
+    shown = '<visual><geometry><mesh filename="ball.stl"/></geometry></visual></link>'
+    text = (robots / "rpr.urdf").read_text()
+    (tmp_path / "rpr.urdf").write_text(text.replace("</link>", shown))
+    plain, drawn = render_report(run), render_report(run, tmp_path / "rpr.urdf")
+    assert "links are drawn as tubes" in plain and "links are drawn as tubes" not in drawn
+    scene = json.loads(re.search(r'id="scene">(.*?)</script>', drawn)[1])
+    assert 200 < sum(len(link["shape"]["faces"]) for link in scene["links"]) <= 4100
+    assert len(drawn) < 2_000_000

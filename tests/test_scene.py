@@ -11,7 +11,8 @@ from spelgen.dynamics.tip import tip_kinematics
 from spelgen.loaded_arm import load_arm
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import json_data
-from spelgen.render.scene import prisms, scene
+from spelgen.render.scene import scene
+from spelgen.render.shapes import joined, tube
 
 
 def frames(links, q):
@@ -46,8 +47,23 @@ def test_links_stand_where_pytorch_kinematics_has_them(robots, robot):
         np.testing.assert_allclose(rotation, pose[:3, :3], atol=1e-6)
 
 
+def test_the_shapes_of_the_file_are_drawn_where_all_are_there(tmp_path):
+    box = "<visual><geometry><box size='0.1 0.2 0.3'/></geometry></visual>"
+    mesh = "<visual><geometry><mesh filename='not_there.stl'/></geometry></visual>"
+    text = f"""<robot name="r"><link name="a">{box}</link><link name="b">BOX</link>
+      <joint name="j" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0 1"/><axis xyz="0 1 0"/>
+      <limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
+    path = tmp_path / "r.urdf"
+    path.write_text(text.replace("BOX", box))
+    found = scene(path, ["j"])
+    assert found.has_meshes and [len(link.shape.faces) for link in found.links] == [12, 12]
+    np.testing.assert_allclose(np.ptp(found.links[1].shape.vertices, axis=0), [0.1, 0.2, 0.3], atol=1e-3)
+    path.write_text(text.replace("BOX", mesh))
+    assert not scene(path, ["j"]).has_meshes  # tubes: an arm with holes is worse
+
+
 def test_tubes_are_closed_and_look_outward():
-    shape = prisms([(np.zeros(3), np.array([0.0, 0.0, 2.0]), 0.5)])
+    shape = joined(tube(np.zeros(3), np.array([0.0, 0.0, 2.0]), 0.5))
     volume = 0.0
     for face in shape.faces:
         first, *rest = shape.vertices[list(face)]

@@ -102,6 +102,10 @@ def report(
             "HTML file, or .json for the data. Default: report.html in the run folder, runs.html for several.",
         ),
     ] = None,
+    robot: Annotated[
+        Path | None,
+        typer.Option(metavar="ROBOT.urdf", help="URDF with its meshes, for the picture of the arm."),
+    ] = None,
     trust: Trust = False,
 ) -> None:
     """Write an HTML page about one run or several."""
@@ -110,10 +114,12 @@ def report(
     if trust:
         for run in runs:
             RunFolder(run).load_module(trust=True)  # a module that ran once may run again
+    if robot is not None and len(runs) > 1:
+        raise typer.BadParameter("belongs to the page of one run", param_hint="'--robot'")
     if len(runs) == 1:
         from spelgen.render.report_page import write_report
 
-        say(f"wrote {write_report(runs[0], output)}")
+        say(f"wrote {write_report(runs[0], output, robot)}")
     else:
         from spelgen.render.runs_page import write_runs
 

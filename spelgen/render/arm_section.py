@@ -59,6 +59,7 @@ class ArmSection:
 
     data: Markup
     motions: tuple[str, ...]
+    has_meshes: bool
 
 
 def matrix(arm: Arm, structure: Structure) -> list[list[Cell]]:
@@ -102,11 +103,12 @@ def _explanations(arm: Arm, structure: Structure) -> dict[str, str]:
 
 def arm_section(arm: Arm, urdf: Path, traces: Traces | None = None) -> ArmSection:
     """Return the arm with the motions of an evaluation's traces, or, without, one through its ranges."""
+    drawn = scene(urdf, arm.joint_names)
     motions = [_sweep(arm)]
     if traces is not None:
         motions = _motions(traces) or motions
-    data = record(scene(urdf, arm.joint_names)) | {"motions": list(map(record, motions))}
-    return ArmSection(json_data(data), tuple(motion.label for motion in motions))
+    data = record(drawn) | {"motions": list(map(record, motions))}
+    return ArmSection(json_data(data), tuple(motion.label for motion in motions), drawn.has_meshes)
 
 
 def _motions(traces: Traces) -> list[Motion]:

@@ -93,10 +93,12 @@ def _record(folder: RunFolder, path: Path) -> Record | None:
     return folder.read_json(path) if path.is_file() else None
 
 
-def write_report(folder: Path | str, output: Path | str | None = None) -> Path:
+def write_report(
+    folder: Path | str, output: Path | str | None = None, robot: Path | str | None = None
+) -> Path:
     """Write the page about a run, by default as report.html in its folder; return its path.
 
-    A name that ends with .json: the same as data.
+    A name that ends with .json: the same as data. robot: the run's URDF where its meshes lie beside it.
 
     Raises RunError or ModuleError when the folder is no run, or a file of it cannot be read.
     """
@@ -104,7 +106,7 @@ def write_report(folder: Path | str, output: Path | str | None = None) -> Path:
     path = Path(output or folder / "report.html")
     if path.suffix == ".json":
         return write_json(path, report_data(folder))
-    return write_text(path, render_report(folder))
+    return write_text(path, render_report(folder, robot))
 
 
 def report_data(folder: Path | str) -> Record:
@@ -129,8 +131,8 @@ def _trained(run: Run) -> EmittedModel | None:
     return trained_model(run.folder) if run.folder.weights.is_file() else None
 
 
-def render_report(folder: Path | str) -> str:
-    """Return the page about a run as HTML; the same folder gives the same text."""
+def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
+    """Return the page about a run as HTML; the same folder gives the same text. robot: see ``write_report``."""
     folder = Path(folder)
     if not RunFolder(folder).module.is_file():
         raise RunError(
@@ -141,7 +143,7 @@ def render_report(folder: Path | str) -> str:
         )
     # files of a run folder may come from anywhere and hold anything
     try:
-        return _rendered(open_run(folder))
+        return _rendered(open_run(folder), robot)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, TemplateError) as error:
         raise RunError(
             f"files without the data of a report ({in_one_line(error)})",
@@ -150,7 +152,7 @@ def render_report(folder: Path | str) -> str:
         ) from error
 
 
-def _rendered(run: Run) -> str:
+def _rendered(run: Run, robot: Path | str | None) -> str:
     facts, config, metrics = run.facts, run.config or {}, run.folder.read_metrics()
     model = _trained(run)
     traces, tables = Traces({}), []
@@ -158,7 +160,7 @@ def _rendered(run: Run) -> str:
         traces, tables = run.results.traces, result_tables(run.results)
     sections = dict.fromkeys(("arm", "cells", "training", "settings", "losses")) | curves(traces, facts)
     if run.arm is not None:
-        sections["arm"] = arm_section(run.arm.arm, run.arm.robot.path, traces)
+        sections["arm"] = arm_section(run.arm.arm, Path(robot or run.arm.robot.path), traces)
         sections["cells"] = matrix(run.arm.arm, run.arm.structure_for(facts.options.assume))
     if config:
         sections["training"] = training_facts(config, metrics, run.identified, model)

@@ -1,6 +1,7 @@
-"""A URDF -> the arm as a page draws it: links that hang on one another, as tubes from joint to joint.
+"""A URDF -> the arm as a page draws it: links that hang on one another, each with its triangles.
 
-A drum lies about the axis of each joint that moves.
+The triangles are those of the file's visual shapes where these are found, simplified to fit a page; else tubes from
+joint to joint, with a drum about the axis of each that turns.
 """
 
 from __future__ import annotations
@@ -14,19 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from spelgen.dynamics.constraint import Constraint, mimic_constraint
 from spelgen.evaluation.plain import Curve
+from spelgen.render.shapes import Shape, joined, tube, visual_shapes
 from spelgen.settings.tuning.render import TUNING
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Joint, Robot
-
-SIDES = 10
-
-
-@dataclass(frozen=True, eq=False)
-class Shape:
-    """Vertices (V, 3) [m] in the link's frame, and faces: corners of each, seen from outside counterclockwise."""
-
-    vertices: Curve
-    faces: list[list[int]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +43,11 @@ class SceneLink:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Links, parents first, and how far the arm reaches [m]."""
+    """Links, parents first, and how far the arm reaches [m]. has_meshes: whether the shapes are the file's own."""
 
     links: tuple[SceneLink, ...]
     reach: float
+    has_meshes: bool
 
 
 def scene(urdf: Path, joints: Sequence[str]) -> Scene:
@@ -62,11 +55,17 @@ def scene(urdf: Path, joints: Sequence[str]) -> Scene:
     robot = read_urdf(urdf)
     constraint = mimic_constraint(robot, joints)
     names = _links(robot, joints)
+    shapes = visual_shapes(urdf, names)
     lengths = [np.linalg.norm(joint.xyz) for name, joint in robot.joint_above.items() if name in names]
     reach = max(float(sum(lengths)), 1e-3)  # an arm of joints in one point has a size, too
-    radius = TUNING.tube_radius * reach
-    links = [_link(robot, name, names, constraint, _tubes(robot, name, names, radius)) for name in names]
-    return Scene(tuple(links), reach)
+    links = []
+    for name in names:
+        if shapes:
+            shape = shapes.get(name, joined([]))
+        else:
+            shape = _tubes(robot, name, names, TUNING.tube_radius * reach)
+        links.append(_link(robot, name, names, constraint, shape))
+    return Scene(tuple(links), reach, bool(shapes))
 
 
 def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint, shape: Shape) -> SceneLink:
@@ -119,41 +118,20 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
     """Return tubes from the link's origin to the joints that it carries; the last link ends at its centre of mass."""
     joint, inertial = robot.joint_above.get(name), robot.link[name].inertial
     below = [joint for joint in robot.joints_below[name] if joint.child in names]
-    origin = np.zeros(3)
-    tubes = []
+    meshes = []
     for carried in below:
         end = np.array(carried.xyz, dtype=float)
-        tubes.append((origin, end, radius))
+        meshes += tube(np.zeros(3), end, radius)
         if carried.type == "prismatic":  # its rail
             travel = max(abs(carried.lower or 0.0), abs(carried.upper or 0.0))
-            tubes.append((end, end + travel * _rotation(carried) @ _axis(carried), 0.4 * radius))
+            meshes += tube(end, end + travel * _rotation(carried) @ _axis(carried), 0.4 * radius)
     if not below and inertial is not None:
-        tubes.append((origin, np.array(inertial.com, dtype=float), 0.7 * radius))
-    if joint is not None and joint.moves:  # a drum about its axis
-        tip = 1.7 * radius * _axis(joint)
-        tubes.append((-tip, tip, 1.5 * radius))
-    return prisms(tubes)
-
-
-def prisms(tubes: Sequence[tuple[np.ndarray, np.ndarray, float]]) -> Shape:
-    """Return tubes, each of start, end and radius, with their lids; none where it is shorter than half its radius."""
-    corners: list[list[float]] = []
-    faces: list[list[int]] = []
-    angle = 2 * np.pi / SIDES * np.arange(SIDES)[:, None]
-    for start, end, radius in tubes:
-        length = np.linalg.norm(end - start)
-        if length <= radius / 2:
-            continue
-        along = (end - start) / length
-        across = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
-        across /= np.linalg.norm(across)
-        ring = radius * (np.cos(angle) * across + np.sin(angle) * np.cross(along, across))
-        lower = len(corners) + np.arange(SIDES)
-        upper = lower + SIDES
-        corners += np.concatenate([start + ring, end + ring]).tolist()
-        sides = np.stack([lower, np.roll(lower, -1), np.roll(upper, -1), upper], axis=1)
-        faces += [lower[::-1].tolist(), upper.tolist(), *sides.tolist()]
-    return Shape(np.array(corners), faces)
+        meshes += tube(np.zeros(3), np.array(inertial.com, dtype=float), 0.7 * radius)
+    if joint is not None and joint.moves:
+        sides, width, half = (4, 1.8, 2.4) if joint.type == "prismatic" else (10, 1.5, 1.725)
+        ends = half * radius * _axis(joint)
+        meshes += tube(-ends, ends, width * radius, sides)
+    return joined(meshes)
 
 
 def _axis(joint: Joint) -> np.ndarray:

@@ -15,7 +15,8 @@ class RenderTuning:
     outlier: float = 100.0
     bulk: float = 0.995  # quantile of measured friction that sets the axis: its outliers are cut off
     zero: float = 1e-9  # of the largest entry of M: a smaller one is what rounding leaves of zero
-    tube_radius: float = 0.028  # of a link, relative to the arm's reach
+    faces: int = 4000  # of all links together, so that a page stays below 1 MB
+    tube_radius: float = 0.028  # of a link without a mesh, relative to the arm's reach
     worst_error: float = 0.5  # relative error that is drawn as the worst colour
     interval: float = 2.0  # standard deviations, a 95 % interval
 

@@ -1,0 +1,166 @@
+"""Meshes from anywhere: drawn, or the arm is drawn without them; no pipe is opened, no file unpacks to gigabytes."""
+
+import base64
+import json
+import os
+import resource
+import struct
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from machine import in_time
+
+from spelgen.render.scene import scene
+
+ARM = """<robot name="r"><link name="a"/><link name="b"><visual><geometry><mesh filename="FILE"/></geometry></visual>
+</link><joint name="j" type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/></joint></robot>"""
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+MANY = 400_000_000  # 4.8 GB as corners of three numbers
+
+
+def test_triangles_without_common_corners_stay_one_surface(tmp_path):
+    """A file may give each triangle corners of its own, as STL does: a simplified ball has no holes."""
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.1)
+    apart = trimesh.Trimesh(
+        ball.triangles.reshape(-1, 3), np.arange(3 * len(ball.faces)).reshape(-1, 3), process=False
+    )
+    (tmp_path / "m.obj").write_text(trimesh.exchange.obj.export_obj(apart, include_normals=True))
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(ARM.replace("FILE", "m.obj"))
+    (shape,) = [link.shape for link in scene(urdf, ["j"]).links if link.name == "b"]
+    drawn = trimesh.Trimesh(shape.vertices, shape.faces, process=False)
+    assert len(drawn.faces) < 0.5 * len(ball.faces)
+    assert drawn.is_watertight
+    assert drawn.area == pytest.approx(ball.area, rel=0.02)
+
+
+def gltf(buffer: dict[str, object], count: int = 3, view: int | None = 0) -> str:
+    """A mesh of positions in a buffer; view None: as many zeros as it says."""
+    positions = {"componentType": 5126, "count": count, "type": "VEC3"}
+    if view is not None:
+        positions["bufferView"] = view
+    content = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}], "accessors": [positions],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}], "buffers": [{"byteLength": 36} | buffer],
+    }  # fmt: skip
+    return json.dumps(content)
+
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "f4").tobytes()
+INLINE = {"uri": "data:application/octet-stream;base64," + base64.b64encode(CORNERS).decode()}
+
+
+def plain_obj(folder: Path) -> str:
+    (folder / "m.obj").write_text(TRIANGLE)
+    return "m.obj"
+
+
+def plain_gltf(folder: Path) -> str:
+    (folder / "m.gltf").write_text(gltf(INLINE))
+    return "m.gltf"
+
+
+def gltf_with_a_file(folder: Path) -> str:
+    (folder / "m.bin").write_bytes(CORNERS)
+    (folder / "m.gltf").write_text(gltf({"uri": "m.bin"}))
+    return "m.gltf"
+
+
+def obj_whose_material_is_a_pipe(folder: Path) -> str:
+    os.mkfifo(folder / "m.mtl")
+    (folder / "m.obj").write_text(f"mtllib m.mtl\nusemtl x\n{TRIANGLE}")
+    return "m.obj"
+
+
+def pipe(folder: Path) -> str:
+    os.mkfifo(folder / "m.obj")
+    return "m.obj"
+
+
+def gltf_whose_buffer_is_a_pipe(folder: Path) -> str:
+    os.mkfifo(folder / "m.bin")
+    (folder / "m.gltf").write_text(gltf({"uri": "m.bin"}))
+    return "m.gltf"
+
+
+def gltf_whose_buffer_lies_elsewhere(folder: Path) -> str:
+    (folder / "inner").mkdir()
+    (folder / "m.bin").write_bytes(CORNERS)
+    (folder / "inner" / "m.gltf").write_text(gltf({"uri": "../m.bin"}))
+    return "inner/m.gltf"
+
+
+def gltf_of_gigabytes(folder: Path) -> str:
+    (folder / "m.gltf").write_text(gltf(INLINE, MANY, None))
+    return "m.gltf"
+
+
+def archive_of_gigabytes(folder: Path) -> str:
+    with (
+        zipfile.ZipFile(folder / "m.zip", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        archive.open("m.stl", "w", force_zip64=True) as file,
+    ):
+        file.write(bytes(80) + struct.pack("<I", MANY))
+        for _ in range(6):
+            file.write(bytes(10**8))
+    return "m.zip"
+
+
+def stl_that_says_more_than_it_has(folder: Path) -> str:
+    (folder / "m.stl").write_bytes(bytes(80) + struct.pack("<I", MANY) + bytes(5000))
+    return "m.stl"
+
+
+def ply_that_says_more_than_it_has(folder: Path) -> str:
+    fields = "property float x\nproperty float y\nproperty float z\n"
+    (folder / "m.ply").write_text(
+        f"ply\nformat ascii 1.0\nelement vertex {MANY}\n{fields}end_header\n0 0 0\n"
+    )
+    return "m.ply"
+
+
+def corners_that_are_no_numbers(folder: Path) -> str:
+    (folder / "m.obj").write_text(TRIANGLE.replace("v 1", "v nan"))
+    return "m.obj"
+
+
+def gltf_of_triangles_without_corners(folder: Path) -> str:
+    content = json.loads(gltf(INLINE))
+    content["meshes"][0]["primitives"][0]["indices"] = 1
+    content["accessors"].append({"bufferView": 1, "componentType": 5123, "count": 3, "type": "SCALAR"})
+    content["bufferViews"].append(
+        {"buffer": 0, "byteOffset": 12, "byteLength": 6}
+    )  # the second corner: 0, 16256, 0
+    (folder / "m.gltf").write_text(json.dumps(content))
+    return "m.gltf"
+
+
+def triangle_beyond_all_areas(folder: Path) -> str:
+    return plain_obj(folder) + '" scale="1e200 1e200 1e200'
+
+
+DRAWN = (plain_obj, plain_gltf, gltf_with_a_file, obj_whose_material_is_a_pipe)
+LEFT_OUT = (
+    pipe, gltf_whose_buffer_is_a_pipe, gltf_whose_buffer_lies_elsewhere, gltf_of_gigabytes, archive_of_gigabytes,
+    stl_that_says_more_than_it_has, ply_that_says_more_than_it_has, corners_that_are_no_numbers,
+    gltf_of_triangles_without_corners, triangle_beyond_all_areas,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("make", DRAWN + LEFT_OUT)
+def test_meshes_are_drawn_or_left_out_in_bounds(tmp_path, make):
+    pytest.importorskip("trimesh")
+    path = tmp_path / "r.urdf"
+    path.write_text(ARM.replace("FILE", make(tmp_path)))
+    begin, used = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert scene(path, ["j"]).has_meshes == (make in DRAWN)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert in_time(after.ru_utime + after.ru_stime - used.ru_utime - used.ru_stime, 10)
+    # kB, of the largest process so far: another test's may have been larger
+    assert after.ru_maxrss <= max(used.ru_maxrss, 1_100_000)
+    assert time.monotonic() - begin < 60  # what waits for a pipe uses no processor
