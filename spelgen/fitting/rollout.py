@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from spelgen.dynamics.protocol import (
-    known_past,
-    memory_along,
-    sliding_memory,
-)
+from spelgen.dynamics.protocol import known_past, memory_along, sliding_memory
 from spelgen.dynamics.runge_kutta import runge_kutta
 from spelgen.dynamics.unbounded import mass_as_learned
 from spelgen.errors import LogError
-from spelgen.fitting.adaptive import roll_out_adaptive
+from spelgen.fitting.adaptive import adaptive_step
 from spelgen.logs.windows import Windows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import Solver
@@ -37,38 +32,29 @@ def roll_out(
 
     The state is (q, p), p = M(q) qd, so that no derivative of M in time is needed. Windows make one batch, each with
     its own sample times, and every interval between samples is solved by itself: the input jumps at its ends.
-    solver: "rk4" takes `substeps` steps of the classical Runge-Kutta method in each. Written out here and not left
-    to torchdiffeq, which cannot know that the weights stay the same over the whole window: `prepare` readies them
-    once. "dopri5": see `adaptive.roll_out_adaptive`.
+    solver: "rk4" takes `substeps` steps of the classical Runge-Kutta method in each, "dopri5" as many steps as it needs
+    (see `adaptive_step`). The weights stay the same over the whole window, and are prepared once.
     """
-    if solver == "dopri5":
-        return roll_out_adaptive(model, windows)
     prepared = model.prepare()
     q = windows.q[:, 0]
     p = model.momentum(model.at(q, prepared=prepared), windows.qd[:, 0])
     z = sliding_memory(model, windows.qd[:, 0]) if windows.z is None else windows.z
+    advance = runge_kutta if solver == "rk4" else adaptive_step
     positions, velocities = [], []
     for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
-        rhs, step = partial(_rhs, model, tau, prepared), dt.unsqueeze(-1) / substeps
+
+        def rhs(
+            q: torch.Tensor, p: torch.Tensor, z: torch.Tensor, tau: torch.Tensor = tau
+        ) -> tuple[torch.Tensor, torch.Tensor]:
+            return model.port_hamiltonian_rhs(q, p, tau, prepared, *known_past(model, z))
+
         for substep in range(substeps):
-            q, p, z, qd = runge_kutta(model, rhs, q, p, z, step)
+            q, p, z, qd = advance(model, rhs, q, p, z, dt.unsqueeze(-1) / substeps)
             if substep == 0:
                 velocities.append(qd)  # of the sample that the interval starts at
         positions.append(q)
     velocities = [*velocities[1:], model.velocity(model.at(q, prepared=prepared), p)]
     return torch.stack(positions, dim=1), torch.stack(velocities, dim=1)  # each (W, K-1, n)
-
-
-def _rhs(
-    model: PortHamiltonian,
-    tau: torch.Tensor,
-    prepared: Any,
-    q: torch.Tensor,
-    p: torch.Tensor,
-    z: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return q' and p' under a held input, where friction's memory is z."""
-    return model.port_hamiltonian_rhs(q, p, tau, prepared, *known_past(model, z))
 
 
 def position_difference(

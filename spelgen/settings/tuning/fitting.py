@@ -173,7 +173,6 @@ class AdaptiveTuning:
 
     relative: float = 1e-7  # [1] tolerance of a step
     absolute: float = 1e-9  # [rad, m, and momenta] tolerance of a step
-    adjoint_samples: int = 20  # from so many on by the adjoint equation: memory does not grow with the steps
 
 
 @dataclass(frozen=True)
