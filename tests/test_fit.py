@@ -9,9 +9,8 @@ from emitted import random_model
 
 import spelgen
 from spelgen.errors import LogError, RunError
-from spelgen.fitting.adaptive import SOLVER
 from spelgen.fitting.fit import RunOptions
-from spelgen.fitting.rollout import loss_scales, roll_out, rollout_loss
+from spelgen.fitting.rollout import SOLVER, loss_scales, roll_out, rollout_loss
 from spelgen.fitting.train import train
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import write_logs

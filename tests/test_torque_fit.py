@@ -25,7 +25,7 @@ from spelgen.fitting.torque.body_steps import moved_bodies
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import ResidualSamples, RigidResponse, TorqueJacobian
 from spelgen.fitting.torque.networks import adapt_networks
-from spelgen.fitting.torque.prior import ADAPTED, adapted_kinds, covariance, most_probable
+from spelgen.fitting.torque.prior import ADAPTED, covariance, most_probable
 from spelgen.fitting.torque.problem import TorqueProblem
 from spelgen.fitting.torque.report import terms_in_use, torque_notes
 from spelgen.fitting.torque.residuals import FRICTION, select_residuals
@@ -154,22 +154,22 @@ def test_deviations_are_those_of_the_largest_marginal_likelihood():
         return float(np.linalg.slogdet(total)[1] + y @ np.linalg.solve(total, y)) / 2
 
     best = np.exp(minimize_scalar(minus_log_likelihood, bounds=(-4, 3), method="bounded").x)
-    weights = {"armature": torch.zeros(3), "bodies": torch.zeros(2, 10), "offset": torch.zeros(2)}
-    kinds = adapted_kinds(weights, dict(zip(weights, ADAPTED, strict=True)))
+    order = torch.arange(25)
+    masks = dict(zip(ADAPTED, (order < 3, (order >= 3) & (order < 23), order >= 23), strict=True))
     guess = prior = GaussianPrior(armature=0.1, bodies=0.1, offset=0.1, degrees_of_freedom=1e-9)
     for _ in range(200):
         posterior = np.linalg.inv(rows.T @ rows / noise**2 + np.eye(20) / prior.bodies**2)
         away, covariance = torch.full((25,), 0.1).double(), torch.zeros(25, 25).double()
         away[3:23] = torch.from_numpy(posterior @ rows.T @ y / noise**2)
         covariance[3:23, 3:23] = torch.from_numpy(posterior)
-        prior = most_probable(prior, guess, kinds, away, covariance)
+        prior = most_probable(prior, guess, masks, away, covariance)
     assert prior.bodies == pytest.approx(best, rel=1e-4)
     # all three armatures are off together, which the prior allows for
     assert prior.armature < 1e-4
     away[:3] = torch.tensor([0.3, -0.3, 0.0])
-    assert most_probable(prior, guess, kinds, away, covariance).armature == pytest.approx(0.3)
+    assert most_probable(prior, guess, masks, away, covariance).armature == pytest.approx(0.3)
     certain = prior.model_copy(update={"degrees_of_freedom": 1e12})
-    assert most_probable(certain, guess, kinds, away, covariance).bodies == pytest.approx(guess.bodies)
+    assert most_probable(certain, guess, masks, away, covariance).bodies == pytest.approx(guess.bodies)
 
 
 def test_a_urdf_that_is_wrong_is_given_up_and_that_is_said(emitted):

@@ -15,7 +15,7 @@ from spelgen.logs.checks import check
 from spelgen.logs.chunks import Chunk
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
-from spelgen.logs.windows import Split, Windows, cut_windows, split_validation, thinned, window_count
+from spelgen.logs.windows import Split, Windows, cut_windows, split_validation, thinned
 from spelgen.settings.tuning.fitting import ValidationTuning
 
 TUNING = ValidationTuning()
@@ -35,60 +35,44 @@ class WindowChoice:
     seed: int = 0
     reach: BristleReach | None = None
 
+    def span(self, preprocessing: Preprocessing) -> int:
+        """Return the samples of one window, of logs that are prepared like this."""
+        return (self.window - 1) * (preprocessing.decimation or 1) + 1
+
+    def windows(self, trajectories: Sequence[Trajectory], preprocessing: Preprocessing) -> Windows:
+        """Return all windows of these trajectories, filtered piece by piece; preprocessing: a resolved one."""
+        return cut_windows(
+            preprocessing.pieces(trajectories, shortest=self.span(preprocessing)),
+            self.window,
+            self.stride,
+            preprocessing.decimation or 1,
+            measured=preprocessing.filtered,
+            reach=self.reach,
+        )
+
 
 DEFAULT_CHOICE = WindowChoice()
-
-
-@dataclass(frozen=True, eq=False)
-class WindowCutting:
-    """How the chosen windows are cut of logs that are prepared like this. preprocessing: a resolved one."""
-
-    choice: WindowChoice
-    preprocessing: Preprocessing
-
-    @property
-    def decimation(self) -> int:
-        """Samples from one sample of a window to the next."""
-        return self.preprocessing.decimation or 1
-
-    @property
-    def shortest(self) -> int:
-        """Samples of one window."""
-        return (self.choice.window - 1) * self.decimation + 1
-
-    def count(self, samples: int) -> int:
-        """Return how many windows a gap-free piece of so many samples has."""
-        return window_count(samples, self.choice.window, self.choice.stride, self.decimation)
-
-    def windows(self, trajectories: Sequence[Trajectory]) -> Windows:
-        """Return all windows of these trajectories, filtered piece by piece."""
-        pieces = self.preprocessing.pieces(trajectories, shortest=self.shortest)
-        filtered, choice = self.preprocessing.filtered, self.choice
-        return cut_windows(
-            pieces, choice.window, choice.stride, self.decimation, measured=filtered, reach=choice.reach
-        )
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
     """Windows of the logs, ready to fit.
 
-    training: all of them, or of logs larger than memory an even sample. size: windows of all training logs.
-    preprocessing: as it was resolved. digest: of every number, to resume on the same data only.
-    recordings: what all was cut from, validation included; of logs larger than memory chunks.
+    training: all of them, or of logs larger than memory an even sample. preprocessing: as it was resolved.
+    digest: of every number, to resume on the same data only. recordings: what all was cut from, validation included; of
+    logs larger than memory chunks.
     """
 
     training: Windows
     validation: Windows
-    size: int
     scales: LossScales
     preprocessing: Preprocessing
     training_names: tuple[str, ...]
     validation_names: tuple[str, ...]
     diagnostics: tuple[Diagnostic, ...]
     digest: str
-    recordings: tuple[Trajectory, ...] = ()
-    chunks: tuple[Chunk, ...] = ()
+    recordings: Sequence[Trajectory] = ()
+    chunks: Sequence[Chunk] = ()
 
 
 def prepare_data(
@@ -110,19 +94,17 @@ def prepare_data(
     require_torques(everything)
     notes = check(everything, joints, joint_types)
     resolved = preprocessing.resolved([x.sample_rate for x in everything])
-    cutting = WindowCutting(choice, resolved)
-    windows = cutting.windows(split.training)
+    windows = choice.windows(split.training, resolved)
     return TrainingData(
         training=windows,
-        validation=thinned(cutting.windows(split.validation), TUNING.windows),
-        size=len(windows),
+        validation=thinned(choice.windows(split.validation, resolved), TUNING.windows),
         scales=loss_scales(windows, joint_types),
         preprocessing=resolved,
         training_names=tuple(x.name for x in split.training),
         validation_names=tuple(x.name for x in split.validation),
         diagnostics=(*notes, *resolved.diagnostics, split.note),
         digest=digest(everything),
-        recordings=tuple(everything),
+        recordings=everything,
     )
 
 

@@ -1,11 +1,12 @@
-"""What a fit is: the protocol of an objective, and what every objective is given."""
+"""What a fit is: the base of all objectives, and what every objective is given."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from spelgen.dynamics.protocol import has_rigid_bodies, input_of
 from spelgen.errors import Diagnostic
@@ -27,11 +28,30 @@ Status = Literal["finished", "stopped early", "out of time", "interrupted"]
 
 
 @dataclass(frozen=True)
+class RunOptions:
+    """How a fit runs, whatever it fits.
+
+    device, threads: of torch. resume: go on from the folder's checkpoint, exactly as if there had been no interruption.
+    force: replace a run. progress: show it on stderr. mapping: how the logs were read, kept with the run. notes: found
+    before, to be reported with the others. began: from when the allowed time counts (`time.monotonic`); None: from now.
+    """
+
+    device: str = "cpu"
+    threads: int = 1
+    resume: bool = False
+    force: bool = False
+    progress: bool = False
+    mapping: LogMapping | None = None
+    notes: Sequence[Diagnostic] = ()
+    began: float | None = None
+
+
+@dataclass(frozen=True)
 class FitRequest:
     """What is fitted to what, and how: the same for each objective.
 
     validation: the fraction of the logs that is set aside, or trajectories. urdf: the robot's, where it is known.
-    mapping: how the logs were read. began: from when the allowed time counts (`time.monotonic`). folder: of the run.
+    began: from when the allowed time counts (`time.monotonic`). folder: of the run.
     """
 
     model: EmittedModel
@@ -41,9 +61,7 @@ class FitRequest:
     validation: float | Sequence[Trajectory]
     seed: int
     urdf: Path | None
-    mapping: LogMapping | None
-    device: str
-    threads: int
+    options: RunOptions
     began: float
     folder: Path | None
 
@@ -74,16 +92,23 @@ class FitSummary:
     headline: tuple[str, str]
 
 
-class Objective(Protocol):
+class Objective(ABC):
     """One way to fit a model: what it needs of logs, how it starts, goes on and is resumed.
 
-    `fit` calls `prepare` first, then `begin` for a new fit or `resume`, then `run`. It owns the run folder: what an
-    objective wants kept it says by `save`, and in `checkpoint`, `history` and `results`.
+    It is made of a model that it is for, and a config of its own. `fit` calls `prepare` first, then `begin` for a new
+    fit or `resume`, then `run`. It owns the run folder: what an objective wants kept it says by ``save``, and in
+    `checkpoint`, history (the lines of metrics.jsonl) and results (what config.json says of how it went).
     """
 
     name: ClassVar[str]
-    input: ClassVar[Literal["torque", "position"]]
+    input: ClassVar[Literal["torque", "position"]] = "torque"
     """What the inputs are of the models that it is for, and what their logs have."""
+
+    def __init__(self, request: FitRequest) -> None:
+        self.request, self.model = request, request.model
+        self.history: list[Content] = []
+        self.results: Content = {}
+        self._checkpoint: Content = {}
 
     @staticmethod
     def summary(record: ReadContent) -> FitSummary | None:
@@ -91,26 +116,24 @@ class Objective(Protocol):
 
         record: contents of config.json.
         """
+        return None
 
-    def __init__(self, request: FitRequest) -> None:
-        """Begin with a model that this objective is for, and a config of its own."""
-
-    @property
-    def history(self) -> list[Content]:
-        """Return the lines of metrics.jsonl."""
-
+    @abstractmethod
     def prepare(self) -> PreparedLogs:
         """Check the logs and read what is fitted. Raises LogError and RunError."""
 
+    @abstractmethod
     def begin(self) -> list[Diagnostic]:
         """Do what comes before the first checkpoint of a new fit; return what there is to tell."""
 
-    def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
+    @abstractmethod
+    def resume(self, checkpoint: Content, history: list[Content]) -> None:
         """Go on from what the run folder holds.
 
         Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError where that is of another model.
         """
 
+    @abstractmethod
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
         """Fit until an end is reached; call ``save`` where `checkpoint` should be kept.
 
@@ -119,20 +142,16 @@ class Objective(Protocol):
 
     def checkpoint(self) -> Content:
         """Return what a resumed fit needs, with "best_weights", and the numbers of `run_record.Checkpoint`."""
-
-    def results(self) -> dict[str, object]:
-        """Return what config.json says of how it went, beside what `prepare` told."""
+        return self._checkpoint
 
 
 def record_of(request: FitRequest, prepared: PreparedLogs) -> Content:
     """Return what goes into config.json: options that were used, resolved, and nothing that does not apply."""
     model, facts = request.model, getattr(request.model, "facts", None)
-    mapping = request.mapping or LogMapping(input=input_of(model))
-    fraction = (
-        request.validation
-        if prepared.record["validation"] and isinstance(request.validation, float)
-        else None
-    )
+    mapping = request.options.mapping or LogMapping(input=input_of(model))
+    fraction = None
+    if prepared.record["validation"] and isinstance(request.validation, float):
+        fraction = request.validation
     return {
         "schema": 2,
         "robot": facts.robot if facts else type(model).__name__,
@@ -145,6 +164,6 @@ def record_of(request: FitRequest, prepared: PreparedLogs) -> Content:
         "seed": request.seed,
         **prepared.record,
         "mapping": mapping.model_dump(exclude_defaults=True),
-        "device": request.device,
-        "threads": request.threads,
+        "device": request.options.device,
+        "threads": request.options.threads,
     }

@@ -2,39 +2,18 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
-
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.errors import Diagnostic, RunError
 from spelgen.fitting.dataset import TrainingData, WindowChoice, prepare_data
-from spelgen.fitting.objective import FitRequest, FitSummary, PreparedLogs
-from spelgen.fitting.run_record import Content, ReadContent
+from spelgen.fitting.objective import Objective, PreparedLogs
 from spelgen.fitting.streaming import LargeLogs, prepare_streamed
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
 from spelgen.settings.fits import FitConfig
 from spelgen.spec import logged_joints
 
 
-class TorqueLogObjective:
-    """An `Objective` on logs of torques, which are cut into windows: to fit, or to measure the model on.
-
-    history, results: none, where an objective has no more to keep.
-    """
-
-    input: ClassVar[Literal["torque", "position"]] = "torque"
-
-    def __init__(self, request: FitRequest) -> None:
-        self.request, self.model = request, request.model
-        self.history: list[Content] = []
-
-    @staticmethod
-    def summary(record: ReadContent) -> FitSummary | None:
-        """Return nothing: a fit to torques determines no more than a model."""
-        return None
-
-    def results(self) -> dict[str, object]:
-        """Return nothing more: history and notes tell how it went."""
-        return {}
+class TorqueLogObjective(Objective):
+    """An `Objective` on logs of torques, which are cut into windows: to fit, or to measure the model on."""
 
     def _cut_windows(self, window: int, stride: int) -> TrainingData:
         """Cut windows of the logs: to be fitted, and to be validated on. Raises LogError and RunError."""
@@ -59,7 +38,7 @@ class TorqueLogObjective:
                 "data_digest": data.digest,
                 "training": list(data.training_names),
                 "validation": list(data.validation_names),
-                "training_windows": data.size,
+                "training_windows": len(data.training),
                 "validation_windows": len(data.validation),
                 "scales": {name: x.tolist() for name, x in data.scales._asdict().items()},
             },

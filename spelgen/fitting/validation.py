@@ -21,6 +21,15 @@ if TYPE_CHECKING:
 TUNING = ValidationTuning()
 
 
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A model's weights, the integrator's steps that they need between samples, and their validation loss."""
+
+    substeps: int
+    loss: float
+    weights: Content
+
+
 class Validation:
     """Validation windows, and a probe of the training windows for the integrator's steps.
 
@@ -67,17 +76,7 @@ class Validation:
             return self.prescribed
         return choose_substeps(self.model, self.probe, self.scales, start=present or 1)
 
-
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """A model's weights, the integrator's steps that they need between samples, and their validation loss."""
-
-    substeps: int
-    loss: float
-    weights: Content
-
-
-def measure(model: EmittedModel, validation: Validation) -> Measured:
-    """Return what validation says of a model as it is."""
-    substeps = validation.substeps()
-    return Measured(substeps, validation.loss(substeps), copy.deepcopy(model.state_dict()))
+    def measure(self) -> Measured:
+        """Return what validation says of the model as it is."""
+        substeps = self.substeps()
+        return Measured(substeps, self.loss(substeps), copy.deepcopy(self.model.state_dict()))

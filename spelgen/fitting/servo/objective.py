@@ -20,7 +20,7 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import digest
 from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
 from spelgen.fitting.levenberg_marquardt import SolverState, levenberg_marquardt
-from spelgen.fitting.objective import FitRequest, FitSummary, PreparedLogs, Status
+from spelgen.fitting.objective import FitRequest, FitSummary, Objective, PreparedLogs, Status
 from spelgen.fitting.run_record import Content, ReadContent
 from spelgen.fitting.servo.laws import select_dead_zones, without_faint
 from spelgen.fitting.servo.linear_servos import fit_linear_servos
@@ -42,7 +42,7 @@ TUNING = ServoSolverTuning()
 ROUNDS = 3  # on few windows with half the steps; on few, with dead zones; on all
 
 
-class ServoObjective:
+class ServoObjective(Objective):
     """Fit all logs, so that none is left to validate on; each round can be gone on with.
 
     What a round computes with, the bodies' load and the scale of errors, comes of the parameters where it and the
@@ -53,17 +53,15 @@ class ServoObjective:
     input: ClassVar[Literal["torque", "position"]] = "position"
 
     def __init__(self, request: FitRequest) -> None:
-        self.request = request
-        self.history: list[Content] = []
-        self._results: dict[str, object] = {}
+        super().__init__(request)
         self._rounds: list[ServoParameters] = []  # where they began
         self._steps = 0
 
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
-        request = self.request
-        self._logs = _commanded(request.model, request.logs)
-        notes = check(self._logs, request.model.facts.joints, request.model.joint_types)
+        request, model = self.request, self.model
+        self._logs = _commanded(model, request.logs)
+        notes = check(self._logs, model.facts.joints, model.joint_types)
         self._windows = servo_windows(self._logs, request.preprocessing)
         return PreparedLogs(
             config=request.config,
@@ -80,19 +78,19 @@ class ServoObjective:
 
     def begin(self) -> list[Diagnostic]:
         """Start servos by least squares."""
-        model, self._since = self.request.model, time.monotonic()
-        start_servos(model, self._windows)
-        self._start = {name: x.clone() for name, x in model.state_dict().items()}
+        self._since = time.monotonic()
+        start_servos(self.model, self._windows)
+        self._start = {name: x.clone() for name, x in self.model.state_dict().items()}
         self._problem = self._new_problem()
         self._begin_round(self._problem.start)
         return []
 
-    def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
+    def resume(self, checkpoint: Content, history: list[Content]) -> None:
         """Go on from the beginning of the last round."""
         self._since = time.monotonic() - checkpoint["seconds"]
         state = checkpoint["servo"]
         self._start = state["start"]
-        self.request.model.load_state_dict(self._start)
+        self.model.load_state_dict(self._start)
         self._problem = self._new_problem()
         self._steps = state["steps"]
         for parameters in state["rounds"]:
@@ -138,7 +136,7 @@ class ServoObjective:
         problem.write(end)
         record = servo_record(problem, solved, end, self._steps)
         linear = fit_linear_servos(self._windows.thinned(TUNING.sparse_windows))
-        self._results["servo"] = record | {"linear": asdict(linear)}
+        self.results["servo"] = record | {"linear": asdict(linear)}
         self._take_checkpoint(float(np.sqrt(np.square(record["rms"]).mean())))
 
     @staticmethod
@@ -146,19 +144,11 @@ class ServoObjective:
         """See `Objective`."""
         return servo_summary(record)
 
-    def checkpoint(self) -> Content:
-        """Return that of the last round's beginning, or of the end."""
-        return self._checkpoint
-
-    def results(self) -> dict[str, object]:
-        """Return at the end what the logs determine."""
-        return self._results
-
     def _new_problem(self) -> ServoProblem:
         steps = np.max([encoder_step(log.q) for log in self._logs], axis=0)
         # the standard deviation of an encoder's rounding, at the least of a hundredth of a milliradian
         noise = torch.from_numpy(steps).clamp(min=1e-5) / 12**0.5
-        return ServoProblem(self.request.model, self._windows.thinned(TUNING.sparse_windows), noise)
+        return ServoProblem(self.model, self._windows.thinned(TUNING.sparse_windows), noise)
 
     def _begin_round(self, x: ServoParameters) -> None:
         problem = self._problem
@@ -177,7 +167,7 @@ class ServoObjective:
         self._take_checkpoint(float(self._errors.square().mean().sqrt()))
 
     def _take_checkpoint(self, rms: float) -> None:
-        weights = {name: x.clone() for name, x in self.request.model.state_dict().items()}
+        weights = {name: x.clone() for name, x in self.model.state_dict().items()}
         self._checkpoint = {
             "epoch": 0,
             "step": self._steps,

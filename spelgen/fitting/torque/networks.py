@@ -38,12 +38,12 @@ def fit_networks(
     """
     if not isinstance(samples, TorqueSamples):
         samples = TorqueSamples.of(samples)
-    count, joints = samples.count, samples.joints
+    count, joints = samples.columns.tau.shape
     scale = samples.columns.tau.std(dim=0)
     scale = torch.maximum(scale, 1e-2 * scale.amax())
 
     def missed() -> Iterator[torch.Tensor]:
-        for number, (q, qd, qdd, tau, _) in enumerate(samples.blocks(BLOCK)):
+        for number, (q, qd, qdd, tau, *_) in enumerate(samples.blocks(BLOCK)):
             error = ((model.inverse_dynamics(q, qd, qdd) - tau) / scale).square()
             part = error.mean() if count <= BLOCK else error.sum() / (count * joints)
             if number == 0 and penalty is not None:

@@ -25,7 +25,7 @@ from spelgen.fitting.torque.report import torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque_logs import TorqueLogObjective
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
-from spelgen.fitting.validation import Validation, measure
+from spelgen.fitting.validation import Validation
 from spelgen.identification.torque_delay import HINTS, NO_DELAY, TorqueDelay, find_torque_delay
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
@@ -53,7 +53,6 @@ class TorqueObjective(TorqueLogObjective):
         super().__init__(request)
         assert isinstance(request.config, TorqueFit)
         self.config = request.config
-        self._checkpoint: Content = {}
         self._late = NO_DELAY
 
     def prepare(self) -> PreparedLogs:
@@ -85,7 +84,7 @@ class TorqueObjective(TorqueLogObjective):
         if not has_rigid_bodies(model):  # the torques of rigid bodies have a prior of their own
             regularizer = self._regularizer(self.data, self.config.urdf_weight, notes)
         notes += fit_torques(model, samples, self.config, regularizer)
-        measured = measure(model, Validation(model, self.data, self.request.device))
+        measured = Validation(model, self.data, self.request.options.device).measure()
         self._checkpoint = {
             "epoch": 0,
             "step": 0,
@@ -97,7 +96,7 @@ class TorqueObjective(TorqueLogObjective):
         }
         return notes
 
-    def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
+    def resume(self, checkpoint: Content, history: list[Content]) -> None:
         """Take the model as it was fitted."""
         self.model.load_state_dict(checkpoint["best_weights"])
         self._checkpoint = checkpoint
@@ -105,10 +104,6 @@ class TorqueObjective(TorqueLogObjective):
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
         """Do nothing more."""
         return "finished"
-
-    def checkpoint(self) -> Content:
-        """See `Objective`."""
-        return self._checkpoint
 
 
 def torque_delay(model: EmittedModel, logs: Logs, preprocessing: Preprocessing) -> TorqueDelay:

@@ -62,19 +62,22 @@ class RigidWeights:
         """Return weights by name as one vector (K,)."""
         return torch.cat([weights[name].flatten() for name in self.start])
 
+    def mask(self, *kinds: str) -> torch.Tensor:
+        """Return which weights (K,) are of these kinds."""
+        named = self.start.items()
+        return self.flattened({name: torch.full_like(x, self.kinds[name] in kinds) for name, x in named}) > 0
+
     def free(self, adapt: Adaptation | None, compensated: torch.Tensor) -> torch.Tensor:
         """Return which weights (K,) move: all, or those of an adaptation; compensation of the joints (n,) that have
         one.
         """
-        kinds = {"load": (), "friction": DAILY}.get(adapt or "", RIGID)
-        masks = {}
-        for name, weight in self.start.items():
-            masks[name] = torch.full_like(weight, self.kinds[name] in kinds, dtype=torch.bool)
         if adapt == "load":
-            masks[self.bodies][-1] = True
-        else:
-            masks[self.compensation] = compensated
-        return self.flattened(masks)
+            free = self.mask()
+            self.named(free)[self.bodies][-1] = True
+            return free
+        free = self.mask(*(DAILY if adapt == "friction" else RIGID))
+        self.named(free)[self.compensation].copy_(compensated)
+        return free
 
 
 def joint_torque(model: EmittedModel, samples: Block) -> torch.Tensor:

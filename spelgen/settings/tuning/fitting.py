@@ -34,7 +34,7 @@ class ValidationTuning:
 
 @dataclass(frozen=True)
 class WindowTuning:
-    """Steps on windows (`fitting.window.objective`)."""
+    """Steps on windows (`fitting.window.momentum`)."""
 
     epoch_steps: int = 20  # at least; few windows are passed over several times between validations
     warm_up: float = 0.02  # [1] of all steps, over which the learning rate rises
@@ -169,7 +169,7 @@ class IntegrationTuning:
 
 @dataclass(frozen=True)
 class AdaptiveTuning:
-    """Rollouts by dopri5 (`fitting.adaptive`)."""
+    """Rollouts by dopri5 (`fitting.rollout`)."""
 
     relative: float = 1e-7  # [1] tolerance of a step
     absolute: float = 1e-9  # [rad, m, and momenta] tolerance of a step
