@@ -22,12 +22,12 @@ from spelgen.cli.main import app
 from spelgen.errors import LogError, ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.exporting.export import export
+from spelgen.fitting.dataset import Validation
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.fitted import load_run
+from spelgen.fitting.process import locked
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.run_lock import locked
 from spelgen.fitting.train import train
-from spelgen.fitting.validation import Validation
 from spelgen.fitting.window import momentum
 from spelgen.logs import chunks
 from spelgen.logs.read import write_logs

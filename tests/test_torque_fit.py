@@ -21,7 +21,6 @@ from spelgen.fitting.fit import fit
 from spelgen.fitting.objectives import default_objective
 from spelgen.fitting.torque import fit as torque_fit
 from spelgen.fitting.torque import jacobian as torque_jacobian
-from spelgen.fitting.torque.body_steps import moved_bodies
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import ResidualSamples, RigidResponse, TorqueJacobian
 from spelgen.fitting.torque.networks import adapt_networks
@@ -30,7 +29,7 @@ from spelgen.fitting.torque.problem import TorqueProblem
 from spelgen.fitting.torque.report import terms_in_use, torque_notes
 from spelgen.fitting.torque.residuals import FRICTION, select_residuals
 from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.fitting.torque.weights import NONE, RIGID, RigidWeights
+from spelgen.fitting.torque.weights import NONE, RIGID, RigidWeights, moved_bodies
 from spelgen.fitting.train import train
 from spelgen.loaded_arm import load_arm
 from spelgen.logs import chunks

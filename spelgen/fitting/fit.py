@@ -13,10 +13,9 @@ from spelgen.files import write_json
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.objective import FitRequest, Logs, Objective, RunOptions, Status, record_of
 from spelgen.fitting.objectives import chosen_config, objective_of
-from spelgen.fitting.process import require_device, termination_as_interrupt, threads_of_torch
+from spelgen.fitting.process import locked, require_device, termination_as_interrupt, threads_of_torch
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import require_same
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.dynamics_samples import SHORTEST

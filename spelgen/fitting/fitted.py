@@ -15,8 +15,8 @@ from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.files import write_json
 from spelgen.fitting.objective import Status
+from spelgen.fitting.process import locked
 from spelgen.fitting.run_folder import RunFolder, trained_model
-from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import Content, recorded_config
 from spelgen.listing import Listing
 from spelgen.logs.dynamics_samples import dynamics_samples

@@ -8,11 +8,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
+from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import has_rigid_bodies, input_of
-from spelgen.errors import Diagnostic
-from spelgen.fitting.run_record import Content, ReadContent
-from spelgen.fitting.streaming import LargeLogs
-from spelgen.listing import Listing
+from spelgen.errors import Diagnostic, RunError
+from spelgen.fitting.dataset import TrainingData, WindowChoice, prepare_data
+from spelgen.fitting.run_record import Content
+from spelgen.fitting.streaming import LargeLogs, prepare_streamed
+from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import FitConfig
@@ -80,18 +82,6 @@ class PreparedLogs:
     notes: Sequence[Diagnostic]
 
 
-@dataclass(frozen=True)
-class FitSummary:
-    """Hold what a fit determined, for people.
-
-    text: for a terminal. listing: parameters with their intervals. headline: the first figure, and what it is.
-    """
-
-    text: str
-    listing: Listing
-    headline: tuple[str, str]
-
-
 class Objective(ABC):
     """One way to fit a model: what it needs of logs, how it starts, goes on and is resumed.
 
@@ -109,14 +99,6 @@ class Objective(ABC):
         self.history: list[Content] = []
         self.results: Content = {}
         self._checkpoint: Content = {}
-
-    @staticmethod
-    def summary(record: ReadContent) -> FitSummary | None:
-        """Return what a fit determined beside a model; None where that is nothing, or it is not over.
-
-        record: contents of config.json.
-        """
-        return None
 
     @abstractmethod
     def prepare(self) -> PreparedLogs:
@@ -143,6 +125,55 @@ class Objective(ABC):
     def checkpoint(self) -> Content:
         """Return what a resumed fit needs, with "best_weights", and the numbers of `run_record.Checkpoint`."""
         return self._checkpoint
+
+
+class TorqueLogObjective(Objective):
+    """An `Objective` on logs of torques, which are cut into windows: to fit, or to measure the model on."""
+
+    def _cut_windows(self, window: int, stride: int) -> TrainingData:
+        """Cut windows of the logs: to be fitted, and to be validated on. Raises LogError and RunError."""
+        request = self.request
+        reach = bristle_reach(self.model)
+        choice = WindowChoice(window, stride, request.validation, request.seed, reach)
+        if not isinstance(request.logs, LargeLogs):
+            joints, kinds = logged_joints(self.model), self.model.joint_types
+            return prepare_data(request.logs, joints, kinds, request.preprocessing, choice)
+        if not isinstance(request.validation, float):
+            raise RunError(
+                "trajectories to validate logs larger than memory on", expected="a fraction of these logs"
+            )
+        return prepare_streamed(request.logs, request.preprocessing, choice)
+
+    def _prepared(self, data: TrainingData, config: FitConfig) -> PreparedLogs:
+        """Return what windows tell of the logs."""
+        return PreparedLogs(
+            config=config,
+            preprocessing=data.preprocessing,
+            record={
+                "data_digest": data.digest,
+                "training": list(data.training_names),
+                "validation": list(data.validation_names),
+                "training_windows": len(data.training),
+                "validation_windows": len(data.validation),
+                "scales": {name: x.tolist() for name, x in data.scales._asdict().items()},
+            },
+            notes=data.diagnostics,
+        )
+
+    def _regularizer(
+        self, data: TrainingData, weight: float, notes: list[Diagnostic]
+    ) -> UrdfRegularizer | None:
+        """Return the regularizer towards the request's URDF, where that has a weight and can be had."""
+        urdf = self.request.urdf
+        if not weight or urdf is None or not urdf.exists():
+            return None
+        try:
+            return urdf_regularizer(urdf, logged_joints(self.model), self.model, data.training)
+        except Exception as error:  # Pinocchio and its parser raise many kinds; the fit goes on without
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            message = f"fitted without the URDF's regularizer: {reason}"
+            notes.append(Diagnostic("info", "no-regularizer", urdf.name, None, message))
+            return None
 
 
 def record_of(request: FitRequest, prepared: PreparedLogs) -> Content:

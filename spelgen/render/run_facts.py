@@ -14,8 +14,8 @@ from rich.filesize import decimal
 from spelgen.baselines.names import MODEL
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import figures
-from spelgen.fitting.objectives import fit_summary
 from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.torque.report import terms_in_use
 from spelgen.labels import counted
 from spelgen.listing import number
@@ -60,7 +60,7 @@ def head_numbers(
             value = figure.values[MODEL]
             if value is not None:
                 numbers.append(Number(figure.text(value), figure.label))
-    summary = fit_summary(config)
+    summary = servo_summary(config)
     if summary is not None:
         numbers.append(Number(*summary.headline))
     elif model is not None:

@@ -20,13 +20,13 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import digest
 from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
 from spelgen.fitting.levenberg_marquardt import SolverState, levenberg_marquardt
-from spelgen.fitting.objective import FitRequest, FitSummary, Objective, PreparedLogs, Status
-from spelgen.fitting.run_record import Content, ReadContent
+from spelgen.fitting.objective import FitRequest, Objective, PreparedLogs, Status
+from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.laws import select_dead_zones, without_faint
 from spelgen.fitting.servo.linear_servos import fit_linear_servos
 from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
-from spelgen.fitting.servo.report import servo_record, servo_summary, solution
+from spelgen.fitting.servo.report import servo_record, solution
 from spelgen.fitting.servo.start import start_servos
 from spelgen.fitting.servo.windows import servo_windows
 from spelgen.fitting.streaming import LargeLogs
@@ -138,11 +138,6 @@ class ServoObjective(Objective):
         linear = fit_linear_servos(self._windows.thinned(TUNING.sparse_windows))
         self.results["servo"] = record | {"linear": asdict(linear)}
         self._take_checkpoint(float(np.sqrt(np.square(record["rms"]).mean())))
-
-    @staticmethod
-    def summary(record: ReadContent) -> FitSummary | None:
-        """See `Objective`."""
-        return servo_summary(record)
 
     def _new_problem(self) -> ServoProblem:
         steps = np.max([encoder_step(log.q) for log in self._logs], axis=0)

@@ -11,9 +11,8 @@ from torch.autograd import grad as gradient
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.residuals import friction_factor, residual_torque
 from spelgen.fitting.functional_model import FunctionalModel, Weights
-from spelgen.fitting.torque.body_steps import moved_bodies
 from spelgen.fitting.torque.samples import Block, TorqueSamples
-from spelgen.fitting.torque.weights import RigidWeights, joint_torque
+from spelgen.fitting.torque.weights import RigidWeights, joint_torque, moved_bodies
 from spelgen.settings.tuning.fitting import TorqueTuning
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from spelgen.arm.actuation import Drives
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import Diagnostic, LogError
-from spelgen.fitting.dataset import TrainingData
-from spelgen.fitting.objective import FitRequest, Logs, PreparedLogs, Status
+from spelgen.fitting.dataset import TrainingData, Validation
+from spelgen.fitting.objective import FitRequest, Logs, PreparedLogs, Status, TorqueLogObjective
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.torque.fit import fit_torque
@@ -23,9 +23,7 @@ from spelgen.fitting.torque.jacobian import TUNING
 from spelgen.fitting.torque.networks import adapt_networks, fit_networks
 from spelgen.fitting.torque.report import torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.fitting.torque_logs import TorqueLogObjective
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
-from spelgen.fitting.validation import Validation
 from spelgen.identification.torque_delay import HINTS, NO_DELAY, TorqueDelay, find_torque_delay
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing

@@ -69,5 +69,5 @@ class TorqueSamples:
 
 
 def _joined(columns: tuple[np.ndarray | None, ...]) -> torch.Tensor | None:
-    known = [column for column in columns if column is not None]
-    return torch.from_numpy(np.concatenate(known)) if known else None
+    arrays = [column for column in columns if column is not None]
+    return torch.from_numpy(np.concatenate(arrays)) if arrays else None

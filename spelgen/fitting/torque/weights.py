@@ -9,7 +9,9 @@ import torch
 from spelgen.dynamics.parameters import parameter_table
 from spelgen.fitting.functional_model import Weights
 from spelgen.fitting.torque.samples import Block
+from spelgen.runtime.rigid_body import body_factor, upper_cholesky
 from spelgen.settings.fits import Adaptation
+from spelgen.settings.tuning.fitting import TorqueTuning
 from spelgen.settings.tuning.identification import IdentificationTuning
 
 if TYPE_CHECKING:
@@ -20,6 +22,7 @@ RIGID = (
     "load_dependence", "fractions",
 )  # fmt: skip
 """Kinds of parameters of bodies, drives and friction laws: all but what stands beside them."""
+TUNING = TorqueTuning()
 MOVING = IdentificationTuning().moving
 DAILY = ("sizes", "effects", "velocities", "load_dependence", "fractions", "offset")
 """Kinds that change from day to day."""
@@ -107,3 +110,36 @@ def bound_friction(model: EmittedModel, samples: Block) -> None:
     for name in rigid.of_kind("offset", "friction_compensation"):
         weights[name] = weights[name] / change
     rigid.write(rigid.flattened(weights))
+
+
+def moved_bodies(raw: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+    """Return weights (B, 10) after a step (B, 10), as `InertialParameters` has them, straight where torques go.
+
+    Torques are linear in the inertial parameters, for which weights stand by way of a Cholesky factor: a step straight
+    in the weights leaves the line that a Gauss-Newton step was computed along.
+    A body's pseudo-inertia is C S C^T, S = T T^T. To first order the step adds T (X + X^T) T^T to S, and that is what
+    is added, or as much of it as keeps S positive definite.
+    """
+    row, column = torch.triu_indices(4, 4)
+    weights, moves = torch.zeros(2, len(raw), 4, 4).double()
+    weights[:, row, column], moves[:, row, column] = raw, step
+    # a complex step differentiates to the last digit; forward mode would load torch's compiler, which takes seconds
+    tiny = 1e-100
+    stepped = body_factor(torch.complex(weights, tiny * moves))
+    factor, change = stepped.real, stepped.imag / tiny
+    relative = torch.linalg.solve_triangular(factor, change, upper=True)
+    added = relative + relative.mT
+    smallest = torch.linalg.eigvalsh(added)[:, 0]
+    fraction = (TUNING.body_step / (-smallest).clamp(min=1e-12)).clamp(max=1.0)
+    factor = factor @ upper_cholesky(torch.eye(4).double() + fraction[:, None, None] * added)
+    return body_weights(factor)
+
+
+def body_weights(factor: torch.Tensor) -> torch.Tensor:
+    """Return the weights (B, 10) of which `body_factor` makes this factor (B, 4, 4)."""
+    scale = factor.diagonal(dim1=-2, dim2=-1)
+    sizes, mass = scale[:, :3].log(), scale[:, 3:].log()
+    logarithms = torch.cat([sizes - mass, 2 * mass], dim=-1)
+    weights = (factor / scale.unsqueeze(-1)).triu(1) + logarithms.diag_embed()
+    row, column = torch.triu_indices(4, 4)
+    return weights[:, row, column]

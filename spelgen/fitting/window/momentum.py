@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, ClassVar
 import torch
 
 from spelgen.errors import Diagnostic, LogError
-from spelgen.fitting.objective import FitRequest, PreparedLogs, Status
+from spelgen.fitting.dataset import Measured, Validation
+from spelgen.fitting.objective import FitRequest, PreparedLogs, Status, TorqueLogObjective
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
 from spelgen.fitting.rollout import momentum_loss
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.streaming import LargeLogs
-from spelgen.fitting.torque_logs import TorqueLogObjective
-from spelgen.fitting.validation import Measured, Validation
 from spelgen.logs.windows import Windows
 from spelgen.settings.fits import DEFAULTS, Solver, WindowConfig
 from spelgen.settings.tuning.fitting import WindowTuning

@@ -25,7 +25,7 @@ class DampingTuning:
 
 @dataclass(frozen=True)
 class ValidationTuning:
-    """Windows that a fit is judged on (`fitting.validation`, `fitting.dataset`)."""
+    """Windows that a fit is judged on (`fitting.dataset`)."""
 
     windows: int = 2048  # at most: validation is a measurement, it needs no more
     probe: int = 64  # training windows on which the integrator's error is watched
