@@ -33,7 +33,7 @@ def covariance(prior: GaussianPrior, weights: Mapping[str, torch.Tensor], kinds:
     for name, weight in weights.items():
         row = torch.arange(first, first + weight.numel())
         field = prior_field(kinds[name])
-        matrix[row, row] = getattr(prior, field) ** 2
+        matrix[row, row] = torch.full((len(row),), getattr(prior, field)).double().square()
         if field in SHARED:
             # of fractions, each element of the bristles by itself
             for of_joints in row.view(len(weight), -1).mT:

@@ -47,7 +47,12 @@ class RolloutObjective(MomentumObjective):
     def begin(self) -> list[Diagnostic]:
         """Fit torques, and measure the model then."""
         if self.config.torque_first and has_rigid_bodies(self.model):
-            self.notes += self._torque_stage()
+            samples = torque_samples(self.model, self.data)
+            if samples is not None:
+                self.notes += fit_torques(self.model, samples, TorqueFit())
+            else:
+                message = f"no torque fit: no log that moves has {SLOWEST:g} Hz for a second; windows alone are fitted"
+                self.notes.append(Diagnostic("warning", "no-torque-fit", "logs", None, message))
         self._set_up_epochs()
         return self.notes
 
@@ -79,15 +84,6 @@ class RolloutObjective(MomentumObjective):
         """See `Objective`."""
         state = {"model": self.model.state_dict(), "optimizer": self.optimizer.state_dict()}
         return super().checkpoint() | state | {"generator": self.generator.get_state()}
-
-    def _torque_stage(self) -> list[Diagnostic]:
-        samples = torque_samples(self.model, self.data)
-        if samples is not None:
-            return fit_torques(self.model, samples, TorqueFit())
-        message = (
-            f"no torque fit: no log that moves has {SLOWEST:g} Hz for a second; windows alone are fitted"
-        )
-        return [Diagnostic("warning", "no-torque-fit", "logs", None, message)]
 
     def _set_up_epochs(self) -> None:
         """Measure the model as it is, and make an optimizer."""
@@ -124,8 +120,11 @@ class RolloutObjective(MomentumObjective):
         """Run one epoch with finite losses, after as many attempts at a lower learning rate as that takes."""
         while True:
             before = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
-            loss = self._train_epoch()
+            steps, start = self._steps_in_time(), self.seconds_now()
+            # not finite as soon as a step has no finite loss or gradient
+            loss = self.optimizer.run(self._rollout_loss, self.training, steps, self._rate)
             trained = self.seconds_now()
+            self.step, self._step_seconds = self.step + steps, (trained - start) / steps
             validation = self.validation.loss(self.substeps) if math.isfinite(loss) else math.nan
             self._validation_seconds = self.seconds_now() - trained
             if math.isfinite(validation):
@@ -148,14 +147,6 @@ class RolloutObjective(MomentumObjective):
         if self.epoch % TUNING.probe_every == 0:
             self.substeps = self.validation.substeps(self.substeps)
         return record
-
-    def _train_epoch(self) -> float:
-        """Return the mean loss over the epoch's steps; NaN as soon as a step has no finite loss or gradient."""
-        steps, start = self._steps_in_time(), self.seconds_now()
-        loss = self.optimizer.run(self._rollout_loss, self.training, steps, self._rate)
-        self._step_seconds = (self.seconds_now() - start) / steps
-        self.step += steps
-        return loss
 
     def _steps_in_time(self) -> int:
         """Return the steps of the next epoch: all, or as many as the remaining time allows at the pace so far."""
