@@ -471,7 +471,7 @@ def test_a_part_of_a_model_of_networks_is_adapted(robots, run, emitted):
         model = build(robots / "two_link.urdf", "spel", width=8)
         before = {name: x.clone() for name, x in model.state_dict().items()}
         missed = nmse(model, samples[0])
-        adapt_networks(model, samples, adapt, evaluations=40)
+        adapt_networks(model, TorqueSamples.of(samples), adapt, evaluations=40)
         moved = {name for name, x in model.state_dict().items() if not torch.equal(x, before[name])}
         assert moved and all(name.startswith(part) for name in moved)
         assert nmse(model, samples[0]) < missed

@@ -21,6 +21,20 @@ from spelgen.logs.windows import Windows, joined, thinned
 from spelgen.settings.log_mapping import LogMapping
 
 
+@dataclass(frozen=True, eq=False)
+class LogContents:
+    """Hold what one pass finds.
+
+    longest: samples of the longest gap-free piece of each chunk. rates: of chunks that are long enough [Hz].
+    """
+
+    chunks: list[Chunk]
+    longest: list[int]
+    rates: list[float]
+    notes: list[Diagnostic]
+    digest: str
+
+
 @dataclass(frozen=True)
 class LargeLogs:
     """Parquet files of which one chunk at a time is in memory; what `large_files` found. gap: see `Preprocessing`."""
@@ -34,21 +48,27 @@ class LargeLogs:
     @cached_property
     def contents(self) -> LogContents:
         """What a pass over the files tells. Raises LogError, and SettingsError where the mapping does not fit."""
-        return _read_once(self)
-
-
-@dataclass(frozen=True, eq=False)
-class LogContents:
-    """Hold what one pass finds.
-
-    longest: samples of the longest gap-free piece of each chunk. rates: of chunks that are long enough [Hz].
-    """
-
-    chunks: list[Chunk]
-    longest: list[int]
-    rates: list[float]
-    notes: list[Diagnostic]
-    digest: str
+        chunks: list[Chunk] = []
+        longest: list[int] = []
+        lengths: list[int] = []
+        rates: list[float] = []
+        problems: list[Finding] = []
+        clock_notes: list[Diagnostic] = []
+        numbers = hashlib.sha256()
+        for chunk, trajectory in scan(self.files, self.joints, self.mapping, self.joint_types):
+            chunks.append(chunk)
+            longest.append(int(np.diff(gap_ends(trajectory.t, self.gap)).max()))
+            lengths.append(len(trajectory))
+            rates.append(trajectory.sample_rate)
+            problems += findings(trajectory, self.joints, self.joint_types)
+            clock_notes += clock_diagnostics(trajectory)
+            for array in numbers_of(trajectory):
+                numbers.update(array)
+        summary = summarised(problems, self.joints, len(chunks))
+        collect(summary.errors)
+        # the last samples of a recording may be a chunk of their own, too short to tell a rate
+        reliable = np.array(rates)[np.array(lengths) > max(lengths) / 10].tolist()
+        return LogContents(chunks, longest, reliable, [*clock_notes[:1], *summary.notes], numbers.hexdigest())
 
 
 def prepare_streamed(
@@ -96,27 +116,3 @@ def _sample(chunks: Sequence[Chunk], preprocessing: Preprocessing, choice: Windo
         # a copy: a slice would keep all windows of its chunk
         samples.append(joined([thinned(windows, max(1, TUNING.windows // len(chosen)))]))
     return joined(samples)
-
-
-def _read_once(logs: LargeLogs) -> LogContents:
-    chunks: list[Chunk] = []
-    longest: list[int] = []
-    lengths: list[int] = []
-    rates: list[float] = []
-    problems: list[Finding] = []
-    clock_notes: list[Diagnostic] = []
-    numbers = hashlib.sha256()
-    for chunk, trajectory in scan(logs.files, logs.joints, logs.mapping, logs.joint_types):
-        chunks.append(chunk)
-        longest.append(int(np.diff(gap_ends(trajectory.t, logs.gap)).max()))
-        lengths.append(len(trajectory))
-        rates.append(trajectory.sample_rate)
-        problems += findings(trajectory, logs.joints, logs.joint_types)
-        clock_notes += clock_diagnostics(trajectory)
-        for array in numbers_of(trajectory):
-            numbers.update(array)
-    summary = summarised(problems, logs.joints, len(chunks))
-    collect(summary.errors)
-    # the last samples of a recording may be a chunk of their own, too short to tell a rate
-    reliable = [rate for rate, length in zip(rates, lengths, strict=True) if length > max(lengths) / 10]
-    return LogContents(chunks, longest, reliable, [*clock_notes[:1], *summary.notes], numbers.hexdigest())

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import torch
 
 from spelgen.fitting.optimizers import minimise
 from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import DEFAULTS, Adaptation
 
 if TYPE_CHECKING:
@@ -26,7 +25,7 @@ BLOCK = 2**16  # samples in memory with all that their gradient needs
 
 def fit_networks(
     model: EmittedModel,
-    samples: TorqueSamples | Sequence[DynamicsSamples],
+    samples: TorqueSamples,
     weight_decay: float = DEFAULTS.lbfgs_decay,
     penalty: Callable[[], torch.Tensor | float] | None = None,
     evaluations: int = 2000,
@@ -36,8 +35,6 @@ def fit_networks(
     The error of each joint is told in standard deviations of its torque. weight_decay: see ``LBFGS``; penalty: what
     else is to be small, the distance from a URDF for one.
     """
-    if not isinstance(samples, TorqueSamples):
-        samples = TorqueSamples.of(samples)
     count, joints = samples.columns.tau.shape
     scale = samples.columns.tau.std(dim=0)
     scale = torch.maximum(scale, 1e-2 * scale.amax())
@@ -55,7 +52,7 @@ def fit_networks(
 
 def adapt_networks(
     model: EmittedModel,
-    samples: TorqueSamples | Sequence[DynamicsSamples],
+    samples: TorqueSamples,
     adapt: Adaptation,
     weight_decay: float = DEFAULTS.lbfgs_decay,
     evaluations: int = 2000,
