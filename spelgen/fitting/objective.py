@@ -95,7 +95,7 @@ class Objective(ABC):
     """What the inputs are of the models that it is for, and what their logs have."""
 
     def __init__(self, request: FitRequest) -> None:
-        self.request, self.model = request, request.model
+        self.request, self.model, self.config = request, request.model, request.config
         self.history: list[Content] = []
         self.results: Content = {}
         self._checkpoint: Content = {}
@@ -108,19 +108,20 @@ class Objective(ABC):
     def begin(self) -> list[Diagnostic]:
         """Do what comes before the first checkpoint of a new fit; return what there is to tell."""
 
-    @abstractmethod
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Go on from what the run folder holds.
+        """Go on from what the run folder holds, by default a model that is fitted.
 
         Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError where that is of another model.
         """
+        self.model.load_state_dict(checkpoint["best_weights"])
+        self._checkpoint = checkpoint
 
-    @abstractmethod
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Fit until an end is reached; call ``save`` where `checkpoint` should be kept.
+        """Fit until an end is reached, by default nothing more; call ``save`` where `checkpoint` should be kept.
 
         KeyboardInterrupt may end it anywhere.
         """
+        return "finished"
 
     def checkpoint(self) -> Content:
         """Return what a resumed fit needs, with "best_weights", and the numbers of `run_record.Checkpoint`."""

@@ -109,6 +109,8 @@ class LBFGS(WindowOptimizer):
     the learning rate is not used.
     """
 
+    _optimizer: torch.optim.LBFGS
+
     def __init__(self, model: torch.nn.Module, weight_decay: float) -> None:
         self._parameters, self._weights = _moving(model)
         self._decay, self._finite = weight_decay, True

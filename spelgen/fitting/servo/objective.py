@@ -8,7 +8,7 @@ that they turn out to have (`laws`); the last has all windows.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -31,11 +31,10 @@ from spelgen.fitting.servo.start import start_servos
 from spelgen.fitting.servo.windows import servo_windows
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.checks import check
-from spelgen.logs.trajectory import Trajectory, require_commands, require_joints
+from spelgen.logs.trajectory import require_commands, require_joints
 from spelgen.settings.tuning.servo import ServoSolverTuning
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
     from spelgen.fitting.progress import TrainingProgress
 
 TUNING = ServoSolverTuning()
@@ -60,7 +59,13 @@ class ServoObjective(Objective):
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
         request, model = self.request, self.model
-        self._logs = _commanded(model, request.logs)
+        if isinstance(request.logs, LargeLogs):
+            expected = "fewer logs, for example every tenth file"
+            raise LogError("logs of positions larger than memory", expected=expected)
+        self._logs = request.logs
+        for log in self._logs:
+            require_joints(log, model.facts.joints)
+            require_commands(log)
         notes = check(self._logs, model.facts.joints, model.joint_types)
         self._windows = servo_windows(self._logs, request.preprocessing)
         return PreparedLogs(
@@ -177,14 +182,3 @@ class ServoObjective(Objective):
                 "steps": self._first_steps,
             },
         }
-
-
-def _commanded(model: EmittedModel, logs: Sequence[Trajectory] | LargeLogs) -> Sequence[Trajectory]:
-    """Return the logs, which hold commands. Raises LogError where they do not."""
-    if isinstance(logs, LargeLogs):
-        expected = "fewer logs, for example every tenth file"
-        raise LogError("logs of positions larger than memory", expected=expected)
-    for log in logs:
-        require_joints(log, model.facts.joints)
-        require_commands(log)
-    return logs

@@ -203,7 +203,7 @@ class ServoProblem:
 
     def _bodies_at(self, bodies: torch.Tensor) -> torch.Tensor:
         """Return the bodies' raw parameters, (..., B, 10), this far (..., r) along their directions."""
-        return self._raw_bodies + (bodies @ self.directions.mT).unflatten(-1, self._raw_bodies.shape)
+        return self._raw_bodies + torch.unflatten(bodies @ self.directions.mT, -1, self._raw_bodies.shape)
 
     def _integrate(
         self, drives: ServoDrives, armature: torch.Tensor, change: torch.Tensor, commands: torch.Tensor

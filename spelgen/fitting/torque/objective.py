@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import chain
 from typing import TYPE_CHECKING, ClassVar
@@ -15,8 +15,7 @@ from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import TrainingData, Validation
-from spelgen.fitting.objective import FitRequest, Logs, PreparedLogs, Status, TorqueLogObjective
-from spelgen.fitting.run_record import Content
+from spelgen.fitting.objective import Logs, PreparedLogs, TorqueLogObjective
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import TUNING
@@ -32,7 +31,6 @@ from spelgen.settings.fits import TorqueFit
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
-    from spelgen.fitting.progress import TrainingProgress
 
 SAMPLES = 5  # of a window that the model is measured on
 MOVED = {
@@ -46,16 +44,11 @@ class TorqueObjective(TorqueLogObjective):
     """All is done in `begin`, before there is a run folder: a fit to torques takes seconds to minutes."""
 
     name: ClassVar[str] = "torque"
-
-    def __init__(self, request: FitRequest) -> None:
-        super().__init__(request)
-        assert isinstance(request.config, TorqueFit)
-        self.config = request.config
-        self._late = NO_DELAY
+    config: TorqueFit
 
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
-        preprocessing = self.request.preprocessing
+        preprocessing, self._late = self.request.preprocessing, NO_DELAY
         if preprocessing.torque_delay is None and has_rigid_bodies(self.model):
             self._late = torque_delay(self.model, self.request.logs, preprocessing)
             preprocessing = replace(preprocessing, torque_delay=self._late.delay)
@@ -93,15 +86,6 @@ class TorqueObjective(TorqueLogObjective):
             "substeps": measured.substeps,
         }
         return notes
-
-    def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Take the model as it was fitted."""
-        self.model.load_state_dict(checkpoint["best_weights"])
-        self._checkpoint = checkpoint
-
-    def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Do nothing more."""
-        return "finished"
 
 
 def torque_delay(model: EmittedModel, logs: Logs, preprocessing: Preprocessing) -> TorqueDelay:

@@ -24,7 +24,7 @@ class Block(NamedTuple):
 
     def rows(self, rows: slice) -> Block:
         """Return these samples alone."""
-        return Block(*(None if column is None else column[rows].contiguous() for column in self))
+        return Block._make(None if column is None else column[rows].contiguous() for column in self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class TorqueSamples:
             # a copy: a slice would keep all samples in memory
             pieces.append([x if x is None else np.ascontiguousarray(x[::decimation]) for x in columns])
             seen += len(samples.q)
-        return cls(Block(*map(_joined, zip(*pieces, strict=True))), seen)
+        return cls(Block._make(map(_joined, zip(*pieces, strict=True))), seen)
 
     @property
     def count(self) -> int:

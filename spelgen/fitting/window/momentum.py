@@ -42,11 +42,9 @@ class MomentumObjective(TorqueLogObjective):
 
     def __init__(self, request: FitRequest) -> None:
         super().__init__(request)
-        assert isinstance(request.config, WindowConfig)
-        self.config = request.config
         self.notes: list[Diagnostic] = []
         self.epoch = self.step = self.best_epoch = 0
-        minutes = request.config.max_minutes
+        minutes = self.config.max_minutes
         self.allowed = math.inf if minutes is None else 60 * minutes  # [s]
 
     def prepare(self) -> PreparedLogs:
