@@ -7,6 +7,7 @@ that they turn out to have (`laws`); the last has all windows.
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -19,7 +20,7 @@ from spelgen.dynamics.bristles import encoder_step
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import digest
 from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
-from spelgen.fitting.levenberg_marquardt import SolverState, levenberg_marquardt
+from spelgen.fitting.levenberg_marquardt import levenberg_marquardt, start
 from spelgen.fitting.objective import FitRequest, Objective, PreparedLogs, Status
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.laws import select_dead_zones, without_faint
@@ -85,8 +86,7 @@ class ServoObjective(Objective):
         """Start servos by least squares."""
         self._since = time.monotonic()
         start_servos(self.model, self._windows)
-        self._start = {name: x.clone() for name, x in self.model.state_dict().items()}
-        self._problem = self._new_problem()
+        self._set_up(copy.deepcopy(self.model.state_dict()))
         self._begin_round(self._problem.start)
         return []
 
@@ -94,9 +94,8 @@ class ServoObjective(Objective):
         """Go on from the beginning of the last round."""
         self._since = time.monotonic() - checkpoint["seconds"]
         state = checkpoint["servo"]
-        self._start = state["start"]
-        self.model.load_state_dict(self._start)
-        self._problem = self._new_problem()
+        self.model.load_state_dict(state["start"])
+        self._set_up(state["start"])
         self._steps = state["steps"]
         for parameters in state["rounds"]:
             self._begin_round(ServoParameters(**parameters))
@@ -109,11 +108,9 @@ class ServoObjective(Objective):
             x, damping = self._rounds[-1], DAMPING.first
             if number > 1:  # near the minimum from where the round before ended
                 damping = TUNING.later_damping
-            cost = problem.cost(x, self._errors)
-            first = SolverState(x, self._errors, cost, damping, self._steps)
             for state in levenberg_marquardt(
                 problem,
-                first,
+                start(problem, x, damping, self._steps),
                 max_steps=TUNING.steps if number < ROUNDS else TUNING.last_steps,
                 least_gain=TUNING.gain,
                 relative_gain=TUNING.relative_gain,
@@ -144,11 +141,13 @@ class ServoObjective(Objective):
         self.results["servo"] = record | {"linear": asdict(linear)}
         self._take_checkpoint(float(np.sqrt(np.square(record["rms"]).mean())))
 
-    def _new_problem(self) -> ServoProblem:
+    def _set_up(self, start: Content) -> None:
+        """Take the model as it is, with these weights, for where the fit starts."""
+        self._start = start
         steps = np.max([encoder_step(log.q) for log in self._logs], axis=0)
         # the standard deviation of an encoder's rounding, at the least of a hundredth of a milliradian
         noise = torch.from_numpy(steps).clamp(min=1e-5) / 12**0.5
-        return ServoProblem(self.model, self._windows.thinned(TUNING.sparse_windows), noise)
+        self._problem = ServoProblem(self.model, self._windows.thinned(TUNING.sparse_windows), noise)
 
     def _begin_round(self, x: ServoParameters) -> None:
         problem = self._problem
@@ -159,21 +158,20 @@ class ServoObjective(Objective):
             problem.windows = replace(problem.windows, steps=self._windows.steps)
         if self._rounds:
             problem.linearise(x, problem.predicted_path(x))
-        self._errors = problem.residuals(x)
-        problem.weigh(self._errors)
+        errors = problem.residuals(x)
+        problem.weigh(errors)
         problem.write(x)  # for the checkpoint: an interrupted fit is usable
         self._rounds.append(x)
         self._first_steps = self._steps
-        self._take_checkpoint(float(self._errors.square().mean().sqrt()))
+        self._take_checkpoint(float(errors.square().mean().sqrt()))
 
     def _take_checkpoint(self, rms: float) -> None:
-        weights = {name: x.clone() for name, x in self.model.state_dict().items()}
         self._checkpoint = {
             "epoch": 0,
             "step": self._steps,
             "best_epoch": 0,
             "best_loss": rms,
-            "best_weights": weights,
+            "best_weights": copy.deepcopy(self.model.state_dict()),
             "seconds": time.monotonic() - self._since,
             "substeps": self._windows.steps,
             "servo": {

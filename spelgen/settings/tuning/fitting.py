@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from spelgen.settings.fits import GaussianPrior
+from spelgen.settings.fits import Adaptation, GaussianPrior
 
 
 @dataclass(frozen=True)
@@ -105,17 +106,16 @@ class TorqueTuning:
     regressor_bytes: float = 4e8  # [B] of regressors: 70,000 samples of six joints; of more, every so many
     in_memory: int = 2**18  # samples of logs larger than memory: 140 MB of six joints
     body_step: float = 0.3  # [1] of the way to the border of the possible bodies, at most in a step
-    # about a run that is adapted: a load is known to a factor of twenty in mass (10 in place of 3 let half a second of
-    # motion err by 27 times the variance of the torque, UR10e)
-    prior_of_load: GaussianPrior = field(default_factory=lambda: GaussianPrior(bodies=3.0))
-    # warmth changes the friction of all joints by tens of per cent, of a joint by itself less (Bittencourt and
-    # Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012)
-    prior_of_friction: GaussianPrior = field(default_factory=lambda: GaussianPrior(**DAY_TO_DAY))
-    # units of one make differ by a few per cent in mass, too
-    prior_of_unit: GaussianPrior = field(
-        default_factory=lambda: GaussianPrior(
-            **DAY_TO_DAY, bodies=0.1, gains=0.1, armature=0.1, shared_armature=0.1
-        )
+    # by what is adapted, about the run. Load: known to a factor of twenty in mass (10 in place of 3 let half a second
+    # of motion err by 27 times the variance of the torque, UR10e). Friction: warmth changes that of all joints by tens
+    # of per cent, of a joint by itself less (Bittencourt and Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012).
+    # Units of one make differ by a few per cent in mass, too
+    priors: Mapping[Adaptation, GaussianPrior] = field(
+        default_factory=lambda: {
+            "load": GaussianPrior(bodies=3.0),
+            "friction": GaussianPrior(**DAY_TO_DAY),
+            "unit": GaussianPrior(**DAY_TO_DAY, bodies=0.1, gains=0.1, armature=0.1, shared_armature=0.1),
+        }
     )
 
 
