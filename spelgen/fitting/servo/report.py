@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from scipy.special import stdtrit
 
-from spelgen.fitting.functional_model import FunctionalModel
+from spelgen.fitting.functional_model import under_weights
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo.laws import sliding_friction
 from spelgen.fitting.servo.parameters import DEAD_ZONE, ServoParameters
@@ -151,8 +151,7 @@ def ratios_with_deviations(
     """Return the ratios to kp, and the standard deviations of their logarithms, each (n,)."""
     tensors = {name: x.detach().clone().requires_grad_() for name, x in problem.rows.tensors.items()}
     qd, gravity = problem.along.qd, problem.load.gravity
-    functional = FunctionalModel(problem.model)
-    values = functional.under(tensors, lambda model: ratios(model, qd, gravity))
+    values = under_weights(problem.model, tensors, lambda model: ratios(model, qd, gravity))
     p, n = problem.start.joints.shape
     blocks = solution.covariance[: p * n, : p * n].view(p, n, p, n).diagonal(dim1=1, dim2=3)  # (p, p, n)
     result = {}

@@ -82,13 +82,13 @@ class ServoWindows:
 
         q, qd: predicted, of which only what they miss is smoothed: so fast motion stays.
         """
-        missed = self.q if q is None else self.q - q
-        slow_qd, slow_qdd = map(torch.from_numpy, smoothed(missed.numpy(), self.rate))
-        path = Path(_midpoints(self.q), _midpoints(slow_qd), _midpoints(slow_qdd))
-        if qd is None:
-            return path
+        if q is None or qd is None:
+            q = qd = torch.zeros_like(self.q)
+        slow_qd, slow_qdd = map(torch.from_numpy, smoothed((self.q - q).numpy(), self.rate))
         acceleration = qd.diff(dim=1) / self.dt.unsqueeze(-1)
-        return Path(path.q, path.qd + _midpoints(qd), path.qdd + acceleration)
+        return Path(
+            _midpoints(self.q), _midpoints(slow_qd) + _midpoints(qd), _midpoints(slow_qdd) + acceleration
+        )
 
     def commands(self, delay: float) -> torch.Tensor:
         """Return those of ``delay`` [s] ago, over the steps between samples (W, K-1, S, n)."""

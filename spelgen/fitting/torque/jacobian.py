@@ -10,7 +10,7 @@ from torch.autograd import grad as gradient
 
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.residuals import friction_factor, residual_torque
-from spelgen.fitting.functional_model import FunctionalModel, Weights
+from spelgen.fitting.functional_model import Weights, under_weights
 from spelgen.fitting.torque.samples import Block, TorqueSamples
 from spelgen.fitting.torque.weights import RigidWeights, joint_torque, moved_bodies
 from spelgen.settings.tuning.fitting import TorqueTuning
@@ -80,7 +80,6 @@ class TorqueJacobian:
         self.model: Any = model
         self.samples = samples
         self.rigid = RigidWeights(model)
-        self._functional = FunctionalModel(model)
         self._of_bodies = self.rigid.mask("bodies")
         self._drives = self.model.motors != 0  # (n, n): whether a drive moves a joint
         self._moves = self._moved_joints()
@@ -225,7 +224,7 @@ class TorqueJacobian:
 
     def _inertial_parameters(self, weights: Weights) -> torch.Tensor:
         """Return the ten parameters of all bodies (B, 10)."""
-        parameters: torch.Tensor = self._functional.under(weights, lambda model: model.inertial_parameters)
+        parameters: torch.Tensor = under_weights(self.model, weights, lambda model: model.inertial_parameters)
         return parameters
 
     def _missing(
@@ -246,7 +245,7 @@ class TorqueJacobian:
             force = model.input_force(None, measured.qd, measured.tau) - samples.residual
             return force - samples.regressor @ parameters - of_drives @ model.motors, friction
 
-        missing, friction = self._functional.under(weights, torques)
+        missing, friction = under_weights(self.model, weights, torques)
         return missing, friction
 
     def _joint_slope(

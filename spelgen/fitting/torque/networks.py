@@ -14,12 +14,12 @@ from spelgen.settings.fits import DEFAULTS, Adaptation
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-PARTS: dict[Adaptation, tuple[str, ...]] = {
-    "load": ("mass", "potential"),
-    "friction": ("friction",),
-    "unit": (),
+MOVING: dict[Adaptation, tuple[str, ...]] = {
+    "load": ("mass.", "potential."),
+    "friction": ("friction.",),
+    "unit": ("",),
 }
-"""The parts of a model whose weights an adaptation moves; a unit's are all."""
+"""How the names of weights begin that an adaptation moves."""
 BLOCK = 2**16  # samples in memory with all that their gradient needs
 
 
@@ -42,10 +42,10 @@ def fit_networks(
     def missed() -> Iterator[torch.Tensor]:
         for number, (q, qd, qdd, tau, *_) in enumerate(samples.blocks(BLOCK)):
             error = ((model.inverse_dynamics(q, qd, qdd) - tau) / scale).square()
-            part = error.mean() if count <= BLOCK else error.sum() / (count * joints)
+            cost = error.mean() if count <= BLOCK else error.sum() / (count * joints)
             if number == 0 and penalty is not None:
-                part = part + penalty()
-            yield part
+                cost = cost + penalty()
+            yield cost
 
     return minimise(model, missed, evaluations, weight_decay)
 
@@ -61,13 +61,11 @@ def adapt_networks(
 
     weight_decay: of half the sum of squared changes, so that what these samples do not show stays as it was.
     """
-    parts = [getattr(model, part) for part in PARTS[adapt]] or [model]
-    chosen = {id(weight) for part in parts if part is not None for weight in part.parameters()}
-    moving = {name: weight for name, weight in model.named_parameters() if id(weight) in chosen}
-    before = {name: x.detach().clone() for name, x in moving.items()}
+    moving = {name: x for name, x in model.named_parameters() if name.startswith(MOVING[adapt])}
+    start = {name: x.detach().clone() for name, x in moving.items()}
 
     def changed() -> torch.Tensor | float:
-        return weight_decay / 2 * sum((x - before[name]).square().sum() for name, x in moving.items())
+        return weight_decay / 2 * sum((x - start[name]).square().sum() for name, x in moving.items())
 
     try:
         for name, parameter in model.named_parameters():

@@ -33,11 +33,14 @@ class RigidWeights:
     """The weights of bodies, drives and friction laws of a model, by name, and what they stand for."""
 
     def __init__(self, model: EmittedModel) -> None:
-        self.model = model
+        tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         self.kinds = {name: x.kind for name, x in parameter_table(model).items() if x.kind in RIGID}
+        self.tensors = {
+            name: tensors[name] for name in self.kinds
+        }  # parameters, or buffers that a fit may set
         (self.bodies,) = self.of_kind("bodies")
         (self.compensation,) = self.of_kind("friction_compensation")
-        self.start = {name: self._tensor(name).detach().clone() for name in self.kinds}
+        self.start = {name: x.detach().clone() for name, x in self.tensors.items()}
         self.sizes = [weight.numel() for weight in self.start.values()]
 
     def of_kind(self, *kinds: str) -> list[str]:
@@ -46,20 +49,14 @@ class RigidWeights:
 
     def named(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the weights by name, of all of them flattened one after the other (K,)."""
-        parts = zip(self.start.items(), x.split(self.sizes), strict=True)
-        return {name: part.view_as(weight) for (name, weight), part in parts}
+        pieces = zip(self.start.items(), x.split(self.sizes), strict=True)
+        return {name: piece.view_as(weight) for (name, weight), piece in pieces}
 
     def write(self, x: torch.Tensor) -> None:
         """Put weights (K,) into the model."""
         with torch.no_grad():
             for name, weight in self.named(x).items():
-                self._tensor(name).copy_(weight)
-
-    def _tensor(self, name: str) -> torch.Tensor:
-        """Return a parameter, or a buffer that a fit may set."""
-        module, _, attribute = name.rpartition(".")
-        tensor: torch.Tensor = getattr(self.model.get_submodule(module), attribute)
-        return tensor
+                self.tensors[name].copy_(weight)
 
     def flattened(self, weights: Weights) -> torch.Tensor:
         """Return weights by name as one vector (K,)."""
