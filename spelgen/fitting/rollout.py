@@ -39,7 +39,9 @@ def roll_out(
     q = windows.q[:, 0]
     p = model.momentum(model.at(q, prepared=prepared), windows.qd[:, 0])
     z = sliding_memory(model, windows.qd[:, 0]) if windows.z is None else windows.z
-    advance = runge_kutta if solver == "rk4" else _adaptive_step
+    advance = runge_kutta
+    if solver == "dopri5":
+        advance, substeps = _adaptive_step, 1
     positions, velocities = [], []
     for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
 
@@ -63,7 +65,7 @@ def _adaptive_step(
     q: torch.Tensor,
     p: torch.Tensor,
     z: torch.Tensor,
-    step: torch.Tensor,
+    step: torch.Tensor | float,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """As `runge_kutta`, in as many steps as the tolerance asks for; gradients go through the solver.
 
