@@ -35,9 +35,8 @@ class RigidWeights:
     def __init__(self, model: EmittedModel) -> None:
         tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         self.kinds = {name: x.kind for name, x in parameter_table(model).items() if x.kind in RIGID}
-        self.tensors = {
-            name: tensors[name] for name in self.kinds
-        }  # parameters, or buffers that a fit may set
+        # parameters, and buffers that a fit may set
+        self.tensors = {name: tensors[name] for name in self.kinds}
         (self.bodies,) = self.of_kind("bodies")
         (self.compensation,) = self.of_kind("friction_compensation")
         self.start = {name: x.detach().clone() for name, x in self.tensors.items()}
