@@ -40,7 +40,7 @@ def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Epochs of few windows take four steps: for tests of what stands around a fit."""
     from spelgen.settings.tuning.fitting import WindowTuning
 
-    monkeypatch.setattr("spelgen.fitting.window.objective.TUNING", WindowTuning(epoch_steps=4))
+    monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", WindowTuning(epoch_steps=4))
 
 
 @pytest.fixture

@@ -22,12 +22,13 @@ from spelgen.cli.main import app
 from spelgen.errors import LogError, ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.exporting.export import export
+from spelgen.fitting.dataset import Validation
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.fitted import load_run
+from spelgen.fitting.process import locked
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.run_lock import locked
 from spelgen.fitting.train import train
-from spelgen.fitting.window import objective as window_objective
+from spelgen.fitting.window import momentum
 from spelgen.logs import chunks
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
@@ -55,7 +56,7 @@ def motions(count: int = 4, samples: int = 25) -> list[Trajectory]:
 def short_epochs():
     """Two steps an epoch: what is written, and when, is the same after twenty."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(window_objective, "TUNING", WindowTuning(epoch_steps=2))
+        patch.setattr(momentum, "TUNING", WindowTuning(epoch_steps=2))
         yield
 
 
@@ -181,7 +182,7 @@ def test_killed_between_any_two_writes_nothing_is_lost(start, tmp_path):
 
 def test_an_interruption_before_the_first_checkpoint_leaves_no_run(start, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(window_objective, "measure", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(Validation, "measure", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             trained(start, tmp_path / "run")
     trained(start, tmp_path / "run")

@@ -21,7 +21,7 @@ from spelgen.dynamics.protocol import has_friction_state, sliding_memory
 from spelgen.emission.bundle import bundle, load_runtime, names_in
 from spelgen.emission.tailored import kinds
 from spelgen.emission.unit_joints import hidden_units
-from spelgen.fitting.torque.body_steps import body_weights
+from spelgen.fitting.torque.weights import body_weights
 from spelgen.loaded_arm import load_arm
 from spelgen.pipeline import make_spec
 from spelgen.runtime.derived_mass import DerivedMass

@@ -28,9 +28,8 @@ from spelgen.fitting.dataset import digest
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.servo import objective
-from spelgen.fitting.servo.intervals import covariance
 from spelgen.fitting.servo.problem import ServoProblem
-from spelgen.fitting.servo.report import servo_text
+from spelgen.fitting.servo.report import covariance, servo_summary
 from spelgen.fitting.servo.windows import servo_windows
 from spelgen.listing import number
 from spelgen.logs.commands import delayed_commands
@@ -278,7 +277,7 @@ def test_what_is_told_covers_the_truth(fitted):
             assert joint[what]["value"] == pytest.approx(truth, rel=0.03 if k == 0 else 0.04), what
             assert joint[what]["low"] < truth < joint[what]["high"], what
     # the elbow's small weight does not tell dry friction from a dead zone
-    assert told[0]["dry"]["determined"] and "dry/kp of elbow" in servo_text(fitted.record["servo"])
+    assert told[0]["dry"]["determined"] and "dry/kp of elbow" in servo_summary(fitted.record).text
 
 
 @pytest.mark.parametrize(

@@ -21,16 +21,15 @@ from spelgen.fitting.fit import fit
 from spelgen.fitting.objectives import default_objective
 from spelgen.fitting.torque import fit as torque_fit
 from spelgen.fitting.torque import jacobian as torque_jacobian
-from spelgen.fitting.torque.body_steps import moved_bodies
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import ResidualSamples, RigidResponse, TorqueJacobian
 from spelgen.fitting.torque.networks import adapt_networks
-from spelgen.fitting.torque.prior import ADAPTED, adapted_kinds, covariance, most_probable
+from spelgen.fitting.torque.prior import ADAPTED, covariance, most_probable
 from spelgen.fitting.torque.problem import TorqueProblem
 from spelgen.fitting.torque.report import terms_in_use, torque_notes
 from spelgen.fitting.torque.residuals import FRICTION, select_residuals
 from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.fitting.torque.weights import NONE, RIGID, RigidWeights
+from spelgen.fitting.torque.weights import NONE, RIGID, RigidWeights, moved_bodies
 from spelgen.fitting.train import train
 from spelgen.loaded_arm import load_arm
 from spelgen.logs import chunks
@@ -154,22 +153,22 @@ def test_deviations_are_those_of_the_largest_marginal_likelihood():
         return float(np.linalg.slogdet(total)[1] + y @ np.linalg.solve(total, y)) / 2
 
     best = np.exp(minimize_scalar(minus_log_likelihood, bounds=(-4, 3), method="bounded").x)
-    weights = {"armature": torch.zeros(3), "bodies": torch.zeros(2, 10), "offset": torch.zeros(2)}
-    kinds = adapted_kinds(weights, dict(zip(weights, ADAPTED, strict=True)))
+    order = torch.arange(25)
+    masks = dict(zip(ADAPTED, (order < 3, (order >= 3) & (order < 23), order >= 23), strict=True))
     guess = prior = GaussianPrior(armature=0.1, bodies=0.1, offset=0.1, degrees_of_freedom=1e-9)
     for _ in range(200):
         posterior = np.linalg.inv(rows.T @ rows / noise**2 + np.eye(20) / prior.bodies**2)
         away, covariance = torch.full((25,), 0.1).double(), torch.zeros(25, 25).double()
         away[3:23] = torch.from_numpy(posterior @ rows.T @ y / noise**2)
         covariance[3:23, 3:23] = torch.from_numpy(posterior)
-        prior = most_probable(prior, guess, kinds, away, covariance)
+        prior = most_probable(prior, guess, masks, away, covariance)
     assert prior.bodies == pytest.approx(best, rel=1e-4)
     # all three armatures are off together, which the prior allows for
     assert prior.armature < 1e-4
     away[:3] = torch.tensor([0.3, -0.3, 0.0])
-    assert most_probable(prior, guess, kinds, away, covariance).armature == pytest.approx(0.3)
+    assert most_probable(prior, guess, masks, away, covariance).armature == pytest.approx(0.3)
     certain = prior.model_copy(update={"degrees_of_freedom": 1e12})
-    assert most_probable(certain, guess, kinds, away, covariance).bodies == pytest.approx(guess.bodies)
+    assert most_probable(certain, guess, masks, away, covariance).bodies == pytest.approx(guess.bodies)
 
 
 def test_a_urdf_that_is_wrong_is_given_up_and_that_is_said(emitted):
@@ -472,7 +471,7 @@ def test_a_part_of_a_model_of_networks_is_adapted(robots, run, emitted):
         model = build(robots / "two_link.urdf", "spel", width=8)
         before = {name: x.clone() for name, x in model.state_dict().items()}
         missed = nmse(model, samples[0])
-        adapt_networks(model, samples, adapt, evaluations=40)
+        adapt_networks(model, TorqueSamples.of(samples), adapt, evaluations=40)
         moved = {name for name, x in model.state_dict().items() if not torch.equal(x, before[name])}
         assert moved and all(name.startswith(part) for name in moved)
         assert nmse(model, samples[0]) < missed

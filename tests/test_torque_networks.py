@@ -35,7 +35,9 @@ def test_another_arms_torques_are_met(tmp_path):
         true.mass.raw_armature += 0.5
         true.friction.raw_viscous += 1.0
     start = missed(model, recorded(true, 7))
-    steps = fit_networks(model, [recorded(true, 5), recorded(true, 6)], 1e-6, evaluations=500)
+    steps = fit_networks(
+        model, TorqueSamples.of([recorded(true, 5), recorded(true, 6)]), 1e-6, evaluations=500
+    )
     assert steps % 20 == 0
     assert start > 1e-3
     assert missed(model, recorded(true, 7)) < 1e-6
@@ -48,7 +50,9 @@ def test_what_is_penalised_stays(tmp_path):
     constants = model.mass.raw_constants
     with torch.no_grad():
         true.mass.raw_constants *= 1.5
-    fit_networks(model, [recorded(true, 5)], 1e-6, lambda: 1e3 * (constants - 1).square().sum())
+    fit_networks(
+        model, TorqueSamples.of([recorded(true, 5)]), 1e-6, lambda: 1e3 * (constants - 1).square().sum()
+    )
     assert (constants - 1).abs().max() < 0.01
 
 
@@ -56,12 +60,12 @@ def test_blocks_give_what_all_at_once_gives(tmp_path, monkeypatch):
     """The loss and its gradient; what many steps make of the last digits is another thing."""
     module = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py")
     true = module.Model(seed=0)
-    samples = [recorded(true, 5), recorded(true, 6)]
+    samples = TorqueSamples.of([recorded(true, 5), recorded(true, 6)])
     whole, parts = module.Model(seed=1), module.Model(seed=1)
     penalty = lambda model: lambda: 1e-3 * model.mass.raw_constants.square().sum()  # noqa: E731
     fit_networks(whole, samples, 1e-6, penalty(whole), evaluations=20)
     monkeypatch.setattr(torque_networks, "BLOCK", 128)
-    fit_networks(parts, TorqueSamples.of(samples), 1e-6, penalty(parts), evaluations=20)
+    fit_networks(parts, samples, 1e-6, penalty(parts), evaluations=20)
     for name, value in whole.state_dict().items():
         torch.testing.assert_close(parts.state_dict()[name], value, rtol=1e-5, atol=1e-7)
 

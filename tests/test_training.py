@@ -242,7 +242,7 @@ class Interrupted(TrainingProgress):
 
 @pytest.mark.parametrize(("optimizer", "steps"), [("adamw", 20), ("lbfgs", 3)])
 def test_resuming_repeats_what_would_have_been(logs, tmp_path, monkeypatch, optimizer, steps):
-    monkeypatch.setattr("spelgen.fitting.window.objective.TUNING", WindowTuning(epoch_steps=steps))
+    monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", WindowTuning(epoch_steps=steps))
     config = quick(optimizer=optimizer, momentum_steps=20 if optimizer == "adamw" else 0)
     straight, broken = tmp_path / "straight", tmp_path / "broken"
     train(STAND_IN, [logs], straight, config)
@@ -452,7 +452,7 @@ def prepared(logs: Path) -> TrainingData:
 
 def loop_of(logs: Path, config: Rollout) -> RolloutObjective:
     request = FitRequest(
-        load_module(STAND_IN), read_logs([logs], JOINTS), config, Preprocessing(), 0.25, 0, None, None, "cpu", 1,
+        load_module(STAND_IN), read_logs([logs], JOINTS), config, Preprocessing(), 0.25, 0, None, RunOptions(),
         time.monotonic(), None,
     )  # fmt: skip
     loop = RolloutObjective(request)
@@ -567,7 +567,9 @@ def test_progress_on_a_terminal_is_one_line_of_80_columns(monkeypatch):
 def test_the_allowed_time_is_kept_within_an_epoch(logs, monkeypatch):
     """An epoch of a million steps of 20 ms would take hours: by a clock that only steps move."""
     now = [100.0]
-    monkeypatch.setattr("spelgen.fitting.window.clock.time", types.SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(
+        "spelgen.fitting.window.momentum.time", types.SimpleNamespace(monotonic=lambda: now[0])
+    )
     run = MiniBatchAdamW.run
 
     def slow(self, loss, windows, steps, rate):

@@ -108,8 +108,7 @@ def fleet(
 
     The same command resumes an interrupted fleet.
     """
-    from spelgen.fitting.process import termination_as_interrupt
-    from spelgen.fitting.run_lock import locked
+    from spelgen.fitting.process import locked, termination_as_interrupt
     from spelgen.fleet.fleet import run_fleet
     from spelgen.fleet.ranking import fleet_listings
     from spelgen.fleet.schema import load_fleet

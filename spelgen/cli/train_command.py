@@ -162,14 +162,14 @@ def _tell(fit: Fit, folder: Path, paths: Sequence[Path], format: str, *, resume:
 
 def _outcome(fit: Fit) -> tuple[str, str]:
     """Return how a fit ended, with the reason where its status does not say it, and what it came to."""
-    from spelgen.fitting.objectives import fit_summary
+    from spelgen.fitting.servo.report import servo_summary
 
     config, loss = fit.config, f"validation loss {fit.best_validation:.3g}"
     reason = ""
     if fit.status == "out of time" and isinstance(config, WindowConfig):
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
     if not isinstance(config, Rollout):  # windows only judge
-        summary = fit_summary(fit.record)
+        summary = servo_summary(fit.record)
         if summary is not None:
             loss = summary.text
         elif not fit.record["validation_windows"]:

@@ -21,7 +21,7 @@ from spelgen.comparison.metrics import RunResult
 from spelgen.design import Design, Net, Preset, load_design
 from spelgen.errors import RunError, SettingsError
 from spelgen.files import read_json, write_json, write_text
-from spelgen.fitting.window.objective import TUNING
+from spelgen.fitting.window.momentum import TUNING
 from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs, write_logs

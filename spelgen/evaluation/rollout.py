@@ -25,7 +25,7 @@ def rollout(
 
     tau[k] is constant for dt [s], or for dt[k] of (..., T). ``model``: an emitted one or any other dynamics. solver:
     ``rk4`` takes ``substeps`` steps of the classical Runge-Kutta method in each dt, ``dopri5`` torchdiffeq's
-    adaptive steps, and over long horizons its adjoint equation for gradients.
+    adaptive steps.
     """
     batch = np.broadcast_shapes(q.shape[:-1], tau.shape[:-2])
     samples, n = tau.shape[-2:]

@@ -1,22 +1,31 @@
-"""The logs that a model is fitted to: checked, split, filtered, cut into windows."""
+"""The logs that a model is fitted to: checked, split, filtered, cut into windows, and what it is judged by on these."""
 
 from __future__ import annotations
 
+import copy
 import hashlib
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
 from spelgen.dynamics.bristles import BristleReach
 from spelgen.errors import Diagnostic, LogError
-from spelgen.fitting.rollout import LossScales, loss_scales
+from spelgen.fitting.rollout import LossScales, choose_substeps, loss_scales, rollout_loss
+from spelgen.fitting.run_record import Content
 from spelgen.logs.checks import check
 from spelgen.logs.chunks import Chunk
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
-from spelgen.logs.windows import Split, Windows, cut_windows, split_validation, thinned, window_count
+from spelgen.logs.windows import Split, Windows, cut_windows, split_validation, thinned
+from spelgen.settings.fits import DEFAULTS, Solver
 from spelgen.settings.tuning.fitting import ValidationTuning
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
 
 TUNING = ValidationTuning()
 
@@ -35,60 +44,44 @@ class WindowChoice:
     seed: int = 0
     reach: BristleReach | None = None
 
+    def span(self, preprocessing: Preprocessing) -> int:
+        """Return the samples of one window, of logs that are prepared like this."""
+        return (self.window - 1) * (preprocessing.decimation or 1) + 1
+
+    def windows(self, trajectories: Sequence[Trajectory], preprocessing: Preprocessing) -> Windows:
+        """Return all windows of these trajectories, filtered piece by piece; preprocessing: a resolved one."""
+        return cut_windows(
+            preprocessing.pieces(trajectories, shortest=self.span(preprocessing)),
+            self.window,
+            self.stride,
+            preprocessing.decimation or 1,
+            measured=preprocessing.filtered,
+            reach=self.reach,
+        )
+
 
 DEFAULT_CHOICE = WindowChoice()
-
-
-@dataclass(frozen=True, eq=False)
-class WindowCutting:
-    """How the chosen windows are cut of logs that are prepared like this. preprocessing: a resolved one."""
-
-    choice: WindowChoice
-    preprocessing: Preprocessing
-
-    @property
-    def decimation(self) -> int:
-        """Samples from one sample of a window to the next."""
-        return self.preprocessing.decimation or 1
-
-    @property
-    def shortest(self) -> int:
-        """Samples of one window."""
-        return (self.choice.window - 1) * self.decimation + 1
-
-    def count(self, samples: int) -> int:
-        """Return how many windows a gap-free piece of so many samples has."""
-        return window_count(samples, self.choice.window, self.choice.stride, self.decimation)
-
-    def windows(self, trajectories: Sequence[Trajectory]) -> Windows:
-        """Return all windows of these trajectories, filtered piece by piece."""
-        pieces = self.preprocessing.pieces(trajectories, shortest=self.shortest)
-        filtered, choice = self.preprocessing.filtered, self.choice
-        return cut_windows(
-            pieces, choice.window, choice.stride, self.decimation, measured=filtered, reach=choice.reach
-        )
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
     """Windows of the logs, ready to fit.
 
-    training: all of them, or of logs larger than memory an even sample. size: windows of all training logs.
-    preprocessing: as it was resolved. digest: of every number, to resume on the same data only.
-    recordings: what all was cut from, validation included; of logs larger than memory chunks.
+    training: all of them, or of logs larger than memory an even sample. preprocessing: as it was resolved.
+    digest: of every number, to resume on the same data only. recordings: what all was cut from, validation included; of
+    logs larger than memory chunks.
     """
 
     training: Windows
     validation: Windows
-    size: int
     scales: LossScales
     preprocessing: Preprocessing
     training_names: tuple[str, ...]
     validation_names: tuple[str, ...]
     diagnostics: tuple[Diagnostic, ...]
     digest: str
-    recordings: tuple[Trajectory, ...] = ()
-    chunks: tuple[Chunk, ...] = ()
+    recordings: Sequence[Trajectory] = ()
+    chunks: Sequence[Chunk] = ()
 
 
 def prepare_data(
@@ -110,19 +103,17 @@ def prepare_data(
     require_torques(everything)
     notes = check(everything, joints, joint_types)
     resolved = preprocessing.resolved([x.sample_rate for x in everything])
-    cutting = WindowCutting(choice, resolved)
-    windows = cutting.windows(split.training)
+    windows = choice.windows(split.training, resolved)
     return TrainingData(
         training=windows,
-        validation=thinned(cutting.windows(split.validation), TUNING.windows),
-        size=len(windows),
+        validation=thinned(choice.windows(split.validation, resolved), TUNING.windows),
         scales=loss_scales(windows, joint_types),
         preprocessing=resolved,
         training_names=tuple(x.name for x in split.training),
         validation_names=tuple(x.name for x in split.validation),
         diagnostics=(*notes, *resolved.diagnostics, split.note),
         digest=digest(everything),
-        recordings=tuple(everything),
+        recordings=everything,
     )
 
 
@@ -148,3 +139,64 @@ def numbers_of(trajectory: Trajectory) -> Iterator[memoryview]:
     for array in (trajectory.t, trajectory.q, trajectory.qd, trajectory.tau, trajectory.u):
         if array is not None:
             yield np.ascontiguousarray(array).data
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A model's weights, the integrator's steps that they need between samples, and their validation loss."""
+
+    substeps: int
+    loss: float
+    weights: Content
+
+
+class Validation:
+    """Validation windows, and a probe of the training windows for the integrator's steps.
+
+    substeps: of rk4 between samples, where they are prescribed. batch: a fourth of the windows predicted together.
+    """
+
+    def __init__(
+        self,
+        model: EmittedModel,
+        data: TrainingData,
+        device: str = "cpu",
+        *,
+        batch: int = DEFAULTS.batch,
+        solver: Solver = "rk4",
+        substeps: int | None = None,
+    ) -> None:
+        self.model = model.to(device)
+        self.solver, self.prescribed = solver, substeps
+        self.size = len(data.validation)
+        self.scales = data.scales.to(device)
+        self.batches = data.validation.to(device).split(4 * batch)
+        self.probe = data.training[:: -(-len(data.training) // TUNING.probe)].to(device)
+
+    def loss(self, substeps: int) -> float:
+        """Return `rollout_loss` of the validation windows; infinite where numbers blow up."""
+        total = 0.0
+        try:
+            with torch.no_grad():
+                for windows in self.batches:
+                    loss = rollout_loss(self.model, windows, self.scales, substeps, self.solver)
+                    total += loss.item() * len(windows)
+        except torch.linalg.LinAlgError:
+            return math.inf
+        return total / self.size
+
+    def substeps(self, present: int | None = None) -> int:
+        """Return the integrator's steps per sample interval: those prescribed, or as many as the model now needs.
+
+        They are never fewer than the present ones.
+        """
+        if self.solver != "rk4":
+            return 1
+        if self.prescribed is not None:
+            return self.prescribed
+        return choose_substeps(self.model, self.probe, self.scales, start=present or 1)
+
+    def measure(self) -> Measured:
+        """Return what validation says of the model as it is."""
+        substeps = self.substeps()
+        return Measured(substeps, self.loss(substeps), copy.deepcopy(self.model.state_dict()))

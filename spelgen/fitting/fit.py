@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -12,19 +11,17 @@ from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import Diagnostic, RunError, SettingsError
 from spelgen.files import write_json
 from spelgen.fitting.fitted import Fit, load_run
-from spelgen.fitting.objective import FitRequest, Logs, Objective, Status, record_of
+from spelgen.fitting.objective import FitRequest, Logs, Objective, RunOptions, Status, record_of
 from spelgen.fitting.objectives import chosen_config, objective_of
-from spelgen.fitting.process import require_device, termination_as_interrupt, threads_of_torch
+from spelgen.fitting.process import locked, require_device, termination_as_interrupt, threads_of_torch
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import require_same
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.dynamics_samples import SHORTEST
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import FitConfig
-from spelgen.settings.log_mapping import LogMapping
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -40,25 +37,6 @@ class ArmOfFile(Protocol):
 
     @property
     def robot(self) -> Robot: ...
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """How a fit runs, whatever it fits.
-
-    device, threads: of torch. resume: go on from the folder's checkpoint, exactly as if there had been no interruption.
-    force: replace a run. progress: show it on stderr. mapping: how the logs were read, kept with the run. notes: found
-    before, to be reported with the others. began: from when the allowed time counts (`time.monotonic`); None: from now.
-    """
-
-    device: str = "cpu"
-    threads: int = 1
-    resume: bool = False
-    force: bool = False
-    progress: bool = False
-    mapping: LogMapping | None = None
-    notes: Sequence[Diagnostic] = ()
-    began: float | None = None
 
 
 QUIET = RunOptions()
@@ -93,18 +71,12 @@ def fit(
     logs = [logs] if isinstance(logs, Trajectory) else logs
     config = _config(model, logs, config)
     urdf = run.urdf if run is not None and options.resume else _urdf(arm)
-    request = FitRequest(
-        model, logs, config, preprocessing, validation, seed, urdf, options.mapping, options.device,
-        options.threads, began, None if run is None else run.path,
-    )  # fmt: skip
+    folder = None if run is None else run.path
+    request = FitRequest(model, logs, config, preprocessing, validation, seed, urdf, options, began, folder)
     objective = objective_of(request)
     if run is not None and not options.resume:
         run.require_free(force=options.force)
-    with (
-        threads_of_torch(options.threads),
-        termination_as_interrupt(),
-        locked(None if run is None else run.path),
-    ):
+    with threads_of_torch(options.threads), termination_as_interrupt(), locked(folder):
         require_device(options.device)
         prepared = objective.prepare()
         notes = [*prepared.notes, *options.notes]
@@ -114,16 +86,22 @@ def fit(
             _resume(objective, run)
         else:
             notes += objective.begin()
-        before = record | objective.results()
-        save = _writer(objective, run)
+
+        def save() -> None:
+            if run is not None:
+                checkpoint = objective.checkpoint()
+                run.write_metrics(objective.history)
+                run.save(checkpoint["best_weights"], checkpoint)
+
         if run is not None and not options.resume:
             run.start(model.source, urdf, force=options.force)
             save()
-            write_json(run.config, before)  # now there is a run, and it can be resumed
+            write_json(run.config, record)  # now there is a run, and it can be resumed
         status = _run(objective, save, notes, show=options.progress)
-        record |= objective.results()
-        if run is not None and record != before:
-            write_json(run.config, record)
+        if objective.results:
+            record |= objective.results
+            if run is not None:
+                write_json(run.config, record)
     checkpoint = objective.checkpoint()
     model.load_state_dict(checkpoint["best_weights"])
     model.requires_grad_(True)  # of what rested, too
@@ -137,7 +115,7 @@ def fit(
         record=record,
         checkpoint=checkpoint,
         urdf=urdf,
-        folder=None if run is None else run.path,
+        folder=folder,
     )
 
 
@@ -171,26 +149,10 @@ def _urdf(arm: ArmOfFile | Path | str | None) -> Path | None:
 def _resume(objective: Objective, run: RunFolder) -> None:
     checkpoint = run.load_checkpoint()
     try:
-        objective.resume(checkpoint, run.read_metrics(), run.read_config())
+        objective.resume(checkpoint, run.read_metrics())
     except (KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
         raise RunError("a checkpoint of another model", file=run.checkpoint, do="start a new run") from error
     run.write_metrics(objective.history)  # epochs after the checkpoint will be run again
-
-
-def _writer(objective: Objective, run: RunFolder | None) -> Callable[[], None]:
-    """Return what writes new lines of the history and the checkpoint."""
-    written = len(objective.history)
-
-    def save() -> None:
-        nonlocal written
-        if run is None:
-            return
-        run.append_metrics(objective.history[written:])
-        written = len(objective.history)
-        checkpoint = objective.checkpoint()
-        run.save(checkpoint["best_weights"], checkpoint)
-
-    return save
 
 
 def _run(

@@ -15,8 +15,8 @@ from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.files import write_json
 from spelgen.fitting.objective import Status
+from spelgen.fitting.process import locked
 from spelgen.fitting.run_folder import RunFolder, trained_model
-from spelgen.fitting.run_lock import locked
 from spelgen.fitting.run_record import Content, recorded_config
 from spelgen.listing import Listing
 from spelgen.logs.dynamics_samples import dynamics_samples
@@ -94,7 +94,9 @@ class Fit:
         for start, stop in pairwise(gap_ends(trajectory.t, self.preprocessing.gap)):
             if stop - start < 2:
                 continue
-            piece = self._filtered(trajectory[start:stop])
+            piece = trajectory[start:stop]
+            if self.preprocessing.cutoff and len(piece) > 3:
+                piece = low_pass(piece, self.preprocessing.cutoff)
             qdd = np.gradient(piece.qd, piece.t, axis=0)
             tau[start:stop] = self._torque(piece.q, piece.qd, qdd, bristles_along(piece.q, reach))
         return tau
@@ -136,10 +138,6 @@ class Fit:
             run.save(self.model.state_dict(), self.checkpoint)
             write_json(run.config, self.record)
         return run.path
-
-    def _filtered(self, piece: Trajectory) -> Trajectory:
-        cutoff = self.preprocessing.cutoff
-        return low_pass(piece, cutoff) if cutoff and len(piece.t) > 3 else piece
 
     def _torque(self, *motion: np.ndarray | None) -> np.ndarray:
         """Return torques (T, n) at q, qd, qdd and, where they are known, z and direction (see `DynamicsSamples`)."""

@@ -14,18 +14,16 @@ if TYPE_CHECKING:
 Weights = Mapping[str, torch.Tensor]
 
 
-class FunctionalModel(torch.nn.Module):
-    """Evaluate functions of a model under weights that stand in for its own."""
-
+class _Evaluated(torch.nn.Module):
     def __init__(self, model: EmittedModel) -> None:
         super().__init__()
         self.model = model
 
     def forward(self, function: Callable[[Any], Any]) -> Any:
-        """Return what a function gives for the model."""
         return function(self.model)
 
-    def under(self, weights: Weights, function: Callable[[Any], Any]) -> Any:
-        """Return what a function gives for the model under these weights, by their names in the model."""
-        named = {f"model.{name}": weight for name, weight in weights.items()}
-        return functional_call(self, named, (function,))
+
+def under_weights(model: EmittedModel, weights: Weights, function: Callable[[Any], Any]) -> Any:
+    """Return what a function gives for the model under weights that stand in for its own, by their names there."""
+    named = {f"model.{name}": weight for name, weight in weights.items()}
+    return functional_call(_Evaluated(model), named, (function,))

@@ -94,12 +94,12 @@ def levenberg_marquardt(
     for _ in range(max_steps):
         if state.converged:
             return
-        before, after = state, _lower(problem, state, least_gain)
-        if after is None:
-            yield replace(before, converged=True)
+        lower = _lower(problem, state, least_gain)
+        if lower is None:
+            yield replace(state, converged=True)
             return
-        gain = before.cost - after.cost
-        state = replace(after, converged=gain < max(least_gain, relative_gain * after.cost))
+        gain = state.cost - lower.cost
+        state = replace(lower, converged=gain < max(least_gain, relative_gain * lower.cost))
         yield state
 
 
@@ -114,9 +114,9 @@ def _lower(
         promised = normal.promised(step)
         if promised < max(TUNING.least_promise * state.cost, least_gain):
             return None
-        after = _best(problem, state, step, promised)
-        if after.cost < state.cost:
-            return replace(after, damping=max(damping / TUNING.factor, TUNING.least))
+        lower = _best(problem, state, step, promised)
+        if lower.cost < state.cost:
+            return replace(lower, damping=max(damping / TUNING.factor, TUNING.least))
         damping *= TUNING.factor
     return None
 

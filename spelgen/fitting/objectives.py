@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 from spelgen.dynamics.protocol import has_rigid_bodies, input_of
 from spelgen.errors import OptionError
-from spelgen.fitting.objective import FitRequest, FitSummary, Objective
-from spelgen.fitting.run_record import ReadContent
+from spelgen.fitting.objective import FitRequest, Objective
 from spelgen.fitting.servo.objective import ServoObjective
 from spelgen.fitting.torque.objective import TorqueObjective
 from spelgen.fitting.window.momentum import MomentumObjective
@@ -21,12 +20,6 @@ if TYPE_CHECKING:
 
 ALL: tuple[type[Objective], ...] = (TorqueObjective, MomentumObjective, RolloutObjective, ServoObjective)
 OBJECTIVES = {objective.name: objective for objective in ALL}
-
-
-def fit_summary(record: ReadContent) -> FitSummary | None:
-    """Return what a fit determined beside a model, if anything; record: contents of config.json, {} without."""
-    objective = OBJECTIVES.get(record.get("objective", ""))
-    return None if objective is None else objective.summary(record)
 
 
 def objective_of(request: FitRequest) -> Objective:

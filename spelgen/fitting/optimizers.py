@@ -7,8 +7,8 @@ logs have many digits to find, and an engineer's first log has few windows.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from typing import Protocol
 
 import torch
 
@@ -23,25 +23,33 @@ LearningRate = Callable[[int], float]
 Summands = Callable[[], Iterable[torch.Tensor]]  # of a loss; one at a time is in memory
 
 
-class WindowOptimizer(Protocol):
+class WindowOptimizer(ABC):
     """Move those weights of one model that required a gradient when this was made.
 
-    stalled: whether there is no way down from here.
+    What a resumed run needs beside the state of torch's optimizer is kept in its groups, which that saves.
     """
 
-    @property
-    def stalled(self) -> bool: ...
+    _optimizer: torch.optim.Optimizer
 
+    @abstractmethod
     def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
         """Take ``steps`` steps on ``loss`` and return the mean loss, NaN as soon as one is not finite.
 
         The learning rates are learning_rate(0), learning_rate(1) ...
         """
-        ...
 
-    def state_dict(self) -> Content: ...
+    @property
+    def stalled(self) -> bool:
+        """Whether there is no way down from here."""
+        return False
 
-    def load_state_dict(self, state: Content) -> None: ...
+    def state_dict(self) -> Content:
+        """All that a resumed run needs."""
+        return self._optimizer.state_dict()
+
+    def load_state_dict(self, state: Content) -> None:
+        """Go on from a ``state_dict``."""
+        self._optimizer.load_state_dict(state)
 
 
 def _moving(model: torch.nn.Module) -> tuple[list[torch.nn.Parameter], list[torch.nn.Parameter]]:
@@ -50,7 +58,7 @@ def _moving(model: torch.nn.Module) -> tuple[list[torch.nn.Parameter], list[torc
     return parameters, [parameter for parameter in parameters if parameter.dim() > 1]
 
 
-class MiniBatchAdamW:
+class MiniBatchAdamW(WindowOptimizer):
     """Step by AdamW on batches in random order.
 
     Single numbers (constants, viscous friction) learn faster than weights and do not decay.
@@ -68,8 +76,6 @@ class MiniBatchAdamW:
                 {"params": numbers, "weight_decay": 0.0, "factor": TUNING.number_factor},
             ]
         )
-
-    stalled = False
 
     def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
         """See ``WindowOptimizer``."""
@@ -95,26 +101,19 @@ class MiniBatchAdamW:
         self._optimizer.step()
         return value.detach() + 0.0 * norm
 
-    def state_dict(self) -> Content:
-        """All that a resumed run needs."""
-        return self._optimizer.state_dict()
 
-    def load_state_dict(self, state: Content) -> None:
-        """Go on from a ``state_dict``."""
-        self._optimizer.load_state_dict(state)
-
-
-class LBFGS:
+class LBFGS(WindowOptimizer):
     """L-BFGS (Liu and Nocedal, Math. Programming 45, 1989) with a strong-Wolfe line search on all windows.
 
     A step is an evaluation. weight_decay: factor of half the sum of squares of all weights, which is added to the loss;
     the learning rate is not used.
     """
 
+    _optimizer: torch.optim.LBFGS
+
     def __init__(self, model: torch.nn.Module, weight_decay: float) -> None:
         self._parameters, self._weights = _moving(model)
         self._decay, self._finite = weight_decay, True
-        self._waits, self._last = 0, (math.inf, math.inf)  # loss, and with the penalty
         self._optimizer = torch.optim.LBFGS(
             self._parameters,
             history_size=TUNING.history,
@@ -122,6 +121,8 @@ class LBFGS:
             tolerance_grad=1e-12,
             tolerance_change=1e-15,
         )
+        # the loss where the call before ended, also with the penalty; and how many in a row found next to nothing
+        self._optimizer.param_groups[0].update(last=(math.inf, math.inf), waits=0)
 
     def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
         """See ``WindowOptimizer``; the loss where it ends, NaN where no evaluation was finite."""
@@ -141,17 +142,16 @@ class LBFGS:
                 penalised = (total + self._penalty()).item()
         except torch.linalg.LinAlgError:
             return math.nan
-        before, self._last = self._last, (total.item(), penalised)
-        if all(value > TUNING.stalled * last for value, last in zip(self._last, before, strict=True)):
-            self._waits += 1
-        else:
-            self._waits = 0
-        return total.item()
+        loss, (last, last_penalised) = total.item(), group["last"]
+        gained = loss <= TUNING.stalled * last or penalised <= TUNING.stalled * last_penalised
+        group["last"], group["waits"] = (loss, penalised), 0 if gained else group["waits"] + 1
+        return loss
 
     @property
     def stalled(self) -> bool:
         """Whether two calls in a row found next to nothing."""
-        return self._waits > 1
+        waits: int = self._optimizer.param_groups[0]["waits"]
+        return waits > 1
 
     def _evaluated(self, summands: Summands) -> torch.Tensor:
         self._optimizer.zero_grad()
@@ -173,19 +173,6 @@ class LBFGS:
 
     def _penalty(self) -> torch.Tensor | float:
         return 0.5 * self._decay * sum(weight.square().sum() for weight in self._weights)
-
-    def state_dict(self) -> Content:
-        """All that a resumed run needs."""
-        return {
-            "optimizer": self._optimizer.state_dict(),
-            "reached": self._last,
-            "waits": self._waits,
-        }
-
-    def load_state_dict(self, state: Content) -> None:
-        """Go on from a ``state_dict``."""
-        self._optimizer.load_state_dict(state["optimizer"])
-        self._last, self._waits = state["reached"], state["waits"]
 
 
 def minimise(model: torch.nn.Module, summands: Summands, evaluations: int, weight_decay: float = 0.0) -> int:

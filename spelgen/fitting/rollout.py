@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 
 from spelgen.dynamics.equations import mass_as_learned, runge_kutta
-from spelgen.dynamics.protocol import (
-    known_past,
-    memory_along,
-    sliding_memory,
-)
+from spelgen.dynamics.protocol import known_past, memory_after, memory_along, sliding_memory
 from spelgen.errors import LogError
-from spelgen.fitting.adaptive import roll_out_adaptive
 from spelgen.logs.windows import Windows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import Solver
-from spelgen.settings.tuning.fitting import IntegrationTuning
+from spelgen.settings.tuning.fitting import AdaptiveTuning, IntegrationTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-TUNING = IntegrationTuning()
+TUNING, ADAPTIVE = IntegrationTuning(), AdaptiveTuning()
+SOLVER: dict[str, Any] = {"method": "dopri5", "rtol": ADAPTIVE.relative, "atol": ADAPTIVE.absolute}
 AT_REST = 1e-6  # [rad, m] finer than encoders
 
 
@@ -36,21 +31,26 @@ def roll_out(
 
     The state is (q, p), p = M(q) qd, so that no derivative of M in time is needed. Windows make one batch, each with
     its own sample times, and every interval between samples is solved by itself: the input jumps at its ends.
-    solver: "rk4" takes `substeps` steps of the classical Runge-Kutta method in each. Written out here and not left
-    to torchdiffeq, which cannot know that the weights stay the same over the whole window: `prepare` readies them
-    once. "dopri5": see `adaptive.roll_out_adaptive`.
+    solver: "rk4" takes `substeps` steps of the classical Runge-Kutta method in each, "dopri5" as many as its tolerance
+    asks for. The weights stay the same over the whole window, and are prepared once.
     """
-    if solver == "dopri5":
-        return roll_out_adaptive(model, windows)
     prepared = model.prepare()
     q = windows.q[:, 0]
     p = model.momentum(model.at(q, prepared=prepared), windows.qd[:, 0])
     z = sliding_memory(model, windows.qd[:, 0]) if windows.z is None else windows.z
+    advance = runge_kutta
+    if solver == "dopri5":
+        advance, substeps = _adaptive_step, 1
     positions, velocities = [], []
     for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
-        rhs, step = partial(_rhs, model, tau, prepared), dt.unsqueeze(-1) / substeps
+
+        def rhs(
+            q: torch.Tensor, p: torch.Tensor, z: torch.Tensor, tau: torch.Tensor = tau
+        ) -> tuple[torch.Tensor, torch.Tensor]:
+            return model.port_hamiltonian_rhs(q, p, tau, prepared, *known_past(model, z))
+
         for substep in range(substeps):
-            q, p, z, qd = runge_kutta(model, rhs, q, p, z, step)
+            q, p, z, qd = advance(model, rhs, q, p, z, dt.unsqueeze(-1) / substeps)
             if substep == 0:
                 velocities.append(qd)  # of the sample that the interval starts at
         positions.append(q)
@@ -58,16 +58,27 @@ def roll_out(
     return torch.stack(positions, dim=1), torch.stack(velocities, dim=1)  # each (W, K-1, n)
 
 
-def _rhs(
-    model: PortHamiltonian,
-    tau: torch.Tensor,
-    prepared: Any,
+def _adaptive_step(
+    dynamics: object,
+    rhs: Callable[[torch.Tensor, torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]],
     q: torch.Tensor,
     p: torch.Tensor,
     z: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return q' and p' under a held input, where friction's memory is z."""
-    return model.port_hamiltonian_rhs(q, p, tau, prepared, *known_past(model, z))
+    step: torch.Tensor | float,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """As `runge_kutta`, in as many steps as the tolerance asks for; gradients go through the solver.
+
+    Dormand and Prince, J. Comput. Appl. Math. 6 (1980). Windows are solved together, in units of their own steps.
+    """
+    from torchdiffeq import odeint  # half a second, for those who ask for dopri5 alone
+
+    def slope(t: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        q_now, p_now = state.chunk(2, dim=-1)
+        return step * torch.cat(rhs(q_now, p_now, memory_after(dynamics, z, q_now - q)), dim=-1)
+
+    unit = torch.tensor([0.0, 1.0], dtype=q.dtype, device=q.device)
+    q_end, p_end = odeint(slope, torch.cat([q, p], dim=-1), unit, **SOLVER)[-1].chunk(2, dim=-1)
+    return q_end, p_end, memory_after(dynamics, z, q_end - q), rhs(q, p, z)[0]
 
 
 def position_difference(

@@ -14,16 +14,7 @@ import torch
 
 from spelgen.emission.loading import has_run, load_module
 from spelgen.errors import RunError
-from spelgen.files import (
-    local,
-    naming,
-    read_bytes,
-    read_json,
-    remove,
-    require_regular_file,
-    sent,
-    write_bytes,
-)
+from spelgen.files import local, read_bytes, read_json, remove, require_regular_file, write_bytes
 from spelgen.fitting.run_record import Checkpoint, Content, Epoch, require, require_record
 from spelgen.spec import read_source
 from spelgen.urdf.document import urdf_bytes
@@ -94,14 +85,6 @@ class RunFolder:
         """Write model.pt and checkpoint.pt."""
         write_state(self.weights, weights)
         write_state(self.checkpoint, checkpoint)
-
-    def append_metrics(self, records: Sequence[Content]) -> None:
-        """Add lines to metrics.jsonl."""
-        if not records:
-            return
-        with naming(self.metrics), self.metrics.open("a", encoding="utf-8") as file:
-            file.writelines(json.dumps(record) + "\n" for record in records)
-        sent(self.metrics)
 
     def write_metrics(self, records: Sequence[Content]) -> None:
         """Make these all lines of metrics.jsonl; no file for none."""

@@ -11,14 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, collect
-from spelgen.fitting.dataset import (
-    DEFAULT_CHOICE,
-    TUNING,
-    TrainingData,
-    WindowChoice,
-    WindowCutting,
-    numbers_of,
-)
+from spelgen.fitting.dataset import DEFAULT_CHOICE, TUNING, TrainingData, WindowChoice, numbers_of
 from spelgen.fitting.rollout import loss_scales
 from spelgen.logs.checks import LogChecks
 from spelgen.logs.chunks import Chunk, scan
@@ -26,6 +19,20 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import GAP, gap_ends
 from spelgen.logs.windows import Windows, joined, thinned
 from spelgen.settings.log_mapping import LogMapping
+
+
+@dataclass(frozen=True, eq=False)
+class LogContents:
+    """Hold what one pass finds.
+
+    longest: samples of the longest gap-free piece of each chunk. rates: of chunks that are long enough [Hz].
+    """
+
+    chunks: list[Chunk]
+    longest: list[int]
+    rates: list[float]
+    notes: list[Diagnostic]
+    digest: str
 
 
 @dataclass(frozen=True)
@@ -41,21 +48,25 @@ class LargeLogs:
     @cached_property
     def contents(self) -> LogContents:
         """What a pass over the files tells. Raises LogError, and SettingsError where the mapping does not fit."""
-        return _read_once(self)
-
-
-@dataclass(frozen=True, eq=False)
-class LogContents:
-    """Hold what one pass finds.
-
-    pieces: lengths of the gap-free pieces of each chunk. rates: of chunks that are long enough [Hz].
-    """
-
-    chunks: list[Chunk]
-    rates: list[float]
-    notes: list[Diagnostic]
-    digest: str
-    pieces: list[list[int]]
+        chunks: list[Chunk] = []
+        longest: list[int] = []
+        lengths: list[int] = []
+        rates: list[float] = []
+        checks = LogChecks(self.joints, self.joint_types)
+        numbers = hashlib.sha256()
+        for chunk, trajectory in scan(self.files, self.joints, self.mapping, self.joint_types):
+            chunks.append(chunk)
+            longest.append(int(np.diff(gap_ends(trajectory.t, self.gap)).max()))
+            lengths.append(len(trajectory))
+            rates.append(trajectory.sample_rate)
+            checks.add(trajectory)
+            for array in numbers_of(trajectory):
+                numbers.update(array)
+        summary = checks.findings()
+        collect(summary.errors)
+        # the last samples of a recording may be a chunk of their own, too short to tell a rate
+        reliable = np.array(rates)[np.array(lengths) > max(lengths) / 10].tolist()
+        return LogContents(chunks, longest, reliable, summary.notes, numbers.hexdigest())
 
 
 def prepare_streamed(
@@ -66,72 +77,40 @@ def prepare_streamed(
         logs = replace(logs, gap=preprocessing.gap)
     contents = logs.contents
     resolved = preprocessing.resolved(contents.rates)
-    cutting = WindowCutting(choice, resolved)
-    counts = [sum(map(cutting.count, pieces)) for pieces in contents.pieces]
-    usable = np.flatnonzero(counts).tolist()
-    chosen = _split(usable, cutting, choice)
-    training, validating = (list(map(contents.chunks.__getitem__, numbers)) for numbers in chosen)
-    windows = _sample(training, cutting)
+    span = choice.span(resolved)
+    usable = [k for k, longest in enumerate(contents.longest) if longest >= span]
+    if len(usable) < 2:
+        raise LogError(f"no two chunks with {span} samples without a gap", expected="several")
+    assert isinstance(choice.validation, float)
+    size = min(max(1, round(choice.validation * len(usable))), len(usable) - 1)
+    validated = set(np.random.default_rng(choice.seed).permutation(usable)[:size].tolist())
+    training = [contents.chunks[k] for k in usable if k not in validated]
+    validating = [contents.chunks[k] for k in sorted(validated)]
+    windows = _sample(training, resolved, choice)
     message = (
         f"larger than memory: read in {len(contents.chunks)} chunks; validation on {len(validating)} chunks, "
         f"{len(contents.chunks) - len(usable)} have no window"
     )
+    streamed = Diagnostic("info", "streamed", "logs", None, message)
     return TrainingData(
         training=windows,
-        validation=_sample(validating, cutting),
-        size=int(np.take(counts, chosen[0]).sum()),
+        validation=_sample(validating, resolved, choice),
         scales=loss_scales(windows, logs.joint_types),
         preprocessing=resolved,
         training_names=tuple(chunk.name for chunk in training),
         validation_names=tuple(chunk.name for chunk in validating),
-        diagnostics=(
-            *contents.notes,
-            *resolved.diagnostics,
-            Diagnostic("info", "streamed", "logs", None, message),
-        ),
+        diagnostics=(*contents.notes, *resolved.diagnostics, streamed),
         digest=contents.digest,
-        chunks=tuple(contents.chunks),
+        chunks=contents.chunks,
     )
 
 
-def _split(
-    usable: Sequence[int], cutting: WindowCutting, choice: WindowChoice
-) -> tuple[list[int], list[int]]:
-    """Return which chunks are for training and which for validation; chunks without a window are left out."""
-    if len(usable) < 2:
-        raise LogError(f"no two chunks with {cutting.shortest} samples without a gap", expected="several")
-    assert isinstance(choice.validation, float)
-    size = min(max(1, round(choice.validation * len(usable))), len(usable) - 1)
-    validated = set(np.random.default_rng(choice.seed).permutation(usable)[:size].tolist())
-    return [k for k in usable if k not in validated], sorted(validated)
-
-
-def _sample(chunks: Sequence[Chunk], cutting: WindowCutting) -> Windows:
+def _sample(chunks: Sequence[Chunk], preprocessing: Preprocessing, choice: WindowChoice) -> Windows:
     """Return some windows, evenly spread over some chunks, which are evenly spread themselves."""
     chosen = chunks[:: -(-len(chunks) // TUNING.chunks)]
     samples = []
     for chunk in chosen:
-        windows = thinned(cutting.windows([chunk.load()]), max(1, TUNING.windows // len(chosen)))
-        samples.append(joined([windows]))  # a copy: a slice would keep all windows of its chunk
+        windows = choice.windows([chunk.load()], preprocessing)
+        # a copy: a slice would keep all windows of its chunk
+        samples.append(joined([thinned(windows, max(1, TUNING.windows // len(chosen)))]))
     return joined(samples)
-
-
-def _read_once(logs: LargeLogs) -> LogContents:
-    chunks: list[Chunk] = []
-    pieces: list[list[int]] = []
-    rates: list[float] = []
-    checks = LogChecks(logs.joints, logs.joint_types)
-    numbers = hashlib.sha256()
-    for chunk, trajectory in scan(logs.files, logs.joints, logs.mapping, logs.joint_types):
-        chunks.append(chunk)
-        pieces.append(np.diff(gap_ends(trajectory.t, logs.gap)).tolist())
-        rates.append(trajectory.sample_rate)
-        checks.add(trajectory)
-        for array in numbers_of(trajectory):
-            numbers.update(array)
-    summary = checks.findings()
-    collect(summary.errors)
-    # the last samples of a recording may be a chunk of their own, too short to tell a rate
-    lengths = np.array(list(map(sum, pieces)))
-    reliable = np.array(rates)[lengths > lengths.max() / 10].tolist()
-    return LogContents(chunks, reliable, summary.notes, numbers.hexdigest(), pieces)

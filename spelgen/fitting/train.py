@@ -71,7 +71,7 @@ def train(
         options = replace(options, mapping=options.mapping or LogMapping(**record["mapping"]))
         model = run.load_module(trust=trust)
     else:
-        model = _new_model(module, source, trust=trust)
+        model = load_module(module) if source is None else fitted_model(RunFolder(source), trust=trust)
         robot, notes = robot_of(module, urdf, model.facts)
     chosen = config(model, None) if callable(config) else config  # before logs, which may take long to read
     logs = open_logs(model, data, options.mapping, preprocessing)
@@ -83,12 +83,6 @@ def train(
         model, logs, chosen, preprocessing=preprocessing, validation=validation or 0.25, seed=seed or 0, arm=robot,
         folder=folder, options=replace(options, notes=[*options.notes, *notes]),
     )  # fmt: skip
-
-
-def _new_model(module: Path, source: Path | str | None, *, trust: bool) -> EmittedModel:
-    if source is None:
-        return load_module(module)
-    return fitted_model(RunFolder(source), trust=trust)
 
 
 def open_logs(

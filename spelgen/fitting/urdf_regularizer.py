@@ -6,9 +6,8 @@ How M varies with q is compared, not its mean: rotors and loads that the URDF le
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
@@ -22,8 +21,7 @@ if TYPE_CHECKING:
 TUNING = RegularizerTuning()
 
 
-@dataclass(frozen=True, eq=False)
-class UrdfRegularizer:
+class UrdfRegularizer(NamedTuple):
     """Hold the URDF's variation of M and its gravity torque at points q (S, n).
 
     The variation is relative to the model's mean M at the start.
@@ -43,8 +41,7 @@ class UrdfRegularizer:
 
     def to(self, device: str | torch.device) -> UrdfRegularizer:
         """The same on another device."""
-        parts = (self.q, self.whitening, self.variation, self.gravity, self.gravity_scale)
-        return UrdfRegularizer(*(x.to(device) for x in parts))
+        return UrdfRegularizer(*(x.to(device) for x in self))
 
 
 def urdf_regularizer(

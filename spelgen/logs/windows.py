@@ -62,12 +62,6 @@ def joined(batches: Sequence[Windows]) -> Windows:
     return Windows(*map(torch.cat, columns))
 
 
-def window_count(samples: int, window: int, stride: int, decimation: int) -> int:
-    """Return how many windows `cut_windows` cuts from a piece of so many samples."""
-    starts = samples - (window - 1) * decimation
-    return max(0, -(-starts // stride))
-
-
 def cut_windows(
     pieces: Sequence[Trajectory],
     window: int,

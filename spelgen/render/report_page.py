@@ -17,8 +17,8 @@ from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.traces import Traces
 from spelgen.evaluation.verdict import Limits, Verdict, verdict
 from spelgen.files import write_json, write_text
-from spelgen.fitting.objectives import fit_summary
 from spelgen.fitting.run_folder import RunFolder, trained_model
+from spelgen.fitting.servo.report import servo_summary
 from spelgen.labels import UNITS, named_joints
 from spelgen.loaded_arm import LoadedArm
 from spelgen.render.arm_section import arm_section, matrix
@@ -184,7 +184,7 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         coverage=coverage_panels(traces, run.identified, joints, run.limits),
         trained=model is not None,
         under_servos=config.get("mapping", {}).get("input") == "position",
-        summary=fit_summary(config),
+        summary=servo_summary(config),
         parameters=parameter_tables(model, run.arm, run.identified),
         commands=commands(run.folder, run.config),
     )

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from spelgen.errors import shortened
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import figures
-from spelgen.fitting.objectives import fit_summary
 from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.torque.report import terms_in_use
 from spelgen.labels import counted
 from spelgen.listing import number
@@ -35,7 +35,7 @@ def head_numbers(
     if results is not None:
         for figure in figures(results):
             numbers.append((figure.text(), figure.label))
-    summary = fit_summary(config)
+    summary = servo_summary(config)
     if summary is not None:
         numbers.append(summary.headline)
     elif model is not None:

@@ -47,17 +47,12 @@ class LinearServos:
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return positions (K, n) after each interval of each part of a log, from q and qd (parts, n)."""
-        result = []
-        for k, (log, rows) in enumerate(parts):
+        frequency, damping, result = np.array(self.frequency), np.array(self.damping), []
+        for start, speed, (log, rows) in zip(q, qd, parts, strict=True):
             dt = float(np.diff(log.t[rows]).mean())
-            predicted = np.zeros((rows.stop - rows.start - 1, q.shape[1]))
-            for joint, delay in enumerate(self.delay):
-                u = delayed_commands(log, rows, delay, 1)[:, 0, joint] + self.offset[joint]
-                start = q[[k], joint], qd[[k], joint]
-                predicted[:, joint] = _rollout(
-                    *start, u[None], dt, self.frequency[joint], self.damping[joint]
-                )
-            result.append(predicted)
+            columns = [delayed_commands(log, rows, late, 1)[:, 0, k] for k, late in enumerate(self.delay)]
+            u = np.stack(columns, axis=-1) + self.offset
+            result.append(_rollout(start, speed, u, dt, frequency, damping))
         return result
 
 
@@ -77,11 +72,12 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
     late = minimize_scalar(delayed_error, bounds=(0, LATEST), method="bounded").x
     fits = []
     for joint in range(q.shape[2]):
+        column = slice(joint, joint + 1)
 
-        def residuals(x: np.ndarray, joint: int = joint) -> np.ndarray:
-            u = commands(x[2])[..., joint] + x[3]
-            predicted = _rollout(q[:, 0, joint], qd[:, 0, joint], u, dt, *np.exp(x[:2]))
-            result: np.ndarray = (predicted - measured[..., joint])[:, windows.settling :].ravel()
+        def residuals(x: np.ndarray, column: slice = column) -> np.ndarray:
+            u = commands(x[2])[..., column] + x[3]
+            predicted = _rollout(q[:, 0, column], qd[:, 0, column], u, dt, np.exp(x[:1]), np.exp(x[1:2]))
+            result: np.ndarray = (predicted - measured[..., column])[:, windows.settling :].ravel()
             return result
 
         fits.append(least_squares(residuals, START, bounds=BOUNDS, x_scale="jac", max_nfev=30).x)
@@ -92,13 +88,19 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
 
 
 def _rollout(
-    q: np.ndarray, qd: np.ndarray, u: np.ndarray, dt: float, frequency: float, damping: float
+    q: np.ndarray, qd: np.ndarray, u: np.ndarray, dt: float, frequency: np.ndarray, damping: np.ndarray
 ) -> np.ndarray:
-    """Return positions (W, K) from q and qd (W,) under u (W, K): exactly, where a command is held over each step."""
-    system = np.array([[0, 1, 0], [-(frequency**2), -2 * damping * frequency, frequency**2], [0, 0, 0]])
-    step = expm(system * dt)[:2]
-    state, positions = np.stack([q, qd]), np.empty_like(u)
-    for k in range(u.shape[1]):
-        state = step[:, :2] @ state + step[:, 2:] * u[:, k]
-        positions[:, k] = state[0]
+    """Return positions (..., K, n) from q and qd (..., n) under u (..., K, n): exactly, where a command is held over
+    each step.
+    """
+    system = np.zeros((len(frequency), 3, 3))  # of position, velocity and command
+    system[:, 0, 1] = 1.0
+    system[:, 1, 0], system[:, 1, 2] = -(frequency**2), frequency**2
+    system[:, 1, 1] = -2 * damping * frequency
+    step = expm(system * dt)[:, :2]
+    state, positions = np.stack([q, qd, u[..., 0, :]], axis=-1), np.empty_like(u)
+    for k in range(u.shape[-2]):
+        state[..., 2] = u[..., k, :]
+        state[..., :2] = np.einsum("nij,...nj->...ni", step, state)
+        positions[..., k, :] = state[..., 0]
     return positions

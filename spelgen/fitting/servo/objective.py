@@ -7,8 +7,9 @@ that they turn out to have (`laws`); the last has all windows.
 
 from __future__ import annotations
 
+import copy
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -19,30 +20,29 @@ from spelgen.dynamics.bristles import encoder_step
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import digest
 from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
-from spelgen.fitting.levenberg_marquardt import SolverState, levenberg_marquardt
-from spelgen.fitting.objective import FitRequest, FitSummary, PreparedLogs, Status
-from spelgen.fitting.run_record import Content, ReadContent
+from spelgen.fitting.levenberg_marquardt import levenberg_marquardt, start
+from spelgen.fitting.objective import FitRequest, Objective, PreparedLogs, Status
+from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.laws import select_dead_zones, without_faint
 from spelgen.fitting.servo.linear_servos import fit_linear_servos
 from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
-from spelgen.fitting.servo.report import servo_record, servo_summary, solution
+from spelgen.fitting.servo.report import servo_record, solution
 from spelgen.fitting.servo.start import start_servos
 from spelgen.fitting.servo.windows import servo_windows
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.checks import check
-from spelgen.logs.trajectory import Trajectory, require_commands, require_joints
+from spelgen.logs.trajectory import require_commands, require_joints
 from spelgen.settings.tuning.servo import ServoSolverTuning
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
     from spelgen.fitting.progress import TrainingProgress
 
 TUNING = ServoSolverTuning()
 ROUNDS = 3  # on few windows with half the steps; on few, with dead zones; on all
 
 
-class ServoObjective:
+class ServoObjective(Objective):
     """Fit all logs, so that none is left to validate on; each round can be gone on with.
 
     What a round computes with, the bodies' load and the scale of errors, comes of the parameters where it and the
@@ -53,17 +53,21 @@ class ServoObjective:
     input: ClassVar[Literal["torque", "position"]] = "position"
 
     def __init__(self, request: FitRequest) -> None:
-        self.request = request
-        self.history: list[Content] = []
-        self._results: dict[str, object] = {}
+        super().__init__(request)
         self._rounds: list[ServoParameters] = []  # where they began
         self._steps = 0
 
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
-        request = self.request
-        self._logs = _commanded(request.model, request.logs)
-        notes = check(self._logs, request.model.facts.joints, request.model.joint_types)
+        request, model = self.request, self.model
+        if isinstance(request.logs, LargeLogs):
+            expected = "fewer logs, for example every tenth file"
+            raise LogError("logs of positions larger than memory", expected=expected)
+        self._logs = request.logs
+        for log in self._logs:
+            require_joints(log, model.facts.joints)
+            require_commands(log)
+        notes = check(self._logs, model.facts.joints, model.joint_types)
         self._windows = servo_windows(self._logs, request.preprocessing)
         return PreparedLogs(
             config=request.config,
@@ -80,20 +84,18 @@ class ServoObjective:
 
     def begin(self) -> list[Diagnostic]:
         """Start servos by least squares."""
-        model, self._since = self.request.model, time.monotonic()
-        start_servos(model, self._windows)
-        self._start = {name: x.clone() for name, x in model.state_dict().items()}
-        self._problem = self._new_problem()
+        self._since = time.monotonic()
+        start_servos(self.model, self._windows)
+        self._set_up(copy.deepcopy(self.model.state_dict()))
         self._begin_round(self._problem.start)
         return []
 
-    def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
+    def resume(self, checkpoint: Content, history: list[Content]) -> None:
         """Go on from the beginning of the last round."""
         self._since = time.monotonic() - checkpoint["seconds"]
         state = checkpoint["servo"]
-        self._start = state["start"]
-        self.request.model.load_state_dict(self._start)
-        self._problem = self._new_problem()
+        self.model.load_state_dict(state["start"])
+        self._set_up(state["start"])
         self._steps = state["steps"]
         for parameters in state["rounds"]:
             self._begin_round(ServoParameters(**parameters))
@@ -106,11 +108,9 @@ class ServoObjective:
             x, damping = self._rounds[-1], DAMPING.first
             if number > 1:  # near the minimum from where the round before ended
                 damping = TUNING.later_damping
-            cost = problem.cost(x, self._errors)
-            first = SolverState(x, self._errors, cost, damping, self._steps)
             for state in levenberg_marquardt(
                 problem,
-                first,
+                start(problem, x, damping, self._steps),
                 max_steps=TUNING.steps if number < ROUNDS else TUNING.last_steps,
                 least_gain=TUNING.gain,
                 relative_gain=TUNING.relative_gain,
@@ -138,27 +138,16 @@ class ServoObjective:
         problem.write(end)
         record = servo_record(problem, solved, end, self._steps)
         linear = fit_linear_servos(self._windows.thinned(TUNING.sparse_windows))
-        self._results["servo"] = record | {"linear": asdict(linear)}
+        self.results["servo"] = record | {"linear": asdict(linear)}
         self._take_checkpoint(float(np.sqrt(np.square(record["rms"]).mean())))
 
-    @staticmethod
-    def summary(record: ReadContent) -> FitSummary | None:
-        """See `Objective`."""
-        return servo_summary(record)
-
-    def checkpoint(self) -> Content:
-        """Return that of the last round's beginning, or of the end."""
-        return self._checkpoint
-
-    def results(self) -> dict[str, object]:
-        """Return at the end what the logs determine."""
-        return self._results
-
-    def _new_problem(self) -> ServoProblem:
+    def _set_up(self, start: Content) -> None:
+        """Take the model as it is, with these weights, for where the fit starts."""
+        self._start = start
         steps = np.max([encoder_step(log.q) for log in self._logs], axis=0)
         # the standard deviation of an encoder's rounding, at the least of a hundredth of a milliradian
         noise = torch.from_numpy(steps).clamp(min=1e-5) / 12**0.5
-        return ServoProblem(self.request.model, self._windows.thinned(TUNING.sparse_windows), noise)
+        self._problem = ServoProblem(self.model, self._windows.thinned(TUNING.sparse_windows), noise)
 
     def _begin_round(self, x: ServoParameters) -> None:
         problem = self._problem
@@ -169,21 +158,20 @@ class ServoObjective:
             problem.windows = replace(problem.windows, steps=self._windows.steps)
         if self._rounds:
             problem.linearise(x, problem.predicted_path(x))
-        self._errors = problem.residuals(x)
-        problem.weigh(self._errors)
+        errors = problem.residuals(x)
+        problem.weigh(errors)
         problem.write(x)  # for the checkpoint: an interrupted fit is usable
         self._rounds.append(x)
         self._first_steps = self._steps
-        self._take_checkpoint(float(self._errors.square().mean().sqrt()))
+        self._take_checkpoint(float(errors.square().mean().sqrt()))
 
     def _take_checkpoint(self, rms: float) -> None:
-        weights = {name: x.clone() for name, x in self.request.model.state_dict().items()}
         self._checkpoint = {
             "epoch": 0,
             "step": self._steps,
             "best_epoch": 0,
             "best_loss": rms,
-            "best_weights": weights,
+            "best_weights": copy.deepcopy(self.model.state_dict()),
             "seconds": time.monotonic() - self._since,
             "substeps": self._windows.steps,
             "servo": {
@@ -192,14 +180,3 @@ class ServoObjective:
                 "steps": self._first_steps,
             },
         }
-
-
-def _commanded(model: EmittedModel, logs: Sequence[Trajectory] | LargeLogs) -> Sequence[Trajectory]:
-    """Return the logs, which hold commands. Raises LogError where they do not."""
-    if isinstance(logs, LargeLogs):
-        expected = "fewer logs, for example every tenth file"
-        raise LogError("logs of positions larger than memory", expected=expected)
-    for log in logs:
-        require_joints(log, model.facts.joints)
-        require_commands(log)
-    return logs

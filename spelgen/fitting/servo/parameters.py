@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch.autograd.functional import jacobian
 from torch.func import functional_call
@@ -17,12 +20,9 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 TUNING = ServoPriorTuning()
-# of all joints, whatever part of a model holds them
-KINDS = ("stiffness", "damping", "armature", "offset")
-FRICTION_KINDS = ("load_dependence", "fractions", "dead_zone")
 DEAD_ZONE = "servo.dead_zone"
 COULOMB = "friction.raw_coulomb"
-STRIBECK, STRIBECK_VELOCITY = "friction.raw_stribeck", "friction.raw_stribeck_velocity"
+STRIBECK_VELOCITY = "friction.raw_stribeck_velocity"
 FIXED = 1e-9  # deviation of a parameter that is not fitted
 
 
@@ -65,17 +65,14 @@ class ParameterRows:
         self._n = model.n
         tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         # a drive's viscous friction and kd are one number: kd has it all
-        names: list[str] = []
-        for kind in KINDS:
-            names += parameters_of_kind(model, kind)
-        names += [COULOMB, STRIBECK, STRIBECK_VELOCITY]
-        for kind in FRICTION_KINDS:
-            names += parameters_of_kind(model, kind)
-        self.tensors = {name: tensors[name] for name in names}
-        self._widths = {name: x[:1].numel() for name, x in self.tensors.items()}
-        self.names: list[str] = []
-        for name, width in self._widths.items():
-            self.names += width * [name]
+        rows = [
+            *(parameters_of_kind(model, kind) for kind in ("stiffness", "damping", "armature", "offset")),
+            (COULOMB, "friction.raw_stribeck", STRIBECK_VELOCITY),
+            *(parameters_of_kind(model, kind) for kind in ("load_dependence", "fractions", "dead_zone")),
+        ]
+        self.tensors = {name: tensors[name] for name in chain(*rows)}
+        self._widths = [x[:1].numel() for x in self.tensors.values()]
+        self.names = np.repeat(list(self.tensors), self._widths).tolist()
         always = torch.tensor([name != DEAD_ZONE for name in self.names])
         self.active = always.unsqueeze(-1).expand(-1, model.n)  # (p, n), at the start
         deviations = torch.full((len(self.names), 1), TUNING.logarithm).double()
@@ -94,7 +91,7 @@ class ParameterRows:
 
     def named(self, joints: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return (P, p, n) as the model's tensors by name, each (P, 1, n) or (P, 1, n, K)."""
-        parts = joints.unsqueeze(1).mT.split(list(self._widths.values()), dim=-1)  # (P, 1, n, K)
+        parts = joints.unsqueeze(1).mT.split(self._widths, dim=-1)  # (P, 1, n, K)
         named = {}
         for (name, tensor), part in zip(self.tensors.items(), parts, strict=True):
             named[name] = part.reshape(*part.shape[:2], *tensor.shape)
@@ -123,28 +120,18 @@ def body_directions(model: EmittedModel, q: torch.Tensor) -> torch.Tensor:
     """Return directions of the bodies' parameters that change gravity at q (M, n) most, (10 B, r), each as long as its
     standard deviation.
     """
-    zero = torch.zeros_like(q)
+    raw, zero = body_parameters(model).detach(), torch.zeros_like(q)
+    # torch.func's jacobians import a compiler for more than a second
+    slopes = jacobian(partial(inertial_parameters, model), raw)
     with torch.no_grad():
-        gravity = regressor_of(model.chain, q, zero, zero) @ inertial_slopes(model)
+        gravity = regressor_of(model.chain, q, zero, zero) @ slopes.reshape(raw.numel(), -1)
     _, sizes, directions = torch.linalg.svd(gravity.flatten(0, 1), full_matrices=False)
     strong = sizes[: TUNING.body_directions] > 1e-3 * sizes[:1].clamp(min=1e-12)
     result: torch.Tensor = TUNING.bodies * directions[: len(strong)][strong].mT
     return result
 
 
-def inertial_slopes(model: EmittedModel) -> torch.Tensor:
-    """Return the derivative of the ten parameters of all bodies by the parameters that are trained, (10 B, 10 B)."""
-    raw = body_parameters(model).detach()
-
-    def inertial(trained: torch.Tensor) -> torch.Tensor:
-        return inertial_parameters(model, trained)
-
-    # torch.func's jacobians import a compiler for more than a second
-    slopes: torch.Tensor = jacobian(inertial, raw)
-    return slopes.reshape(raw.numel(), raw.numel())
-
-
 def inertial_parameters(model: EmittedModel, raw: torch.Tensor) -> torch.Tensor:
-    """Return the ten parameters of all bodies, (B, 10), made of trained ones (B, 10)."""
+    """Return the ten parameters of all bodies, (..., B, 10), made of trained ones (..., B, 10)."""
     parameters: torch.Tensor = functional_call(model.bodies, {"raw": raw}, ())
     return parameters

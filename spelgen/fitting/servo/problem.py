@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from spelgen.dynamics.servo_rollout import Load, ServoDrives, advanced, balanced, servo_drives
-from spelgen.fitting.functional_model import FunctionalModel
+from spelgen.fitting.functional_model import under_weights
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo.parameters import (
     ParameterRows,
@@ -80,7 +80,6 @@ class ServoProblem:
         self.model, self.windows, self._noise = model, windows, noise
         self.rows = ParameterRows(model)
         self.nudge = TUNING.nudge
-        self._functional = FunctionalModel(model)
         q = windows.q.flatten(0, 1)
         self.directions = body_directions(model, q[:: max(1, len(q) // GRAVITY_SAMPLES)])
         self._raw_bodies = body_parameters(model).detach().clone()
@@ -196,22 +195,14 @@ class ServoProblem:
         named = self.rows.named(joints)
         tensors = {name: tensor.detach() for name, tensor in named.items()}
         with torch.inference_mode():  # small operations, of which each takes a tenth less so
-            drives, armature = self._functional.under(tensors, _drives)
-            change = torch.einsum("wkni,pi->pwkn", self.load.slopes, self._changed(bodies))
+            drives, armature = under_weights(self.model, tensors, _drives)
+            inertial = inertial_parameters(self.model, self._bodies_at(bodies)).flatten(1)
+            change = torch.einsum("wkni,pi->pwkn", self.load.slopes, inertial - self._inertial)
             return self._integrate(drives, armature, change, commands)
 
-    def _changed(self, bodies: torch.Tensor) -> torch.Tensor:
-        """Return by how much inertial parameters differ from those of the load, (P, 10 B), at bodies (P, r)."""
-        distinct, which = bodies.unique(dim=0, return_inverse=True)
-        changes = []
-        for point in distinct:
-            inertial = inertial_parameters(self.model, self._bodies_at(point))
-            changes.append(inertial.flatten() - self._inertial)
-        return torch.stack(changes)[which]
-
     def _bodies_at(self, bodies: torch.Tensor) -> torch.Tensor:
-        """Return the bodies' raw parameters, (B, 10), this far (r,) along their directions."""
-        return self._raw_bodies + (self.directions @ bodies).view_as(self._raw_bodies)
+        """Return the bodies' raw parameters, (..., B, 10), this far (..., r) along their directions."""
+        return self._raw_bodies + torch.unflatten(bodies @ self.directions.mT, -1, self._raw_bodies.shape)
 
     def _integrate(
         self, drives: ServoDrives, armature: torch.Tensor, change: torch.Tensor, commands: torch.Tensor

@@ -1,38 +1,42 @@
-"""Report what logs of commanded positions determine: ratios to kp with intervals, and what they leave open."""
+"""Report what logs of commanded positions determine: ratios to kp with intervals, and what they leave open.
+
+Errors of neighbouring samples are alike, and those of one motion are: what a model lacks shows otherwise in another. So
+what a log says is taken as one observation (the jackknife of a weighted least squares; one step without each log, see
+Cameron and Miller, J. Human Resources 50:317, 2015, CV3). What logs do not determine stays as unsure as the prior.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any
 
 import torch
 from scipy.special import stdtrit
 
-from spelgen.fitting.functional_model import FunctionalModel
+from spelgen.fitting.functional_model import under_weights
 from spelgen.fitting.levenberg_marquardt import NormalEquations
-from spelgen.fitting.objective import FitSummary
-from spelgen.fitting.servo.intervals import TUNING, by_stretch, covariance, identifiable
 from spelgen.fitting.servo.laws import sliding_friction
 from spelgen.fitting.servo.parameters import DEAD_ZONE, ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
 from spelgen.listing import Listing, number
+from spelgen.settings.tuning.servo import ServoIntervalTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
+TUNING = ServoIntervalTuning()
 QUANTILE = 0.975  # of an interval of 95 %, of Student's t: windows are few
-UNITS = {"kd": "s", "armature": "s^2", "dry": "rad, m", "static_error": "rad, m"}
-"""The ratios to kp, and their units; dry: friction of a joint that slides, over what it slid; static_error: dry and
-half the dead zone, together."""
-LABELS = {
-    "kd": "kd/kp",
-    "armature": "armature/kp",
-    "dry": "dry/kp",
-    "static_error": "static error",
-    "dead_zone": "half dead zone",
+RATIOS = {
+    "kd": ("kd/kp", "s"),
+    "armature": ("armature/kp", "s^2"),
+    "dry": ("dry/kp", "rad, m"),
+    "static_error": ("static error", "rad, m"),
+    "dead_zone": ("half dead zone", "rad, m"),
 }
+"""The ratios to kp, with labels and units; dry: friction of a joint that slides, over what it slid; static_error: dry
+and half the dead zone, together."""
 ABOUT = (
     "divided by kp, with half a 95 % interval. kp itself is scaled by the URDF's masses, unless it is known. kd is the "
     "sum of kd and viscous friction, which such logs do not distinguish. dry: dry friction; open where it cannot be "
@@ -40,20 +44,20 @@ ABOUT = (
 )
 
 
-class Interval(TypedDict):
-    """Hold a ratio with its interval of 95 %; determined: whether this is narrow enough to be of use."""
-
-    unit: str
-    value: float
-    low: float
-    high: float
-    determined: bool
+Record = dict[str, Any]
+"""What config.json holds of a fit of servos, or a part of it."""
 
 
-JointRecord = dict[str, Any]
-"""The joint's name, its kp, and an `Interval` for each ratio."""
-ServoRecord = Mapping[str, Any]
-"""What config.json holds of a fit of servos."""
+@dataclass(frozen=True)
+class FitSummary:
+    """Hold what a fit determined, for people.
+
+    text: for a terminal. listing: parameters with their intervals. headline: the first figure, and what it is.
+    """
+
+    text: str
+    listing: Listing
+    headline: tuple[str, str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +95,43 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     return end, ServoSolution(windows, precision, covariance(windows, precision, step))
 
 
+def by_stretch(windows: NormalEquations, stretches: torch.Tensor) -> NormalEquations:
+    """Return the sums of windows' normal equations (W, ...) over the stretches that these are of, (W,)."""
+
+    def summed(terms: torch.Tensor) -> torch.Tensor:
+        sums = terms.new_zeros(int(stretches.max()) + 1, *terms.shape[1:])
+        return sums.index_add(0, stretches, terms)
+
+    return NormalEquations(*map(summed, windows))
+
+
+def covariance(windows: NormalEquations, precision: torch.Tensor, halved: torch.Tensor) -> torch.Tensor:
+    """Return that of the unknowns, (k, k): S^-1 (B + P) S^-1, of which the jackknife gives the first term, P is the
+    prior's; and as much as they changed when steps were halved (k,).
+    """
+    count, prior = len(windows.curvature), torch.diag(precision)
+    total = windows.curvature.sum(dim=0) + prior
+    # where the fit ended, the slopes of all windows and of the prior add up to nothing
+    shifts = torch.linalg.solve(total - windows.curvature, -windows.descent.unsqueeze(-1)).squeeze(-1)
+    shifts = shifts - shifts.mean(dim=0)
+    inverse = torch.linalg.inv(total)
+    jackknife = (count - 1) / count * shifts.mT @ shifts
+    result: torch.Tensor = jackknife + inverse @ prior @ inverse + torch.outer(halved, halved)
+    return result
+
+
+def identifiable(windows: NormalEquations, precision: torch.Tensor, unknowns: torch.Tensor) -> torch.Tensor:
+    """Return whether windows tell these unknowns (m,) from all others, by their variance inflation factors, (m,).
+
+    Of joints that gravity does not load the slopes of errors by a dead zone and by dry friction are the same but for a
+    factor, and what is linear in them says nothing of the one without the other.
+    """
+    curvature = windows.curvature.sum(dim=0)
+    inverse = torch.linalg.inv(curvature + torch.diag(precision))
+    inflation: torch.Tensor = (curvature.diagonal() * inverse.diagonal())[unknowns]
+    return inflation < TUNING.variance_inflation
+
+
 def ratios(model: EmittedModel, qd: torch.Tensor, gravity: torch.Tensor) -> dict[str, torch.Tensor]:
     """Return the ratios to kp, each (n,), of a model that moved at qd under gravity's torques, (..., n)."""
     dead_zone = model.servo.dead_zone
@@ -110,8 +151,7 @@ def ratios_with_deviations(
     """Return the ratios to kp, and the standard deviations of their logarithms, each (n,)."""
     tensors = {name: x.detach().clone().requires_grad_() for name, x in problem.rows.tensors.items()}
     qd, gravity = problem.along.qd, problem.load.gravity
-    functional = FunctionalModel(problem.model)
-    values = functional.under(tensors, lambda model: ratios(model, qd, gravity))
+    values = under_weights(problem.model, tensors, lambda model: ratios(model, qd, gravity))
     p, n = problem.start.joints.shape
     blocks = solution.covariance[: p * n, : p * n].view(p, n, p, n).diagonal(dim1=1, dim2=3)  # (p, p, n)
     result = {}
@@ -126,106 +166,86 @@ def ratios_with_deviations(
     return result
 
 
-def joint_records(problem: ServoProblem, solution: ServoSolution) -> list[JointRecord]:
-    """Return by joint kp, and the ratios to it with intervals."""
-    model, joints = problem.model, []
+def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Record:
+    """Return for config.json: delay [s], errors [rad, m], and by joint kp and the ratios to it with intervals of 95 %.
+
+    determined: whether an interval is narrow enough to be of use.
+    """
+    return {
+        "delay": {"value": x.delay, "half": solution.quantile * float(solution.covariance[-1, -1].sqrt())},
+        "rms": problem.residuals(x).square().mean(dim=(0, 1)).sqrt().tolist(),
+        "steps": steps,
+        "joints": _joint_records(problem, solution),
+    }
+
+
+def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Record]:
+    model, records = problem.model, []
     values = ratios_with_deviations(problem, solution)
     dead_zones = problem.rows.row(DEAD_ZONE) * model.n + torch.arange(model.n)
     distinct = identifiable(solution.windows, solution.precision, dead_zones).tolist()
     for joint, name in enumerate(model.facts.joints):
-        known = not float(model.servo.trained[joint])
-        record: JointRecord = {
-            "joint": name,
-            "kp": {"value": float(model.kp[joint].detach()), "known": known},
-        }
-        for ratio, (value, deviation) in values.items():
-            if ratio == "dead_zone" and not value[joint]:  # a law that this joint has not
+        kp = {"value": float(model.kp[joint].detach()), "known": not float(model.servo.trained[joint])}
+        record: Record = {"joint": name, "kp": kp}
+        for ratio, (of_joints, deviations) in values.items():
+            value = float(of_joints[joint])
+            if ratio == "dead_zone" and not value:  # a law that this joint has not
                 continue
-            half = solution.quantile * math.hypot(TUNING.law_deviation, float(deviation[joint]))
-            interval = _interval(UNITS.get(ratio, "rad, m"), float(value[joint]), half)
-            # each by itself, while their sum, the static error, is determined anyway
-            if ratio in ("dry", "dead_zone"):
-                interval["determined"] &= distinct[joint]
-            record[ratio] = interval
-        joints.append(record)
-    return joints
+            half = solution.quantile * math.hypot(TUNING.law_deviation, float(deviations[joint]))
+            factor = math.exp(min(half, 50.0))  # which is open by far, and does not overflow
+            # dry friction and dead zone each by itself, while their sum, the static error, is determined anyway
+            determined = factor < TUNING.open_factor and (
+                distinct[joint] or ratio not in ("dry", "dead_zone")
+            )
+            record[ratio] = {
+                "unit": RATIOS[ratio][1],
+                "value": value,
+                "low": value / factor,
+                "high": value * factor,
+                "determined": determined,
+            }
+        records.append(record)
+    return records
 
 
-def _interval(unit: str, value: float, half: float) -> Interval:
-    """Return that of a logarithm's half width."""
-    factor = math.exp(min(half, 50.0))  # which is open by far, and does not overflow
-    determined = factor < TUNING.open_factor
-    return Interval(unit=unit, value=value, low=value / factor, high=value * factor, determined=determined)
-
-
-def servo_record(
-    problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int
-) -> dict[str, Any]:
-    """Return for config.json: delay [s], errors [rad, m], and by joint kp and the ratios to it with intervals."""
-    half = solution.quantile * float(solution.covariance[-1, -1].sqrt())
-    return {
-        "delay": {"value": x.delay, "half": half},
-        "rms": problem.residuals(x).square().mean(dim=(0, 1)).sqrt().tolist(),
-        "steps": steps,
-        "joints": joint_records(problem, solution),
-    }
-
-
-def servo_summary(config: ServoRecord) -> FitSummary | None:
-    """Return what a fit determined; config: what config.json holds, of a fit that is over."""
+def servo_summary(config: Mapping[str, Any]) -> FitSummary | None:
+    """Return what a fit determined; None for contents of config.json of a fit that is not over, or of no servos."""
     if "servo" not in config:
         return None
     record = config["servo"]
-    listing = servo_listing(record)
-    listing = replace(listing, note=f"{listing.note} {open_text(record)}.")
-    return FitSummary(servo_text(record), listing, (delay_text(record), "delay of the commands"))
-
-
-def servo_text(record: ServoRecord) -> str:
-    """Return for a terminal: delay, ratios with intervals, and what the logs left open."""
+    listing = _listing(record)
+    delay = f"{1000 * record['delay']['value']:.1f} ms, +- {1000 * record['delay']['half']:.1f} ms"
     errors = ", ".join(number(1000 * rms) for rms in record["rms"])
-    return "\n".join(
-        [
-            f"delay {delay_text(record)}",
-            f"errors on training windows, RMS by joint: {errors} mrad",
-            servo_listing(record).text(),
-            open_text(record),
-        ]
-    )
+    undetermined = _undetermined(record)
+    text = f"delay {delay}\nerrors on training windows, RMS by joint: {errors} mrad\n{listing.text()}\n{undetermined}"
+    listing = replace(listing, note=f"{listing.note} {undetermined}.")
+    return FitSummary(text, listing, (delay, "delay of the commands"))
 
 
-def delay_text(record: ServoRecord) -> str:
-    """Return the delay with its interval."""
-    delay = record["delay"]
-    return f"{1000 * delay['value']:.1f} ms, +- {1000 * delay['half']:.1f} ms"
-
-
-def servo_listing(record: ServoRecord) -> Listing:
+def _listing(record: Record) -> Listing:
     """Return by joint kp, and the ratios to it with intervals; half dead zones too, where a joint has one."""
-    columns = [*UNITS]
-    if any("dead_zone" in joint for joint in record["joints"]):
-        columns.append("dead_zone")
+    columns = [ratio for ratio in RATIOS if any(ratio in joint for joint in record["joints"])]
     rows = []
     for joint in record["joints"]:
         cells = [_shown(joint.get(column)) for column in columns]
         rows.append((joint["joint"], number(joint["kp"]["value"]), *cells))
-    head = ["joint", "kp [Nm/rad]"]
-    head += [f"{LABELS[column]} [{UNITS.get(column, 'rad, m')}]" for column in columns]
-    return Listing("Servos", tuple(head), tuple(rows), f"All columns but kp are {ABOUT}.")
+    head = ("joint", "kp [Nm/rad]", *("{} [{}]".format(*RATIOS[column]) for column in columns))
+    return Listing("Servos", head, tuple(rows), f"All columns but kp are {ABOUT}.")
 
 
-def open_text(record: ServoRecord) -> str:
-    """Return what the logs leave open."""
+def _undetermined(record: Record) -> str:
+    """Return what the logs leave open, dead zones apart."""
     names = []
     for joint in record["joints"]:
-        left = (ratio for ratio in UNITS if not joint[ratio]["determined"])
-        names += [f"{LABELS[ratio]} of {joint['joint']}" for ratio in left]
+        for ratio, (label, _) in RATIOS.items():
+            if ratio != "dead_zone" and not joint[ratio]["determined"]:
+                names.append(f"{label} of {joint['joint']}")
     if not names:
         return "All ratios are determined"
     return f"Not determined by these logs: {', '.join(names)}"
 
 
-def _shown(interval: Interval | None) -> str:
+def _shown(interval: Record | None) -> str:
     if interval is None:
         return "none"
     if not interval["determined"]:

@@ -6,7 +6,6 @@ motion is a hundredth of a radian away, and as far off is what the arm weighs th
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -60,39 +59,37 @@ class ServoWindows:
 
     def thinned(self, count: int) -> ServoWindows:
         """Return at most so many of the windows, evenly spread, with half the steps."""
-        some = slice(None, None, -(-len(self.q) // count))
+        rows = slice(None, None, -(-len(self.q) // count))
         return ServoWindows(
-            self.parts[some], self.q[some], self.qd[some], self.dt[some], self.settling, -(-self.steps // 2)
+            self.parts[rows], self.q[rows], self.qd[rows], self.dt[rows], self.settling, -(-self.steps // 2)
         )
 
     def stretches(self, logs: int, count: int) -> torch.Tensor:
         """Return the number (W,) of the stretch that each window is of: logs, or where there are fewer than so many,
         equal parts of them, at least ``count``.
         """
-        sizes = Counter(log.name for log, _ in self.parts)
-        cuts = 1 if len(sizes) >= logs else -(-count // len(sizes))
-        numbers: dict[tuple[str, int], int] = {}
-        passed: Counter[str] = Counter()
-        result = []
-        for log, _ in self.parts:
-            stretch = log.name, passed[log.name] * cuts // sizes[log.name]
-            passed[log.name] += 1
-            result.append(numbers.setdefault(stretch, len(numbers)))
-        return torch.tensor(result)
+        names, log_numbers = np.unique([log.name for log, _ in self.parts], return_inverse=True)
+        cuts = 1 if len(names) >= logs else -(-count // len(names))
+        stretches = log_numbers * cuts
+        for number in range(len(names)):
+            windows = np.flatnonzero(log_numbers == number)
+            stretches[windows] += np.arange(len(windows)) * cuts // len(windows)
+        # of a log with fewer windows than cuts, some stretches have none
+        return torch.from_numpy(np.unique(stretches, return_inverse=True)[1])
 
     def path(self, q: torch.Tensor | None = None, qd: torch.Tensor | None = None) -> Path:
         """Return the measured motion.
 
         q, qd: predicted, of which only what they miss is smoothed: so fast motion stays.
         """
-        missed = self.q if q is None else self.q - q
-        slow = (derivative(missed.numpy(), self.rate, order) for order in (1, 2))
-        slow_qd, slow_qdd = map(torch.from_numpy, slow)
-        path = Path(_midpoints(self.q), _midpoints(slow_qd), _midpoints(slow_qdd))
-        if qd is None:
-            return path
+        if q is None or qd is None:
+            q = qd = torch.zeros_like(self.q)
+        missed = (self.q - q).numpy()
+        slow_qd, slow_qdd = (torch.from_numpy(derivative(missed, self.rate, order)) for order in (1, 2))
         acceleration = qd.diff(dim=1) / self.dt.unsqueeze(-1)
-        return Path(path.q, path.qd + _midpoints(qd), path.qdd + acceleration)
+        return Path(
+            _midpoints(self.q), _midpoints(slow_qd) + _midpoints(qd), _midpoints(slow_qdd) + acceleration
+        )
 
     def commands(self, delay: float) -> torch.Tensor:
         """Return those of ``delay`` [s] ago, over the steps between samples (W, K-1, S, n)."""

@@ -62,7 +62,9 @@ def fit_torque(
     subset = samples.thinned(TUNING.subset)
     if adapt is None:
         bound_friction(model, subset.columns)
-    problem = TorqueProblem(TorqueJacobian(model, subset), prior or _default_prior(adapt), adapt)
+    if prior is None:
+        prior = TUNING.priors[adapt] if adapt else GaussianPrior()
+    problem = TorqueProblem(TorqueJacobian(model, subset), prior, adapt)
     select_memory = adapt is None and model.elements > 0
     if select_memory:
         model.friction.memoryless.fill_(1.0)
@@ -93,16 +95,6 @@ def _most_samples(model: EmittedModel) -> int:
     """Return how many samples there may be: their two regressors stay in memory from step to step."""
     numbers = 2 * model.n * model.inertial_parameters.numel()
     return max(TUNING.subset, int(TUNING.regressor_bytes / (8 * numbers)))
-
-
-def _default_prior(adapt: Adaptation | None) -> GaussianPrior:
-    if adapt is None:
-        return GaussianPrior()
-    return {
-        "load": TUNING.prior_of_load,
-        "friction": TUNING.prior_of_friction,
-        "unit": TUNING.prior_of_unit,
-    }[adapt]
 
 
 def _with_residuals(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -11,10 +10,9 @@ from torch.autograd import grad as gradient
 
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.residuals import friction_factor, residual_torque
-from spelgen.fitting.functional_model import FunctionalModel, Weights
-from spelgen.fitting.torque.body_steps import moved_bodies
+from spelgen.fitting.functional_model import Weights, under_weights
 from spelgen.fitting.torque.samples import Block, TorqueSamples
-from spelgen.fitting.torque.weights import RigidWeights, joint_torque
+from spelgen.fitting.torque.weights import RigidWeights, joint_torque, moved_bodies
 from spelgen.settings.tuning.fitting import TorqueTuning
 
 if TYPE_CHECKING:
@@ -24,16 +22,12 @@ TUNING = TorqueTuning()
 LOGARITHMS = ("armature", "sizes", "effects", "load_dependence")
 
 
-@dataclass(frozen=True, eq=False)
-class _Samples:
+class _Samples(NamedTuple):
     """Samples (T, n) with the drives' motion, and the regressors (T, n, 10 B) of torque and of the gravity torque that
     the drives bear. residual: (T, n) torque of what stands beside rigid bodies. factor: (T, n) on friction.
-    direction: (T, n) of dry friction without memory; None: as the speed has it.
     """
 
     measured: Block
-    z: torch.Tensor | None
-    direction: torch.Tensor | None
     speed: torch.Tensor
     acceleration: torch.Tensor
     regressor: torch.Tensor
@@ -86,11 +80,7 @@ class TorqueJacobian:
         self.model: Any = model
         self.samples = samples
         self.rigid = RigidWeights(model)
-        self._functional = FunctionalModel(model)
-        of_bodies = {
-            name: torch.full_like(x, name == self.rigid.bodies) for name, x in self.rigid.start.items()
-        }
-        self._of_bodies = self.rigid.flattened(of_bodies) > 0
+        self._of_bodies = self.rigid.mask("bodies")
         self._drives = self.model.motors != 0  # (n, n): whether a drive moves a joint
         self._moves = self._moved_joints()
         self._colours = _colours(self._drives.double().mT @ self._drives.double() > 0)
@@ -99,7 +89,7 @@ class TorqueJacobian:
     def squares(self, x: torch.Tensor) -> torch.Tensor:
         """Return sums of squares (n,) of the missing torque [Nm^2, N^2], as logged where gains are trained."""
         weights = self.rigid.named(x)
-        total = torch.zeros(self.samples.joints).double()
+        total = torch.zeros(self.model.n).double()
         with torch.no_grad():
             for block in self._blocks:
                 total += (self._missing(weights, block)[0] * self._per_gain(weights)).square().sum(dim=0)
@@ -110,7 +100,7 @@ class TorqueJacobian:
         return self._per_gain(self.rigid.named(x)).detach()
 
     def _per_gain(self, weights: Weights) -> torch.Tensor:
-        ones = torch.ones(self.samples.joints).double()
+        ones = torch.ones(self.model.n).double()
         for name in self.rigid.of_kind("gains"):  # logarithms of gains between logged and joint torques
             change = weights[name] - self.rigid.start[name]
             return ones.expand(*change.shape[:-1], -1).index_copy(-1, self.model.gain_rows, (-change).exp())
@@ -171,9 +161,8 @@ class TorqueJacobian:
         weights, blocks = self.rigid.named(x), []
         with torch.no_grad():
             for block in self._blocks:
-                missing, friction = self._missing(weights, block)
-                q, qd, qdd, _, _ = block.measured
-                blocks.append(ResidualSamples(q, qd, qdd, missing, friction))
+                motion = block.measured[:3]
+                blocks.append(ResidualSamples(*motion, *self._missing(weights, block)))
         return ResidualSamples(*(torch.cat(column) for column in zip(*blocks, strict=True)))
 
     def response(self, x: torch.Tensor, noise: torch.Tensor, covariance: torch.Tensor) -> RigidResponse:
@@ -191,21 +180,6 @@ class TorqueJacobian:
         """Return standard deviations (n,) of the measured torque, as the joints feel it."""
         return joint_torque(self.model, self.samples.columns).std(dim=0)
 
-    def by_velocity(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return of the missing torque the slope by velocity (n,) [Nm s/rad, N s/m], how much of its sum of squares
-        this line explains (n,), and how large that is, as a root mean square (n,) [Nm, N].
-        """
-        weights = self.rigid.named(x)
-        sums = torch.zeros(3, self.samples.joints).double()
-        with torch.no_grad():
-            for block in self._blocks:
-                tau, qd = self._missing(weights, block)[0], block.measured.qd
-                sums += torch.stack([tau * qd, qd * qd, tau * tau]).sum(dim=1)
-        products, speeds, squares = sums
-        slope = products / speeds.clamp(min=1e-300)
-        size = (slope * products / self.samples.count).sqrt()
-        return slope, slope * products / squares.clamp(min=1e-300), size
-
     def moved(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """Return the weights (K,) after a step, which goes straight where torques do: in the bodies' inertial
         parameters, and in what grows of the quantities whose logarithms are weights.
@@ -222,16 +196,12 @@ class TorqueJacobian:
         return self.rigid.flattened(weights)
 
     def _with_regressors(self, block: Block) -> _Samples:
-        q, qd, qdd, _, z = block
-        rest = torch.zeros_like(q)
-        model = self.model
-        elements, columns = model.elements, z.shape[-1]
+        model, q, qd, qdd = self.model, block.q, block.qd, block.qdd
+        still = torch.zeros_like(q)
         with torch.no_grad():
-            gravity_regressor = regressor_of(model.chain, q, rest, rest)
+            gravity_regressor = regressor_of(model.chain, q, still, still)
             return _Samples(
                 measured=block,
-                z=z[..., :elements] if columns else None,
-                direction=z[..., elements] if columns > elements else None,
                 speed=qd @ model.motors.mT,
                 acceleration=qdd @ model.motors.mT,
                 regressor=regressor_of(model.chain, q, qd, qdd),
@@ -254,7 +224,7 @@ class TorqueJacobian:
 
     def _inertial_parameters(self, weights: Weights) -> torch.Tensor:
         """Return the ten parameters of all bodies (B, 10)."""
-        parameters: torch.Tensor = self._functional.under(weights, lambda model: model.inertial_parameters)
+        parameters: torch.Tensor = under_weights(self.model, weights, lambda model: model.inertial_parameters)
         return parameters
 
     def _missing(
@@ -264,18 +234,18 @@ class TorqueJacobian:
 
         load: gravity torque that the drives bear (T, n); None: that of the weights.
         """
-        _, qd, _, tau, _ = samples.measured
+        measured = samples.measured
 
         def torques(model: Any) -> tuple[torch.Tensor, torch.Tensor]:
             constants, parameters = model.friction.prepare(), model.inertial_parameters.flatten()
             borne = samples.load_regressor @ parameters if load is None else load
-            friction = model.friction(samples.speed, borne, constants, samples.z, samples.direction)
+            friction = model.friction(samples.speed, borne, constants, measured.z, measured.direction)
             friction = samples.factor * friction
             of_drives = friction + model.armature * samples.acceleration
-            force = model.input_force(None, qd, tau) - samples.residual
+            force = model.input_force(None, measured.qd, measured.tau) - samples.residual
             return force - samples.regressor @ parameters - of_drives @ model.motors, friction
 
-        missing, friction = self._functional.under(weights, torques)
+        missing, friction = under_weights(self.model, weights, torques)
         return missing, friction
 
     def _joint_slope(

@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import torch
 
 from spelgen.fitting.optimizers import minimise
 from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import DEFAULTS, Adaptation
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-PARTS: dict[Adaptation, tuple[str, ...]] = {
-    "load": ("mass", "potential"),
-    "friction": ("friction",),
-    "unit": (),
+MOVING: dict[Adaptation, tuple[str, ...]] = {
+    "load": ("mass.", "potential."),
+    "friction": ("friction.",),
+    "unit": ("",),
 }
-"""The parts of a model whose weights an adaptation moves; a unit's are all."""
+"""How the names of weights begin that an adaptation moves."""
 BLOCK = 2**16  # samples in memory with all that their gradient needs
 
 
 def fit_networks(
     model: EmittedModel,
-    samples: TorqueSamples | Sequence[DynamicsSamples],
+    samples: TorqueSamples,
     weight_decay: float = DEFAULTS.lbfgs_decay,
     penalty: Callable[[], torch.Tensor | float] | None = None,
     evaluations: int = 2000,
@@ -36,26 +35,24 @@ def fit_networks(
     The error of each joint is told in standard deviations of its torque. weight_decay: see ``LBFGS``; penalty: what
     else is to be small, the distance from a URDF for one.
     """
-    if not isinstance(samples, TorqueSamples):
-        samples = TorqueSamples.of(samples)
-    count, joints = samples.count, samples.joints
+    count, joints = samples.columns.tau.shape
     scale = samples.columns.tau.std(dim=0)
     scale = torch.maximum(scale, 1e-2 * scale.amax())
 
     def missed() -> Iterator[torch.Tensor]:
-        for number, (q, qd, qdd, tau, _) in enumerate(samples.blocks(BLOCK)):
+        for number, (q, qd, qdd, tau, *_) in enumerate(samples.blocks(BLOCK)):
             error = ((model.inverse_dynamics(q, qd, qdd) - tau) / scale).square()
-            part = error.mean() if count <= BLOCK else error.sum() / (count * joints)
+            cost = error.mean() if count <= BLOCK else error.sum() / (count * joints)
             if number == 0 and penalty is not None:
-                part = part + penalty()
-            yield part
+                cost = cost + penalty()
+            yield cost
 
     return minimise(model, missed, evaluations, weight_decay)
 
 
 def adapt_networks(
     model: EmittedModel,
-    samples: TorqueSamples | Sequence[DynamicsSamples],
+    samples: TorqueSamples,
     adapt: Adaptation,
     weight_decay: float = DEFAULTS.lbfgs_decay,
     evaluations: int = 2000,
@@ -64,13 +61,11 @@ def adapt_networks(
 
     weight_decay: of half the sum of squared changes, so that what these samples do not show stays as it was.
     """
-    parts = [getattr(model, part) for part in PARTS[adapt]] or [model]
-    chosen = {id(weight) for part in parts if part is not None for weight in part.parameters()}
-    moving = {name: weight for name, weight in model.named_parameters() if id(weight) in chosen}
-    before = {name: x.detach().clone() for name, x in moving.items()}
+    moving = {name: x for name, x in model.named_parameters() if name.startswith(MOVING[adapt])}
+    start = {name: x.detach().clone() for name, x in moving.items()}
 
     def changed() -> torch.Tensor | float:
-        return weight_decay / 2 * sum((x - before[name]).square().sum() for name, x in moving.items())
+        return weight_decay / 2 * sum((x - start[name]).square().sum() for name, x in moving.items())
 
     try:
         for name, parameter in model.named_parameters():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import chain
 from typing import TYPE_CHECKING, ClassVar
@@ -14,18 +14,15 @@ from spelgen.arm.actuation import Drives
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import Diagnostic, LogError
-from spelgen.fitting.dataset import TrainingData
-from spelgen.fitting.objective import FitRequest, Logs, PreparedLogs, Status
-from spelgen.fitting.run_record import Content
+from spelgen.fitting.dataset import TrainingData, Validation
+from spelgen.fitting.objective import Logs, PreparedLogs, TorqueLogObjective
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import TUNING
 from spelgen.fitting.torque.networks import adapt_networks, fit_networks
 from spelgen.fitting.torque.report import torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.fitting.torque_logs import TorqueLogObjective
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
-from spelgen.fitting.validation import Validation, measure
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay, find_torque_delay
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
@@ -35,7 +32,6 @@ from spelgen.settings.tuning.identification import HINTS
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
-    from spelgen.fitting.progress import TrainingProgress
 
 SAMPLES = 5  # of a window that the model is measured on
 MOVED = {
@@ -49,17 +45,11 @@ class TorqueObjective(TorqueLogObjective):
     """All is done in `begin`, before there is a run folder: a fit to torques takes seconds to minutes."""
 
     name: ClassVar[str] = "torque"
-
-    def __init__(self, request: FitRequest) -> None:
-        super().__init__(request)
-        assert isinstance(request.config, TorqueFit)
-        self.config = request.config
-        self._checkpoint: Content = {}
-        self._late = NO_DELAY
+    config: TorqueFit
 
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
-        preprocessing = self.request.preprocessing
+        preprocessing, self._late = self.request.preprocessing, NO_DELAY
         if preprocessing.torque_delay is None and has_rigid_bodies(self.model):
             self._late = torque_delay(self.model, self.request.logs, preprocessing)
             preprocessing = replace(preprocessing, torque_delay=self._late.delay)
@@ -86,7 +76,7 @@ class TorqueObjective(TorqueLogObjective):
         if not has_rigid_bodies(model):  # the torques of rigid bodies have a prior of their own
             regularizer = self._regularizer(self.data, self.config.urdf_weight, notes)
         notes += fit_torques(model, samples, self.config, regularizer)
-        measured = measure(model, Validation(model, self.data, self.request.device))
+        measured = Validation(model, self.data, self.request.options.device).measure()
         self._checkpoint = {
             "epoch": 0,
             "step": 0,
@@ -97,19 +87,6 @@ class TorqueObjective(TorqueLogObjective):
             "substeps": measured.substeps,
         }
         return notes
-
-    def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
-        """Take the model as it was fitted."""
-        self.model.load_state_dict(checkpoint["best_weights"])
-        self._checkpoint = checkpoint
-
-    def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Do nothing more."""
-        return "finished"
-
-    def checkpoint(self) -> Content:
-        """See `Objective`."""
-        return self._checkpoint
 
 
 def torque_delay(model: EmittedModel, logs: Logs, preprocessing: Preprocessing) -> TorqueDelay:

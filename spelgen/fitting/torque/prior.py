@@ -28,45 +28,40 @@ SHARED = {
 
 def covariance(prior: GaussianPrior, weights: Mapping[str, torch.Tensor], kinds: Kinds) -> torch.Tensor:
     """Return the covariance (K, K) of weights with these names and shapes, flattened one after the other."""
-    deviations, rows, count = [], {}, 0
+    count = sum(weight.numel() for weight in weights.values())
+    matrix, friction, first = torch.zeros(count, count).double(), torch.zeros(count).double(), 0
     for name, weight in weights.items():
-        deviations.append(torch.full((weight.numel(),), getattr(prior, prior_field(kinds[name]))))
-        rows[name] = torch.arange(count, count + weight.numel())
-        count += weight.numel()
-    matrix = torch.diag(torch.cat(deviations).double().square())
-    friction = []
-    for name, row in rows.items():
-        own = prior_field(kinds[name])
-        if own in SHARED:
+        row = torch.arange(first, first + weight.numel())
+        field = prior_field(kinds[name])
+        matrix[row, row] = torch.full((len(row),), getattr(prior, field)).double().square()
+        if field in SHARED:
             # of fractions, each element of the bristles by itself
-            for of_joints in row.view(len(weights[name]), -1).mT:
-                matrix[of_joints[:, None], of_joints] += getattr(prior, SHARED[own]) ** 2
+            for of_joints in row.view(len(weight), -1).mT:
+                matrix[of_joints[:, None], of_joints] += getattr(prior, SHARED[field]) ** 2
         if kinds[name] in ("sizes", "effects"):
-            friction.append(row)
-    if friction:
-        together = torch.cat(friction)
-        matrix[together[:, None], together] += prior.shared_friction**2
-    return matrix
+            friction[row] = prior.shared_friction
+        first += weight.numel()
+    return matrix + friction.outer(friction)
 
 
 def most_probable(
     prior: GaussianPrior,
     guess: GaussianPrior,
-    kinds: torch.Tensor,
+    masks: Mapping[str, torch.Tensor],
     away: torch.Tensor,
     posterior: torch.Tensor,
 ) -> GaussianPrior:
     """Return the prior with the deviations of `ADAPTED` kinds that make the data more probable.
 
-    kinds: (K,) of each weight the place of its kind in `ADAPTED`, -1 for others. away: (K,) of the most probable
-    weights from the prior's centre. posterior: (K, K) covariance of the weights after the fit. A step of MacKay's
+    masks: (K,) by kind, which weights are of it. away: (K,) of the most probable weights from the prior's centre.
+    posterior: (K, K) covariance of the weights after the fit. A step of MacKay's
     fixed point (Bayesian Interpolation, Neural Computation 4:415, 1992), whose end is the maximum of the marginal
     likelihood in Laplace's approximation, times a scaled inverse chi-squared density of the deviation's square with c
     degrees of freedom about ``guess``: (|away|^2 + c guess^2) / (g + c) where the data determine g weights.
     """
     deviations, freedom = {}, prior.degrees_of_freedom
-    for place, kind in enumerate(ADAPTED):
-        mask = kinds == place
+    for kind in ADAPTED:
+        mask = masks[kind]
         count = int(mask.sum())
         centre = torch.eye(count).double()
         if kind in SHARED and count:
@@ -77,17 +72,6 @@ def most_probable(
         squares = float((centre @ away[mask]).square().sum()) + freedom * getattr(guess, kind) ** 2
         deviations[kind] = (squares / (max(determined, 0.0) + freedom)) ** 0.5
     return prior.model_copy(update=deviations)
-
-
-def adapted_kinds(weights: Mapping[str, torch.Tensor], kinds: Kinds) -> torch.Tensor:
-    """Return, of each weight (K,), the place of its kind in `ADAPTED`; -1 for others."""
-    places = []
-    for name, weight in weights.items():
-        place = -1
-        if kinds[name] in ADAPTED:
-            place = ADAPTED.index(kinds[name])
-        places.append(torch.full((weight.numel(),), place))
-    return torch.cat(places)
 
 
 def prior_field(kind: str) -> str:

@@ -18,10 +18,9 @@ from dataclasses import replace
 
 import torch
 
-from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
-from spelgen.fitting.levenberg_marquardt import NormalEquations, SolverState, levenberg_marquardt
+from spelgen.fitting.levenberg_marquardt import NormalEquations, SolverState, levenberg_marquardt, start
 from spelgen.fitting.torque.jacobian import TUNING, ResidualSamples, RigidResponse, TorqueJacobian
-from spelgen.fitting.torque.prior import adapted_kinds, covariance, most_probable
+from spelgen.fitting.torque.prior import ADAPTED, covariance, most_probable
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.weights import NONE
 from spelgen.settings.fits import Adaptation, GaussianPrior
@@ -48,7 +47,7 @@ class TorqueProblem:
         self.start, self.guess, self.adapt = rigid.flattened(rigid.start), prior, adapt
         self.compensated = rigid.start[rigid.compensation] != 0
         self.covariance = torch.zeros(len(self.start), len(self.start)).double()
-        self.kinds = adapted_kinds(rigid.start, rigid.kinds)
+        self.masks = {kind: rigid.mask(kind) for kind in ADAPTED}
         self._use(jacobian)
         self.set_prior(prior)
 
@@ -99,8 +98,7 @@ class TorqueProblem:
         Bodies that are far off leave much of the torque, which is taken for noise, and noise asks for no better bodies.
         """
         self._set_least_squares_noise(x)
-        state = State(x, self.jacobian.squares(x), 0.0, DAMPING.first, steps)
-        return self._steps(state, TUNING.first_steps)
+        return self._steps(start(self, x, steps=steps), TUNING.first_steps)
 
     def _fit_from_start(self, steps: int) -> State:
         """Return the first fit from the start, where bodies may be far off.
@@ -109,7 +107,7 @@ class TorqueProblem:
         """
         self._set_least_squares_noise(self.start)
         least = self.noise
-        state = State(self.start, self.jacobian.squares(self.start), 0.0, DAMPING.first, steps)
+        state = start(self, self.start, steps=steps)
         for _ in range(TUNING.first_rounds):
             missed = (self.correlation * state.residuals / self.count).sqrt()
             self.noise = torch.maximum(least, TUNING.first_noise * missed)
@@ -210,11 +208,15 @@ class TorqueProblem:
         No friction explains a torque that falls with velocity: a drive that compensates friction by itself, after
         its torque was measured, does.
         """
-        slope, explained, size = self.jacobian.by_velocity(x)
+        samples = self.jacobian.residual_samples(x)
+        products = (samples.missing * samples.qd).sum(dim=0)
+        slope = products / samples.qd.square().sum(dim=0).clamp(min=1e-300)
+        # of the sum of squares, what a line explains
+        explained = slope * products / samples.missing.square().sum(dim=0).clamp(min=1e-300)
         count = self.count / self.correlation
         significant = explained * count > TUNING.compensation_deviations**2 * (1 - explained)
         # milliseconds between torque and motion look alike, but smaller
-        visible = size > TUNING.compensation_visible * self.range
+        visible = (slope * products / self.count).sqrt() > TUNING.compensation_visible * self.range
         falls = (slope < 0) & (explained > TUNING.compensation_explained) & visible
         further = falls & significant & ~self.compensated
         self.compensated = self.compensated | further
@@ -229,7 +231,7 @@ class TorqueProblem:
             self.set_noise(state.residuals, self._determined() / len(state.residuals))
             if self.adapt != "load":
                 away = state.x - self.start
-                self.set_prior(most_probable(self.prior, self.guess, self.kinds, away, self.covariance))
+                self.set_prior(most_probable(self.prior, self.guess, self.masks, away, self.covariance))
             if number + 1 >= rounds and (self.noise > TUNING.noise_settled * previous).all():
                 break
         return state

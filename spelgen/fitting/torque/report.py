@@ -13,7 +13,7 @@ from torch.autograd.functional import jacobian
 from spelgen.dynamics.protocol import has_residuals
 from spelgen.dynamics.residuals import idle_residuals
 from spelgen.errors import Diagnostic
-from spelgen.fitting.functional_model import FunctionalModel
+from spelgen.fitting.functional_model import under_weights
 from spelgen.fitting.torque.fit import TorqueSolution
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.weights import RigidWeights
@@ -113,11 +113,11 @@ def terms_in_use(model: EmittedModel) -> list[str]:
 
 def _inertia(model: EmittedModel, q: torch.Tensor, covariance: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean diagonal of M at q (n,) [kg m^2, kg], and the standard deviations of its logarithm (n,)."""
-    functional, weights = FunctionalModel(model), RigidWeights(model).start
+    weights = RigidWeights(model).start
 
     def diagonal(*changed: torch.Tensor) -> torch.Tensor:
         by_name = dict(zip(weights, changed, strict=True))
-        mass: torch.Tensor = functional.under(by_name, lambda other: other.mass_matrix(q))
+        mass: torch.Tensor = under_weights(model, by_name, lambda other: other.mass_matrix(q))
         return mass.diagonal(dim1=-2, dim2=-1).mean(dim=0)
 
     value = diagonal(*weights.values()).detach()

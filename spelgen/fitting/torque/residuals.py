@@ -252,24 +252,6 @@ def _noise(missing: torch.Tensor) -> torch.Tensor:
     return deviation.clamp(min=1e-12 * float(deviation.max()) + 1e-300)
 
 
-class _Sums(NamedTuple):
-    """Of a linear model X w of y: X^T X, X^T y, y^T y, and how many samples there are."""
-
-    gram: torch.Tensor
-    moment: torch.Tensor
-    square: float
-    samples: int
-
-    @classmethod
-    def of(cls, x: torch.Tensor, y: torch.Tensor) -> _Sums:
-        return cls(x.mT @ x, x.mT @ y, float(y @ y), len(y))
-
-    def without(self, other: _Sums) -> _Sums:
-        """Return the sums over all samples but those of another."""
-        gram, moment = self.gram - other.gram, self.moment - other.moment
-        return _Sums(gram, moment, self.square - other.square, self.samples - other.samples)
-
-
 def _halves(count: int, correlation: float) -> tuple[slice, slice]:
     """Return the first half of the samples without the gap before the last half, and the last half."""
     middle = count // 2
@@ -288,14 +270,15 @@ def _held_out_errors(
     """Return what is missed (T,) of each block after a fit to the others, and which samples lie between positions of
     these.
     """
-    everything, gap = _Sums.of(candidate.features, target), round(TUNING.gap * correlation)
+    rows, gap = _beside(candidate.features, target), round(TUNING.gap * correlation)
+    everything = rows.mT @ rows
     errors, between, position = [], [], candidate.position
     for block in _blocks(len(target)):
         near = slice(max(0, block.start - gap), block.stop + gap)
-        fitted_to = everything.without(_Sums.of(candidate.features[near], target[near]))
-        weights = _most_probable(fitted_to, candidate.groups, correlation)
-        errors.append(target[block] - candidate.torque(weights, block))
         others = torch.cat([position[: near.start], position[near.stop :]])
+        sums = everything - rows[near].mT @ rows[near]
+        weights = _most_probable(sums, len(others), candidate.groups, correlation)
+        errors.append(target[block] - candidate.torque(weights, block))
         between.append(_between(position[block], others))
     return torch.cat(errors), torch.cat(between)
 
@@ -326,14 +309,22 @@ def _fit_candidate(
     candidate: _Candidate, target: torch.Tensor, correlation: float, rows: slice = EVERY
 ) -> torch.Tensor:
     """Return the most probable weights (P,) after these samples."""
-    return _most_probable(_Sums.of(candidate.features[rows], target[rows]), candidate.groups, correlation)
+    samples = _beside(candidate.features[rows], target[rows])
+    return _most_probable(samples.mT @ samples, len(samples), candidate.groups, correlation)
 
 
-def _most_probable(sums: _Sums, groups: torch.Tensor, correlation: float) -> torch.Tensor:
+def _beside(features: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """Return a linear model's features (T, P) with its target (T,) as the last column."""
+    return torch.cat([features, target.unsqueeze(-1)], dim=1)
+
+
+def _most_probable(sums: torch.Tensor, count: int, groups: torch.Tensor, correlation: float) -> torch.Tensor:
     """Return weights (P,) of a linear model, with the noise and the deviation of each group of weights at which the
     samples are most probable.
+
+    sums: (P + 1, P + 1) of products of so many samples' features and target, see `_beside`.
     """
-    gram, moment, square, count = sums
+    gram, moment, square = sums[:-1, :-1], sums[:-1, -1], float(sums[-1, -1])
     member = F.one_hot(groups.long()).double()  # (P, groups)
     seen = gram.diagonal() > 0
     size, noise = member.sum(dim=0), square / count
@@ -357,36 +348,37 @@ def _select_networks(model: Any, samples: ResidualSamples, correlation: float) -
     """Select the potential's network, then that of the mass matrix."""
     step = -(-len(samples.q) // TUNING.network_samples)
     subset = ResidualSamples(*(column[::step] for column in samples))
+    # what all residuals together are to give: functions of joints are there already
+    with torch.no_grad():
+        present = residual_torque(model, *subset[:3])
+    subset = subset._replace(missing=subset.missing + present)
     terms = model.residuals
     networks = {"residual_potential": list(terms.potential.parameters()) if terms.potential else []}
     networks["residual_mass"] = [terms.raw_constants, *(terms.mass.parameters() if terms.mass else ())]
     for name, weights in networks.items():
-        gain, present = None, _present_torque(model, subset)
+        gain = None
         if weights:
             network = torch.nn.ParameterList(weights)
-            gain = _fit_network(model, network, subset, present, max(1.0, correlation / step))
-        if gain is None:
-            continue
-        # functions of joints are in both
-        added = _present_torque(model, subset) - present
-        subset = subset._replace(missing=subset.missing - added)
-        yield SelectedResidual(name, None, gain)
+            gain = _fit_network(model, network, subset, max(1.0, correlation / step))
+        if gain is not None:
+            yield SelectedResidual(name, None, gain)
 
 
 def _fit_network(
-    model: Any, network: torch.nn.Module, samples: ResidualSamples, present: torch.Tensor, correlation: float
+    model: Any, network: torch.nn.Module, samples: ResidualSamples, correlation: float
 ) -> float | None:
     """Fit one network where that pays on the last half of the samples after a fit to the first; return the gain there.
 
-    Else it is left as it is. present: (T, n), torque of all residuals before.
+    Else it is left as it is. samples: as missing, what all residuals together are to give.
     """
-    start, noise = copy.deepcopy(network.state_dict()), _noise(samples.missing)
+    start, missing = copy.deepcopy(network.state_dict()), _still_missing(model, samples)
+    noise = _noise(missing)
 
     def fit(rows: slice, evaluations: int) -> None:
         chosen = ResidualSamples(*(column[rows] for column in samples))
 
         def cost() -> torch.Tensor:
-            error = chosen.missing - residual_torque(model, *chosen[:3]) + present[rows]
+            error = chosen.missing - residual_torque(model, *chosen[:3])
             return 0.5 * (error / noise).square().sum() / correlation
 
         network.load_state_dict(start)
@@ -396,8 +388,8 @@ def _fit_network(
     # most networks explain nothing, which few evaluations show
     for evaluations in (TUNING.network_first_look, TUNING.network_evaluations):
         fit(first, evaluations)
-        error = samples.missing - _present_torque(model, samples) + present
-        squares, missed = _by_block((samples.missing / noise)[last]), _by_block((error / noise)[last])
+        error = _still_missing(model, samples)
+        squares, missed = _by_block((missing / noise)[last]), _by_block((error / noise)[last])
         gain = _significant_gain(squares, missed)
         if missed.sum() >= squares.sum():
             break
@@ -408,7 +400,7 @@ def _fit_network(
     return gain
 
 
-def _present_torque(model: Any, samples: ResidualSamples) -> torch.Tensor:
-    """Return the torque (T, n) of all that stands beside rigid bodies as it is."""
+def _still_missing(model: Any, samples: ResidualSamples) -> torch.Tensor:
+    """Return what all that stands beside rigid bodies leaves of the torque that it is to give, (T, n)."""
     with torch.no_grad():
-        return residual_torque(model, samples.q, samples.qd, samples.qdd)
+        return samples.missing - residual_torque(model, *samples[:3])

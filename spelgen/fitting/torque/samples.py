@@ -13,13 +13,18 @@ from spelgen.logs.dynamics_samples import DynamicsSamples
 
 
 class Block(NamedTuple):
-    """q, qd, qdd and tau, (T, n), and z with the direction of friction without memory, (T, n, K or K + 1)."""
+    """q, qd, qdd and tau, (T, n), and z and direction of friction (see `DynamicsSamples`); None: not known."""
 
     q: torch.Tensor
     qd: torch.Tensor
     qdd: torch.Tensor
     tau: torch.Tensor
-    z: torch.Tensor
+    z: torch.Tensor | None = None
+    direction: torch.Tensor | None = None
+
+    def rows(self, rows: slice) -> Block:
+        """Return these samples alone."""
+        return Block._make(None if column is None else column[rows].contiguous() for column in self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,42 +42,32 @@ class TorqueSamples:
     @classmethod
     def of(cls, trajectories: Iterable[DynamicsSamples], decimation: int = 1) -> TorqueSamples:
         """Take one of so many samples of each trajectory."""
-        rows, seen = [], 0
+        pieces, seen = [], 0
         for samples in trajectories:
+            columns = (getattr(samples, name) for name in Block._fields)
             # a copy: a slice would keep all samples in memory
-            rows.append([np.ascontiguousarray(column[::decimation]) for column in _columns(samples)])
+            pieces.append([x if x is None else np.ascontiguousarray(x[::decimation]) for x in columns])
             seen += len(samples.q)
-        columns = [torch.from_numpy(np.concatenate(column)) for column in zip(*rows, strict=True)]
-        return cls(Block(*columns), seen)
+        return cls(Block._make(map(_joined, zip(*pieces, strict=True))), seen)
 
     @property
     def count(self) -> int:
         """How many there are."""
         return len(self.columns.q)
 
-    @property
-    def joints(self) -> int:
-        """How many joints they are of."""
-        return self.columns.q.shape[1]
-
     def thinned(self, count: int) -> TorqueSamples:
         """Return at most that many of them, evenly spread; these themselves where there are no more."""
         step = -(-self.count // count)
         if step <= 1:
             return self
-        columns = Block(*(column[::step].contiguous() for column in self.columns))
-        return TorqueSamples(columns, self.seen, step * self.step)
+        return TorqueSamples(self.columns.rows(slice(None, None, step)), self.seen, step * self.step)
 
     def blocks(self, size: int) -> Iterator[Block]:
         """Yield all samples in order, at most ``size`` at a time."""
         for start in range(0, self.count, size):
-            yield Block(*(column[start : start + size] for column in self.columns))
+            yield self.columns.rows(slice(start, start + size))
 
 
-def _columns(samples: DynamicsSamples) -> list[np.ndarray]:
-    z = samples.z
-    if z is None:
-        z = np.zeros((*samples.q.shape, 0))
-    if samples.direction is not None:
-        z = np.concatenate([z, samples.direction[..., None]], axis=2)
-    return [samples.q, samples.qd, samples.qdd, samples.tau, z]
+def _joined(columns: tuple[np.ndarray | None, ...]) -> torch.Tensor | None:
+    arrays = [column for column in columns if column is not None]
+    return torch.from_numpy(np.concatenate(arrays)) if arrays else None

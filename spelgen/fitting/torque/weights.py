@@ -9,7 +9,9 @@ import torch
 from spelgen.dynamics.parameters import parameter_table
 from spelgen.fitting.functional_model import Weights
 from spelgen.fitting.torque.samples import Block
+from spelgen.runtime.rigid_body import body_factor, upper_cholesky
 from spelgen.settings.fits import Adaptation
+from spelgen.settings.tuning.fitting import TorqueTuning
 from spelgen.settings.tuning.identification import IdentificationTuning
 
 if TYPE_CHECKING:
@@ -20,6 +22,7 @@ RIGID = (
     "load_dependence", "fractions",
 )  # fmt: skip
 """Kinds of parameters of bodies, drives and friction laws: all but what stands beside them."""
+TUNING = TorqueTuning()
 MOVING = IdentificationTuning().moving
 DAILY = ("sizes", "effects", "velocities", "load_dependence", "fractions", "offset")
 """Kinds that change from day to day."""
@@ -30,11 +33,13 @@ class RigidWeights:
     """The weights of bodies, drives and friction laws of a model, by name, and what they stand for."""
 
     def __init__(self, model: EmittedModel) -> None:
-        self.model = model
+        tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         self.kinds = {name: x.kind for name, x in parameter_table(model).items() if x.kind in RIGID}
+        # parameters, and buffers that a fit may set
+        self.tensors = {name: tensors[name] for name in self.kinds}
         (self.bodies,) = self.of_kind("bodies")
         (self.compensation,) = self.of_kind("friction_compensation")
-        self.start = {name: self._tensor(name).detach().clone() for name in self.kinds}
+        self.start = {name: x.detach().clone() for name, x in self.tensors.items()}
         self.sizes = [weight.numel() for weight in self.start.values()]
 
     def of_kind(self, *kinds: str) -> list[str]:
@@ -43,38 +48,35 @@ class RigidWeights:
 
     def named(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the weights by name, of all of them flattened one after the other (K,)."""
-        parts = zip(self.start.items(), x.split(self.sizes), strict=True)
-        return {name: part.view_as(weight) for (name, weight), part in parts}
+        pieces = zip(self.start.items(), x.split(self.sizes), strict=True)
+        return {name: piece.view_as(weight) for (name, weight), piece in pieces}
 
     def write(self, x: torch.Tensor) -> None:
         """Put weights (K,) into the model."""
         with torch.no_grad():
             for name, weight in self.named(x).items():
-                self._tensor(name).copy_(weight)
-
-    def _tensor(self, name: str) -> torch.Tensor:
-        """Return a parameter, or a buffer that a fit may set."""
-        module, _, attribute = name.rpartition(".")
-        tensor: torch.Tensor = getattr(self.model.get_submodule(module), attribute)
-        return tensor
+                self.tensors[name].copy_(weight)
 
     def flattened(self, weights: Weights) -> torch.Tensor:
         """Return weights by name as one vector (K,)."""
         return torch.cat([weights[name].flatten() for name in self.start])
 
+    def mask(self, *kinds: str) -> torch.Tensor:
+        """Return which weights (K,) are of these kinds."""
+        named = self.start.items()
+        return self.flattened({name: torch.full_like(x, self.kinds[name] in kinds) for name, x in named}) > 0
+
     def free(self, adapt: Adaptation | None, compensated: torch.Tensor) -> torch.Tensor:
         """Return which weights (K,) move: all, or those of an adaptation; compensation of the joints (n,) that have
         one.
         """
-        kinds = {"load": (), "friction": DAILY}.get(adapt or "", RIGID)
-        masks = {}
-        for name, weight in self.start.items():
-            masks[name] = torch.full_like(weight, self.kinds[name] in kinds, dtype=torch.bool)
         if adapt == "load":
-            masks[self.bodies][-1] = True
-        else:
-            masks[self.compensation] = compensated
-        return self.flattened(masks)
+            free = self.mask()
+            self.named(free)[self.bodies][-1] = True
+            return free
+        free = self.mask(*(DAILY if adapt == "friction" else RIGID))
+        self.named(free)[self.compensation].copy_(compensated)
+        return free
 
 
 def joint_torque(model: EmittedModel, samples: Block) -> torch.Tensor:
@@ -104,3 +106,36 @@ def bound_friction(model: EmittedModel, samples: Block) -> None:
     for name in rigid.of_kind("offset", "friction_compensation"):
         weights[name] = weights[name] / change
     rigid.write(rigid.flattened(weights))
+
+
+def moved_bodies(raw: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+    """Return weights (B, 10) after a step (B, 10), as `InertialParameters` has them, straight where torques go.
+
+    Torques are linear in the inertial parameters, for which weights stand by way of a Cholesky factor: a step straight
+    in the weights leaves the line that a Gauss-Newton step was computed along.
+    A body's pseudo-inertia is C S C^T, S = T T^T. To first order the step adds T (X + X^T) T^T to S, and that is what
+    is added, or as much of it as keeps S positive definite.
+    """
+    row, column = torch.triu_indices(4, 4)
+    weights, moves = torch.zeros(2, len(raw), 4, 4).double()
+    weights[:, row, column], moves[:, row, column] = raw, step
+    # a complex step differentiates to the last digit; forward mode would load torch's compiler, which takes seconds
+    tiny = 1e-100
+    stepped = body_factor(torch.complex(weights, tiny * moves))
+    factor, change = stepped.real, stepped.imag / tiny
+    relative = torch.linalg.solve_triangular(factor, change, upper=True)
+    added = relative + relative.mT
+    smallest = torch.linalg.eigvalsh(added)[:, 0]
+    fraction = (TUNING.body_step / (-smallest).clamp(min=1e-12)).clamp(max=1.0)
+    factor = factor @ upper_cholesky(torch.eye(4).double() + fraction[:, None, None] * added)
+    return body_weights(factor)
+
+
+def body_weights(factor: torch.Tensor) -> torch.Tensor:
+    """Return the weights (B, 10) of which `body_factor` makes this factor (B, 4, 4)."""
+    scale = factor.diagonal(dim1=-2, dim2=-1)
+    sizes, mass = scale[:, :3].log(), scale[:, 3:].log()
+    logarithms = torch.cat([sizes - mass, 2 * mass], dim=-1)
+    weights = (factor / scale.unsqueeze(-1)).triu(1) + logarithms.diag_embed()
+    row, column = torch.triu_indices(4, 4)
+    return weights[:, row, column]

@@ -16,7 +16,7 @@ from spelgen.fitting.optimizers import WindowOptimizer
 from spelgen.fitting.rollout import rollout_loss
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.objective import fit_torques, torque_samples
-from spelgen.fitting.window.objective import WindowObjective
+from spelgen.fitting.window.momentum import MomentumObjective
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.windows import Windows
 from spelgen.settings.fits import Rollout, TorqueFit
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 TUNING = LoopTuning()
 
 
-class RolloutObjective(WindowObjective):
+class RolloutObjective(MomentumObjective):
     """Torques first, of rigid bodies; then momentum; then predicted windows, epoch by epoch.
 
     A checkpoint has all of the changing state, so that a resumed run repeats the same numbers.
@@ -41,17 +41,22 @@ class RolloutObjective(WindowObjective):
     name: ClassVar[str] = "rollout"
     config: Rollout
     kept: ClassVar[tuple[str, ...]] = (
-        *WindowObjective.kept, "rollbacks", "learning_rate_factor", "resting", "stage_from", "stage_epoch",
+        *MomentumObjective.kept, "rollbacks", "learning_rate_factor", "resting", "stage_from", "stage_epoch",
     )  # fmt: skip
 
     def begin(self) -> list[Diagnostic]:
         """Fit torques, and measure the model then."""
         if self.config.torque_first and has_rigid_bodies(self.model):
-            self.notes += self._torque_stage()
+            samples = torque_samples(self.model, self.data)
+            if samples is not None:
+                self.notes += fit_torques(self.model, samples, TorqueFit())
+            else:
+                message = f"no torque fit: no log that moves has {SLOWEST:g} Hz for a second; windows alone are fitted"
+                self.notes.append(Diagnostic("warning", "no-torque-fit", "logs", None, message))
         self._set_up_epochs()
         return self.notes
 
-    def resume(self, checkpoint: Content, history: list[Content], record: Content) -> None:
+    def resume(self, checkpoint: Content, history: list[Content]) -> None:
         """Go on from the last whole epoch."""
         self._set_up_epochs()
         self._restore(checkpoint)
@@ -69,7 +74,7 @@ class RolloutObjective(WindowObjective):
             save()
         while (end := self._end()) is None or self._release(end):
             record = self._run_epoch()
-            self.seconds = record["seconds"] = self.clock.seconds
+            self.seconds = record["seconds"] = self.seconds_now()
             self.history.append(record)
             save()
             progress.epoch(record, self.config.epochs)
@@ -79,15 +84,6 @@ class RolloutObjective(WindowObjective):
         """See `Objective`."""
         state = {"model": self.model.state_dict(), "optimizer": self.optimizer.state_dict()}
         return super().checkpoint() | state | {"generator": self.generator.get_state()}
-
-    def _torque_stage(self) -> list[Diagnostic]:
-        samples = torque_samples(self.model, self.data)
-        if samples is not None:
-            return fit_torques(self.model, samples, TorqueFit())
-        message = (
-            f"no torque fit: no log that moves has {SLOWEST:g} Hz for a second; windows alone are fitted"
-        )
-        return [Diagnostic("warning", "no-torque-fit", "logs", None, message)]
 
     def _set_up_epochs(self) -> None:
         """Measure the model as it is, and make an optimizer."""
@@ -116,7 +112,7 @@ class RolloutObjective(WindowObjective):
             patience = min(patience, TUNING.second_patience)
         if self.epoch - max(self.best_epoch, self.stage_epoch) >= patience:
             return "stopped early"
-        if self.clock.fraction(self.seconds + self._step_seconds + self._validation_seconds) >= 1.0:
+        if self.fraction(self.seconds + self._step_seconds + self._validation_seconds) >= 1.0:
             return "out of time"
         return "finished" if self._done() >= self._stage_end else None
 
@@ -124,10 +120,13 @@ class RolloutObjective(WindowObjective):
         """Run one epoch with finite losses, after as many attempts at a lower learning rate as that takes."""
         while True:
             before = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
-            loss = self._train_epoch()
-            trained = self.clock.seconds
+            steps, start = self._steps_in_time(), self.seconds_now()
+            # not finite as soon as a step has no finite loss or gradient
+            loss = self.optimizer.run(self._rollout_loss, self.training, steps, self._rate)
+            trained = self.seconds_now()
+            self.step, self._step_seconds = self.step + steps, (trained - start) / steps
             validation = self.validation.loss(self.substeps) if math.isfinite(loss) else math.nan
-            self._validation_seconds = self.clock.seconds - trained
+            self._validation_seconds = self.seconds_now() - trained
             if math.isfinite(validation):
                 break
             self._roll_back(*before)
@@ -149,22 +148,14 @@ class RolloutObjective(WindowObjective):
             self.substeps = self.validation.substeps(self.substeps)
         return record
 
-    def _train_epoch(self) -> float:
-        """Return the mean loss over the epoch's steps; NaN as soon as a step has no finite loss or gradient."""
-        steps, start = self._steps_in_time(), self.clock.seconds
-        loss = self.optimizer.run(self._rollout_loss, self.training, steps, self._rate)
-        self._step_seconds = (self.clock.seconds - start) / steps
-        self.step += steps
-        return loss
-
     def _steps_in_time(self) -> int:
         """Return the steps of the next epoch: all, or as many as the remaining time allows at the pace so far."""
         steps = self.epoch_steps
-        if math.isinf(self.clock.allowed):
+        if math.isinf(self.allowed):
             return steps
         if not self._step_seconds:
             return min(steps, self.call_steps)
-        remaining = self.clock.allowed - self.clock.seconds - self._validation_seconds
+        remaining = self.allowed - self.seconds_now() - self._validation_seconds
         return max(1, min(steps, int(remaining / self._step_seconds)))
 
     def _rate(self, ahead: int = 0) -> float:
@@ -175,7 +166,7 @@ class RolloutObjective(WindowObjective):
     def _done(self, ahead: int = 0) -> float:
         """Return the fraction of all steps or minutes that is gone so many steps ahead."""
         steps = self.config.epochs * self.epoch_steps
-        return max((self.step + ahead) / steps, self.clock.fraction(self.seconds))
+        return max((self.step + ahead) / steps, self.fraction(self.seconds))
 
     @property
     def _stage_end(self) -> float:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from spelgen.settings.fits import GaussianPrior
+from spelgen.settings.fits import Adaptation, GaussianPrior
 
 
 @dataclass(frozen=True)
@@ -13,19 +14,17 @@ class DampingTuning:
 
     first: float = 1e-3  # [1] before the first step (Marquardt, J. SIAM 11:431, 1963: 1e-2)
     least: float = 1e-9  # [1] smallest damping: below it steps are those of Gauss-Newton to nine digits
-    factor: float = (
-        10.0  # [1] by which damping falls after a step that gains, and rises otherwise (Marquardt: 10)
-    )
+    # [1] by which damping falls after a step that gains, and rises otherwise (Marquardt: 10)
+    factor: float = 10.0
     tries: int = 15  # dampings tried for one step: from the least to 1e6, where steps are next to nothing
     least_promise: float = 1e-10  # [1] of the cost: a step that promises less is rounding, and is not tried
-    kept_promise: float = (
-        0.5  # [1] of what a step promises: one that keeps less is tried along the second way, too
-    )
+    # [1] of what a step promises: one that keeps less is tried along the second way, too
+    kept_promise: float = 0.5
 
 
 @dataclass(frozen=True)
 class ValidationTuning:
-    """Windows that a fit is judged on (`fitting.validation`, `fitting.dataset`)."""
+    """Windows that a fit is judged on (`fitting.dataset`)."""
 
     windows: int = 2048  # at most: validation is a measurement, it needs no more
     probe: int = 64  # training windows on which the integrator's error is watched
@@ -34,7 +33,7 @@ class ValidationTuning:
 
 @dataclass(frozen=True)
 class WindowTuning:
-    """Steps on windows (`fitting.window.objective`)."""
+    """Steps on windows (`fitting.window.momentum`)."""
 
     epoch_steps: int = 20  # at least; few windows are passed over several times between validations
     warm_up: float = 0.02  # [1] of all steps, over which the learning rate rises
@@ -83,9 +82,8 @@ class TorqueTuning:
     effects_evidence: float = 2.0
     first_steps: int = 60  # at most, before noise and prior are found
     first_rounds: int = 12  # at most, while noise falls to that of least squares
-    first_noise: float = (
-        0.03  # [1] of what is missed (a low_cost_robot from placeholders: M(q) 0.44 -> 0.005)
-    )
+    # [1] of what is missed (a low_cost_robot from placeholders: M(q) 0.44 -> 0.005)
+    first_noise: float = 0.03
     last_rounds: int = 2  # where all but the last digits are fitted, and of least squares
     longer: int = 4  # times as many rounds at most, while some joint's noise falls
     noise_settled: float = 0.98  # [1] noise by that of the round before: what falls by less is settled
@@ -96,32 +94,28 @@ class TorqueTuning:
     windows: int = 2**12  # at most, of 5 samples, on which the model is measured after the fit
     residual_samples: int = 2**14  # that what stands beside rigid bodies is selected on
     seen: float = 1e-10  # [1] of the largest curvature: directions with less are not seen in the samples
-    least_noise: float = (
-        1e-4  # [1] of it: noise-free samples are fitted to four digits of their torque's range
-    )
+    # [1] of it: noise-free samples are fitted to four digits of their torque's range
+    least_noise: float = 1e-4
     least_left: float = 0.1  # [1] of independent errors, however many weights a torque determines
-    compensation_explained: float = (
-        0.1  # [1] of the missed squares, by a drive that adds torque with velocity
-    )
+    # [1] of the missed squares, by a drive that adds torque with velocity
+    compensation_explained: float = 0.1
     compensation_deviations: float = 4.0  # standard deviations that such a slope has to be away from zero
-    compensation_visible: float = (
-        0.05  # [1] of the torque's deviation: delays of milliseconds look alike, but smaller
-    )
+    # [1] of the torque's deviation: delays of milliseconds look alike, but smaller
+    compensation_visible: float = 0.05
     block: int = 2**13  # samples at a time: of seven joints some 100 MB with their derivatives
     regressor_bytes: float = 4e8  # [B] of regressors: 70,000 samples of six joints; of more, every so many
     in_memory: int = 2**18  # samples of logs larger than memory: 140 MB of six joints
     body_step: float = 0.3  # [1] of the way to the border of the possible bodies, at most in a step
-    # about a run that is adapted: a load is known to a factor of twenty in mass (10 in place of 3 let half a second of
-    # motion err by 27 times the variance of the torque, UR10e)
-    prior_of_load: GaussianPrior = field(default_factory=lambda: GaussianPrior(bodies=3.0))
-    # warmth changes the friction of all joints by tens of per cent, of a joint by itself less (Bittencourt and
-    # Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012)
-    prior_of_friction: GaussianPrior = field(default_factory=lambda: GaussianPrior(**DAY_TO_DAY))
-    # units of one make differ by a few per cent in mass, too
-    prior_of_unit: GaussianPrior = field(
-        default_factory=lambda: GaussianPrior(
-            **DAY_TO_DAY, bodies=0.1, gains=0.1, armature=0.1, shared_armature=0.1
-        )
+    # by what is adapted, about the run. Load: known to a factor of twenty in mass (10 in place of 3 let half a second
+    # of motion err by 27 times the variance of the torque, UR10e). Friction: warmth changes that of all joints by tens
+    # of per cent, of a joint by itself less (Bittencourt and Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012).
+    # Units of one make differ by a few per cent in mass, too
+    priors: Mapping[Adaptation, GaussianPrior] = field(
+        default_factory=lambda: {
+            "load": GaussianPrior(bodies=3.0),
+            "friction": GaussianPrior(**DAY_TO_DAY),
+            "unit": GaussianPrior(**DAY_TO_DAY, bodies=0.1, gains=0.1, armature=0.1, shared_armature=0.1),
+        }
     )
 
 
@@ -131,13 +125,11 @@ class ResidualTuning:
 
     folds: int = 10  # blocks of samples that are held out in turn
     gap: float = 5.0  # [1] of the samples that err alike, 0.3 s: left out between fitted and held-out samples
-    standard_errors: float = (
-        2.82  # of a block's mean gain: 1 % of luck, by Student's t of nine degrees of freedom
-    )
+    # of a block's mean gain: 1 % of luck, by Student's t of nine degrees of freedom
+    standard_errors: float = 2.82
     least_gain: float = 1e-3  # [1] of the squares that are missed: what explains less is not worth a function
-    clearly_less: float = (
-        0.9  # [1] of what the best function so far leaves: a later one has to leave less than that
-    )
+    # [1] of what the best function so far leaves: a later one has to leave less than that
+    clearly_less: float = 0.9
     rounds: int = 30  # of the marginal likelihood's fixed point, at most
     converged: float = 1e-3  # [1] relative change of the noise
     network_samples: int = 2**12  # that networks are fitted to
@@ -149,12 +141,10 @@ class ResidualTuning:
 class TorqueReportTuning:
     """When a fit to torques warns (`fitting.torque.report`)."""
 
-    undetermined: float = (
-        0.5  # [1] relative standard deviation from which on logs do not determine an inertia
-    )
-    weak_acceleration: float = (
-        2.0  # [1] torque missed, by what accelerates a joint: beyond, motion is hardly predicted
-    )
+    # [1] relative standard deviation from which on logs do not determine an inertia
+    undetermined: float = 0.5
+    # [1] torque missed, by what accelerates a joint: beyond, motion is hardly predicted
+    weak_acceleration: float = 2.0
     positions: int = 50  # at which inertias are looked at
 
 
@@ -169,11 +159,10 @@ class IntegrationTuning:
 
 @dataclass(frozen=True)
 class AdaptiveTuning:
-    """Rollouts by dopri5 (`fitting.adaptive`)."""
+    """Rollouts by dopri5 (`fitting.rollout`)."""
 
     relative: float = 1e-7  # [1] tolerance of a step
     absolute: float = 1e-9  # [rad, m, and momenta] tolerance of a step
-    adjoint_samples: int = 20  # from so many on by the adjoint equation: memory does not grow with the steps
 
 
 @dataclass(frozen=True)

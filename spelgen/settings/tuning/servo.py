@@ -29,9 +29,8 @@ class ServoLogTuning:
 class ServoWindowTuning:
     """Decide which windows a fit of servos predicts."""
 
-    length: float = (
-        4.0  # [s] as long as gravity and friction need to show; longer ones diverge with the delay
-    )
+    # [s] as long as gravity and friction need to show; longer ones diverge with the delay
+    length: float = 4.0
     settling: float = 1.0  # [s] of its beginning that is not judged: friction's state forms there
     count: int = 200  # at most, evenly spread: ten minutes of motion
 
@@ -41,9 +40,8 @@ class ServoPriorTuning:
     """Standard deviations of the Gaussian prior of a fit of servos, from where its parameters start."""
 
     logarithm: float = 2.0  # [1] of a joint's gains, armature and friction: a factor of seven
-    stribeck_velocity: float = (
-        1.0  # [1] of its logarithm: by more, friction that falls at any speed fits offsets
-    )
+    # [1] of its logarithm: by more, friction that falls at any speed fits offsets
+    stribeck_velocity: float = 1.0
     dead_zone: float = 0.02  # [rad, m] half a dead zone: gears of hobby servos have a few mrad
     delay: float = 0.1  # [s]
     bodies: float = 0.3  # [1] of the bodies' log-Cholesky parameters: 30 % in mass
@@ -67,12 +65,10 @@ class ServoSolverTuning:
     last_steps: int = 2  # of the last round, on all windows: it starts near the minimum of few
     gain: float = 0.01  # [1] of the cost: a step that gains less ends a round, and a comparison of laws
     relative_gain: float = 1e-4  # [1] likewise, of the cost: where a model's form is wrong costs are high
-    later_damping: float = (
-        1e-5  # [1] of the first step of a round, after the first round; by 1e-3 kd ends 0.3 % off
-    )
-    last_nudge: float = (
-        1e-3  # of parameters for the last slopes: by shorter ones a joint that just slips looks known
-    )
+    # [1] of the first step of a round, after the first round; by 1e-3 kd ends 0.3 % off
+    later_damping: float = 1e-5
+    # of parameters for the last slopes: by shorter ones a joint that just slips looks known
+    last_nudge: float = 1e-3
 
 
 @dataclass(frozen=True)
@@ -81,9 +77,8 @@ class ServoLawTuning:
 
     dead_zone_fraction: float = 0.25  # [1] of the static error, that a dead zone makes up to begin with
     steps: int = 6  # of joints by themselves
-    significance: float = (
-        4.0  # [1] standard deviations that a law has to gain: other forms of friction gain 3
-    )
+    # [1] standard deviations that a law has to gain: other forms of friction gain 3
+    significance: float = 4.0
     least_dead_zone: float = 1e-3  # [rad, m] smaller ones are none: a step of a 12-bit encoder is 1.5e-3
 
 
@@ -93,12 +88,10 @@ class ServoIntervalTuning:
 
     logs: int = 3  # [1] at least, each left out whole: half of a motion says what its other half does
     stretches: int = 6  # [1] into which fewer logs are cut, at least
-    variance_inflation: float = (
-        50.0  # [1] from which on two effects are one; measured on SO-101s: below 30, above 90
-    )
-    law_deviation: float = (
-        0.015  # [1] of ratios, by what friction's laws are not: benchmarks/servo_recovery.py
-    )
+    # [1] from which on two effects are one; measured on SO-101s: below 30, above 90
+    variance_inflation: float = 50.0
+    # [1] of ratios, by what friction's laws are not: benchmarks/servo_recovery.py
+    law_deviation: float = 0.015
     open_factor: float = 1.25  # [1] what may be larger by this factor within its interval is not determined
 
 
@@ -106,15 +99,12 @@ class ServoIntervalTuning:
 class ServoStartTuning:
     """Decide where a fit of servos starts."""
 
-    significance: float = (
-        8.0  # [1] standard deviations of kp by gravity: samples of neighbouring windows are alike
-    )
-    kp_range: float = (
-        20.0  # [1] factor on the kp of the settings, or 2 efforts a rad, beyond which it is not believed
-    )
-    least: float = (
-        0.05  # [1] of usual dry friction; squared of kd/kp, cubed of armature/kp: so that these have a log
-    )
+    # [1] standard deviations of kp by gravity: samples of neighbouring windows are alike
+    significance: float = 8.0
+    # [1] factor on the kp of the settings, or 2 efforts a rad, beyond which it is not believed
+    kp_range: float = 20.0
+    # [1] of usual dry friction; squared of kd/kp, cubed of armature/kp: so that these have a log
+    least: float = 0.05
 
 
 @dataclass(frozen=True)
