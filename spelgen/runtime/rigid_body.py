@@ -2,65 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.joints import vector
-from spelgen.runtime.parts import Row, Rows
-
-
-def skew(a: Tensor) -> Tensor:
-    """[a]x, (..., 3, 3), with [a]x b = a x b."""
-    x, y, z = a.unbind(dim=-1)
-    zero = torch.zeros_like(x)
-    entries = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
-    return torch.unflatten(entries, -1, (3, 3))
-
-
-def crossed(twists: Tensor, axes: Tensor) -> Tensor:
-    """Return how axes carried along by ``twists`` change, (..., 6, k) (Featherstone 2008, eq. 2.31)."""
-    (w, u), (a, m) = twists.chunk(2, dim=-2), axes.chunk(2, dim=-2)
-    linear = torch.linalg.cross(w, m, dim=-2) + torch.linalg.cross(u, a, dim=-2)
-    return torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
-
-
-def pushed_along(twists: Tensor, momenta: Tensor) -> Tensor:
-    """Return how momenta carried along by ``twists`` change, (..., 6, k) (Featherstone, eq. 2.32)."""
-    (w, u), (n, f) = twists.chunk(2, dim=-2), momenta.chunk(2, dim=-2)
-    angular = torch.linalg.cross(w, n, dim=-2) + torch.linalg.cross(u, f, dim=-2)
-    return torch.cat([angular, torch.linalg.cross(w, f, dim=-2)], dim=-2)
-
-
-def motion_table(revolute: Sequence[bool], rotation: Sequence[Rows], position: Rows) -> tuple[Tensor, Tensor]:
-    """Return what takes cos, sin and value of displacements to what takes twists from parents' frames.
-
-    (36 bodies, 3 bodies), and what is added, (36 bodies,).
-    """
-    count, identity = len(revolute), torch.eye(6, dtype=torch.float64)
-    table = torch.zeros(count, 6, 6, 3, count, dtype=torch.float64)
-    fixed = torch.zeros(count, 6, 6, dtype=torch.float64)
-    for index, turns in enumerate(revolute):
-        # (w, v) at the frame of a body that has not moved
-        turn = torch.stack([vector(row) for row in rotation[index]]).mT
-        start = torch.ops.aten.block_diag([turn, turn])
-        start[3:, :3] = -turn @ skew(vector(position[index]))
-        # to turn by x takes it to (1 + sin x rate + (1 - cos x) rate^2) start, to slide to (1 + x rate) start
-        rate = -crossed(identity[:, 2:3] if turns else identity[:, 5:], identity)
-        square = rate @ rate @ start
-        table[index, :, :, 0, index] = -square.mT
-        table[index, :, :, 1 if turns else 2, index] = (rate @ start).mT
-        fixed[index] = (start + square).mT
-    return table.reshape(36 * count, 3 * count), fixed.flatten()
-
-
-def spatial_inertia(ten: Tensor) -> Tensor:
-    """Return [[I, [m c]x], [-[m c]x, m]], (..., 6, 6), of (m, m c, I), (..., 10)."""
-    m, _, _, _, xx, xy, xz, yy, yz, zz = ten.unbind(dim=-1)
-    inertia = torch.unflatten(torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=-1), -1, (3, 3))
-    moment, mass = skew(ten[..., 1:4]), m[..., None, None] * torch.eye(3).to(ten)
-    return torch.cat([torch.cat([inertia, moment], dim=-1), torch.cat([-moment, mass], dim=-1)], dim=-2)
+from spelgen.runtime.parts import Row
 
 
 def pseudo_inertia(ten: Tensor) -> Tensor:
@@ -108,9 +54,13 @@ class InertialParameters(nn.Module):
         self.triangle = nn.Buffer(torch.eye(16, dtype=torch.float64)[4 * row + column])
         self.raw = nn.Parameter(torch.zeros(len(nominal), 10, dtype=torch.float64))
 
+    def roots(self) -> Tensor:
+        """Return, by body, a root of its pseudo-inertia, upper triangular, (bodies, 4, 4)."""
+        return self.factors @ body_factor(torch.unflatten(self.raw @ self.triangle, -1, (4, 4)))
+
     def forward(self) -> Tensor:
         """Return, by body, (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
-        root = self.factors @ body_factor(torch.unflatten(self.raw @ self.triangle, -1, (4, 4)))
+        root = self.roots()
         pseudo = root @ root.mT
         second = pseudo[..., :3, :3]
         trace = second.diagonal(dim1=-2, dim2=-1).sum(dim=-1)

@@ -13,13 +13,13 @@ from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
 from spelgen.runtime.joints import vector
 from spelgen.runtime.parts import Row, Rows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
-from spelgen.runtime.rigid_body import InertialParameters, spatial_inertia
+from spelgen.runtime.rigid_body import InertialParameters
 
 
 class RigidPrepared(NamedTuple):
     """What depends on the weights alone, worked out once for many states."""
 
-    inertia: Tensor  # spatial inertias on the diagonal, (6 bodies, 6 bodies)
+    points: Tensor  # of the bodies' masses, see ``BodyChain``, (4 bodies, 4 bodies)
     armature: Tensor  # what the rotors add to M, (n, n)
     friction: FrictionConstants
     residual: Any = None  # of what a model has beside rigid bodies
@@ -29,7 +29,6 @@ class Motion(NamedTuple):
     """What depends on q alone."""
 
     chain: Chain
-    momenta: Tensor  # of the chain's twists, by joint velocity, (..., n, 6 bodies)
     mass: Tensor  # M(q), (..., n, n)
     gravity: Tensor  # dV/dq of the bodies, (..., n)
     prepared: RigidPrepared
@@ -63,7 +62,6 @@ class RigidBodyDynamics(PortHamiltonian):
         self.actuated = nn.Buffer(self.input_matrix(vector([0.0] * self.n)).any(dim=0).double())
         zeros = torch.zeros(self.n, dtype=torch.float64)
         self.elements = friction.bristles.reach.shape[1]
-        self.basis = nn.Buffer(spatial_inertia(torch.eye(10).double()))
         self.chain, self.bodies, self.friction = chain, bodies, friction
         self.nominal_armature = nn.Buffer(vector(armature))
         self.raw_armature = nn.Parameter(zeros.clone())  # its logarithm
@@ -108,24 +106,20 @@ class RigidBodyDynamics(PortHamiltonian):
 
     def prepare(self) -> RigidPrepared:
         """Return all that depends on the weights alone; holds until they change."""
-        inertia = torch.ops.aten.block_diag([*torch.tensordot(self.inertial_parameters, self.basis, dims=1)])
+        points = torch.ops.aten.block_diag([*self.bodies.roots()])
         armature = self.motors.mT @ (self.armature.unsqueeze(-1) * self.motors)
-        return RigidPrepared(inertia, armature, self.friction.prepare())
+        return RigidPrepared(points, armature, self.friction.prepare())
 
     def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
         """Return what depends on q alone."""
-        chain = self.chain.forward(q)
-        momenta = chain.twists @ prepared.inertia
-        mass = momenta @ chain.twists.mT + prepared.armature
-        return Motion(chain, momenta, mass, applied(momenta, chain.weight), prepared)
+        chain = self.chain.forward(q, prepared.points)
+        mass = chain.jacobian @ chain.jacobian.mT + prepared.armature
+        return Motion(chain, mass, applied(chain.jacobian, chain.weight), prepared)
 
     def potential_energy(self, q: Tensor | Motion) -> Tensor:
         """Return V(q), (...) [J]; zero for a mass at the base's origin."""
         pose: Motion = self.at(q)
-        # the moment of mass of all bodies together stands in their inertia's upper right block
-        total = pose.chain.frames @ pose.prepared.inertia @ pose.chain.frames.mT
-        moment = torch.stack([total[..., 2, 4], total[..., 0, 5], total[..., 1, 3]], dim=-1)
-        return applied(moment.unsqueeze(-2), self.chain.base[3:]).squeeze(-1)
+        return (pose.chain.points[..., :3, :].flatten(-2) * pose.chain.weight).sum(dim=-1)
 
     def gravity(self, q: Tensor | Motion) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
@@ -135,14 +129,12 @@ class RigidBodyDynamics(PortHamiltonian):
     def lagrangian_gradient(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
         pose: Motion = self.at(q, qd)
-        # the momentum of all that a joint carries, by what its displacement adds to their twist
-        momenta = self.chain.at_base(pose.chain, applied(pose.momenta.mT, qd))
-        return self.chain.by_joints(self.chain.turning(pose.chain, qd)[1], momenta) - pose.gravity
+        return self.chain.kinetic_gradient(pose.chain, qd) - pose.gravity
 
     def nonlinear_effects(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
         """Return the torque that holds qd steady without friction, (..., n), by Newton and Euler."""
         pose: Motion = self.at(q, qd)
-        return self.chain.steady_torque(pose.chain, qd, pose.momenta)
+        return applied(pose.chain.jacobian, self.chain.accelerations(pose.chain, qd))
 
     def friction_torque(self, q: Tensor | Motion, qd: Tensor, *state: Tensor | None) -> Tensor:
         """Return the friction torque C^T f(C qd), (..., n) [Nm, N]; state: z and direction of `friction`."""
