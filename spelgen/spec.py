@@ -99,9 +99,10 @@ class BodySpec:
     kind: Literal["revolute", "prismatic"]
     ratio: float
     offset: float
-    rotation: tuple[Triple, Triple, Triple]
-    position: Triple
-    reference: tuple[float, ...]
+    placement: tuple[tuple[float, ...], ...]
+    """Of its joint's frame in its parent's: three rows of [R p] [m]."""
+    pseudo_inertia: tuple[float, ...]
+    """The upper triangle of [[S, m c], [(m c)^T, m]], row by row, with S the second moments of mass."""
 
 
 @dataclass(frozen=True)

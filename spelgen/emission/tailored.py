@@ -242,9 +242,9 @@ def _rigid_bodies(body: _Body, spec: ModelSpec) -> None:
         gravity=spec.gravity,
         **_columns(spec.bodies, "parent", "joint"),
         revolute=_revolute(spec.bodies),
-        **_columns(spec.bodies, "ratio", "offset", "rotation", "position"),
+        **_columns(spec.bodies, "ratio", "offset", "placement"),
     )
-    inertias = tuple(map(attrgetter("reference"), spec.bodies))
+    inertias = tuple(map(attrgetter("pseudo_inertia"), spec.bodies))
     body.give("BodyChain", body.let("chain", chain))
     body.give("InertialParameters", body.let("bodies", call("InertialParameters", *inertias)))
     body.give("FrictionLaws", body.let("friction", _friction_laws(spec, usual)))

@@ -19,15 +19,8 @@ class Chain(NamedTuple):
 
     points: Tensor  # in the base's frame, (..., 4, 4 bodies)
     axes: Tensor  # twists that bodies have by their own displacements, (..., 6, bodies)
-    jacobian: Tensor  # of the points by joint positions, (..., n, 12 bodies)
+    jacobian: Tensor  # of the points by the bodies' displacements, (..., bodies, 12 bodies)
     weight: Tensor  # acceleration of the points that stands for gravity, (..., 12 bodies)
-
-
-def crossed(twists: Tensor, axes: Tensor) -> Tensor:
-    """Return how axes carried along by ``twists`` change, (..., 6, k) (Featherstone 2008, eq. 2.31)."""
-    (w, u), (a, m) = twists.chunk(2, dim=-2), axes.chunk(2, dim=-2)
-    linear = torch.linalg.cross(w, m, dim=-2) + torch.linalg.cross(u, a, dim=-2)
-    return torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
 
 
 class BodyChain(nn.Module):
@@ -47,32 +40,31 @@ class BodyChain(nn.Module):
         revolute: Sequence[bool],  # whether a body turns about its frame's z, or slides along it,
         ratio: Row,  # by ratio * q + offset
         offset: Row,
-        rotation: Sequence[Rows],  # of the joint's frame in its parent's
-        position: Rows,  # likewise [m]
+        placement: Sequence[Rows],  # of the joint's frame in its parent's: three rows of [R p], p in m
     ) -> None:
         super().__init__()
         self.parents, count, turns = parent, len(parent), vector(revolute)
-        carriers, identity = torch.eye(count).double(), torch.eye(4).double()
-        for index, carrier in enumerate(parent):
-            if carrier >= 0:
-                carriers[:, index] += carriers[:, carrier]
+        # displacements are ratios q + offset, (bodies, n) and (bodies,)
+        self.ratios = nn.Buffer(vector(ratio).unsqueeze(-1) * torch.eye(n)[list(joint)])
+        self.offset, self.turns = nn.Buffer(vector(offset)), nn.Buffer(turns)
         # to turn by x moves a frame by 1 + sin x rate + (1 - cos x) rate^2, to slide by 1 + x rate
-        start, rate = identity.repeat(count, 1, 1), torch.zeros(count, 4, 4).double()
-        start[:, :3] = torch.cat([torch.tensor(rotation, dtype=torch.float64), torch.tensor(position, dtype=torch.float64).unsqueeze(-1)], dim=-1)
+        start, rate = torch.eye(4).double().repeat(count, 1, 1), torch.zeros(count, 4, 4).double()
+        start[:, :3] = torch.tensor(placement, dtype=torch.float64)
         rate[:, 1, 0], rate[:, 0, 1], rate[:, 2, 3] = turns, -turns, 1 - turns
         first, second = (start @ rate).flatten(1), (start @ rate @ rate).flatten(1)
         by_feature = [-second, turns.unsqueeze(-1) * first, (1 - turns).unsqueeze(-1) * first]
         # what takes cos, sin and value of displacements to frames in parents', (16 bodies, 3 bodies)
         self.table = nn.Buffer(torch.cat([torch.block_diag(*x.unsqueeze(-1)) for x in by_feature], dim=1))
         self.fixed = nn.Buffer((start.flatten(1) + second).flatten())  # what is added
-        # displacements are ratios q + offset, (bodies, n) and (bodies,)
-        self.ratios = nn.Buffer(vector(ratio).unsqueeze(-1) * torch.eye(n).double()[list(joint)])
-        self.offset, self.turns = nn.Buffer(vector(offset)), nn.Buffer(turns)
-        # what takes twists to motions of points, three rows of a 4 x 4 matrix each, (6, 12)
-        motions, unit = torch.zeros(6, 3, 4).double(), identity[:3, :3]
+        # what takes twists to the first three rows of 4 x 4 matrices, which take points to velocities
+        motions, unit = torch.zeros(6, 3, 4).double(), torch.eye(3).double()
         motions[:3, :, :3] = torch.linalg.cross(unit.unsqueeze(-1), unit.unsqueeze(0), dim=1)
         motions[3:, :, 3] = unit
-        self.motions = nn.Buffer(motions.flatten(1))
+        self.motions = nn.Buffer(motions.flatten(1))  # (6, 12)
+        carriers = torch.eye(count).double()
+        for index, carrier in enumerate(parent):
+            if carrier >= 0:
+                carriers[:, index] += carriers[:, carrier]
         self.carriers = nn.Buffer(carriers)  # whether a body carries another, or is it, (bodies, bodies)
         # likewise, by numbers of the points, (bodies, 12 bodies)
         self.carried = nn.Buffer(carriers.repeat_interleave(4, dim=1).repeat(1, 3))
@@ -89,33 +81,37 @@ class BodyChain(nn.Module):
             placed.append(relative[index] if parent < 0 else placed[parent] @ relative[index])
         frames = torch.cat(placed, dim=-1)
         z, origin = torch.unflatten(frames[..., :3, :], -1, (-1, 4))[..., 2:].unbind(dim=-1)
-        turning = self.turns * z
-        axes = torch.cat([turning, torch.linalg.cross(origin, turning, dim=-2) + (z - turning)], dim=-2)
+        angular = self.turns * z
+        axes = torch.cat([angular, torch.linalg.cross(origin, angular, dim=-2) + (z - angular)], dim=-2)
         points = frames @ points
         motions = (axes.mT @ self.motions).reshape(*q.shape[:-1], -1, 4) @ points
-        jacobian = self.ratios.mT @ (motions.reshape(*q.shape[:-1], *self.carried.shape) * self.carried)
+        jacobian = motions.reshape(*q.shape[:-1], *self.carried.shape) * self.carried
         return Chain(points, axes, jacobian, (self.base * points[..., 3:, :]).flatten(-2))
 
-    def turning(self, pose: Chain, qd: Tensor) -> tuple[Tensor, Tensor]:
-        """The bodies' twists, and how these turn the bodies' axes, (..., 6, bodies)."""
-        twists = (pose.axes * (qd @ self.ratios.mT).unsqueeze(-2)) @ self.carriers
-        return twists, crossed(twists, pose.axes)
+    def turning(self, pose: Chain, rates: Tensor) -> tuple[Tensor, Tensor]:
+        """The bodies' twists, and how these turn the bodies' axes, (..., 6, bodies) (Featherstone, eq. 2.31)."""
+        twists = (pose.axes * rates.unsqueeze(-2)) @ self.carriers
+        (w, u), (a, m) = twists.chunk(2, dim=-2), pose.axes.chunk(2, dim=-2)
+        linear = torch.linalg.cross(w, m, dim=-2) + torch.linalg.cross(u, a, dim=-2)
+        return twists, torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
 
     def accelerations(self, pose: Chain, qd: Tensor) -> Tensor:
         """The points' accelerations at steady qd, gravity taken as one, (..., 12 bodies)."""
-        twists, turning = self.turning(pose, qd)
-        steady = (turning * (qd @ self.ratios.mT).unsqueeze(-2)) @ self.carriers
+        rates = qd @ self.ratios.mT
+        twists, turning = self.turning(pose, rates)
+        steady = (turning * rates.unsqueeze(-2)) @ self.carriers
         w, (a, u) = twists[..., :3, :], steady.unsqueeze(-1).chunk(2, dim=-3)
         place, mass = torch.unflatten(pose.points, -1, (-1, 4)).tensor_split((3,), dim=-3)
-        velocity = torch.unflatten(applied(pose.jacobian.mT, qd), -1, (3, -1, 4))
+        velocity = torch.unflatten(applied(pose.jacobian.mT, rates), -1, (3, -1, 4))
         turned = torch.linalg.cross(w.unsqueeze(-1), velocity, dim=-3) + torch.linalg.cross(a, place, dim=-3)
         return torch.addcmul(turned, u, mass).flatten(-3) + pose.weight
 
     def kinetic_gradient(self, pose: Chain, qd: Tensor) -> Tensor:
         """Return d/dq of the kinetic energy at qd, (..., n)."""
+        rates = qd @ self.ratios.mT
         place, mass = torch.unflatten(pose.points, -1, (-1, 4)).tensor_split((3,), dim=-3)
-        velocity = torch.unflatten(applied(pose.jacobian.mT, qd), -1, (3, -1, 4))
+        velocity = torch.unflatten(applied(pose.jacobian.mT, rates), -1, (3, -1, 4))
         momenta = torch.cat([torch.linalg.cross(place, velocity, dim=-3), mass * velocity], dim=-3).sum(dim=-1)
         # the momentum of all that a joint carries, by what its displacement adds to their twist
-        turning = self.turning(pose, qd)[1]
+        turning = self.turning(pose, rates)[1]
         return (turning * (momenta @ self.carriers.mT)).sum(dim=-2) @ self.ratios

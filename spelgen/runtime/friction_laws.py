@@ -7,7 +7,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from spelgen.runtime.bristles import Bristles
 from spelgen.runtime.joints import vector
 from spelgen.runtime.parts import Row, Rows
 
@@ -48,6 +47,11 @@ class FrictionLaws(nn.Module):
     No law has an exponential: a control loop has them in a third of the time. The Stribeck effect is
     nearly the Gaussian of Armstrong-Helouvry (Control of Machines with Friction, 1991) where r is large, and
     the exponential of Bo and Pavelescu (Wear 82:277, 1982), without its corner at rest, where it is small.
+
+    Bristles are K elements a joint, elastic up to their reach, sliding beyond; z is (..., n, K) [rad, m]
+    (Maxwell-slip elements: Lampaert, Al-Bender and Swevers, A Generalized Maxwell-Slip Friction Model, 2003).
+    What turns around within the reach closes its loop, so a joint that stiction stops does not creep where
+    its load oscillates.
     """
 
     # weight, kind, unit, and the constant that a zero stands for, by usual friction and velocity
@@ -65,13 +69,13 @@ class FrictionLaws(nn.Module):
     def __init__(self, friction: Row, speed: Row, reach: Rows) -> None:
         super().__init__()
         self.nominal, self.speed = nn.Buffer(vector(friction)), nn.Buffer(vector(speed))
-        self.bristles = Bristles(reach)
+        self.reach = nn.Buffer(torch.tensor(reach, dtype=torch.float64))  # (n, K), a joint's shortest first
         # no parameter: a fit to torques compares both forms
         self.memoryless = nn.Buffer(torch.zeros_like(self.speed))
         self.stribeck_rounding = nn.Buffer(torch.full_like(self.speed, 10.0))
         for name, *_ in FrictionLaws.kinds[:-1]:
             self.register_parameter(name, nn.Parameter(torch.zeros_like(self.speed)))
-        self.raw_bristle_fractions = nn.Parameter(torch.zeros_like(self.bristles.reach))
+        self.raw_bristle_fractions = nn.Parameter(torch.zeros_like(self.reach))
 
     def prepare(self) -> FrictionConstants:
         """The constants, in their units."""
@@ -80,18 +84,13 @@ class FrictionLaws(nn.Module):
 
     def constants(self, smoothing_velocity: Tensor, bristle_fractions: Tensor) -> FrictionConstants:
         """The constants, where dry friction turns around like this."""
-        size, speed, values = self.nominal, self.speed, {}
+        size, speed, laws = self.nominal, self.speed, []
         units = {"Nm s/rad, N s/m": size / speed, "Nm, N": size, "rad/s, m/s": speed, "1": size.sign()}
         for name, _, unit, start in FrictionLaws.kinds[:-1]:
-            weight: Tensor = getattr(self, name)
-            values[name.removeprefix("raw_")] = start * units[unit] * weight.exp()
+            laws.append(start * units[unit] * getattr(self, name).exp())
+        least_load = LEAST_LOAD * torch.where(size > 0, size, 1.0)
         return FrictionConstants(
-            **values,
-            stribeck_rounding=self.stribeck_rounding,
-            coulomb_smoothing_velocity=smoothing_velocity,
-            least_load=LEAST_LOAD * torch.where(size > 0, size, 1.0),
-            bristle_fractions=bristle_fractions,
-            memoryless=self.memoryless,
+            *laws, self.stribeck_rounding, smoothing_velocity, least_load, bristle_fractions, self.memoryless
         )
 
     def resistance(self, qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
@@ -114,13 +113,18 @@ class FrictionLaws(nn.Module):
         if direction is None:
             direction = qd * turning(qd, c.coulomb_smoothing_velocity)
         if z is not None:
-            bent = (c.bristle_fractions / self.bristles.reach * z).sum(dim=-1)
+            bent = (c.bristle_fractions / self.reach * z).sum(dim=-1)
             direction = bent + c.memoryless * direction
         return self.viscosity(qd, c) * qd + self.dry(qd, gravity, c) * direction
 
+    def rate(self, qd: Tensor, z: Tensor) -> Tensor:
+        """z', (..., n, K): qd, and zero where |z| is the reach and would grow."""
+        qd = qd.unsqueeze(-1)
+        return qd * (qd.sign() * z < self.reach)
+
     def stored_energy(self, z: Tensor, c: FrictionConstants) -> Tensor:
         """What the bristles of Coulomb friction give back, (...) [J]."""
-        stored = c.bristle_fractions * z.square() / self.bristles.reach
+        stored = c.bristle_fractions * z.square() / self.reach
         return 0.5 * (c.coulomb * stored.sum(dim=-1)).sum(dim=-1)
 
     @staticmethod

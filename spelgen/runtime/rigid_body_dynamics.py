@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.body_chain import BodyChain, Chain
-from spelgen.runtime.bristles import moved_bristles
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
 from spelgen.runtime.joints import vector
 from spelgen.runtime.parts import Row, Rows
@@ -61,7 +60,7 @@ class RigidBodyDynamics(PortHamiltonian):
         # 1 where the measured torque moves a joint, (n,)
         self.actuated = nn.Buffer(self.input_matrix(vector([0.0] * self.n)).any(dim=0).double())
         zeros = torch.zeros(self.n, dtype=torch.float64)
-        self.elements = friction.bristles.reach.shape[1]
+        self.elements = friction.reach.shape[1]
         self.chain, self.bodies, self.friction = chain, bodies, friction
         self.nominal_armature = nn.Buffer(vector(armature))
         self.raw_armature = nn.Parameter(zeros.clone())  # its logarithm
@@ -77,7 +76,13 @@ class RigidBodyDynamics(PortHamiltonian):
     @property
     def inertial_parameters(self) -> Tensor:
         """By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
-        return self.bodies.forward()
+        root = self.bodies.forward()
+        pseudo = root @ root.mT
+        second = pseudo[..., :3, :3]
+        trace = second.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
+        inertia = trace[..., None, None] * torch.eye(3).to(pseudo) - second
+        row, column = torch.triu_indices(3, 3)
+        return torch.cat([pseudo[..., 3, 3:], pseudo[..., 3, :3], inertia[..., row, column]], dim=-1)
 
     @property
     def armature(self) -> Tensor:
@@ -106,20 +111,22 @@ class RigidBodyDynamics(PortHamiltonian):
 
     def prepare(self) -> RigidPrepared:
         """Return all that depends on the weights alone; holds until they change."""
-        points = torch.ops.aten.block_diag([*self.bodies.roots()])
+        points = torch.ops.aten.block_diag([*self.bodies.forward()])
         armature = self.motors.mT @ (self.armature.unsqueeze(-1) * self.motors)
         return RigidPrepared(points, armature, self.friction.prepare())
 
     def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
         """Return what depends on q alone."""
         chain = self.chain.forward(q, prepared.points)
-        mass = chain.jacobian @ chain.jacobian.mT + prepared.armature
-        return Motion(chain, mass, applied(chain.jacobian, chain.weight), prepared)
+        ratios = self.chain.ratios
+        mass = ratios.mT @ (chain.jacobian @ chain.jacobian.mT) @ ratios + prepared.armature
+        return Motion(chain, mass, applied(chain.jacobian, chain.weight) @ ratios, prepared)
 
-    def potential_energy(self, q: Tensor | Motion) -> Tensor:
-        """Return V(q), (...) [J]; zero for a mass at the base's origin."""
+    def potential_energy(self, q: Tensor | Motion, z: Tensor | None = None) -> Tensor:
+        """Return V(q) and what bristles store, (...) [J]; zero for a mass at the base's origin."""
         pose: Motion = self.at(q)
-        return (pose.chain.points[..., :3, :].flatten(-2) * pose.chain.weight).sum(dim=-1)
+        energy = (pose.chain.points[..., :3, :].flatten(-2) * pose.chain.weight).sum(dim=-1)
+        return energy if z is None else energy + self.friction.stored_energy(z, pose.prepared.friction)
 
     def gravity(self, q: Tensor | Motion) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
@@ -134,7 +141,7 @@ class RigidBodyDynamics(PortHamiltonian):
     def nonlinear_effects(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
         """Return the torque that holds qd steady without friction, (..., n), by Newton and Euler."""
         pose: Motion = self.at(q, qd)
-        return applied(pose.chain.jacobian, self.chain.accelerations(pose.chain, qd))
+        return applied(pose.chain.jacobian, self.chain.accelerations(pose.chain, qd)) @ self.chain.ratios
 
     def friction_torque(self, q: Tensor | Motion, qd: Tensor, *state: Tensor | None) -> Tensor:
         """Return the friction torque C^T f(C qd), (..., n) [Nm, N]; state: z and direction of `friction`."""
@@ -150,11 +157,6 @@ class RigidBodyDynamics(PortHamiltonian):
         resistance = self.friction.resistance(qd @ self.motors.mT, loads, pose.prepared.friction)
         return self.motors.mT @ ((pose.varied * resistance).unsqueeze(-1) * self.motors)
 
-    def hamiltonian(self, q: Tensor | Motion, p: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return H, (...) [J]."""
-        energy = super().hamiltonian(q, p)
-        return energy if z is None else energy + self.friction.stored_energy(z, self.friction.prepare())
-
     def memory(self, qd: Tensor) -> Tensor:
         """Return z, (..., n, K), of drives that have long gone this way.
 
@@ -162,12 +164,12 @@ class RigidBodyDynamics(PortHamiltonian):
         """
         # bent as far as they go a few widths on: the rest of an algebraic turn would be a stiff transient
         direction = (qd @ self.motors.mT / self.friction.prepare().coulomb_smoothing_velocity).tanh()
-        return direction.unsqueeze(-1) * self.friction.bristles.reach
+        return direction.unsqueeze(-1) * self.friction.reach
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
         """Return z after joints went one way by (..., n), exactly."""
-        path = (displacement @ self.motors.mT).unsqueeze(-1)
-        return moved_bristles(z, path, self.friction.bristles.reach)
+        reach = self.friction.reach
+        return (z + (displacement @ self.motors.mT).unsqueeze(-1)).clamp(-reach, reach)
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
         """Return the rate of (q, p, z), (..., 2 n + n K), or of (q, p, z, tau), where tau is held.
@@ -181,14 +183,9 @@ class RigidBodyDynamics(PortHamiltonian):
         z = flat.reshape(*flat.shape[:-1], n, -1) if size else None
         qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare(), z)
         if z is not None:
-            flat = self.friction.bristles.rate(qd @ self.motors.mT, z).flatten(-2)
+            flat = self.friction.rate(qd @ self.motors.mT, z).flatten(-2)
         return torch.cat([qd, force, flat, torch.zeros_like(tau)], dim=-1)
 
     def input_force(self, pose: Motion, qd: Tensor, tau: Tensor) -> Tensor:
         """Return G (tau - torque offset) + friction compensation qd, (..., n) [Nm, N]."""
         return super().input_force(pose, qd, tau - self.torque_offset) + self.friction_compensation * qd
-
-    def input_torque(self, pose: Motion, qd: Tensor, force: Tensor) -> Tensor:
-        """Return the tau, (..., n), that is measured while the drives make this force."""
-        measured = force - self.friction_compensation * qd
-        return super().input_torque(pose, qd, measured) + self.torque_offset

@@ -25,4 +25,4 @@ class SlidingFriction(FrictionLaws):
     def prepare(self) -> FrictionConstants:
         """The constants, in their units."""
         velocity = SMOOTHING_VELOCITY * self.speed * self.raw_coulomb_smoothing_velocity.exp()
-        return self.constants(velocity, self.bristles.reach)
+        return self.constants(velocity, self.reach)
