@@ -15,9 +15,10 @@ from spelgen.runtime.port_hamiltonian import applied
 
 
 class Chain(NamedTuple):
-    """The bodies at a position, each as four points: homogeneous ones, times the roots of their masses."""
+    """The bodies at a position, each as four points, in the base's frame and times the roots of their masses."""
 
-    points: Tensor  # in the base's frame, (..., 4, 4 bodies)
+    place: Tensor  # (..., 3, bodies, 4)
+    mass: Tensor  # the roots, (..., 1, bodies, 4)
     axes: Tensor  # twists that bodies have by their own displacements, (..., 6, bodies)
     jacobian: Tensor  # of the points by the bodies' displacements, (..., bodies, 12 bodies)
     weight: Tensor  # acceleration of the points that stands for gravity, (..., 12 bodies)
@@ -57,9 +58,9 @@ class BodyChain(nn.Module):
         self.table = nn.Buffer(torch.cat([torch.block_diag(*x.unsqueeze(-1)) for x in by_feature], dim=1))
         self.fixed = nn.Buffer((start.flatten(1) + second).flatten())  # what is added
         # what takes twists to the first three rows of 4 x 4 matrices, which take points to velocities
-        motions, unit = torch.zeros(6, 3, 4).double(), torch.eye(3).double()
-        motions[:3, :, :3] = torch.linalg.cross(unit.unsqueeze(-1), unit.unsqueeze(0), dim=1)
-        motions[3:, :, 3] = unit
+        unit = torch.eye(3).double()
+        skew = torch.linalg.cross(unit.unsqueeze(-1), unit.unsqueeze(0), dim=1)
+        motions = torch.cat([F.pad(skew, (0, 1)), F.pad(unit.unsqueeze(-1), (3, 0))])
         self.motions = nn.Buffer(motions.flatten(1))  # (6, 12)
         carriers = torch.eye(count).double()
         for index, carrier in enumerate(parent):
@@ -68,8 +69,8 @@ class BodyChain(nn.Module):
         self.carriers = nn.Buffer(carriers)  # whether a body carries another, or is it, (bodies, bodies)
         # likewise, by numbers of the points, (bodies, 12 bodies)
         self.carried = nn.Buffer(carriers.repeat_interleave(4, dim=1).repeat(1, 3))
-        # acceleration of the base that stands for gravity, (3, 1)
-        self.base = nn.Buffer(-vector(gravity).unsqueeze(-1))
+        # acceleration of the base that stands for gravity, (3, 1, 1)
+        self.base = nn.Buffer(-vector(gravity)[:, None, None])
 
     def forward(self, q: Tensor, points: Tensor) -> Chain:
         """The bodies at q, (..., n); points in their own frames, (4 bodies, 4 bodies), zero but on blocks."""
@@ -86,32 +87,33 @@ class BodyChain(nn.Module):
         points = frames @ points
         motions = (axes.mT @ self.motions).reshape(*q.shape[:-1], -1, 4) @ points
         jacobian = motions.reshape(*q.shape[:-1], *self.carried.shape) * self.carried
-        return Chain(points, axes, jacobian, (self.base * points[..., 3:, :]).flatten(-2))
+        place, mass = torch.unflatten(points, -1, (-1, 4)).tensor_split((3,), dim=-3)
+        return Chain(place, mass, axes, jacobian, (self.base * mass).flatten(-3))
 
-    def turning(self, pose: Chain, rates: Tensor) -> tuple[Tensor, Tensor]:
-        """The bodies' twists, and how these turn the bodies' axes, (..., 6, bodies) (Featherstone, eq. 2.31)."""
+    def motion(self, pose: Chain, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Velocities of the points, (..., 3, bodies, 4), the bodies' twists, and how these turn the axes.
+
+        The latter are (..., 6, bodies) (Featherstone, eq. 2.31).
+        """
+        rates = qd @ self.ratios.mT
+        velocity = torch.unflatten(applied(pose.jacobian.mT, rates), -1, (3, -1, 4))
         twists = (pose.axes * rates.unsqueeze(-2)) @ self.carriers
         (w, u), (a, m) = twists.chunk(2, dim=-2), pose.axes.chunk(2, dim=-2)
         linear = torch.linalg.cross(w, m, dim=-2) + torch.linalg.cross(u, a, dim=-2)
-        return twists, torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
+        return velocity, twists, torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
 
     def accelerations(self, pose: Chain, qd: Tensor) -> Tensor:
         """The points' accelerations at steady qd, gravity taken as one, (..., 12 bodies)."""
-        rates = qd @ self.ratios.mT
-        twists, turning = self.turning(pose, rates)
-        steady = (turning * rates.unsqueeze(-2)) @ self.carriers
-        w, (a, u) = twists[..., :3, :], steady.unsqueeze(-1).chunk(2, dim=-3)
-        place, mass = torch.unflatten(pose.points, -1, (-1, 4)).tensor_split((3,), dim=-3)
-        velocity = torch.unflatten(applied(pose.jacobian.mT, rates), -1, (3, -1, 4))
-        turned = torch.linalg.cross(w.unsqueeze(-1), velocity, dim=-3) + torch.linalg.cross(a, place, dim=-3)
-        return torch.addcmul(turned, u, mass).flatten(-3) + pose.weight
+        velocity, twists, turning = self.motion(pose, qd)
+        steady = (turning * (qd @ self.ratios.mT).unsqueeze(-2)) @ self.carriers
+        w, (a, u) = twists[..., :3, :, None], steady.unsqueeze(-1).chunk(2, dim=-3)
+        turned = torch.linalg.cross(w, velocity, dim=-3) + torch.linalg.cross(a, pose.place, dim=-3)
+        return torch.addcmul(turned, u, pose.mass).flatten(-3) + pose.weight
 
     def kinetic_gradient(self, pose: Chain, qd: Tensor) -> Tensor:
         """Return d/dq of the kinetic energy at qd, (..., n)."""
-        rates = qd @ self.ratios.mT
-        place, mass = torch.unflatten(pose.points, -1, (-1, 4)).tensor_split((3,), dim=-3)
-        velocity = torch.unflatten(applied(pose.jacobian.mT, rates), -1, (3, -1, 4))
-        momenta = torch.cat([torch.linalg.cross(place, velocity, dim=-3), mass * velocity], dim=-3).sum(dim=-1)
-        # the momentum of all that a joint carries, by what its displacement adds to their twist
-        turning = self.turning(pose, rates)[1]
-        return (turning * (momenta @ self.carriers.mT)).sum(dim=-2) @ self.ratios
+        velocity, _, turning = self.motion(pose, qd)
+        momenta = [torch.linalg.cross(pose.place, velocity, dim=-3), pose.mass * velocity]
+        # of all that a body carries, by what its displacement adds to their twist
+        carried = torch.cat(momenta, dim=-3).sum(dim=-1) @ self.carriers.mT
+        return (turning * carried).sum(dim=-2) @ self.ratios

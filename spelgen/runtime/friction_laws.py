@@ -33,6 +33,24 @@ class FrictionConstants(NamedTuple):
     bristle_fractions: Tensor  # of dry friction, (n, K); a joint's add up to one, or are zero
     memoryless: Tensor  # 1 where dry friction follows velocity alone, 0 where bristles
 
+    def viscosity(self, qd: Tensor) -> Tensor:
+        """Torque by velocity, (..., n)."""
+        return self.viscous + self.saturation * turning(qd, self.saturation_velocity)
+
+    def dry(self, qd: Tensor, gravity: Tensor) -> Tensor:
+        """The size of dry friction, (..., n) [Nm, N]."""
+        speed = qd.abs() / self.stribeck_velocity
+        rounding = self.stribeck_rounding
+        slow = 1 / (1 + (1 + rounding) / 8 * speed.square() / (speed + rounding))
+        slow = slow.square().square().square()  # a power of 8 takes twice the time
+        load = (gravity.square() + self.least_load**2).sqrt()
+        return self.coulomb + self.stribeck * slow + self.load_dependence * load
+
+    def resistance(self, qd: Tensor, gravity: Tensor) -> Tensor:
+        """The diagonal of D, (..., n): friction torque by velocity, of joints that slide."""
+        dry = self.dry(qd, gravity) * turning(qd, self.coulomb_smoothing_velocity)
+        return self.viscosity(qd) + dry
+
 
 class FrictionLaws(nn.Module):
     """Friction which resists whatever the weights are: they are logarithms.
@@ -93,10 +111,6 @@ class FrictionLaws(nn.Module):
             *laws, self.stribeck_rounding, smoothing_velocity, least_load, bristle_fractions, self.memoryless
         )
 
-    def resistance(self, qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
-        """The diagonal of D, (..., n): friction torque by velocity, of joints that slide."""
-        return self.viscosity(qd, c) + self.dry(qd, gravity, c) * turning(qd, c.coulomb_smoothing_velocity)
-
     def forward(
         self,
         qd: Tensor,
@@ -115,32 +129,12 @@ class FrictionLaws(nn.Module):
         if z is not None:
             bent = (c.bristle_fractions / self.reach * z).sum(dim=-1)
             direction = bent + c.memoryless * direction
-        return self.viscosity(qd, c) * qd + self.dry(qd, gravity, c) * direction
-
-    def rate(self, qd: Tensor, z: Tensor) -> Tensor:
-        """z', (..., n, K): qd, and zero where |z| is the reach and would grow."""
-        qd = qd.unsqueeze(-1)
-        return qd * (qd.sign() * z < self.reach)
+        return c.viscosity(qd) * qd + c.dry(qd, gravity) * direction
 
     def stored_energy(self, z: Tensor, c: FrictionConstants) -> Tensor:
         """What the bristles of Coulomb friction give back, (...) [J]."""
         stored = c.bristle_fractions * z.square() / self.reach
         return 0.5 * (c.coulomb * stored.sum(dim=-1)).sum(dim=-1)
-
-    @staticmethod
-    def viscosity(qd: Tensor, c: FrictionConstants) -> Tensor:
-        """Torque by velocity, (..., n)."""
-        return c.viscous + c.saturation * turning(qd, c.saturation_velocity)
-
-    @staticmethod
-    def dry(qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
-        """The size of dry friction, (..., n) [Nm, N]."""
-        speed = qd.abs() / c.stribeck_velocity
-        rounding = c.stribeck_rounding
-        slow = 1 / (1 + (1 + rounding) / 8 * speed.square() / (speed + rounding))
-        slow = slow.square().square().square()  # a power of 8 takes twice the time
-        load = (gravity.square() + c.least_load**2).sqrt()
-        return c.coulomb + c.stribeck * slow + c.load_dependence * load
 
 
 def turning(velocity: Tensor, width: Tensor) -> Tensor:

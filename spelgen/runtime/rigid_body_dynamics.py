@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from spelgen.runtime.body_chain import BodyChain, Chain
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
 from spelgen.runtime.joints import vector
-from spelgen.runtime.parts import Row, Rows
+from spelgen.runtime.parts import Row
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
 from spelgen.runtime.rigid_body import InertialParameters
 
@@ -39,7 +39,7 @@ class RigidBodyDynamics(PortHamiltonian):
     """Rigid bodies with trained inertial parameters, friction by laws, a trained torque offset.
 
     z, (..., n, K), is the state of friction's bristles [rad, m], and adds their energy to H; without it
-    friction is that of joints that slide the way they move. motors: C, the drives' speeds are C qd.
+    friction is that of joints that slide the way they move. armature: nominal, of the drives [kg m^2, kg].
     """
 
     kinds = (
@@ -49,12 +49,7 @@ class RigidBodyDynamics(PortHamiltonian):
     )
 
     def __init__(
-        self,
-        chain: BodyChain,
-        bodies: InertialParameters,
-        friction: FrictionLaws,
-        armature: Row,  # nominal, of the drives [kg m^2, kg]
-        motors: Rows = (),
+        self, chain: BodyChain, bodies: InertialParameters, friction: FrictionLaws, armature: Row
     ) -> None:
         super().__init__()
         # 1 where the measured torque moves a joint, (n,)
@@ -64,10 +59,6 @@ class RigidBodyDynamics(PortHamiltonian):
         self.chain, self.bodies, self.friction = chain, bodies, friction
         self.nominal_armature = nn.Buffer(vector(armature))
         self.raw_armature = nn.Parameter(zeros.clone())  # its logarithm
-        # C, (n, n), and its inverse; each drive moves its own joint alone where it is not given
-        rows = [vector(row) for row in motors]
-        self.motors = nn.Buffer(torch.stack(rows) if rows else torch.eye(self.n).double())
-        self.loads = nn.Buffer(torch.linalg.inv(self.motors))
         # of the measured torque, in units of the joints' usual friction
         self.raw_offset = nn.Parameter(zeros.clone())
         # in units of usual friction at usual speed; no parameter: only a fit to torques may find one
@@ -77,12 +68,9 @@ class RigidBodyDynamics(PortHamiltonian):
     def inertial_parameters(self) -> Tensor:
         """By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
         root = self.bodies.forward()
-        pseudo = root @ root.mT
-        second = pseudo[..., :3, :3]
-        trace = second.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
-        inertia = trace[..., None, None] * torch.eye(3).to(pseudo) - second
-        row, column = torch.triu_indices(3, 3)
-        return torch.cat([pseudo[..., 3, 3:], pseudo[..., 3, :3], inertia[..., row, column]], dim=-1)
+        row, column = torch.triu_indices(4, 4)
+        xx, xy, xz, x, yy, yz, y, zz, z, m = (root @ root.mT)[..., row, column].unbind(dim=-1)
+        return torch.stack([m, x, y, z, yy + zz, -xy, -xz, xx + zz, -yz, xx + yy], dim=-1)
 
     @property
     def armature(self) -> Tensor:
@@ -112,8 +100,7 @@ class RigidBodyDynamics(PortHamiltonian):
     def prepare(self) -> RigidPrepared:
         """Return all that depends on the weights alone; holds until they change."""
         points = torch.ops.aten.block_diag([*self.bodies.forward()])
-        armature = self.motors.mT @ (self.armature.unsqueeze(-1) * self.motors)
-        return RigidPrepared(points, armature, self.friction.prepare())
+        return RigidPrepared(points, torch.diag_embed(self.armature), self.friction.prepare())
 
     def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
         """Return what depends on q alone."""
@@ -125,7 +112,7 @@ class RigidBodyDynamics(PortHamiltonian):
     def potential_energy(self, q: Tensor | Motion, z: Tensor | None = None) -> Tensor:
         """Return V(q) and what bristles store, (...) [J]; zero for a mass at the base's origin."""
         pose: Motion = self.at(q)
-        energy = (pose.chain.points[..., :3, :].flatten(-2) * pose.chain.weight).sum(dim=-1)
+        energy = (pose.chain.place.flatten(-3) * pose.chain.weight).sum(dim=-1)
         return energy if z is None else energy + self.friction.stored_energy(z, pose.prepared.friction)
 
     def gravity(self, q: Tensor | Motion) -> Tensor:
@@ -144,18 +131,14 @@ class RigidBodyDynamics(PortHamiltonian):
         return applied(pose.chain.jacobian, self.chain.accelerations(pose.chain, qd)) @ self.chain.ratios
 
     def friction_torque(self, q: Tensor | Motion, qd: Tensor, *state: Tensor | None) -> Tensor:
-        """Return the friction torque C^T f(C qd), (..., n) [Nm, N]; state: z and direction of `friction`."""
+        """Return the friction torque, (..., n) [Nm, N]; state: z and direction of `friction`."""
         pose: Motion = self.at(q, qd)
-        loads = pose.gravity @ self.loads
-        torque = self.friction.forward(qd @ self.motors.mT, loads, pose.prepared.friction, *state)
-        return (pose.varied * torque) @ self.motors
+        return pose.varied * self.friction.forward(qd, pose.gravity, pose.prepared.friction, *state)
 
     def dissipation(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
-        """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m], diagonal where each drive moves its own joint."""
+        """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
         pose: Motion = self.at(q, qd)
-        loads = pose.gravity @ self.loads
-        resistance = self.friction.resistance(qd @ self.motors.mT, loads, pose.prepared.friction)
-        return self.motors.mT @ ((pose.varied * resistance).unsqueeze(-1) * self.motors)
+        return torch.diag_embed(pose.varied * pose.prepared.friction.resistance(qd, pose.gravity))
 
     def memory(self, qd: Tensor) -> Tensor:
         """Return z, (..., n, K), of drives that have long gone this way.
@@ -163,13 +146,17 @@ class RigidBodyDynamics(PortHamiltonian):
         Near the smoothing velocity they bear up to 7.4 % more than friction without z, far above it the same.
         """
         # bent as far as they go a few widths on: the rest of an algebraic turn would be a stiff transient
-        direction = (qd @ self.motors.mT / self.friction.prepare().coulomb_smoothing_velocity).tanh()
+        direction = (qd / self.friction.prepare().coulomb_smoothing_velocity).tanh()
         return direction.unsqueeze(-1) * self.friction.reach
+
+    def memory_rate(self, z: Tensor, qd: Tensor) -> Tensor:
+        """Return z', (..., n, K): qd, and zero where |z| is the reach and would grow."""
+        qd = qd.unsqueeze(-1)
+        return qd * (qd.sign() * z < self.friction.reach)
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
         """Return z after joints went one way by (..., n), exactly."""
-        reach = self.friction.reach
-        return (z + (displacement @ self.motors.mT).unsqueeze(-1)).clamp(-reach, reach)
+        return (z + displacement.unsqueeze(-1)).clamp(-self.friction.reach, self.friction.reach)
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
         """Return the rate of (q, p, z), (..., 2 n + n K), or of (q, p, z, tau), where tau is held.
@@ -183,7 +170,7 @@ class RigidBodyDynamics(PortHamiltonian):
         z = flat.reshape(*flat.shape[:-1], n, -1) if size else None
         qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare(), z)
         if z is not None:
-            flat = self.friction.rate(qd @ self.motors.mT, z).flatten(-2)
+            flat = self.memory_rate(z, qd).flatten(-2)
         return torch.cat([qd, force, flat, torch.zeros_like(tau)], dim=-1)
 
     def input_force(self, pose: Motion, qd: Tensor, tau: Tensor) -> Tensor:
