@@ -18,6 +18,7 @@ from spelgen.dynamics.protocol import (
     has_residuals,
     has_rigid_bodies,
     input_of,
+    motors_of,
 )
 from spelgen.errors import RunError
 from spelgen.exporting.description import (
@@ -60,10 +61,10 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
         identifiers=tuple(model.joint_names),
         inertias=array(exact.inertial_parameters),
         constant_mass=constant_mass,
-        motors=array(exact.motors),
+        motors=array(motors_of(exact)),
         residuals=residuals,
         friction=weights.friction._make(map(array, weights.friction)),
-        reach=array(exact.friction.bristles.reach),
+        reach=array(exact.friction.reach),
         inputs=array(exact.input_matrix(torch.zeros(exact.n).double())),
         actuated=array(exact.actuated),
         torque_offset=array(exact.torque_offset),

@@ -13,7 +13,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.protocol import has_rigid_bodies
+from spelgen.dynamics.protocol import has_rigid_bodies, motors_of
 from spelgen.dynamics.residuals import without_residuals
 from spelgen.emission.loading import load_module
 from spelgen.exporting.parity import usual_speeds
@@ -89,7 +89,7 @@ def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProje
         arm=arm,
         inertias=bodies.inertial_parameters.numpy(),
         armature=bodies.armature.numpy(),
-        motors=bodies.motors.numpy(),
+        motors=motors_of(bodies).numpy(),
         viscous=viscous,
         forward=forward,
         backward=backward,

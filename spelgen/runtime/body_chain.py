@@ -57,11 +57,12 @@ class BodyChain(nn.Module):
         # what takes cos, sin and value of displacements to frames in parents', (16 bodies, 3 bodies)
         self.table = nn.Buffer(torch.cat([torch.block_diag(*x.unsqueeze(-1)) for x in by_feature], dim=1))
         self.fixed = nn.Buffer((start.flatten(1) + second).flatten())  # what is added
-        # what takes twists to the first three rows of 4 x 4 matrices, which take points to velocities
+        # what takes twists to 3 x 4 matrices, which take points to velocities, (6, 12)
         unit = torch.eye(3).double()
         skew = torch.linalg.cross(unit.unsqueeze(-1), unit.unsqueeze(0), dim=1)
-        motions = torch.cat([F.pad(skew, (0, 1)), F.pad(unit.unsqueeze(-1), (3, 0))])
-        self.motions = nn.Buffer(motions.flatten(1))  # (6, 12)
+        self.motions = nn.Buffer(
+            torch.cat([F.pad(skew, (0, 1)), F.pad(unit.unsqueeze(-1), (3, 0))]).flatten(1)
+        )
         carriers = torch.eye(count).double()
         for index, carrier in enumerate(parent):
             if carrier >= 0:
@@ -91,10 +92,7 @@ class BodyChain(nn.Module):
         return Chain(place, mass, axes, jacobian, (self.base * mass).flatten(-3))
 
     def motion(self, pose: Chain, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Velocities of the points, (..., 3, bodies, 4), the bodies' twists, and how these turn the axes.
-
-        The latter are (..., 6, bodies) (Featherstone, eq. 2.31).
-        """
+        """Points' velocities, (..., 3, bodies, 4), twists, and how these turn axes (Featherstone, eq. 2.31)."""
         rates = qd @ self.ratios.mT
         velocity = torch.unflatten(applied(pose.jacobian.mT, rates), -1, (3, -1, 4))
         twists = (pose.axes * rates.unsqueeze(-2)) @ self.carriers

@@ -31,6 +31,7 @@ class FrictionConstants(NamedTuple):
     coulomb_smoothing_velocity: Tensor  # over which dry friction turns around [rad/s, m/s]
     least_load: Tensor  # [Nm, N]
     bristle_fractions: Tensor  # of dry friction, (n, K); a joint's add up to one, or are zero
+    bristle_reach: Tensor  # (n, K) [rad, m]
     memoryless: Tensor  # 1 where dry friction follows velocity alone, 0 where bristles
 
     def viscosity(self, qd: Tensor) -> Tensor:
@@ -46,10 +47,25 @@ class FrictionConstants(NamedTuple):
         load = (gravity.square() + self.least_load**2).sqrt()
         return self.coulomb + self.stribeck * slow + self.load_dependence * load
 
-    def resistance(self, qd: Tensor, gravity: Tensor) -> Tensor:
-        """The diagonal of D, (..., n): friction torque by velocity, of joints that slide."""
-        dry = self.dry(qd, gravity) * turning(qd, self.coulomb_smoothing_velocity)
-        return self.viscosity(qd) + dry
+    def torque(
+        self, qd: Tensor, gravity: Tensor, z: Tensor | None = None, direction: Tensor | None = None
+    ) -> Tensor:
+        """The friction torque, (..., n) [Nm, N], under this gravity torque, of bristles at z, (..., n, K).
+
+        z: None where nothing is known of the way here; all joints are then without memory.
+        direction: (..., n) of joints without memory; None: that of qd.
+        """
+        if direction is None:
+            direction = qd * turning(qd, self.coulomb_smoothing_velocity)
+        if z is not None:
+            bent = (self.bristle_fractions / self.bristle_reach * z).sum(dim=-1)
+            direction = bent + self.memoryless * direction
+        return self.viscosity(qd) * qd + self.dry(qd, gravity) * direction
+
+    def stored_energy(self, z: Tensor) -> Tensor:
+        """What the bristles of Coulomb friction give back, (...) [J]."""
+        stored = self.bristle_fractions * z.square() / self.bristle_reach
+        return 0.5 * (self.coulomb * stored.sum(dim=-1)).sum(dim=-1)
 
 
 class FrictionLaws(nn.Module):
@@ -97,44 +113,21 @@ class FrictionLaws(nn.Module):
 
     def prepare(self) -> FrictionConstants:
         """The constants, in their units."""
-        fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
-        return self.constants(SHARP_VELOCITY * self.speed, fractions)
-
-    def constants(self, smoothing_velocity: Tensor, bristle_fractions: Tensor) -> FrictionConstants:
-        """The constants, where dry friction turns around like this."""
         size, speed, laws = self.nominal, self.speed, []
         units = {"Nm s/rad, N s/m": size / speed, "Nm, N": size, "rad/s, m/s": speed, "1": size.sign()}
         for name, _, unit, start in FrictionLaws.kinds[:-1]:
             laws.append(start * units[unit] * getattr(self, name).exp())
-        least_load = LEAST_LOAD * torch.where(size > 0, size, 1.0)
+        load = LEAST_LOAD * torch.where(size > 0, size, 1.0)
+        fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
         return FrictionConstants(
-            *laws, self.stribeck_rounding, smoothing_velocity, least_load, bristle_fractions, self.memoryless
+            *laws,
+            self.stribeck_rounding,
+            SHARP_VELOCITY * speed,
+            load,
+            fractions,
+            self.reach,
+            self.memoryless,
         )
-
-    def forward(
-        self,
-        qd: Tensor,
-        gravity: Tensor,
-        c: FrictionConstants,
-        z: Tensor | None = None,
-        direction: Tensor | None = None,
-    ) -> Tensor:
-        """The friction torque, (..., n) [Nm, N], under this gravity torque, of bristles at z, (..., n, K).
-
-        z: None where nothing is known of the way here; all joints are then without memory.
-        direction: (..., n) of joints without memory; None: that of qd.
-        """
-        if direction is None:
-            direction = qd * turning(qd, c.coulomb_smoothing_velocity)
-        if z is not None:
-            bent = (c.bristle_fractions / self.reach * z).sum(dim=-1)
-            direction = bent + c.memoryless * direction
-        return c.viscosity(qd) * qd + c.dry(qd, gravity) * direction
-
-    def stored_energy(self, z: Tensor, c: FrictionConstants) -> Tensor:
-        """What the bristles of Coulomb friction give back, (...) [J]."""
-        stored = c.bristle_fractions * z.square() / self.reach
-        return 0.5 * (c.coulomb * stored.sum(dim=-1)).sum(dim=-1)
 
 
 def turning(velocity: Tensor, width: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.body_chain import BodyChain, Chain
-from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
+from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws, turning
 from spelgen.runtime.joints import vector
 from spelgen.runtime.parts import Row
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
@@ -52,17 +52,16 @@ class RigidBodyDynamics(PortHamiltonian):
         self, chain: BodyChain, bodies: InertialParameters, friction: FrictionLaws, armature: Row
     ) -> None:
         super().__init__()
-        # 1 where the measured torque moves a joint, (n,)
-        self.actuated = nn.Buffer(self.input_matrix(vector([0.0] * self.n)).any(dim=0).double())
-        zeros = torch.zeros(self.n, dtype=torch.float64)
-        self.elements = friction.reach.shape[1]
         self.chain, self.bodies, self.friction = chain, bodies, friction
+        self.elements = friction.reach.shape[1]
         self.nominal_armature = nn.Buffer(vector(armature))
-        self.raw_armature = nn.Parameter(zeros.clone())  # its logarithm
+        # 1 where the measured torque moves a joint, (n,)
+        self.actuated = nn.Buffer(self.input_matrix(self.nominal_armature).any(dim=0).double())
+        self.raw_armature = nn.Parameter(torch.zeros_like(self.actuated))  # its logarithm
         # of the measured torque, in units of the joints' usual friction
-        self.raw_offset = nn.Parameter(zeros.clone())
+        self.raw_offset = nn.Parameter(torch.zeros_like(self.actuated))
         # in units of usual friction at usual speed; no parameter: only a fit to torques may find one
-        self.raw_friction_compensation = nn.Buffer(zeros)
+        self.raw_friction_compensation = nn.Buffer(torch.zeros_like(self.actuated))
 
     @property
     def inertial_parameters(self) -> Tensor:
@@ -104,8 +103,7 @@ class RigidBodyDynamics(PortHamiltonian):
 
     def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
         """Return what depends on q alone."""
-        chain = self.chain.forward(q, prepared.points)
-        ratios = self.chain.ratios
+        chain, ratios = self.chain.forward(q, prepared.points), self.chain.ratios
         mass = ratios.mT @ (chain.jacobian @ chain.jacobian.mT) @ ratios + prepared.armature
         return Motion(chain, mass, applied(chain.jacobian, chain.weight) @ ratios, prepared)
 
@@ -113,7 +111,7 @@ class RigidBodyDynamics(PortHamiltonian):
         """Return V(q) and what bristles store, (...) [J]; zero for a mass at the base's origin."""
         pose: Motion = self.at(q)
         energy = (pose.chain.place.flatten(-3) * pose.chain.weight).sum(dim=-1)
-        return energy if z is None else energy + self.friction.stored_energy(z, pose.prepared.friction)
+        return energy if z is None else energy + pose.prepared.friction.stored_energy(z)
 
     def gravity(self, q: Tensor | Motion) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
@@ -131,14 +129,16 @@ class RigidBodyDynamics(PortHamiltonian):
         return applied(pose.chain.jacobian, self.chain.accelerations(pose.chain, qd)) @ self.chain.ratios
 
     def friction_torque(self, q: Tensor | Motion, qd: Tensor, *state: Tensor | None) -> Tensor:
-        """Return the friction torque, (..., n) [Nm, N]; state: z and direction of `friction`."""
+        """Return the friction torque, (..., n) [Nm, N]; state: see ``FrictionConstants.torque``."""
         pose: Motion = self.at(q, qd)
-        return pose.varied * self.friction.forward(qd, pose.gravity, pose.prepared.friction, *state)
+        return pose.varied * pose.prepared.friction.torque(qd, pose.gravity, *state)
 
     def dissipation(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
         """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
         pose: Motion = self.at(q, qd)
-        return torch.diag_embed(pose.varied * pose.prepared.friction.resistance(qd, pose.gravity))
+        friction = pose.prepared.friction
+        dry = friction.dry(qd, pose.gravity) * turning(qd, friction.coulomb_smoothing_velocity)
+        return torch.diag_embed(pose.varied * (friction.viscosity(qd) + dry))
 
     def memory(self, qd: Tensor) -> Tensor:
         """Return z, (..., n, K), of drives that have long gone this way.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import torch
 
-from spelgen.runtime.rigid_body import body_factor, upper_cholesky
+from spelgen.runtime.rigid_body import body_factor
 from spelgen.settings.tuning.fitting import TorqueTuning
 
 TUNING = TorqueTuning()
@@ -34,6 +34,12 @@ def moved_bodies(raw: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
     fraction = (TUNING.body_step / (-smallest).clamp(min=1e-12)).clamp(max=1.0)
     factor = factor @ upper_cholesky(torch.eye(4).double() + fraction[:, None, None] * added)
     return body_weights(factor)
+
+
+def upper_cholesky(matrix: torch.Tensor) -> torch.Tensor:
+    """Return the upper triangular U, (..., n, n), with U U^T the matrix."""
+    lower: torch.Tensor = torch.linalg.cholesky(matrix.flip(-1, -2))
+    return lower.flip(-1, -2)
 
 
 def body_weights(factor: torch.Tensor) -> torch.Tensor:

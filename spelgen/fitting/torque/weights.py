@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from spelgen.dynamics.parameters import parameter_table
+from spelgen.dynamics.protocol import motors_of
 from spelgen.fitting.functional_model import Weights
 from spelgen.fitting.torque.samples import Block
 from spelgen.settings.fits import Adaptation
@@ -89,7 +90,7 @@ def bound_friction(model: EmittedModel, samples: Block) -> None:
 
     It is guessed from efforts, which many URDFs have as placeholders: offsets in its units would pass for weights.
     """
-    rigid, motors = RigidWeights(model), model.motors
+    rigid, motors = RigidWeights(model), motors_of(model)
     with torch.no_grad():
         of_drives = joint_torque(model, samples) @ torch.linalg.inv(motors)
         largest = of_drives.std(dim=0) / model.friction.nominal
