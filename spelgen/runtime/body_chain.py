@@ -28,7 +28,8 @@ class BodyChain(nn.Module):
     """Bodies that turn about or slide along axes, each carried by another or by the base.
 
     Twists are (angular, linear) in the base's frame, as in Featherstone, Rigid Body Dynamics Algorithms,
-    2008; frames are 4 x 4 (Uicker, J. Appl. Mech. 34:418, 1967). Only frames are followed body by body: sums
+    2008; frames are 4 x 4 (Uicker, J. Appl. Mech. 34:418, 1967). A body moves as four points do, the columns
+    (position, 1) root of mass of a root of its pseudo-inertia. Only frames are followed body by body: sums
     over all that carries a body, or that it carries, are products with a mask, so few operations are left.
     """
 
@@ -86,8 +87,8 @@ class BodyChain(nn.Module):
         angular = self.turns * z
         axes = torch.cat([angular, torch.linalg.cross(origin, angular, dim=-2) + (z - angular)], dim=-2)
         points = frames @ points
-        motions = (axes.mT @ self.motions).reshape(*q.shape[:-1], -1, 4) @ points
-        jacobian = motions.reshape(*q.shape[:-1], *self.carried.shape) * self.carried
+        motions = torch.unflatten(axes.mT @ self.motions, -1, (3, 4)).flatten(-3, -2) @ points
+        jacobian = torch.unflatten(motions, -2, (-1, 3)).flatten(-2) * self.carried
         place, mass = torch.unflatten(points, -1, (-1, 4)).tensor_split((3,), dim=-3)
         return Chain(place, mass, axes, jacobian, (self.base * mass).flatten(-3))
 

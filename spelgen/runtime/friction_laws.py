@@ -119,15 +119,8 @@ class FrictionLaws(nn.Module):
             laws.append(start * units[unit] * getattr(self, name).exp())
         load = LEAST_LOAD * torch.where(size > 0, size, 1.0)
         fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
-        return FrictionConstants(
-            *laws,
-            self.stribeck_rounding,
-            SHARP_VELOCITY * speed,
-            load,
-            fractions,
-            self.reach,
-            self.memoryless,
-        )
+        rounding, sharp = self.stribeck_rounding, SHARP_VELOCITY * speed
+        return FrictionConstants(*laws, rounding, sharp, load, fractions, self.reach, self.memoryless)
 
 
 def turning(velocity: Tensor, width: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""A port-Hamiltonian model of rigid bodies, by the recursive Newton-Euler equations."""
+"""A port-Hamiltonian model of rigid bodies, each of which moves as four points do."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from spelgen.runtime.rigid_body import InertialParameters
 class RigidPrepared(NamedTuple):
     """What depends on the weights alone, worked out once for many states."""
 
-    points: Tensor  # of the bodies' masses, see ``BodyChain``, (4 bodies, 4 bodies)
+    points: Tensor  # of the bodies in their own frames, columns of blocks, (4 bodies, 4 bodies)
     armature: Tensor  # what the rotors add to M, (n, n)
     friction: FrictionConstants
     residual: Any = None  # of what a model has beside rigid bodies
@@ -124,7 +124,7 @@ class RigidBodyDynamics(PortHamiltonian):
         return self.chain.kinetic_gradient(pose.chain, qd) - pose.gravity
 
     def nonlinear_effects(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
-        """Return the torque that holds qd steady without friction, (..., n), by Newton and Euler."""
+        """Return the torque that holds qd steady without friction, (..., n), by d'Alembert's principle."""
         pose: Motion = self.at(q, qd)
         return applied(pose.chain.jacobian, self.chain.accelerations(pose.chain, qd)) @ self.chain.ratios
 
