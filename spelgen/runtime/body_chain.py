@@ -15,7 +15,7 @@ from spelgen.runtime.port_hamiltonian import applied
 
 
 class Chain(NamedTuple):
-    """The bodies at a position, each as four points, in the base's frame and times the roots of their masses."""
+    """The bodies at a position, each as four points, in the base's frame and times roots of their masses."""
 
     place: Tensor  # (..., 3, bodies, 4)
     mass: Tensor  # the roots, (..., 1, bodies, 4)
@@ -56,7 +56,8 @@ class BodyChain(nn.Module):
         first, second = (start @ rate).flatten(1), (start @ rate @ rate).flatten(1)
         by_feature = [-second, turns.unsqueeze(-1) * first, (1 - turns).unsqueeze(-1) * first]
         # what takes cos, sin and value of displacements to frames in parents', (16 bodies, 3 bodies)
-        self.table = nn.Buffer(torch.cat([torch.block_diag(*x.unsqueeze(-1)) for x in by_feature], dim=1))
+        blocks = [torch.ops.aten.block_diag([*x.unsqueeze(-1)]) for x in by_feature]
+        self.table = nn.Buffer(torch.cat(blocks, dim=1))
         self.fixed = nn.Buffer((start.flatten(1) + second).flatten())  # what is added
         # what takes twists to 3 x 4 matrices, which take points to velocities, (6, 12)
         unit = torch.eye(3).double()
@@ -93,7 +94,7 @@ class BodyChain(nn.Module):
         return Chain(place, mass, axes, jacobian, (self.base * mass).flatten(-3))
 
     def motion(self, pose: Chain, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Points' velocities, (..., 3, bodies, 4), twists, and how these turn axes (Featherstone, eq. 2.31)."""
+        """Points' velocities, (..., 3, bodies, 4), twists, and how they turn axes (Featherstone, eq. 2.31)."""
         rates = qd @ self.ratios.mT
         velocity = torch.unflatten(applied(pose.jacobian.mT, rates), -1, (3, -1, 4))
         twists = (pose.axes * rates.unsqueeze(-2)) @ self.carriers

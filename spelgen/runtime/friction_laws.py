@@ -120,7 +120,7 @@ class FrictionLaws(nn.Module):
         load = LEAST_LOAD * torch.where(size > 0, size, 1.0)
         fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
         rounding, sharp = self.stribeck_rounding, SHARP_VELOCITY * speed
-        return FrictionConstants(*laws, rounding, sharp, load, fractions, self.reach, self.memoryless)
+        return FrictionConstants._make([*laws, rounding, sharp, load, fractions, self.reach, self.memoryless])
 
 
 def turning(velocity: Tensor, width: Tensor) -> Tensor:

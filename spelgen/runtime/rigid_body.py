@@ -39,5 +39,5 @@ class InertialParameters(nn.Module):
         self.raw = nn.Parameter(torch.zeros(len(nominal), 10, dtype=torch.float64))
 
     def forward(self) -> Tensor:
-        """Return C T of each body, (bodies, 4, 4): its columns are points that move as the body's mass does."""
+        """Return C T of each body, (bodies, 4, 4): its columns are points that move as its mass does."""
         return self.factors @ body_factor(torch.unflatten(self.raw @ self.triangle, -1, (4, 4)))
