@@ -94,7 +94,7 @@ class BodyChain(nn.Module):
         return Chain(place, mass, axes, jacobian, (self.base * mass).flatten(-3))
 
     def motion(self, pose: Chain, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Points' velocities, (..., 3, bodies, 4), twists, and how they turn axes (Featherstone, eq. 2.31)."""
+        """Points' velocities, (..., 3, bodies, 4), twists, how these turn axes (Featherstone, eq. 2.31)."""
         rates = qd @ self.ratios.mT
         velocity = torch.unflatten(applied(pose.jacobian.mT, rates), -1, (3, -1, 4))
         twists = (pose.axes * rates.unsqueeze(-2)) @ self.carriers

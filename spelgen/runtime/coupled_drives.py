@@ -31,7 +31,7 @@ class CoupledDrives(RigidBodyDynamics):
         return pose._replace(gravity=pose.gravity @ self.loads), qd @ self.motors.mT
 
     def friction_torque(self, q: Tensor | Motion, qd: Tensor, *state: Tensor | None) -> Tensor:
-        """Return the friction torque C^T f(C qd), (..., n) [Nm, N]; state: see ``FrictionConstants.torque``."""
+        """Return the friction torque C^T f(C qd), (..., n) [Nm, N]; state: see ``FrictionConstants``."""
         return super().friction_torque(*self._at_drives(q, qd), *state) @ self.motors
 
     def dissipation(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
