@@ -34,7 +34,7 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
     rises = torch.unflatten(rises, -1, (3, count, 4))
     jacobian = torch.unflatten(chain.ratios.mT @ pose.jacobian, -1, (3, count, 4))
     products = torch.einsum("...nxba,...xbc->...nbac", jacobian, rises)
-    rows = torch.tensordot(products, pseudo_inertia(torch.eye(10).to(q)), dims=([-2, -1], [1, 2]))
+    rows: Tensor = torch.tensordot(products, pseudo_inertia(torch.eye(10).to(q)), dims=([-2, -1], [1, 2]))
     return rows.flatten(-2)
 
 

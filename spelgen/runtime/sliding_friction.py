@@ -21,7 +21,7 @@ class SlidingFriction(FrictionLaws):
         self.memoryless.fill_(1.0)
         self.raw_coulomb_smoothing_velocity = nn.Parameter(torch.zeros_like(self.speed))
         del self.raw_bristle_fractions
-        self.raw_bristle_fractions = nn.Buffer(self.reach)  # none
+        self.register_buffer("raw_bristle_fractions", self.reach)  # none
 
     def prepare(self) -> FrictionConstants:
         """The constants, in their units."""
