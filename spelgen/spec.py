@@ -25,7 +25,7 @@ Kind = Literal["zero", "constant", "varying"]
 Entries = tuple[tuple[int, int, float], ...]
 """A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""
 
-MODULE_FORMAT = 7
+MODULE_FORMAT = 8
 """Of emitted modules: it changes when a module, or weights of one, written before cannot be used any more."""
 LARGEST_MODULE = 2**22  # bytes: the largest that `build` writes has a tenth
 _MOST_WEIGHTS = 2**24  # of the hidden layers of one network: 134 MB in double precision
@@ -99,9 +99,10 @@ class BodySpec:
     kind: Literal["revolute", "prismatic"]
     ratio: float
     offset: float
-    rotation: tuple[Triple, Triple, Triple]
-    position: Triple
-    reference: tuple[float, ...]
+    placement: tuple[tuple[float, ...], ...]
+    """Of its joint's frame in its parent's: three rows of [R p] [m]."""
+    pseudo_inertia: tuple[float, ...]
+    """The upper triangle of [[S, m c], [(m c)^T, m]], row by row, with S the second moments of mass."""
 
 
 @dataclass(frozen=True)

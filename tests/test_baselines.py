@@ -15,6 +15,7 @@ from spelgen.baselines.predictor import accurate_solver
 from spelgen.baselines.rosenbrock import roll_out_stiff
 from spelgen.baselines.urdf import UrdfValues
 from spelgen.cli.main import app
+from spelgen.dynamics.bristles import moved_bristles
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.fitting.fitted import load_run
@@ -22,7 +23,6 @@ from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows
 from spelgen.pipeline import generate
-from spelgen.runtime.bristles import moved_bristles
 
 
 class Slider:

@@ -173,10 +173,10 @@ def test_friction_at_a_standstill_has_its_slope(emitted):
     q = states(6)[0]
     constants = model.friction.prepare()
     still = torch.zeros_like(q).requires_grad_()
-    (slope,) = torch.autograd.grad(model.friction(still, model.gravity(q), constants).sum(), still)
+    (slope,) = torch.autograd.grad(constants.torque(still, model.gravity(q)).sum(), still)
     near(slope, model.dissipation(q, still).diagonal(dim1=-2, dim2=-1))
     away = torch.full_like(q, 1e-3)
-    torque = model.friction(away, model.gravity(q), constants)
+    torque = constants.torque(away, model.gravity(q))
     dry = constants.coulomb + constants.load_dependence * torch.hypot(model.gravity(q), constants.least_load)
     relative = away / constants.stribeck_velocity
     rounding = constants.stribeck_rounding

@@ -276,7 +276,7 @@ def test_invariants_notice_what_breaks_them(study, quick):
     low, high = (torch.full((2,), bound, dtype=torch.float64) for bound in (-math.pi, math.pi))
     kept = invariants.invariants(model, windows, low, high)
     assert kept.energy_rise <= 1e-12 < kept.least_eigenvalue
-    model.friction.forward = lambda qd, gravity, prepared, z=None: -5.0 * qd  # drives instead of braking
+    model.friction_torque = lambda pose, qd, *state: -5.0 * qd  # drives instead of braking
     assert invariants.invariants(model, windows, low, high).energy_rise > 1e-3
     model.mass_matrix = lambda q: torch.diag_embed(torch.cat([q.cos()[..., :1], 1 + 0 * q[..., :1]], dim=-1))
     assert invariants.invariants(model, windows, low, high).least_eigenvalue < -1

@@ -4,8 +4,17 @@ import numpy as np
 import pytest
 import torch
 from emitted import ROBOTS, built, import_source
+from exported_runs import arm_of
 
-from spelgen.dynamics.bristles import BristleReach, bristle_reach, bristles_along, encoder_step, reach_of
+from spelgen.building import build
+from spelgen.dynamics.bristles import (
+    BristleReach,
+    bristle_reach,
+    bristles_along,
+    encoder_step,
+    moved_bristles,
+    reach_of,
+)
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.emission.loading import load_module
 from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
@@ -15,7 +24,6 @@ from spelgen.loaded_arm import load_arm
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
-from spelgen.runtime.bristles import Bristles, moved_bristles
 from spelgen.runtime.friction_laws import FrictionLaws
 from spelgen.runtime.sliding_friction import SlidingFriction
 
@@ -32,28 +40,28 @@ def swings(samples: int, seed: int = 0) -> np.ndarray:
 
 
 def test_one_pass_over_positions_solves_the_differential_equation():
-    bristles, q = Bristles(REACH), torch.from_numpy(swings(100_001))
+    model, q = build(arm_of("two_link"), "closed-form"), torch.from_numpy(swings(100_001))
+    model.friction.reach = reach = torch.tensor(REACH).double()
     z = torch.zeros(2, 3).double()
     qd = q.diff(dim=0)
     for moved in qd:  # Euler, with steps far below the least reach
-        z = z + bristles.rate(moved, z)
+        z = z + model.memory_rate(z, moved)
     found = bristles_along(q[::1000].numpy(), BristleReach(np.array(REACH)))[-1]
     # between samples that lie so far apart a joint may turn around: finer ones know of it
     finer = bristles_along(q[::10].numpy(), BristleReach(np.array(REACH)))[-1]
-    assert np.abs(finer / REACH - (z / bristles.reach).numpy()).max() < 1e-2
+    assert np.abs(finer / REACH - (z / reach).numpy()).max() < 1e-2
     assert np.abs(found / REACH).max() <= 1.0
 
 
 def test_a_step_of_any_length_is_exact_along_one_way():
-    bristles, z = Bristles(REACH), torch.randn(2, 3).double().clamp(-1, 1) * torch.tensor(REACH)
+    reach = torch.tensor(REACH).double()
+    z = torch.randn(2, 3).double().clamp(-1, 1) * reach
     way = torch.tensor([0.02, -0.003]).double()
     parts = z
     for part in torch.rand(50, 1).double().softmax(dim=0):
-        parts = moved_bristles(parts, (part * way).unsqueeze(-1), bristles.reach)
+        parts = moved_bristles(parts, (part * way).unsqueeze(-1), reach)
     # Fifty sums of a way of 20 mrad round by some 1e-17, and an element may end at zero.
-    torch.testing.assert_close(
-        parts, moved_bristles(z, way.unsqueeze(-1), bristles.reach), rtol=1e-12, atol=1e-15
-    )
+    torch.testing.assert_close(parts, moved_bristles(z, way.unsqueeze(-1), reach), rtol=1e-12, atol=1e-15)
 
 
 def test_load_dependent_friction_is_smooth_at_right_angles():
@@ -62,7 +70,7 @@ def test_load_dependent_friction_is_smooth_at_right_angles():
     still = torch.ones(2).double()
 
     def dry(gravity: torch.Tensor) -> torch.Tensor:
-        return laws.dry(still, gravity, constants)
+        return constants.dry(still, gravity)
 
     slopes = [torch.func.jacrev(dry)(x * still).diagonal() for x in (-1e-13, 0.0, 1e-13)]
     torch.testing.assert_close(slopes[0], slopes[2], rtol=0, atol=1e-9)
@@ -82,18 +90,14 @@ def test_bristles_store_and_dissipate_but_never_give_more_than_they_hold():
         laws.raw_load_dependence -= 100.0
         constants = laws.prepare()
         qd = torch.randn(500, 2, generator=torch.Generator().manual_seed(2)).double()
-        z = (
-            2 * torch.rand(500, 2, 3, generator=torch.Generator().manual_seed(3)).double() - 1
-        ) * laws.bristles.reach
-        rate = laws.bristles.rate(qd, z)
-        stored = (
-            constants.coulomb.unsqueeze(-1) * constants.bristle_fractions * z / laws.bristles.reach * rate
-        )
-        power = (laws(qd, torch.zeros_like(qd), constants, z) * qd).sum(dim=-1)
+        z = (2 * torch.rand(500, 2, 3, generator=torch.Generator().manual_seed(3)).double() - 1) * laws.reach
+        rate = qd.unsqueeze(-1) * (qd.sign().unsqueeze(-1) * z < laws.reach)
+        stored = constants.coulomb.unsqueeze(-1) * constants.bristle_fractions * z / laws.reach * rate
+        power = (constants.torque(qd, torch.zeros_like(qd), z) * qd).sum(dim=-1)
         lost = power - stored.sum(dim=(-2, -1))
         assert lost.min() >= -1e-12
         assert power.min() < 0  # bristles do give back
-        energy = laws.stored_energy(z, constants)
+        energy = constants.stored_energy(z)
         assert energy.min() > 0
 
 

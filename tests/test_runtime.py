@@ -16,12 +16,13 @@ from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 from spelgen.building import build
 from spelgen.design import PRESET_NAMES, load_design
+from spelgen.dynamics.body_regressor import pseudo_inertia
 from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
 from spelgen.dynamics.protocol import has_friction_state, sliding_memory
 from spelgen.emission.bundle import bundle, load_runtime, names_in
 from spelgen.emission.tailored import kinds
 from spelgen.emission.unit_joints import hidden_units
-from spelgen.fitting.torque.weights import body_weights
+from spelgen.fitting.torque.weights import body_weights, upper_cholesky
 from spelgen.loaded_arm import load_arm
 from spelgen.pipeline import make_spec
 from spelgen.runtime.derived_mass import DerivedMass
@@ -31,7 +32,7 @@ from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.masked_kan import MaskedKAN
 from spelgen.runtime.masked_mlp import MaskedMLP
 from spelgen.runtime.residual_terms import HARMONICS, SPLINES, ResidualTerms
-from spelgen.runtime.rigid_body import InertialParameters, pseudo_inertia, upper_cholesky
+from spelgen.runtime.rigid_body import InertialParameters
 from spelgen.runtime.sliding_friction import SlidingFriction
 from spelgen.runtime.symmetric import symmetric
 from spelgen.spec import Options
@@ -40,7 +41,7 @@ NUMBERS = Path(__file__).parent / "golden" / "numbers.json"
 FIRST_STAGE = (  # friction's laws then: |gravity torque|, tanh and exp
     ("LEAST_LOAD = 0.01", "LEAST_LOAD = 0.0"),
     ("torch.rsqrt(velocity * velocity + width**2)", "(velocity / width).tanh() / velocity"),
-    ("slow.square().square().square()", "(-((qd / c.stribeck_velocity) ** 2)).exp()"),
+    ("slow.square().square().square()", "(-((qd / self.stribeck_velocity) ** 2)).exp()"),
 )
 PRESETS = (
     ("hybrid", "mlp"),
@@ -232,11 +233,14 @@ def test_bound_leaves_what_is_positive_definite_and_mends_what_is_not():
 
 def test_bodies_are_possible_for_all_weights():
     ten = (2.0, 0.1, 0.2, 0.3, 0.5, 0.01, 0.02, 0.6, 0.03, 0.4)
-    parameters = InertialParameters(ten)
-    near(parameters(), torch.tensor([ten], dtype=torch.float64))
+    nominal = pseudo_inertia(torch.tensor(ten, dtype=torch.float64))
+    row, column = torch.triu_indices(4, 4)
+    parameters = InertialParameters(tuple(nominal[row, column].tolist()))
+    near(parameters() @ parameters().mT, nominal[None])
     for seed in range(100):
         parameters.raw.data = 2 * draw(1, 10, seed=seed)
-        assert torch.linalg.eigvalsh(pseudo_inertia(parameters()))[0, 0] > 0
+        root = parameters()
+        assert torch.linalg.eigvalsh(root @ root.mT)[0, 0] > 0
 
 
 def test_friction_laws_resist_and_read_as_what_they_are():
@@ -249,11 +253,11 @@ def test_friction_laws_resist_and_read_as_what_they_are():
     dry += constants.stribeck / (1 + (fast / constants.stribeck_velocity) ** 2)
     expected = constants.viscous * fast + dry * fast * turning(fast, constants.coulomb_smoothing_velocity)
     expected += constants.saturation * fast * turning(fast, constants.saturation_velocity)
-    near(laws(fast, gravity, constants), expected)
+    near(constants.torque(fast, gravity), expected)
     assert expected.allclose(constants.viscous * fast + constants.saturation + dry, rtol=0, atol=1e-6)
     qd = draw(100, 3)
-    assert (laws(qd, gravity, constants) * qd >= 0).all()
-    near(laws(-qd, gravity, constants), -laws(qd, gravity, constants))
+    assert (constants.torque(qd, gravity) * qd >= 0).all()
+    near(constants.torque(-qd, gravity), -constants.torque(qd, gravity))
     x = torch.tensor([0.0, 1e-9, 0.75, -4e9], dtype=torch.float64)
     near(x * turning(x, torch.ones(4)), torch.tensor([0.0, 1e-9, 0.6, -1.0], dtype=torch.float64))
 

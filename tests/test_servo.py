@@ -187,7 +187,7 @@ def test_joints_get_the_laws_that_they_have(fitted):
     # its velocity is that of another form: the curves are compared, by kp
     speeds = torch.tensor([0.05, 0.1, 0.2, 0.4]).double()
     with torch.no_grad():
-        dry = fitted.model.friction.dry(speeds[:, None].expand(-1, 2), torch.zeros(4, 2).double(), laws)
+        dry = laws.dry(speeds[:, None].expand(-1, 2), torch.zeros(4, 2).double())
     falling = TRUTH.coulomb[1] + TRUTH.stribeck[1] * torch.exp(-((speeds / STRIBECK_VELOCITY) ** 2))
     torch.testing.assert_close(
         dry[:, 1] / fitted.model.kp[1].detach(), falling / TRUTH.kp[1], rtol=0.06, atol=0

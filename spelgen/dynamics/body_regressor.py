@@ -8,7 +8,18 @@ from torch import Tensor
 
 from spelgen.runtime.body_chain import BodyChain
 from spelgen.runtime.port_hamiltonian import applied
-from spelgen.runtime.rigid_body import pushed_along, spatial_inertia
+
+
+def pseudo_inertia(ten: Tensor) -> Tensor:
+    """[[tr(I)/2 - I, m c], [(m c)^T, m]], (..., 4, 4), of (m, m c, I), (..., 10).
+
+    It is positive definite exactly where some distribution of mass has these parameters (Wensing,
+    Kim and Slotine, IEEE RA-L 3:60, 2018).
+    """
+    m, x, y, z, xx, xy, xz, yy, yz, zz = ten.unbind(dim=-1)
+    half = (xx + yy + zz) / 2
+    rows = [half - xx, -xy, -xz, x, -xy, half - yy, -yz, y, -xz, -yz, half - zz, z, x, y, z, m]
+    return torch.unflatten(torch.stack(rows, dim=-1), -1, (4, 4))
 
 
 def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
@@ -16,17 +27,15 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
 
     ``chain`` is that of this package or of an emitted module.
     """
-    basis = spatial_inertia(torch.eye(10).to(q))
-    pose = chain.forward(q)
-    rises = chain.accelerations(pose, qd, chain.turning(pose, qd)[1]) + applied(pose.twists.mT, qdd)
-    rises, twists = (torch.unflatten(rows, -1, (-1, 6)) for rows in (rises, applied(pose.twists.mT, qd)))
-    # by body and parameter: (..., bodies, 6, 10)
-    momenta = torch.tensordot(twists, basis, dims=([-1], [2])).mT
-    wrenches = torch.tensordot(rises, basis, dims=([-1], [2])).mT
-    wrenches = wrenches + pushed_along(twists.unsqueeze(-1), momenta)
-    columns = torch.unflatten(pose.twists, -1, (-1, 6)).transpose(-3, -2)  # (..., bodies, n, 6)
-    rows: Tensor = (columns @ wrenches).transpose(-3, -2)
-    return rows.reshape(*q.shape, 10 * len(chain.parents))
+    count = len(chain.parents)
+    # the frames themselves in place of points: a pseudo-inertia weighs products of their columns
+    pose = chain.forward(q, torch.eye(4 * count).to(q))
+    rises = chain.accelerations(pose, qd) + applied(pose.jacobian.mT, qdd @ chain.ratios.mT)
+    rises = torch.unflatten(rises, -1, (3, count, 4))
+    jacobian = torch.unflatten(chain.ratios.mT @ pose.jacobian, -1, (3, count, 4))
+    products = torch.einsum("...nxba,...xbc->...nbac", jacobian, rises)
+    rows: Tensor = torch.tensordot(products, pseudo_inertia(torch.eye(10).to(q)), dims=([-2, -1], [1, 2]))
+    return rows.flatten(-2)
 
 
 def chain_regressor(chain: BodyChain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:

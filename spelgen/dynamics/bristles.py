@@ -1,4 +1,4 @@
-"""The memory of friction along a measured path: the state z of `runtime.bristles` at every sample, in one pass."""
+"""The memory of friction along a measured path: the state z of its bristles at every sample, in one pass."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import numpy as np
 import torch
 
 from spelgen.design import BRISTLE_REACH
-from spelgen.dynamics.protocol import has_friction_state
-from spelgen.runtime.bristles import moved_bristles
+from spelgen.dynamics.protocol import has_friction_state, motors_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +45,14 @@ def bristle_reach(model: Any) -> BristleReach:
     if not has_friction_state(model):
         return BristleReach(np.zeros((model.n, 0)))
     width = model.friction.prepare().coulomb_smoothing_velocity
-    tensors = (model.friction.bristles.reach, model.motors, width)
+    tensors = (model.friction.reach, motors_of(model), width)
     arrays = [x.detach().cpu().double().numpy() for x in tensors]
     return BristleReach(*arrays)
+
+
+def moved_bristles(z: torch.Tensor, displacement: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
+    """Return z after drives went one way by a displacement, exactly; shapes as z, or broadcast to it."""
+    return (z + displacement).clamp(-reach, reach)
 
 
 def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:

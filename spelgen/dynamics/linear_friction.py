@@ -18,7 +18,7 @@ class FrictionModel:
 
     coulomb_smoothing_velocity [rad/s, m/s]: width of the tanh in place of Coulomb friction's jump. stribeck: dry
     friction of slow motion (Gaussian, Armstrong-Helouvry 1991). polynomial: qd |qd| and qd^3. memory: dry friction by
-    how far each bristle is bent (see ``runtime.bristles``), one column each, in place of the tanh.
+    how far each bristle is bent (see ``runtime.friction_laws``), one column each, in place of the tanh.
     """
 
     coulomb_smoothing_velocity: float = 0.01

@@ -35,7 +35,8 @@ def parameter_table(model: nn.Module) -> dict[str, ParameterInfo]:
     for path, module in model.named_modules():
         for declared in type(module).__mro__:
             for name, kind, unit, *_ in vars(declared).get("kinds", ()):
-                if getattr(module, name) is not None:  # a part may do without
+                weight = getattr(module, name)
+                if weight is not None and weight.numel():  # a part may do without
                     table[f"{path}.{name}" if path else name] = ParameterInfo(kind, unit)
     return table
 

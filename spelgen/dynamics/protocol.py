@@ -51,7 +51,6 @@ class FrictionState(Protocol):
     """Friction that depends on the state z of bristles, (..., n, elements) [rad, m]."""
 
     elements: int
-    motors: Tensor  # C: the drives' speeds are C qd, (n, n)
     friction: Any  # the laws, see `runtime.friction_laws`
 
     def memory(self, qd: Tensor) -> Tensor:
@@ -74,6 +73,14 @@ def has_residuals(model: object) -> TypeGuard[ResidualModel]:
 def has_friction_state(model: object) -> TypeGuard[FrictionState]:
     """Return whether the model's friction depends on the state z of bristles, which all calls then take last."""
     return getattr(model, "elements", 0) > 0
+
+
+def motors_of(model: Any) -> Tensor:
+    """Return C, (n, n): the drives' speeds are C qd; the identity where each drive moves its own joint alone."""
+    if hasattr(model, "motors"):
+        motors: Tensor = model.motors
+        return motors
+    return torch.eye(model.n).to(model.friction.nominal)
 
 
 def input_of(model: object) -> Literal["torque", "position"]:

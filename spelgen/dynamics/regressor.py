@@ -16,9 +16,9 @@ def body_chain(arm: Arm) -> BodyChain:
     """Return how the arm's bodies may move, for q (..., n) [rad; m]."""
     rows: list[tuple[Any, ...]] = []
     for body in arm.bodies:
-        geometry = tuple(map(_row, body.rotation)), _row(body.translation)
+        placement = [(*_row(row), float(x)) for row, x in zip(body.rotation, body.translation, strict=True)]
         is_revolute, ratio = body.kind == "revolute", float(body.multiplier)
-        rows.append((body.parent, body.coordinate, is_revolute, ratio, body.offset, *geometry))
+        rows.append((body.parent, body.coordinate, is_revolute, ratio, body.offset, placement))
     return BodyChain(len(arm.coordinates), _row(arm.gravity), *zip(*rows, strict=True))
 
 

@@ -11,11 +11,12 @@ from torch import Tensor
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
+from spelgen.dynamics.body_regressor import pseudo_inertia
+from spelgen.dynamics.bristles import moved_bristles
 from spelgen.dynamics.equations import Pose
 from spelgen.dynamics.regressor import body_chain
-from spelgen.runtime.bristles import moved_bristles
+from spelgen.runtime.body_chain import Chain
 from spelgen.runtime.port_hamiltonian import applied
-from spelgen.runtime.rigid_body import spatial_inertia
 
 
 class RegressorDynamics:
@@ -37,7 +38,7 @@ class RegressorDynamics:
     ) -> None:
         self.chain, self.friction = body_chain(arm), friction
         by_body = torch.from_numpy(parameters).double().reshape(-1, 10)
-        self.inertia = torch.block_diag(*spatial_inertia(by_body))
+        self.inertia = torch.block_diag(*pseudo_inertia(by_body))
         self.armature = torch.tensor(armature, dtype=torch.float64)
         alone = np.eye(len(armature))
         reach = alone[:, :0] if bristle_reach is None else bristle_reach
@@ -65,8 +66,14 @@ class RegressorDynamics:
 
     def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
         """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
-        chain = self.chain.forward(q)
-        return self.chain.steady_torque(chain, qd, chain.twists @ self.inertia)
+        chain, momenta = self._bodies(q)
+        return applied(momenta, self.chain.accelerations(chain, qd))
+
+    def _bodies(self, q: Tensor) -> tuple[Chain, Tensor]:
+        """Return the bodies' frames as points, and their momenta by joint velocity, (..., n, 12 bodies)."""
+        chain = self.chain.forward(q, torch.eye(len(self.inertia)).to(q))
+        jacobian = torch.unflatten(self.chain.ratios.mT @ chain.jacobian, -1, (3, -1))
+        return chain, (jacobian @ self.inertia).flatten(-2)
 
     def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
         """What friction takes, and what the measured torque shows without any, (..., n) [Nm, N]."""
@@ -93,15 +100,15 @@ class RegressorDynamics:
 
     def pose_at(self, q: Tensor) -> Pose:
         """Return the equations of motion at q, (T, n), see `equations.poses`."""
-        chain = self.chain.forward(q)
-        momenta = chain.twists @ self.inertia
+        chain, momenta = self._bodies(q)
 
         def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
-            bias = self.chain.steady_torque(chain, qd, momenta)
+            bias = applied(momenta, self.chain.accelerations(chain, qd))
             return tau @ self.inputs.mT - bias - self.friction_torque(q, qd, z)
 
         rotors = self.motors.mT @ torch.diag(self.armature) @ self.motors
-        return Pose(momenta @ chain.twists.mT + rotors, force, partial(self.friction_torque, q))
+        mass = momenta @ chain.jacobian.mT @ self.chain.ratios + rotors
+        return Pose(mass, force, partial(self.friction_torque, q))
 
     def memory(self, qd: Tensor) -> Tensor:
         """z, (..., n, K), of drives that have long gone this way."""

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from spelgen.runtime.bristles import moved_bristles
-from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
+from spelgen.dynamics.bristles import moved_bristles
+from spelgen.runtime.friction_laws import FrictionConstants
 from spelgen.runtime.port_hamiltonian import applied
 from spelgen.runtime.position_servo import ServoConstants, beyond
 
@@ -24,14 +24,13 @@ ServoArm = Any  # an emitted model with servos: emission comes after this room
 
 
 class ServoDrives(NamedTuple):
-    """Hold what servos and friction do at joints: their constants, (..., n), and the laws that these belong to.
+    """Hold what servos and friction do at joints: their constants, (..., n).
 
     Bristles are (K, ..., n) here, so that numbers of an element lie side by side in memory: with (..., n, K) a step
     takes half as long again.
     """
 
     servo: ServoConstants
-    laws: FrictionLaws
     friction: FrictionConstants
     offset: Tensor  # torque that the drives lack [Nm, N]
     reach: Tensor  # of bristles, (K, ..., n) [rad, m]
@@ -61,15 +60,13 @@ class Load(NamedTuple):
 
 def servo_drives(model: ServoArm) -> ServoDrives:
     """Return those of a model with servos."""
-    laws, constants = model.friction, model.friction.prepare()
-    reach = laws.bristles.reach.T.contiguous()
-    steepness = (constants.bristle_fractions / laws.bristles.reach).movedim(-1, 0).contiguous()
+    constants = model.friction.prepare()
+    reach = constants.bristle_reach.T.contiguous()
+    steepness = (constants.bristle_fractions / constants.bristle_reach).movedim(-1, 0).contiguous()
     batch = steepness.shape[1:-1] or (1,)  # of constants
     shape = len(reach), *[1] * len(batch), model.n
     steepness = steepness.reshape(len(reach), *batch, model.n)
-    return ServoDrives(
-        model.servo.prepare(), laws, constants, model.torque_offset, reach.view(shape), steepness
-    )
+    return ServoDrives(model.servo.prepare(), constants, model.torque_offset, reach.view(shape), steepness)
 
 
 def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
@@ -77,25 +74,25 @@ def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) 
 
     Its friction makes up, as far as it can, for what the servos' torque is not.
     """
-    servo, laws = drives.servo, drives.laws
+    servo = drives.servo
     torque = servo.kp * beyond(u - q, servo.dead_zone) - servo.kd * qd
     torque = torque.clamp(-servo.limit, servo.limit) - drives.offset
-    excess = torque - load.bias - laws.viscosity(qd, drives.friction) * qd
-    direction = (excess / laws.dry(qd, load.gravity, drives.friction)).clamp(-1.0, 1.0)
+    excess = torque - load.bias - drives.friction.viscosity(qd) * qd
+    direction = (excess / drives.friction.dry(qd, load.gravity)).clamp(-1.0, 1.0)
     return ServoState(q, qd, direction * drives.reach)
 
 
 def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: Tensor) -> ServoState:
     """Return the state one step ``h`` (..., 1) [s] later, under the delayed command u (..., n)."""
-    (q, qd, z), servo, laws = state, drives.servo, drives.laws
-    strength = laws.dry(qd, load.gravity, drives.friction) * drives.steepness
+    (q, qd, z), servo = state, drives.servo
+    strength = drives.friction.dry(qd, load.gravity) * drives.steepness
     spring = servo.kp * beyond(u - q, servo.dead_zone)
     torque = spring - servo.kd * qd
     free = (torque.abs() < servo.limit).to(q)  # 0 where the servo is saturated: it neither stiffens nor damps
     servo_stiffness = free * servo.kp * (spring != 0)
     torque = torch.where(free > 0, spring, servo.limit * torque.sign())
     force = torque - drives.offset - load.bias - (strength * z).sum(dim=0)
-    damping = free * servo.kd + laws.viscosity(qd, drives.friction)
+    damping = free * servo.kd + drives.friction.viscosity(qd)
     inertia = load.inertia.diagonal(dim1=-2, dim2=-1) if load.coupled else load.inertia
     stiffness = (strength * (qd.sign() * z < drives.reach)).sum(dim=0)
     decay = h * (damping + h * (servo_stiffness / 2 + stiffness)) / inertia

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from decimal import Decimal
 
 import numpy as np
 
@@ -20,16 +21,16 @@ def body_specs(arm: Arm, inertias: Sequence[Sequence[float]]) -> tuple[BodySpec,
     heaviest = max(float(ten[0]) for ten in inertias)
     specs = []
     for index, (body, ten) in enumerate(zip(arm.bodies, inertias, strict=True)):
-        first, second, third = map(_floats, body.rotation)
+        position = _floats(body.translation)
+        placement = tuple((*_floats(row), x) for row, x in zip(body.rotation, position, strict=True))
         spec = BodySpec(
             parent=body.parent,
             joint=body.coordinate,
             kind=body.kind,
             ratio=float(body.multiplier),
             offset=body.offset,
-            rotation=(first, second, third),
-            position=_floats(body.translation),
-            reference=_possible(arm, index, ten, heaviest),
+            placement=placement,
+            pseudo_inertia=_upper_triangle(_possible(arm, index, ten, heaviest)),
         )
         specs.append(spec)
     return tuple(specs)
@@ -43,6 +44,14 @@ def _possible(arm: Arm, index: int, ten: Sequence[float], heaviest: float) -> tu
     if not possible:
         values = _rounded(parameters_of(factor @ factor.T), 6)
     return tuple(values.tolist())
+
+
+def _upper_triangle(ten: Iterable[float]) -> tuple[float, ...]:
+    """Return the upper triangle of a pseudo-inertia, row by row, without an error of rounding."""
+    m, x, y, z, xx, xy, xz, yy, yz, zz = (Decimal(repr(value)) for value in ten)
+    half = (xx + yy + zz) / 2
+    triangle = (half - xx, -xy, -xz, x, half - yy, -yz, y, half - zz, z, m)
+    return tuple(float(value) + 0.0 for value in triangle)  # no -0.0
 
 
 def _rounded(values: Iterable[float], digits: int) -> np.ndarray:

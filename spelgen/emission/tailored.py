@@ -50,6 +50,8 @@ def bases(spec: ModelSpec) -> str:
     dynamics = "NetworkDynamics"
     if spec.bodies:
         dynamics = "RigidBodyDynamics" if spec.design.net == "none" else "ResidualDynamics"
+        if spec.motor_speeds:
+            dynamics = "CoupledDrives" if spec.design.net == "none" else "ResidualDynamics, CoupledDrives"
     return f"{dynamics}, MotorInput" if spec.inputs else dynamics
 
 
@@ -242,15 +244,15 @@ def _rigid_bodies(body: _Body, spec: ModelSpec) -> None:
         gravity=spec.gravity,
         **_columns(spec.bodies, "parent", "joint"),
         revolute=_revolute(spec.bodies),
-        **_columns(spec.bodies, "ratio", "offset", "rotation", "position"),
+        **_columns(spec.bodies, "ratio", "offset", "placement"),
     )
-    inertias = tuple(map(attrgetter("reference"), spec.bodies))
+    if spec.motor_speeds:
+        body.give("Rows", spec.motor_speeds)
+    inertias = tuple(map(attrgetter("pseudo_inertia"), spec.bodies))
     body.give("BodyChain", body.let("chain", chain))
     body.give("InertialParameters", body.let("bodies", call("InertialParameters", *inertias)))
     body.give("FrictionLaws", body.let("friction", _friction_laws(spec, usual)))
     body.give("Row", armature)
-    if spec.motor_speeds:
-        body.give("Rows", spec.motor_speeds)
 
 
 def _friction_laws(spec: ModelSpec, usual: dict[str, object]) -> Call:

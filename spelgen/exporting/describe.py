@@ -15,7 +15,7 @@ from torch import Tensor
 from spelgen.arm.arm import make_arm
 from spelgen.arm.chain import choose_chain
 from spelgen.arm.lump_links import lump_links
-from spelgen.dynamics.protocol import ResidualModel, has_residuals, has_rigid_bodies, input_of
+from spelgen.dynamics.protocol import ResidualModel, has_residuals, has_rigid_bodies, input_of, motors_of
 from spelgen.dynamics.tip import last_link
 from spelgen.errors import RunError
 from spelgen.exporting.description import Harmonics, Network, Residuals, Servos, Tip, TrainedModel
@@ -48,10 +48,10 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
         identifiers=tuple(model.joint_names),
         inertias=array(exact.inertial_parameters),
         constant_mass=constant_mass,
-        motors=array(exact.motors),
+        motors=array(motors_of(exact)),
         residuals=residuals,
         friction=weights.friction._make(map(array, weights.friction)),
-        reach=array(exact.friction.bristles.reach),
+        reach=array(exact.friction.reach),
         inputs=array(exact.input_matrix(torch.zeros(exact.n).double())),
         actuated=array(exact.actuated),
         torque_offset=array(exact.torque_offset),

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from spelgen.arm.arm import Arm
 from spelgen.building import build
-from spelgen.dynamics.protocol import has_rigid_bodies
+from spelgen.dynamics.protocol import has_rigid_bodies, motors_of
 from spelgen.dynamics.residuals import without_residuals
 from spelgen.exporting.describe import array, servos_of
 from spelgen.exporting.description import Servos
@@ -87,7 +87,7 @@ def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProje
         arm=arm,
         inertias=bodies.inertial_parameters.numpy(),
         armature=bodies.armature.numpy(),
-        motors=bodies.motors.numpy(),
+        motors=motors_of(bodies).numpy(),
         friction=nearest_friction(arm.arm, model, q),
         inputs=array(model.input_matrix(torch.zeros(model.n, dtype=torch.float64))),
         servos=servos_of(model),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import yaml
 
-from spelgen.dynamics.protocol import has_friction_state
 from spelgen.dynamics.residuals import friction_factor
 from spelgen.exporting.describe import array
 from spelgen.exporting.exported import UNITS, Exported, readme
@@ -84,8 +83,6 @@ def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[st
     factor = array(friction_factor(model, sampled_positions(projection.arm.arm)))
     if (factor != 1).any():
         constants["position_factor"] = np.stack([factor.min(axis=0), factor.max(axis=0)], axis=-1)
-    if has_friction_state(model):
-        constants["bristle_reach"] = array(model.friction.bristles.reach)
     return constants
 
 

@@ -52,7 +52,7 @@ class MotorInput(PortHamiltonian):
         """Return G tau, (..., n) [Nm, N]."""
         return applied(self.gains(), tau)
 
-    def input_torque(self, pose: Pose, qd: Tensor, force: Tensor) -> Tensor:
+    def input_torque(self, pose: Pose, force: Tensor) -> Tensor:
         """Return the inputs, (..., n), that make this force; a passive joint shows the torque it lacks."""
         matrix = self.gains() + torch.diag(self.passive)
         tau: Tensor = torch.linalg.solve(matrix, force.unsqueeze(-1))
@@ -91,6 +91,6 @@ class DenseInput(NetworkDynamics):
         """Return G(q) tau, (..., n)."""
         return self._gains(pose) * tau
 
-    def input_torque(self, pose: NetworkPose, qd: Tensor, force: Tensor) -> Tensor:
+    def input_torque(self, pose: NetworkPose, force: Tensor) -> Tensor:
         """Return the inputs, (..., n), that make this force."""
         return force / self._gains(pose)

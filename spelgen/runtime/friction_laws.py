@@ -7,7 +7,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from spelgen.runtime.bristles import Bristles
 from spelgen.runtime.joints import vector
 from spelgen.runtime.parts import Row, Rows
 
@@ -32,7 +31,41 @@ class FrictionConstants(NamedTuple):
     coulomb_smoothing_velocity: Tensor  # over which dry friction turns around [rad/s, m/s]
     least_load: Tensor  # [Nm, N]
     bristle_fractions: Tensor  # of dry friction, (n, K); a joint's add up to one, or are zero
+    bristle_reach: Tensor  # (n, K) [rad, m]
     memoryless: Tensor  # 1 where dry friction follows velocity alone, 0 where bristles
+
+    def viscosity(self, qd: Tensor) -> Tensor:
+        """Torque by velocity, (..., n)."""
+        return self.viscous + self.saturation * turning(qd, self.saturation_velocity)
+
+    def dry(self, qd: Tensor, gravity: Tensor) -> Tensor:
+        """The size of dry friction, (..., n) [Nm, N]."""
+        speed = qd.abs() / self.stribeck_velocity
+        rounding = self.stribeck_rounding
+        slow = 1 / (1 + (1 + rounding) / 8 * speed.square() / (speed + rounding))
+        slow = slow.square().square().square()  # a power of 8 takes twice the time
+        load = (gravity.square() + self.least_load**2).sqrt()
+        return self.coulomb + self.stribeck * slow + self.load_dependence * load
+
+    def torque(
+        self, qd: Tensor, gravity: Tensor, z: Tensor | None = None, direction: Tensor | None = None
+    ) -> Tensor:
+        """The friction torque, (..., n) [Nm, N], under this gravity torque, of bristles at z, (..., n, K).
+
+        z: None where nothing is known of the way here; all joints are then without memory.
+        direction: (..., n) of joints without memory; None: that of qd.
+        """
+        if direction is None:
+            direction = qd * turning(qd, self.coulomb_smoothing_velocity)
+        if z is not None:
+            bent = (self.bristle_fractions / self.bristle_reach * z).sum(dim=-1)
+            direction = bent + self.memoryless * direction
+        return self.viscosity(qd) * qd + self.dry(qd, gravity) * direction
+
+    def stored_energy(self, z: Tensor) -> Tensor:
+        """What the bristles of Coulomb friction give back, (...) [J]."""
+        stored = self.bristle_fractions * z.square() / self.bristle_reach
+        return 0.5 * (self.coulomb * stored.sum(dim=-1)).sum(dim=-1)
 
 
 class FrictionLaws(nn.Module):
@@ -48,6 +81,11 @@ class FrictionLaws(nn.Module):
     No law has an exponential: a control loop has them in a third of the time. The Stribeck effect is
     nearly the Gaussian of Armstrong-Helouvry (Control of Machines with Friction, 1991) where r is large, and
     the exponential of Bo and Pavelescu (Wear 82:277, 1982), without its corner at rest, where it is small.
+
+    Bristles are K elements a joint, elastic up to their reach, sliding beyond; z is (..., n, K) [rad, m]
+    (Maxwell-slip elements: Lampaert, Al-Bender and Swevers, A Generalized Maxwell-Slip Friction Model, 2003).
+    What turns around within the reach closes its loop, so a joint that stiction stops does not creep where
+    its load oscillates.
     """
 
     # weight, kind, unit, and the constant that a zero stands for, by usual friction and velocity
@@ -65,78 +103,24 @@ class FrictionLaws(nn.Module):
     def __init__(self, friction: Row, speed: Row, reach: Rows) -> None:
         super().__init__()
         self.nominal, self.speed = nn.Buffer(vector(friction)), nn.Buffer(vector(speed))
-        self.bristles = Bristles(reach)
+        self.reach = nn.Buffer(torch.tensor(reach, dtype=torch.float64))  # (n, K), a joint's shortest first
         # no parameter: a fit to torques compares both forms
         self.memoryless = nn.Buffer(torch.zeros_like(self.speed))
         self.stribeck_rounding = nn.Buffer(torch.full_like(self.speed, 10.0))
         for name, *_ in FrictionLaws.kinds[:-1]:
             self.register_parameter(name, nn.Parameter(torch.zeros_like(self.speed)))
-        self.raw_bristle_fractions = nn.Parameter(torch.zeros_like(self.bristles.reach))
+        self.raw_bristle_fractions = nn.Parameter(torch.zeros_like(self.reach))
 
     def prepare(self) -> FrictionConstants:
         """The constants, in their units."""
-        fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
-        return self.constants(SHARP_VELOCITY * self.speed, fractions)
-
-    def constants(self, smoothing_velocity: Tensor, bristle_fractions: Tensor) -> FrictionConstants:
-        """The constants, where dry friction turns around like this."""
-        size, speed, values = self.nominal, self.speed, {}
+        size, speed, laws = self.nominal, self.speed, []
         units = {"Nm s/rad, N s/m": size / speed, "Nm, N": size, "rad/s, m/s": speed, "1": size.sign()}
         for name, _, unit, start in FrictionLaws.kinds[:-1]:
-            weight: Tensor = getattr(self, name)
-            values[name.removeprefix("raw_")] = start * units[unit] * weight.exp()
-        return FrictionConstants(
-            **values,
-            stribeck_rounding=self.stribeck_rounding,
-            coulomb_smoothing_velocity=smoothing_velocity,
-            least_load=LEAST_LOAD * torch.where(size > 0, size, 1.0),
-            bristle_fractions=bristle_fractions,
-            memoryless=self.memoryless,
-        )
-
-    def resistance(self, qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
-        """The diagonal of D, (..., n): friction torque by velocity, of joints that slide."""
-        return self.viscosity(qd, c) + self.dry(qd, gravity, c) * turning(qd, c.coulomb_smoothing_velocity)
-
-    def forward(
-        self,
-        qd: Tensor,
-        gravity: Tensor,
-        c: FrictionConstants,
-        z: Tensor | None = None,
-        direction: Tensor | None = None,
-    ) -> Tensor:
-        """The friction torque, (..., n) [Nm, N], under this gravity torque, of bristles at z, (..., n, K).
-
-        z: None where nothing is known of the way here; all joints are then without memory.
-        direction: (..., n) of joints without memory; None: that of qd.
-        """
-        if direction is None:
-            direction = qd * turning(qd, c.coulomb_smoothing_velocity)
-        if z is not None:
-            bent = (c.bristle_fractions / self.bristles.reach * z).sum(dim=-1)
-            direction = bent + c.memoryless * direction
-        return self.viscosity(qd, c) * qd + self.dry(qd, gravity, c) * direction
-
-    def stored_energy(self, z: Tensor, c: FrictionConstants) -> Tensor:
-        """What the bristles of Coulomb friction give back, (...) [J]."""
-        stored = c.bristle_fractions * z.square() / self.bristles.reach
-        return 0.5 * (c.coulomb * stored.sum(dim=-1)).sum(dim=-1)
-
-    @staticmethod
-    def viscosity(qd: Tensor, c: FrictionConstants) -> Tensor:
-        """Torque by velocity, (..., n)."""
-        return c.viscous + c.saturation * turning(qd, c.saturation_velocity)
-
-    @staticmethod
-    def dry(qd: Tensor, gravity: Tensor, c: FrictionConstants) -> Tensor:
-        """The size of dry friction, (..., n) [Nm, N]."""
-        speed = qd.abs() / c.stribeck_velocity
-        rounding = c.stribeck_rounding
-        slow = 1 / (1 + (1 + rounding) / 8 * speed.square() / (speed + rounding))
-        slow = slow.square().square().square()  # a power of 8 takes twice the time
-        load = (gravity.square() + c.least_load**2).sqrt()
-        return c.coulomb + c.stribeck * slow + c.load_dependence * load
+            laws.append(start * units[unit] * getattr(self, name).exp())
+        load = LEAST_LOAD * torch.where(size > 0, size, 1.0)
+        fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
+        rounding, sharp = self.stribeck_rounding, SHARP_VELOCITY * speed
+        return FrictionConstants._make([*laws, rounding, sharp, load, fractions, self.reach, self.memoryless])
 
 
 def turning(velocity: Tensor, width: Tensor) -> Tensor:

@@ -68,9 +68,8 @@ class NetworkDynamics(PortHamiltonian):
     def friction_torque(self, q: Tensor | NetworkPose, qd: Tensor) -> Tensor:
         """Return D(q, qd) qd, (..., n) [Nm, N]."""
         pose: NetworkPose = self.at(q, qd)
-        return self.friction.forward(pose.encoded, qd, pose.prepared["friction"], qd.unsqueeze(-1)).squeeze(
-            -1
-        )
+        layers = pose.prepared["friction"]
+        return self.friction.forward(pose.encoded, qd, layers, qd.unsqueeze(-1)).squeeze(-1)
 
     def dissipation(self, q: Tensor | NetworkPose, qd: Tensor) -> Tensor:
         """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""

@@ -28,7 +28,7 @@ class PortHamiltonian(nn.Module):
     n: int
     prepare: Callable[..., Prepared]  # networks and rigid bodies have each their own of these
     configuration: Callable[[Tensor, Prepared], Pose]
-    potential_energy: Callable[[Tensor | Pose], Tensor]  # V, (...) [J]
+    potential_energy: Callable[..., Tensor]  # V, (...) [J]
     gravity: Callable[[Tensor | Pose], Tensor]  # dV/dq, (..., n) [Nm, N]
     lagrangian_gradient: Callable[[Tensor | Pose, Tensor], Tensor]  # d/dq of 1/2 qd^T M qd - V
     nonlinear_effects: Callable[[Tensor | Pose, Tensor], Tensor]  # Coriolis, centrifugal, gravity torque
@@ -61,8 +61,8 @@ class PortHamiltonian(nn.Module):
         """Return G tau, (..., n) [Nm, N]."""
         return tau
 
-    def input_torque(self, pose: Pose, qd: Tensor, force: Tensor) -> Tensor:
-        """Return the tau, (..., n), that makes this force."""
+    def input_torque(self, pose: Pose, force: Tensor) -> Tensor:
+        """Return the tau, (..., n), that G makes this force of."""
         return force
 
     def momentum(self, q: Tensor | Pose, qd: Tensor) -> Tensor:
@@ -75,10 +75,10 @@ class PortHamiltonian(nn.Module):
         qd: Tensor = torch.linalg.solve(self.at(q, p).mass, p.unsqueeze(-1))
         return qd.squeeze(-1)
 
-    def hamiltonian(self, q: Tensor | Pose, p: Tensor) -> Tensor:
+    def hamiltonian(self, q: Tensor | Pose, p: Tensor, *state: Tensor) -> Tensor:
         """Return H, (...) [J]."""
         pose = self.at(q, p)
-        return 0.5 * (p * self.velocity(pose, p)).sum(dim=-1) + self.potential_energy(pose)
+        return 0.5 * (p * self.velocity(pose, p)).sum(dim=-1) + self.potential_energy(pose, *state)
 
     def forward_dynamics(self, q: Tensor | Pose, qd: Tensor, tau: Tensor, *state: Tensor | None) -> Tensor:
         """Return qdd, (..., n), under the input tau."""
@@ -91,7 +91,8 @@ class PortHamiltonian(nn.Module):
         """Return the input tau, (..., n), that gives qdd."""
         pose = self.at(q, qd, qdd)
         force = applied(pose.mass, qdd) + self.nonlinear_effects(pose, qd)
-        return self.input_torque(pose, qd, force + self.friction_torque(pose, qd, *state))
+        force = force + self.friction_torque(pose, qd, *state)
+        return self.input_torque(pose, force - self.input_force(pose, qd, 0 * qd))
 
     def port_hamiltonian_rhs(
         self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Prepared, *state: Tensor | None

@@ -34,10 +34,10 @@ class ResidualDynamics(RigidBodyDynamics):
         residual = self.residuals.at(q, prepared.residual)
         return pose._replace(mass=pose.mass + residual.mass, varied=residual.friction, residual=residual)
 
-    def potential_energy(self, q: Tensor | Motion) -> Tensor:
-        """Return V(q), (...) [J]."""
+    def potential_energy(self, q: Tensor | Motion, z: Tensor | None = None) -> Tensor:
+        """Return V(q) and what bristles store, (...) [J]."""
         pose: Motion = self.at(q)
-        energy = super().potential_energy(pose)
+        energy = super().potential_energy(pose, z)
         return energy if self.residuals is None else energy + self.residuals.energy(pose.residual)
 
     def gravity(self, q: Tensor | Motion) -> Tensor:

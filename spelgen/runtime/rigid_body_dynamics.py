@@ -1,4 +1,4 @@
-"""A port-Hamiltonian model of rigid bodies, by the recursive Newton-Euler equations."""
+"""A port-Hamiltonian model of rigid bodies, each of which moves as four points do."""
 
 from __future__ import annotations
 
@@ -8,18 +8,17 @@ import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.body_chain import BodyChain, Chain
-from spelgen.runtime.bristles import moved_bristles
-from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
+from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws, turning
 from spelgen.runtime.joints import vector
-from spelgen.runtime.parts import Row, Rows
+from spelgen.runtime.parts import Row
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
-from spelgen.runtime.rigid_body import InertialParameters, spatial_inertia
+from spelgen.runtime.rigid_body import InertialParameters
 
 
 class RigidPrepared(NamedTuple):
     """What depends on the weights alone, worked out once for many states."""
 
-    inertia: Tensor  # spatial inertias on the diagonal, (6 bodies, 6 bodies)
+    points: Tensor  # of the bodies in their own frames, columns of blocks, (4 bodies, 4 bodies)
     armature: Tensor  # what the rotors add to M, (n, n)
     friction: FrictionConstants
     residual: Any = None  # of what a model has beside rigid bodies
@@ -29,7 +28,6 @@ class Motion(NamedTuple):
     """What depends on q alone."""
 
     chain: Chain
-    momenta: Tensor  # of the chain's twists, by joint velocity, (..., n, 6 bodies)
     mass: Tensor  # M(q), (..., n, n)
     gravity: Tensor  # dV/dq of the bodies, (..., n)
     prepared: RigidPrepared
@@ -41,7 +39,7 @@ class RigidBodyDynamics(PortHamiltonian):
     """Rigid bodies with trained inertial parameters, friction by laws, a trained torque offset.
 
     z, (..., n, K), is the state of friction's bristles [rad, m], and adds their energy to H; without it
-    friction is that of joints that slide the way they move. motors: C, the drives' speeds are C qd.
+    friction is that of joints that slide the way they move. armature: nominal, of the drives [kg m^2, kg].
     """
 
     kinds = (
@@ -51,35 +49,27 @@ class RigidBodyDynamics(PortHamiltonian):
     )
 
     def __init__(
-        self,
-        chain: BodyChain,
-        bodies: InertialParameters,
-        friction: FrictionLaws,
-        armature: Row,  # nominal, of the drives [kg m^2, kg]
-        motors: Rows = (),
+        self, chain: BodyChain, bodies: InertialParameters, friction: FrictionLaws, armature: Row
     ) -> None:
         super().__init__()
-        # 1 where the measured torque moves a joint, (n,)
-        self.actuated = nn.Buffer(self.input_matrix(vector([0.0] * self.n)).any(dim=0).double())
-        zeros = torch.zeros(self.n, dtype=torch.float64)
-        self.elements = friction.bristles.reach.shape[1]
-        self.basis = nn.Buffer(spatial_inertia(torch.eye(10).double()))
         self.chain, self.bodies, self.friction = chain, bodies, friction
+        self.elements = friction.reach.shape[1]
         self.nominal_armature = nn.Buffer(vector(armature))
-        self.raw_armature = nn.Parameter(zeros.clone())  # its logarithm
-        # C, (n, n), and its inverse; each drive moves its own joint alone where it is not given
-        rows = [vector(row) for row in motors]
-        self.motors = nn.Buffer(torch.stack(rows) if rows else torch.eye(self.n).double())
-        self.loads = nn.Buffer(torch.linalg.inv(self.motors))
+        # 1 where the measured torque moves a joint, (n,)
+        self.actuated = nn.Buffer(self.input_matrix(self.nominal_armature).any(dim=0).double())
+        self.raw_armature = nn.Parameter(torch.zeros_like(self.actuated))  # its logarithm
         # of the measured torque, in units of the joints' usual friction
-        self.raw_offset = nn.Parameter(zeros.clone())
+        self.raw_offset = nn.Parameter(torch.zeros_like(self.actuated))
         # in units of usual friction at usual speed; no parameter: only a fit to torques may find one
-        self.raw_friction_compensation = nn.Buffer(zeros)
+        self.raw_friction_compensation = nn.Buffer(torch.zeros_like(self.actuated))
 
     @property
     def inertial_parameters(self) -> Tensor:
         """By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
-        return self.bodies.forward()
+        root = self.bodies.forward()
+        row, column = torch.triu_indices(4, 4)
+        xx, xy, xz, x, yy, yz, y, zz, z, m = (root @ root.mT)[..., row, column].unbind(dim=-1)
+        return torch.stack([m, x, y, z, yy + zz, -xy, -xz, xx + zz, -yz, xx + yy], dim=-1)
 
     @property
     def armature(self) -> Tensor:
@@ -108,24 +98,20 @@ class RigidBodyDynamics(PortHamiltonian):
 
     def prepare(self) -> RigidPrepared:
         """Return all that depends on the weights alone; holds until they change."""
-        inertia = torch.ops.aten.block_diag([*torch.tensordot(self.inertial_parameters, self.basis, dims=1)])
-        armature = self.motors.mT @ (self.armature.unsqueeze(-1) * self.motors)
-        return RigidPrepared(inertia, armature, self.friction.prepare())
+        points = torch.ops.aten.block_diag([*self.bodies.forward()])
+        return RigidPrepared(points, torch.diag_embed(self.armature), self.friction.prepare())
 
     def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
         """Return what depends on q alone."""
-        chain = self.chain.forward(q)
-        momenta = chain.twists @ prepared.inertia
-        mass = momenta @ chain.twists.mT + prepared.armature
-        return Motion(chain, momenta, mass, applied(momenta, chain.weight), prepared)
+        chain, ratios = self.chain.forward(q, prepared.points), self.chain.ratios
+        mass = ratios.mT @ (chain.jacobian @ chain.jacobian.mT) @ ratios + prepared.armature
+        return Motion(chain, mass, applied(chain.jacobian, chain.weight) @ ratios, prepared)
 
-    def potential_energy(self, q: Tensor | Motion) -> Tensor:
-        """Return V(q), (...) [J]; zero for a mass at the base's origin."""
+    def potential_energy(self, q: Tensor | Motion, z: Tensor | None = None) -> Tensor:
+        """Return V(q) and what bristles store, (...) [J]; zero for a mass at the base's origin."""
         pose: Motion = self.at(q)
-        # the moment of mass of all bodies together stands in their inertia's upper right block
-        total = pose.chain.frames @ pose.prepared.inertia @ pose.chain.frames.mT
-        moment = torch.stack([total[..., 2, 4], total[..., 0, 5], total[..., 1, 3]], dim=-1)
-        return applied(moment.unsqueeze(-2), self.chain.base[3:]).squeeze(-1)
+        energy = (pose.chain.place.flatten(-3) * pose.chain.weight).sum(dim=-1)
+        return energy if z is None else energy + pose.prepared.friction.stored_energy(z)
 
     def gravity(self, q: Tensor | Motion) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
@@ -135,33 +121,24 @@ class RigidBodyDynamics(PortHamiltonian):
     def lagrangian_gradient(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
         pose: Motion = self.at(q, qd)
-        # the momentum of all that a joint carries, by what its displacement adds to their twist
-        momenta = self.chain.at_base(pose.chain, applied(pose.momenta.mT, qd))
-        return self.chain.by_joints(self.chain.turning(pose.chain, qd)[1], momenta) - pose.gravity
+        return self.chain.kinetic_gradient(pose.chain, qd) - pose.gravity
 
     def nonlinear_effects(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
-        """Return the torque that holds qd steady without friction, (..., n), by Newton and Euler."""
+        """Return the torque that holds qd steady without friction, (..., n), by d'Alembert's principle."""
         pose: Motion = self.at(q, qd)
-        return self.chain.steady_torque(pose.chain, qd, pose.momenta)
+        return applied(pose.chain.jacobian, self.chain.accelerations(pose.chain, qd)) @ self.chain.ratios
 
     def friction_torque(self, q: Tensor | Motion, qd: Tensor, *state: Tensor | None) -> Tensor:
-        """Return the friction torque C^T f(C qd), (..., n) [Nm, N]; state: z and direction of `friction`."""
+        """Return the friction torque, (..., n) [Nm, N]; state: see ``FrictionConstants.torque``."""
         pose: Motion = self.at(q, qd)
-        loads = pose.gravity @ self.loads
-        torque = self.friction.forward(qd @ self.motors.mT, loads, pose.prepared.friction, *state)
-        return (pose.varied * torque) @ self.motors
+        return pose.varied * pose.prepared.friction.torque(qd, pose.gravity, *state)
 
     def dissipation(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
-        """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m], diagonal where each drive moves its own joint."""
+        """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
         pose: Motion = self.at(q, qd)
-        loads = pose.gravity @ self.loads
-        resistance = self.friction.resistance(qd @ self.motors.mT, loads, pose.prepared.friction)
-        return self.motors.mT @ ((pose.varied * resistance).unsqueeze(-1) * self.motors)
-
-    def hamiltonian(self, q: Tensor | Motion, p: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return H, (...) [J]."""
-        energy = super().hamiltonian(q, p)
-        return energy if z is None else energy + self.friction.stored_energy(z, self.friction.prepare())
+        friction = pose.prepared.friction
+        dry = friction.dry(qd, pose.gravity) * turning(qd, friction.coulomb_smoothing_velocity)
+        return torch.diag_embed(pose.varied * (friction.viscosity(qd) + dry))
 
     def memory(self, qd: Tensor) -> Tensor:
         """Return z, (..., n, K), of drives that have long gone this way.
@@ -169,13 +146,17 @@ class RigidBodyDynamics(PortHamiltonian):
         Near the smoothing velocity they bear up to 7.4 % more than friction without z, far above it the same.
         """
         # bent as far as they go a few widths on: the rest of an algebraic turn would be a stiff transient
-        direction = (qd @ self.motors.mT / self.friction.prepare().coulomb_smoothing_velocity).tanh()
-        return direction.unsqueeze(-1) * self.friction.bristles.reach
+        direction = (qd / self.friction.prepare().coulomb_smoothing_velocity).tanh()
+        return direction.unsqueeze(-1) * self.friction.reach
+
+    def memory_rate(self, z: Tensor, qd: Tensor) -> Tensor:
+        """Return z', (..., n, K): qd, and zero where |z| is the reach and would grow."""
+        qd = qd.unsqueeze(-1)
+        return qd * (qd.sign() * z < self.friction.reach)
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
         """Return z after joints went one way by (..., n), exactly."""
-        path = (displacement @ self.motors.mT).unsqueeze(-1)
-        return moved_bristles(z, path, self.friction.bristles.reach)
+        return (z + displacement.unsqueeze(-1)).clamp(-self.friction.reach, self.friction.reach)
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
         """Return the rate of (q, p, z), (..., 2 n + n K), or of (q, p, z, tau), where tau is held.
@@ -189,14 +170,9 @@ class RigidBodyDynamics(PortHamiltonian):
         z = flat.reshape(*flat.shape[:-1], n, -1) if size else None
         qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare(), z)
         if z is not None:
-            flat = self.friction.bristles.rate(qd @ self.motors.mT, z).flatten(-2)
+            flat = self.memory_rate(z, qd).flatten(-2)
         return torch.cat([qd, force, flat, torch.zeros_like(tau)], dim=-1)
 
     def input_force(self, pose: Motion, qd: Tensor, tau: Tensor) -> Tensor:
         """Return G (tau - torque offset) + friction compensation qd, (..., n) [Nm, N]."""
         return super().input_force(pose, qd, tau - self.torque_offset) + self.friction_compensation * qd
-
-    def input_torque(self, pose: Motion, qd: Tensor, force: Tensor) -> Tensor:
-        """Return the tau, (..., n), that is measured while the drives make this force."""
-        measured = force - self.friction_compensation * qd
-        return super().input_torque(pose, qd, measured) + self.torque_offset

@@ -20,9 +20,10 @@ class SlidingFriction(FrictionLaws):
         super().__init__(friction, speed, [[]] * len(speed))
         self.memoryless.fill_(1.0)
         self.raw_coulomb_smoothing_velocity = nn.Parameter(torch.zeros_like(self.speed))
-        self.register_parameter("raw_bristle_fractions", None)
+        del self.raw_bristle_fractions
+        self.register_buffer("raw_bristle_fractions", self.reach)  # none
 
     def prepare(self) -> FrictionConstants:
         """The constants, in their units."""
         velocity = SMOOTHING_VELOCITY * self.speed * self.raw_coulomb_smoothing_velocity.exp()
-        return self.constants(velocity, self.bristles.reach)
+        return super().prepare()._replace(coulomb_smoothing_velocity=velocity)

@@ -26,9 +26,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 7, "robot": "rpr", "urdf": "rpr.urdf",
+FACTS = r"""{"format": 8, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "fd9844abd9d2c3ac7c9888bcacbdd0f8d4d105f63b86e2ca3ef52f16fb43a600",
+ "spec_sha256": "c87c02253f66c01040a57660ed2e58d4674878791b038433bffa7c594b206c63",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
   "net": null, "preset": "closed-form", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
@@ -42,17 +42,16 @@ def make_parts(seed: int) -> tuple[BodyChain, InertialParameters, FrictionLaws, 
     chain = BodyChain(
         n=3, gravity=(0.0, 0.0, -9.81), parent=(-1, 0, 1), joint=(0, 1, 2), revolute=(True, False, True),
         ratio=(1.0, 1.0, 1.0), offset=(0.0, 0.0, 0.0),
-        rotation=(
-            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-            ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
-            ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+        placement=(
+            ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)),
+            ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 0.154)),
+            ((0.0, 1.0, 0.0, 0.0), (-1.0, 0.0, 0.0, -0.0203), (0.0, 0.0, 1.0, 0.0)),
         ),
-        position=((0.0, 0.0, 0.0), (0.0, 0.0, 0.154), (0.0, -0.0203, 0.0)),
     )  # fmt: skip
     bodies = InertialParameters(
-        (5.01, 0.0, 0.0, -4.48896, 4.13010816, 0.0, 0.0, 4.12210816, 0.0, 0.018),
-        (4.25, 0.0, -0.086275, -27.4125, 179.3223764, 0.0, 0.0, 179.320625, -0.55647375, 0.0077513825),
-        (1.08, 0.0, 0.09936, -0.05832, 0.0142904, 0.0, 0.0, 0.00425851, 0.00536544, 0.0102504),
+        (0.005, 0.0, 0.0, 0.0, 0.013, 0.0, 0.0, 4.11710816, -4.48896, 5.01),
+        (0.00299999125, 0.0, 0.0, 0.0, 0.00475139125, 0.55647375, -0.086275, 179.31762500875, -27.4125, 4.25),
+        (0.000109255, 0.0, 0.0, 0.0, 0.010141145, -0.00536544, 0.09936, 0.004149255, -0.05832, 1.08),
     )  # fmt: skip
     friction = FrictionLaws(
         friction=(0.4, 0.4, 0.4), speed=(3.0, 1.0, 6.0),

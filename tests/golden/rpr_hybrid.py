@@ -28,9 +28,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 7, "robot": "rpr", "urdf": "rpr.urdf",
+FACTS = r"""{"format": 8, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "420b54556321f503f4c5eabb13f403d60e6723206638c7ceba9548528c905488",
+ "spec_sha256": "d6712053e8ba7bfe2ec89cb1882a3e0bd1c4c19a59e294ba174bb26d1d3de5e1",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
   "net": "mlp", "preset": "hybrid", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
@@ -68,17 +68,16 @@ def make_parts(seed: int) -> tuple[ResidualTerms, BodyChain, InertialParameters,
     chain = BodyChain(
         n=3, gravity=(0.0, 0.0, -9.81), parent=(-1, 0, 1), joint=(0, 1, 2), revolute=(True, False, True),
         ratio=(1.0, 1.0, 1.0), offset=(0.0, 0.0, 0.0),
-        rotation=(
-            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-            ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
-            ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+        placement=(
+            ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)),
+            ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 0.154)),
+            ((0.0, 1.0, 0.0, 0.0), (-1.0, 0.0, 0.0, -0.0203), (0.0, 0.0, 1.0, 0.0)),
         ),
-        position=((0.0, 0.0, 0.0), (0.0, 0.0, 0.154), (0.0, -0.0203, 0.0)),
     )  # fmt: skip
     bodies = InertialParameters(
-        (5.01, 0.0, 0.0, -4.48896, 4.13010816, 0.0, 0.0, 4.12210816, 0.0, 0.018),
-        (4.25, 0.0, -0.086275, -27.4125, 179.3223764, 0.0, 0.0, 179.320625, -0.55647375, 0.0077513825),
-        (1.08, 0.0, 0.09936, -0.05832, 0.0142904, 0.0, 0.0, 0.00425851, 0.00536544, 0.0102504),
+        (0.005, 0.0, 0.0, 0.0, 0.013, 0.0, 0.0, 4.11710816, -4.48896, 5.01),
+        (0.00299999125, 0.0, 0.0, 0.0, 0.00475139125, 0.55647375, -0.086275, 179.31762500875, -27.4125, 4.25),
+        (0.000109255, 0.0, 0.0, 0.0, 0.010141145, -0.00536544, 0.09936, 0.004149255, -0.05832, 1.08),
     )  # fmt: skip
     friction = FrictionLaws(
         friction=joints.friction, speed=joints.speed,

@@ -27,7 +27,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 7, "robot": "rpr", "urdf": "rpr.urdf",
+FACTS = r"""{"format": 8, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
  "spec_sha256": "a3178383c59411fcd1be26f55c056099de06bfe3983bfdf4c079e77e030c84ce",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,

@@ -26,7 +26,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 7, "robot": "rpr", "urdf": "rpr.urdf",
+FACTS = r"""{"format": 8, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
  "spec_sha256": "d4511fddccd89dbc30682439e8daba284f7e9133a2c042b2cebd61ca8c300d24",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,

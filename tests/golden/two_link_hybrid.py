@@ -26,9 +26,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-FACTS = r"""{"format": 7, "robot": "two_link", "urdf": "two_link.urdf",
+FACTS = r"""{"format": 8, "robot": "two_link", "urdf": "two_link.urdf",
  "urdf_sha256": "d5393c842e189b72219c5ce02e115de571a94cd406b48898ea64b5431a395232",
- "spec_sha256": "b39c214c5a314cd296914f6b9abedc38fa3070faab5ca6443958c25eee3b218d",
+ "spec_sha256": "922ed99538d67e20d08980eab05335e17aed1e85204bdab16872b4d82da8d46b",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
   "net": "mlp", "preset": "hybrid", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "revolute"}}"""
@@ -64,15 +64,14 @@ def make_parts(seed: int) -> tuple[ResidualTerms, BodyChain, InertialParameters,
     chain = BodyChain(
         n=2, gravity=(0.0, -9.81, 0.0), parent=(-1, 0), joint=(0, 1), revolute=(True, True), ratio=(1.0, 1.0),
         offset=(0.0, 0.0),
-        rotation=(
-            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        placement=(
+            ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)),
+            ((1.0, 0.0, 0.0, 1.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)),
         ),
-        position=((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
     )  # fmt: skip
     bodies = InertialParameters(
-        (1.0, 0.5, 0.0, 0.0, 0.6, 0.0, 0.0, 0.85, 0.0, 1.25),
-        (1.0, 0.5, 0.0, 0.0, 0.6, 0.0, 0.0, 0.85, 0.0, 1.25),
+        (0.75, 0.0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.1, 0.0, 1.0),
+        (0.75, 0.0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.1, 0.0, 1.0),
     )  # fmt: skip
     friction = FrictionLaws(
         friction=joints.friction, speed=joints.speed,

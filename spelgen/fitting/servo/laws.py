@@ -84,6 +84,6 @@ def divided(problem: ServoProblem, x: ServoParameters, fraction: float) -> Servo
 def sliding_friction(friction: Any, qd: torch.Tensor, gravity: torch.Tensor) -> torch.Tensor:
     """Return dry friction of each joint, (n,) [Nm, N], over what it slid; qd and gravity's torque: (..., n)."""
     slid = qd.abs() + 1e-9  # so that joints which never move have friction
-    dry = friction.dry(qd, gravity, friction.prepare()) * slid
+    dry = friction.prepare().dry(qd, gravity) * slid
     mean: torch.Tensor = dry.flatten(0, -2).sum(dim=0) / slid.flatten(0, -2).sum(dim=0)
     return mean

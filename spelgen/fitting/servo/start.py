@@ -30,7 +30,7 @@ def start_servos(model: EmittedModel, windows: ServoWindows) -> None:
     path = windows.path()
     load = body_load(model, path)
     bristles = np.stack([bristles_along(q.numpy(), bristle_reach(model)) for q in windows.q])
-    direction = (torch.from_numpy(bristles) / friction.bristles.reach).mean(dim=-1)[:, :-1]
+    direction = (torch.from_numpy(bristles) / friction.reach).mean(dim=-1)[:, :-1]
     columns = torch.stack([path.qd, path.qdd, direction, load.bias, torch.ones_like(direction)], dim=-1)
     error = windows.commands(delay).mean(dim=2) - windows.q[:, :-1]
     slopes, significance = _regression(columns[:, windows.settling :], error[:, windows.settling :])

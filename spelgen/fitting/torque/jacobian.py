@@ -9,6 +9,7 @@ import torch
 from torch.autograd import grad as gradient
 
 from spelgen.dynamics.body_regressor import regressor_of
+from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.residuals import friction_factor, residual_torque
 from spelgen.fitting.functional_model import Weights, under_weights
 from spelgen.fitting.torque.samples import Block, TorqueSamples
@@ -81,7 +82,8 @@ class TorqueJacobian:
         self.samples = samples
         self.rigid = RigidWeights(model)
         self._of_bodies = self.rigid.mask("bodies")
-        self._drives = self.model.motors != 0  # (n, n): whether a drive moves a joint
+        self._motors = motors_of(model)
+        self._drives = self._motors != 0  # (n, n): whether a drive moves a joint
         self._moves = self._moved_joints()
         self._colours = _colours(self._drives.double().mT @ self._drives.double() > 0)
         self._blocks = [self._with_regressors(block) for block in samples.blocks(TUNING.block)]
@@ -202,10 +204,10 @@ class TorqueJacobian:
             gravity_regressor = regressor_of(model.chain, q, still, still)
             return _Samples(
                 measured=block,
-                speed=qd @ model.motors.mT,
-                acceleration=qdd @ model.motors.mT,
+                speed=qd @ self._motors.mT,
+                acceleration=qdd @ self._motors.mT,
                 regressor=regressor_of(model.chain, q, qd, qdd),
-                load_regressor=torch.einsum("jm,tjk->tmk", model.loads, gravity_regressor),
+                load_regressor=torch.einsum("jm,tjk->tmk", torch.linalg.inv(self._motors), gravity_regressor),
                 residual=residual_torque(model, q, qd, qdd),
                 factor=friction_factor(model, q),
             )
@@ -239,11 +241,11 @@ class TorqueJacobian:
         def torques(model: Any) -> tuple[torch.Tensor, torch.Tensor]:
             constants, parameters = model.friction.prepare(), model.inertial_parameters.flatten()
             borne = samples.load_regressor @ parameters if load is None else load
-            friction = model.friction(samples.speed, borne, constants, measured.z, measured.direction)
+            friction = constants.torque(samples.speed, borne, measured.z, measured.direction)
             friction = samples.factor * friction
             of_drives = friction + model.armature * samples.acceleration
             force = model.input_force(None, measured.qd, measured.tau) - samples.residual
-            return force - samples.regressor @ parameters - of_drives @ model.motors, friction
+            return force - samples.regressor @ parameters - of_drives @ self._motors, friction
 
         missing, friction = under_weights(self.model, weights, torques)
         return missing, friction

@@ -12,7 +12,7 @@ import torch
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.bristles import bristle_reach
-from spelgen.dynamics.protocol import has_rigid_bodies
+from spelgen.dynamics.protocol import has_rigid_bodies, motors_of
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import TrainingData, Validation
 from spelgen.fitting.objective import Logs, PreparedLogs, TorqueLogObjective
@@ -96,7 +96,7 @@ def torque_delay(model: EmittedModel, logs: Logs, preprocessing: Preprocessing) 
         logs = [chunk.load() for chunk in chunks[:: -(-len(chunks) // HINTS.trajectories)]]
     with torch.no_grad():
         inputs = model.input_matrix(torch.zeros(1, model.n).double())[0].numpy()
-    drives = Drives(inputs, model.motors.numpy())
+    drives = Drives(inputs, motors_of(model).numpy())
     return find_torque_delay(logs, model.joint_types, drives, model.chain, preprocessing)
 
 

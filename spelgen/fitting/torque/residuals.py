@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import torch
 import torch.nn.functional as F
 
+from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.residuals import residual_torque
 from spelgen.fitting.optimizers import minimise
 from spelgen.fitting.torque.jacobian import ResidualSamples, RigidResponse
@@ -208,7 +209,7 @@ def _candidates(
 
     Torques by position are those that ``rigid`` leaves, where it is given. chosen: parameters and joints; None: all.
     """
-    functions, motors = model.residuals, model.motors
+    functions, motors = model.residuals, motors_of(model)
     with torch.no_grad():
         splines, ripple = functions.splines(samples.q), functions.revolute * functions.waves(samples.q)
     joints, unit = torch.eye(len(motors)).to(motors), functions.unit.flatten()

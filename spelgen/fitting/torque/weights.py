@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import torch
 
 from spelgen.dynamics.parameters import parameter_table
+from spelgen.dynamics.protocol import motors_of
 from spelgen.fitting.functional_model import Weights
 from spelgen.fitting.torque.samples import Block
-from spelgen.runtime.rigid_body import body_factor, upper_cholesky
+from spelgen.runtime.rigid_body import body_factor
 from spelgen.settings.fits import Adaptation
 from spelgen.settings.tuning.fitting import TorqueTuning
 from spelgen.settings.tuning.identification import IdentificationTuning
@@ -91,7 +92,7 @@ def bound_friction(model: EmittedModel, samples: Block) -> None:
 
     It is guessed from efforts, which many URDFs have as placeholders: offsets in its units would pass for weights.
     """
-    rigid, motors = RigidWeights(model), model.motors
+    rigid, motors = RigidWeights(model), motors_of(model)
     with torch.no_grad():
         of_drives = joint_torque(model, samples) @ torch.linalg.inv(motors)
         largest = of_drives.std(dim=0) / model.friction.nominal
@@ -129,6 +130,12 @@ def moved_bodies(raw: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
     fraction = (TUNING.body_step / (-smallest).clamp(min=1e-12)).clamp(max=1.0)
     factor = factor @ upper_cholesky(torch.eye(4).double() + fraction[:, None, None] * added)
     return body_weights(factor)
+
+
+def upper_cholesky(matrix: torch.Tensor) -> torch.Tensor:
+    """Return the upper triangular U, (..., n, n), with U U^T the matrix."""
+    lower: torch.Tensor = torch.linalg.cholesky(matrix.flip(-1, -2))
+    return lower.flip(-1, -2)
 
 
 def body_weights(factor: torch.Tensor) -> torch.Tensor:
