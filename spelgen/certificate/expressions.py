@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 
 from flint import fmpq, fmpq_mpoly, fmpq_mpoly_ctx
-from sympy import Add, Expr, Integer, Mul, Rational, Symbol, cos, sin
+from sympy import Add, Expr, Integer, Rational, Symbol, cos, sin
 from sympy.core.parameters import distribute
 
 from spelgen.arm.arm import Arm
@@ -35,9 +35,12 @@ def parameter(name: str) -> Symbol:
 
 def weighted_sum(terms: Mapping[Expr, fmpq]) -> Expr:
     """Return the sum of the expressions, each times its number."""
+    products = []
     # SymPy would else make 2*(a + b) into 2*a + 2*b
     with distribute(False):
-        return Add(*(Rational(int(x.p), int(x.q)) * expression for expression, x in terms.items()))
+        for expression, number in terms.items():
+            products.append(Rational(int(number.p), int(number.q)) * expression)
+    return Add(*products)
 
 
 class PolynomialWriter:
@@ -64,18 +67,19 @@ class PolynomialWriter:
         """Return a polynomial with its products of cosines and sines as multiple angles."""
         result: Terms = {}
         for exponents, coefficient in polynomial.terms():
-            products = {
-                Mul(*(coordinate(k) ** power for k, power in enumerate(exponents[2::3]))): coefficient
-            }
+            distances = Integer(1)
+            for joint, power in enumerate(exponents[2::3]):
+                distances *= coordinate(joint) ** power
+            products = [(distances, coefficient)]
             for run in self._runs:
                 powers = tuple((self._angles[k], exponents[3 * k], exponents[3 * k + 1]) for k in run)
-                waves = multiple_angles(powers)
-                products = {
-                    x * wave: y * number for x, y in products.items() for wave, number in waves.items()
-                }
-            for factors, value in products.items():
-                result[factors] = result.get(factors, fmpq(0)) + value
-        return {factors: value for factors, value in result.items() if value != 0}
+                factors, products = products, []
+                for factor, value in factors:
+                    for wave, number in multiple_angles(powers).items():
+                        products.append((factor * wave, value * number))
+            for factor, value in products:
+                result[factor] = result.get(factor, fmpq(0)) + value
+        return {factor: value for factor, value in result.items() if value != 0}
 
 
 def parallel_runs(arm: Arm) -> list[list[int]]:

@@ -111,7 +111,9 @@ class _Words:
     def idle_joints(self) -> Iterator[Fact]:
         """Yield joints that no entry of M depends on."""
         # what no network reads is the most useful fact: an input less
-        read = {joint for entry in self.structure.entries for joint in entry.joints}
+        read: set[int] = set()
+        for entry in self.structure.entries:
+            read.update(entry.joints)
         if not read:
             return  # every entry is zero or constant, which has been said
         for joint in sorted(set(range(len(self.structure.joints))) - read):

@@ -33,10 +33,12 @@ values: what the URDF gives them, where it has inertials.
 
 def latex(formulas: Formulas) -> str:
     """Return the formulas and the definitions of their parameters in two ``align*`` environments."""
-    rows = {Symbol(row.name): row.expression for row in formulas.written}
-    definitions = {
-        name: definition for name, definition in formulas.base_parameters.items() if not definition.is_Symbol
-    }
+    rows, definitions = {}, {}
+    for row in formulas.written:
+        rows[Symbol(row.name)] = row.expression
+    for name, definition in formulas.base_parameters.items():
+        if not definition.is_Symbol:
+            definitions[name] = definition
     result = ["% Closed forms of a serial arm's mass matrix and potential energy, by spelgen; needs amsmath."]
     result += _comments(formulas, "%")
     for equations in (rows, definitions):

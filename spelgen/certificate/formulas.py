@@ -164,7 +164,10 @@ def formulas(
     written. Raises SpelgenError for an entry that M does not have.
     """
     n = len(arm.coordinates)
-    entries: list[Entry] = [*((row + 1, column + 1) for row, column in triangle(n)), "V"]
+    entries: list[Entry] = []
+    for row, column in triangle(n):
+        entries.append((row + 1, column + 1))
+    entries.append("V")
     if entry is not None:
         lower: Entry = entry
         if entry != "V":

@@ -45,14 +45,15 @@ def lines(formula: str, start: str, width: int, end: str = "") -> list[str]:
     indent = " " * (len(start) - len(start.lstrip()) + 4)
     # a sign stays with what follows it; angles, and short brackets, stay in one line
     formula = re.sub(r"([+-]) ", rf"\1{_FIXED}", formula)
-    unbroken = [x for x in re.findall(r"\((?:[^()]|\([^()]*\))+\)", formula) if len(x) < width // 2]
-    unbroken += re.findall(r"(?:cos|sin)\b.*?\)", formula)
-    for text in dict.fromkeys([*unbroken, r" \, "]):
-        formula = formula.replace(text, text.replace(" ", _FIXED))
-    wrapped = textwrap.wrap(
+    brackets = re.findall(r"\((?:[^()]|\([^()]*\))+\)", formula)
+    angles = re.findall(r"(?:cos|sin)\b.*?\)", formula)
+    for text in dict.fromkeys([*brackets, *angles, r" \, "]):
+        if len(text) < width // 2 or text in angles:
+            formula = formula.replace(text, text.replace(" ", _FIXED))
+    wrapped = textwrap.fill(
         start + formula + end, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
     )
-    return [line.replace(_FIXED, " ") for line in wrapped]
+    return wrapped.replace(_FIXED, " ").split("\n")
 
 
 class _PythonPrinter(StrPrinter):  # type: ignore[misc]  # SymPy has no types

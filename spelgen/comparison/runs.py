@@ -6,6 +6,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import product
 from typing import TYPE_CHECKING
 
 import torch
@@ -45,8 +46,11 @@ TUNING = ComparisonTuning()
 def run_study(study: Study, run_tasks: RunTasks, *, note: Callable[[str], None]) -> None:
     """Train and measure what is not yet done; `note` hears of each run that ends. What a run raises ends all."""
     # seed by seed: a comparison that is stopped has all variants of the first seeds
-    tasks = [(variant, seed) for seed in range(study.settings.seeds) for variant in study.variants]
-    waiting = [task for task in tasks if not study.result(*task).exists()]
+    tasks = list(product(range(study.settings.seeds), study.variants))
+    waiting = []
+    for seed, variant in tasks:
+        if not study.result(variant, seed).exists():
+            waiting.append((variant, seed))
     done = len(tasks) - len(waiting)
     if done:
         note(f"{done} of {len(tasks)} runs are done already")

@@ -57,9 +57,11 @@ def prepare(preparation: Preparation) -> list[SplitLogs]:
     # reading logs takes longer than asking for their times of change
     files, errors = log_files(robot.data)
     collect(errors)
-    stamps = [(file, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-    settings = [x.model_dump_json(exclude_unset=True) for x in (arm.settings, mapping)]
-    sources = [arm.robot.digest, robot.joints, robot.tip, *settings, stamps, count]
+    sources: list[object] = [arm.robot.digest, robot.joints, robot.tip, count]
+    for settings in (arm.settings, mapping):
+        sources.append(settings.model_dump_json(exclude_unset=True))
+    for file in files:
+        sources.append((file, file.stat().st_size, file.stat().st_mtime_ns))
     digest = hashlib.sha256(json.dumps(sources, default=str).encode()).hexdigest()[:16]
     names = arm.arm.joint_names
     element = f"robots.{preparation.name}.data"
