@@ -22,7 +22,6 @@ import numpy as np
 import pinocchio as pin
 import torch
 
-from spelgen.building import build
 from spelgen.dynamics.pinocchio_arm import pinocchio_model
 from spelgen.exporting.c_library import called_by_c, compile_library, compiler
 from spelgen.exporting.c_source import c_functions, write_c
@@ -37,7 +36,8 @@ from spelgen.exporting.parity import Called, Parity, check_parity
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
 from spelgen.exporting.torch_export import PROGRAMS
 from spelgen.exporting.trained import Trained
-from spelgen.loaded_arm import load_arm
+from spelgen.pipeline.build import build
+from spelgen.pipeline.loaded_arm import load_arm
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 ARMS = ("two_link", "rpr", "scara", "six_dof", "ur10e", "panda")

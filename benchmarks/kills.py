@@ -23,9 +23,9 @@ from pathlib import Path
 import torch
 
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import write_logs
-from spelgen.pipeline import generate
+from spelgen.pipeline.generate import generate
+from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.simulation.simulate import simulate
 
 URDF = Path(__file__).parents[1] / "robots" / "rpr.urdf"

@@ -30,7 +30,6 @@ from characters import read_characters, write_arm
 import spelgen
 from spelgen.arm.arm import Arm
 from spelgen.baselines.predictor import Solver
-from spelgen.building import build
 from spelgen.dynamics.bristles import bristle_reach, reach_of
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.regressor import regressor
@@ -41,12 +40,13 @@ from spelgen.fitting.fitted import Fit
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.identification.identification import Identification, LeastSquares
 from spelgen.identification.identify import least_squares
-from spelgen.loaded_arm import load_arm
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows, joined
+from spelgen.pipeline.build import build
+from spelgen.pipeline.loaded_arm import load_arm
 
 Torque = Callable[[DynamicsSamples], np.ndarray]
 

@@ -28,10 +28,10 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from emitted import NETWORKS, network_inputs
 from published_phnode import ByJvp, Published
 
-from spelgen.building import build
 from spelgen.design import Design
 from spelgen.dynamics.equations import unbounded
 from spelgen.fitting.rollout import position_difference
+from spelgen.pipeline.build import build
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

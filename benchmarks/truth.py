@@ -41,13 +41,13 @@ sys.path.insert(0, str(Path(__file__).parent))
 from figaroh_identification import figaroh_dynamics
 
 import spelgen
-from spelgen.dynamics.base_parameters import base_parameters
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import memory_along
 from spelgen.dynamics.regressor import regressor
 from spelgen.errors import SpelgenError
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.objective import torque_delay
+from spelgen.identification.base_parameters import base_parameters
 from spelgen.logs.dynamics_samples import dynamics_samples
 
 FRICTIONS = ("none", "coulomb", "stribeck", "bristles", "load", "asymmetric")

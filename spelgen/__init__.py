@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 from spelgen.version import __version__
 
 if TYPE_CHECKING:
-    from spelgen.building import build
     from spelgen.certificate.inspection import Inspection
     from spelgen.design import Design
     from spelgen.dynamics.linear_friction import FrictionModel
@@ -22,26 +21,27 @@ if TYPE_CHECKING:
     from spelgen.fitting.fit import Fit, RunOptions, fit, load_run
     from spelgen.identification.identification import Identification, LeastSquares
     from spelgen.identification.identify import identify
-    from spelgen.loaded_arm import LoadedArm, load_arm
     from spelgen.log_checks.check_logs import check_logs
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs, write_logs
     from spelgen.logs.trajectory import Trajectory
-    from spelgen.pipeline import check, generate, inspect
+    from spelgen.pipeline.build import build
+    from spelgen.pipeline.generate import check, generate, inspect
+    from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
     from spelgen.settings.fits import GaussianPrior, MomentumFit, Rollout, TorqueFit
     from spelgen.simulation.simulate import simulate
 
 
 _HOME = {
-    "load_arm": "loaded_arm",
-    "LoadedArm": "loaded_arm",
-    "inspect": "pipeline",
+    "load_arm": "pipeline.loaded_arm",
+    "LoadedArm": "pipeline.loaded_arm",
+    "inspect": "pipeline.generate",
     "Inspection": "certificate.inspection",
-    "generate": "pipeline",
+    "generate": "pipeline.generate",
     "Design": "design",
-    "build": "building",
+    "build": "pipeline.build",
     "load_module": "emission.loading",
-    "check": "pipeline",
+    "check": "pipeline.generate",
     "read_logs": "logs.read",
     "write_logs": "logs.read",
     "Trajectory": "logs.trajectory",

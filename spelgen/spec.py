@@ -17,9 +17,7 @@ from typing import Any, Literal
 from spelgen.design import Design, Net
 from spelgen.errors import ModuleError, SettingsError
 from spelgen.files import read_bytes
-
-Assume = Literal["kinematics", "inertials"]
-"""Values of the URDF that the structure uses: the kinematics, or also the inertials' zeros and symmetries."""
+from spelgen.urdf.robot import Assume
 
 Kind = Literal["zero", "constant", "varying"]
 Entries = tuple[tuple[int, int, float], ...]

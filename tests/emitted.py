@@ -19,8 +19,8 @@ from torch import nn
 
 from spelgen.design import Design
 from spelgen.emission.emit import emit
-from spelgen.loaded_arm import LoadedArm, load_arm
-from spelgen.pipeline import make_spec
+from spelgen.pipeline.generate import make_spec
+from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
 from spelgen.spec import Options
 from spelgen.structure.structure import Structure
 

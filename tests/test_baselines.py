@@ -19,10 +19,10 @@ from spelgen.dynamics.bristles import moved_bristles
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.fitting.fitted import load_run
-from spelgen.loaded_arm import load_arm
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows
-from spelgen.pipeline import generate
+from spelgen.pipeline.generate import generate
+from spelgen.pipeline.loaded_arm import load_arm
 
 
 class Slider:

@@ -16,7 +16,6 @@ from spelgen.errors import LogError, SpelgenError, SpelgenErrors
 from spelgen.identification import drive_samples
 from spelgen.identification.drive_hints import drive_problem, find_coupling
 from spelgen.identification.drive_samples import DriveLog
-from spelgen.loaded_arm import load_arm
 from spelgen.log_checks import check_logs as check_logs_room
 from spelgen.log_checks import robot_checks
 from spelgen.log_checks.check_logs import check_logs, require_sound_logs
@@ -26,6 +25,7 @@ from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
+from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.render.logs_page import page
 from spelgen.settings.log_mapping import LogMapping
 

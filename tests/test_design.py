@@ -7,12 +7,12 @@ from typing import get_args
 import pytest
 import torch
 
-from spelgen.building import build
 from spelgen.design import CHOICES, PRESETS, Design, Preset, load_design
 from spelgen.emission.loading import load_module
 from spelgen.errors import SettingsError, SpelgenError
-from spelgen.loaded_arm import load_arm
-from spelgen.pipeline import check, generate
+from spelgen.pipeline.build import build
+from spelgen.pipeline.generate import check, generate
+from spelgen.pipeline.loaded_arm import load_arm
 
 COMBINATIONS = [dict(zip(CHOICES, values, strict=True)) for values in itertools.product(*CHOICES.values())]
 

@@ -13,7 +13,7 @@ import pytest
 from emitted import GANTRY, built, import_source
 
 from spelgen.design import Preset
-from spelgen.pipeline import check, generate
+from spelgen.pipeline.generate import check, generate
 from spelgen.spec import read_facts
 
 ROOT = Path(__file__).parents[1]

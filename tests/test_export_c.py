@@ -12,7 +12,6 @@ import torch
 from exported_runs import COUPLED, MOTORS, arm_of, moved_model, run_folder
 from typer.testing import CliRunner
 
-from spelgen.building import build
 from spelgen.cli.main import app
 from spelgen.errors import RunError
 from spelgen.exporting import friction_expressions, parity
@@ -26,7 +25,8 @@ from spelgen.exporting.export import export
 from spelgen.exporting.model_expressions import expression_functions
 from spelgen.exporting.parity import check_parity, random_inputs
 from spelgen.exporting.trained import Trained
-from spelgen.loaded_arm import load_arm
+from spelgen.pipeline.build import build
+from spelgen.pipeline.loaded_arm import load_arm
 
 ONE_JOINT = """<robot name="one"><link name="base"/>
 <link name="arm"><inertial><origin xyz="0.1 0 0"/><mass value="1"/>

@@ -7,7 +7,6 @@ import pytest
 import torch
 from exported_runs import arm_of, moved_model
 
-from spelgen.building import build
 from spelgen.errors import RunError
 from spelgen.exporting.c_library import called_by_c, compile_library
 from spelgen.exporting.c_source import c_functions, c_source, write_c
@@ -16,6 +15,7 @@ from spelgen.exporting.describe import describe
 from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.parity import check_parity
 from spelgen.exporting.trained import Trained
+from spelgen.pipeline.build import build
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
 ENTRIES = {name: entry for name, entry in ENTRY_POINTS.items() if name != "servo_torque"}

@@ -19,12 +19,12 @@ from spelgen.baselines.predictor import Predictor
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
 from spelgen.exporting import exported
-from spelgen.loaded_arm import load_arm
 from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs import checks, formats
 from spelgen.logs.read import read_logs
 from spelgen.logs.tables import LogFormat
 from spelgen.logs.trajectory import Trajectory
+from spelgen.pipeline.loaded_arm import load_arm
 
 ROOT = Path(__file__).parents[1]
 JOINTS = ["joint1", "joint2"]

@@ -6,7 +6,6 @@ import torch
 from emitted import ROBOTS, built, import_source
 from exported_runs import arm_of
 
-from spelgen.building import build
 from spelgen.dynamics.bristles import (
     BristleReach,
     bristle_reach,
@@ -20,10 +19,11 @@ from spelgen.emission.loading import load_module
 from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
 from spelgen.identification.identification import LeastSquares
 from spelgen.identification.identify import least_squares
-from spelgen.loaded_arm import load_arm
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
+from spelgen.pipeline.build import build
+from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.runtime.friction_laws import FrictionLaws
 from spelgen.runtime.sliding_friction import SlidingFriction
 

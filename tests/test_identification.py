@@ -8,18 +8,18 @@ import pytest
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
-from spelgen.dynamics.base_parameters import base_parameters
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.errors import LogError
+from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.identification import LeastSquares
 from spelgen.identification.identify import least_squares
 from spelgen.identification.least_squares import correlation_time
-from spelgen.loaded_arm import load_arm
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
-from spelgen.pipeline import inspect
+from spelgen.pipeline.generate import inspect
+from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.structure.pseudo_inertia import parameters_of, pseudo_inertia, reference_factor
 
 ROBOTS = ("two_link", "rpr", "scara", "six_dof", "ur10e", "panda")

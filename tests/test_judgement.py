@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from spelgen.building import build
 from spelgen.evaluation import invariants
 from spelgen.evaluation.horizons import end_errors
 from spelgen.exporting.mjcf_file import mjcf_text
@@ -27,8 +26,9 @@ from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.fitting.window.momentum import MomentumObjective
 from spelgen.fleet import jobs
 from spelgen.identification.least_squares import deviations
-from spelgen.loaded_arm import load_arm
 from spelgen.logs.windows import Windows
+from spelgen.pipeline.build import build
+from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.fits import Rollout, TorqueFit
 
 

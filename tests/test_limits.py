@@ -27,7 +27,7 @@ SECONDS, MEGABYTES = 10, 1000
 SERVER = """
 import json, os, resource, signal, sys
 import spelgen.emission.emit
-import spelgen.pipeline
+import spelgen.pipeline.generate
 from spelgen.cli.main import main
 
 def run(folder, told, *arguments):

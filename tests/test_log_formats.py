@@ -15,7 +15,6 @@ import pyarrow.parquet
 import pytest
 
 from spelgen.errors import LogError, SettingsError, SpelgenErrors
-from spelgen.loaded_arm import load_arm
 from spelgen.logs import checks, formats, npz
 from spelgen.logs.chunks import scan
 from spelgen.logs.formats import FORMATS
@@ -23,6 +22,7 @@ from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.suggest import suggest_mapping
 from spelgen.logs.tables import LogFormat, table_layout
 from spelgen.logs.trajectory import Trajectory
+from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.log_mapping import LogMapping
 
 JOINTS = ("shoulder", "elbow")

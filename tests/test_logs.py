@@ -11,9 +11,7 @@ import pyarrow.parquet
 import pytest
 import torch
 
-from spelgen.building import build
 from spelgen.errors import LogError, SpelgenErrors
-from spelgen.loaded_arm import load_arm
 from spelgen.logs.checks import check
 from spelgen.logs.chunks import scan
 from spelgen.logs.filtering import low_pass, regular_times, resampled
@@ -22,6 +20,8 @@ from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.trajectory import split_at_gaps
 from spelgen.logs.windows import cut_windows, split_validation
+from spelgen.pipeline.build import build
+from spelgen.pipeline.loaded_arm import load_arm
 
 JOINTS = ("a", "b")
 

@@ -12,7 +12,6 @@ import torch
 from emitted import ROBOTS, import_source
 
 from spelgen.arm.actuation import motor_speeds
-from spelgen.building import build
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.fitting.fit import fit
@@ -23,13 +22,14 @@ from spelgen.identification import torque_delay
 from spelgen.identification.drive_hints import Coupling
 from spelgen.identification.identification import LeastSquares
 from spelgen.identification.identify import identify, least_squares
-from spelgen.loaded_arm import load_arm
 from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline import generate, inspect
+from spelgen.pipeline.build import build
+from spelgen.pipeline.generate import generate, inspect
+from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.log_mapping import LogMapping
 
 WRIST = np.array([[50.0, 50.0], [40.0, -40.0]])  # joint torques by motor torques of the last two joints

@@ -5,9 +5,9 @@ import pytest
 import torch
 from exported_runs import arm_of, moved_model
 
-from spelgen.building import build
 from spelgen.dynamics.protocol import has_residuals
 from spelgen.dynamics.tip import tip_kinematics
+from spelgen.pipeline.build import build
 
 
 @pytest.fixture(scope="module", params=["closed-form", "hybrid", "spel"])

@@ -14,7 +14,6 @@ from exported_runs import arm_of
 from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
 
-from spelgen.building import build
 from spelgen.design import PRESET_NAMES, load_design
 from spelgen.dynamics.body_regressor import pseudo_inertia
 from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
@@ -23,8 +22,9 @@ from spelgen.emission.bundle import bundle, load_runtime, names_in
 from spelgen.emission.tailored import kinds
 from spelgen.emission.unit_joints import hidden_units
 from spelgen.fitting.torque.weights import body_weights, upper_cholesky
-from spelgen.loaded_arm import load_arm
-from spelgen.pipeline import make_spec
+from spelgen.pipeline.build import build
+from spelgen.pipeline.generate import make_spec
+from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.runtime.derived_mass import DerivedMass
 from spelgen.runtime.encoding import JointEncoding
 from spelgen.runtime.friction_laws import turning

@@ -18,19 +18,19 @@ import pytest
 import torch
 from machine import in_time
 
-from spelgen.building import build
 from spelgen.comparison.metrics import RunResult
 from spelgen.emission.loading import load_module
 from spelgen.errors import LogError, RunError, SettingsError, SpelgenError
 from spelgen.exporting.exported import readme
 from spelgen.fitting.fit import fit
-from spelgen.loaded_arm import load_arm
 from spelgen.log_checks.check_logs import check_logs
 from spelgen.log_checks.gravity import find_opposed_inertia, state_samples
 from spelgen.logs import bags
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline import generate
+from spelgen.pipeline.build import build
+from spelgen.pipeline.generate import generate
+from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.fits import MomentumFit, Rollout
 from spelgen.settings.messages import validated
 

@@ -13,7 +13,6 @@ from motions import smooth_motion
 from scipy.optimize import minimize_scalar
 from typer.testing import CliRunner
 
-from spelgen.building import build
 from spelgen.cli.main import app
 from spelgen.emission.loading import load_module
 from spelgen.errors import LogError
@@ -31,12 +30,13 @@ from spelgen.fitting.torque.residuals import FRICTION, select_residuals
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.weights import NONE, RIGID, RigidWeights, moved_bodies
 from spelgen.fitting.train import train
-from spelgen.loaded_arm import load_arm
 from spelgen.logs import chunks
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline import generate
+from spelgen.pipeline.build import build
+from spelgen.pipeline.generate import generate
+from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.fits import GaussianPrior, Rollout, TorqueFit
 from spelgen.settings.tuning.fitting import TorqueTuning
 from tests.test_closed_form import FOLLOWED, drawn

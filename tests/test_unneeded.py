@@ -3,8 +3,8 @@
 import pytest
 
 from spelgen.errors import SpelgenError
-from spelgen.loaded_arm import load_arm
-from spelgen.pipeline import generate
+from spelgen.pipeline.generate import generate
+from spelgen.pipeline.loaded_arm import load_arm
 
 TRANSMISSION = """<transmission name="drive"><type>transmission_interface/SimpleTransmission</type>
 <joint name="joint1"><mechanicalReduction>{} </mechanicalReduction></joint>

@@ -19,11 +19,11 @@ import numpy as np
 from mujoco import minimize, rollout
 
 from spelgen.arm.arm import Arm
-from spelgen.building import build
 from spelgen.dynamics.rigid_bodies import about_center, quaternion
 from spelgen.fitting.servo.windows import ServoWindows
-from spelgen.loaded_arm import LoadedArm
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
+from spelgen.pipeline.build import build
+from spelgen.pipeline.loaded_arm import LoadedArm
 from spelgen.settings.tuning.exporting import TUNING as EXPORT_TUNING
 from spelgen.settings.tuning.servo import PositionActuatorTuning
 

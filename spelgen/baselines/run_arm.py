@@ -9,8 +9,8 @@ from spelgen.errors import RunError
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.train import open_logs
-from spelgen.loaded_arm import LoadedArm, arm_of_module
 from spelgen.logs.trajectory import Trajectory
+from spelgen.pipeline.loaded_arm import LoadedArm, arm_of_module
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.spec import read_facts
 

@@ -25,7 +25,7 @@ from spelgen.errors import SpelgenErrors
 from spelgen.files import write_text
 
 if TYPE_CHECKING:
-    from spelgen.loaded_arm import LoadedArm
+    from spelgen.pipeline.loaded_arm import LoadedArm
 
 
 def excite(

@@ -14,11 +14,11 @@ from typer.models import OptionInfo
 from spelgen.cli.console import deliver
 from spelgen.errors import SpelgenError, suggestion
 from spelgen.settings.log_mapping import Accepted
-from spelgen.spec import Assume
+from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:
-    from spelgen.loaded_arm import LoadedArm
     from spelgen.logs.arm_mapping import LoggedArm
+    from spelgen.pipeline.loaded_arm import LoadedArm
     from spelgen.settings.log_mapping import LogMapping
 
 SUFFIXES = {".json": "json", ".csv": "csv", ".html": "html", ".tex": "latex", ".py": "sympy"}
@@ -191,7 +191,7 @@ def log_mapping(arm: LoggedArm, mapping: Path | LogMapping | None, codes: Sequen
 
 def load(robot: Path, joints: str | None, tip: str | None, angle_tolerance: float) -> LoadedArm:
     """Return the arm that a command names."""
-    from spelgen.loaded_arm import load_arm
+    from spelgen.pipeline.loaded_arm import load_arm
 
     return load_arm(robot, names(joints), tip, angle_tolerance)
 

@@ -100,8 +100,8 @@ def train(
     folder = output or (module if resume and module.is_dir() else Path("runs") / module.stem)
     urdf = None if resume else robot or _unchanged_urdf(module)
     start = resumed_run(folder, request) if resume else new_run(module, urdf, request)
-    from spelgen.loaded_arm import arm_of_module
     from spelgen.log_checks.check_logs import require_sound_logs
+    from spelgen.pipeline.loaded_arm import arm_of_module
 
     facts = read_facts(start.module)
     # the mapping may speak of all joints of a URDF, and logs are checked beside the arm
@@ -195,7 +195,7 @@ def _warm_start(request: Request) -> Request:
 
 def _unchanged_urdf(module: Path) -> Path | None:
     """Return the URDF of the module's name near it, where it is still the one the module was built from."""
-    from spelgen.pipeline import find_urdf
+    from spelgen.pipeline.generate import find_urdf
     from spelgen.urdf.document import urdf_bytes
 
     facts = read_facts(module)

@@ -17,9 +17,9 @@ from spelgen.evaluation.invariants import Invariants
 from spelgen.evaluation.plain import finite, record
 from spelgen.files import read_json, write_json
 from spelgen.fitting.rollout import position_difference, roll_out
-from spelgen.loaded_arm import load_arm
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
+from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.tuning.comparison import ComparisonTuning
 
 if TYPE_CHECKING:

@@ -22,11 +22,11 @@ from spelgen.design import Design, Net, Preset, load_design
 from spelgen.errors import RunError, SettingsError
 from spelgen.files import read_json, write_json, write_text
 from spelgen.fitting.window.momentum import TUNING
-from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline import generate, require_own_module
+from spelgen.pipeline.generate import generate, require_own_module
+from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.fits import Rollout, fit_config
 from spelgen.settings.settings import Settings

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from spelgen.dynamics.protocol import RigidDynamics
     from spelgen.emission.loading import EmittedModel
     from spelgen.fitting.fitted import Fit
-    from spelgen.loaded_arm import LoadedArm
+    from spelgen.pipeline.loaded_arm import LoadedArm
 
 TUNING = EvaluationTuning()
 STEPS: Sequence[int] = (1, 10)

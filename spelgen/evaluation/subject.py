@@ -24,7 +24,7 @@ from spelgen.urdf.read import read_urdf
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
-    from spelgen.loaded_arm import LoadedArm
+    from spelgen.pipeline.loaded_arm import LoadedArm
 
 
 TUNING = EvaluationTuning()

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.base_parameters import base_parameters
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.regressor import body_chain, urdf_parameters
 from spelgen.excitation.trajectory import ExcitationTrajectory
+from spelgen.identification.base_parameters import base_parameters
 from spelgen.settings.tuning.simulation import EXCITATION
 
 FRICTION = FrictionModel()

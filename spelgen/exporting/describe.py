@@ -19,7 +19,7 @@ from spelgen.dynamics.protocol import ResidualModel, has_residuals, has_rigid_bo
 from spelgen.dynamics.tip import last_link
 from spelgen.errors import RunError
 from spelgen.exporting.description import Harmonics, Network, Residuals, Servos, Tip, TrainedModel
-from spelgen.loaded_arm import LoadedArm
+from spelgen.pipeline.loaded_arm import LoadedArm
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

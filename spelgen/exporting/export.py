@@ -12,7 +12,7 @@ from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
 from spelgen.exporting.trained import Trained
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.labels import listed
-from spelgen.loaded_arm import LoadedArm, arm_of_module
+from spelgen.pipeline.loaded_arm import LoadedArm, arm_of_module
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

@@ -12,14 +12,14 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from spelgen.arm.arm import Arm
-from spelgen.building import build
 from spelgen.dynamics.protocol import has_rigid_bodies, motors_of
 from spelgen.dynamics.residuals import without_residuals
 from spelgen.exporting.describe import array, servos_of
 from spelgen.exporting.description import Servos
 from spelgen.exporting.parity import random_inputs, usual_speeds
 from spelgen.fitting.optimizers import minimise
-from spelgen.loaded_arm import LoadedArm
+from spelgen.pipeline.build import build
+from spelgen.pipeline.loaded_arm import LoadedArm
 from spelgen.settings.tuning.exporting import TUNING
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from spelgen.exporting.describe import describe
 from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.entry_points import EntryPoint, entry_points
-from spelgen.loaded_arm import LoadedArm
+from spelgen.pipeline.loaded_arm import LoadedArm
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

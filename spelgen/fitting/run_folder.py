@@ -151,7 +151,7 @@ class RunFolder:
         """
         if not trust and not has_run(read_source(self.module)):
             # looked up when it is needed: what fits knows no symbolic algebra, and this derives the arm anew
-            import_module("spelgen.pipeline").require_own_module(self.module, self.urdf)
+            import_module("spelgen.pipeline.generate").require_own_module(self.module, self.urdf)
         return load_module(self.module)
 
 

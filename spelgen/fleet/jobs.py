@@ -24,9 +24,9 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.train import train
 from spelgen.fleet.prepare import SplitLogs
 from spelgen.fleet.schema import Fleet, FleetRobot
-from spelgen.loaded_arm import load_arm
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.pipeline import generate
+from spelgen.pipeline.generate import generate
+from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.fits import FitConfig
 from spelgen.settings.settings import load_settings
 from spelgen.settings.training import TrainingSettings

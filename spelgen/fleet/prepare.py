@@ -13,12 +13,12 @@ import numpy as np
 from spelgen.errors import LogError, RunError, collect
 from spelgen.files import read_json, write_json
 from spelgen.fleet.schema import FleetRobot
-from spelgen.loaded_arm import LoadedArm, load_arm
 from spelgen.logs.chunks import large_files
 from spelgen.logs.formats import log_files
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import split_validation
+from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.settings import load_mapping
 from spelgen.settings.values import Group

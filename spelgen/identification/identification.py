@@ -13,11 +13,11 @@ import torch
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.base_parameters import BaseParameters
 from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.errors import Diagnostic
+from spelgen.identification.base_parameters import BaseParameters
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay
 from spelgen.labels import UNITS, counted
 from spelgen.listing import WIDTH, Listing

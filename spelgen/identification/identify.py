@@ -10,11 +10,11 @@ import numpy as np
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
 from spelgen.arm.configured_arm import ConfiguredArm
-from spelgen.dynamics.base_parameters import base_parameters
 from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.regressor import body_chain, regressor
 from spelgen.errors import Diagnostic, LogError
+from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.identification import Identification, LeastSquares
 from spelgen.identification.least_squares import Columns, Solution, deviations, reduce, solve
 from spelgen.identification.torque_delay import TorqueDelay, find_torque_delay

@@ -27,7 +27,7 @@ from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, requ
 from spelgen.settings.tuning.log_checks import TUNING
 
 if TYPE_CHECKING:
-    from spelgen.loaded_arm import LoadedArm
+    from spelgen.pipeline.loaded_arm import LoadedArm
     from spelgen.settings.log_mapping import LogMapping
 
 ORDER = replace(

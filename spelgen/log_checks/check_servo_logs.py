@@ -21,7 +21,7 @@ from spelgen.settings.tuning.log_checks import TUNING as CHECK_TUNING
 from spelgen.settings.tuning.servo import ServoLogTuning
 
 if TYPE_CHECKING:
-    from spelgen.loaded_arm import LoadedArm
+    from spelgen.pipeline.loaded_arm import LoadedArm
 
 TUNING = ServoLogTuning()
 MOVING = IdentificationTuning().moving

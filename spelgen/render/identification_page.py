@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from spelgen.identification.identification import Identification
-from spelgen.loaded_arm import LoadedArm
+from spelgen.pipeline.loaded_arm import LoadedArm
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import render_page
 from spelgen.render.parameters import DETERMINED, base_table

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spelgen.dynamics.base_parameters import base_parameters
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.parameters import parameters_of_kind
 from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.dynamics.rigid_bodies import about_center
 from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
+from spelgen.identification.base_parameters import base_parameters
 from spelgen.labels import UNITS
 from spelgen.listing import Listing
-from spelgen.loaded_arm import LoadedArm
+from spelgen.pipeline.loaded_arm import LoadedArm
 from spelgen.render.plots import Record
 from spelgen.settings.tuning.render import TUNING
 

@@ -20,7 +20,7 @@ from spelgen.files import write_json, write_text
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.labels import UNITS, named_joints
-from spelgen.loaded_arm import LoadedArm
+from spelgen.pipeline.loaded_arm import LoadedArm
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.curves import curves
 from spelgen.render.page import render_page

@@ -29,7 +29,7 @@ from spelgen.structure.field import (
 from spelgen.structure.recursion import Element, Position, base_denominators, coefficients, energies, triangle
 
 if TYPE_CHECKING:
-    from spelgen.spec import Assume
+    from spelgen.urdf.robot import Assume
 
 Ten = Sequence[Element]
 TUNING = StructureTuning()

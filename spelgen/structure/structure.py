@@ -23,7 +23,7 @@ from spelgen.structure.basis import Term, smallest_form
 from spelgen.structure.sampling import Spans
 
 if TYPE_CHECKING:
-    from spelgen.spec import Assume
+    from spelgen.urdf.robot import Assume
 
 
 @dataclass(frozen=True)

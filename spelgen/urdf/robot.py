@@ -5,11 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 from spelgen.errors import Diagnostic, UrdfError
 
 Vector = tuple[float, float, float]
 Tensor = tuple[float, float, float, float, float, float]
+
+Assume = Literal["kinematics", "inertials"]
+"""Values of the URDF that are trusted: the kinematics, or also the inertials' zeros and symmetries."""
 
 MOVING = ("revolute", "continuous", "prismatic")
 """Joint types with one degree of freedom."""

@@ -13,8 +13,9 @@ from spelgen.design import PRESET_NAMES, Design, Net, load_design
 from spelgen.emission.emit import emit
 from spelgen.emission.plan import plan_model
 from spelgen.errors import ModuleError, RunError, SpelgenError
-from spelgen.loaded_arm import LoadedArm, arm_of_module, load_arm
-from spelgen.spec import Assume, Facts, ModelSpec, Options, parse_facts, read_facts, read_source
+from spelgen.pipeline.loaded_arm import LoadedArm, arm_of_module, load_arm
+from spelgen.spec import Facts, ModelSpec, Options, parse_facts, read_facts, read_source
+from spelgen.urdf.robot import Assume
 
 
 def inspect(

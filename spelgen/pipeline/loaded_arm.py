@@ -16,10 +16,11 @@ from spelgen.certificate.verification import Verification
 from spelgen.errors import Diagnostic
 from spelgen.labels import counted
 from spelgen.settings.settings import load_settings
-from spelgen.spec import Assume, Facts
+from spelgen.spec import Facts
 from spelgen.structure.base_parameters import BaseParameter, base_parameters
 from spelgen.structure.structure import Structure, derive
 from spelgen.urdf.read import read_urdf
+from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:  # SymPy is read in only for formulas
     from spelgen.certificate.formulas import Entry, Formulas

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from spelgen.design import Design, Net
 from spelgen.emission.loading import load_module
-from spelgen.loaded_arm import LoadedArm
-from spelgen.pipeline import generate
-from spelgen.spec import Assume
+from spelgen.pipeline.generate import generate
+from spelgen.pipeline.loaded_arm import LoadedArm
+from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
