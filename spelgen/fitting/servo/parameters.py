@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch.autograd.functional import jacobian
-from torch.func import functional_call
 
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.parameters import parameters_of_kind
+from spelgen.fitting.functional_model import FunctionalModel
 from spelgen.settings.tuning.servo import ServoPriorTuning
 
 if TYPE_CHECKING:
@@ -146,5 +146,6 @@ def inertial_slopes(model: EmittedModel) -> torch.Tensor:
 
 def inertial_parameters(model: EmittedModel, raw: torch.Tensor) -> torch.Tensor:
     """Return the ten parameters of all bodies, (B, 10), made of trained ones (B, 10)."""
-    parameters: torch.Tensor = functional_call(model.bodies, {"raw": raw}, ())
+    (name,) = parameters_of_kind(model, "bodies")
+    parameters: torch.Tensor = FunctionalModel(model).under({name: raw}, lambda x: x.inertial_parameters)
     return parameters
