@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 FACTS = """{
-  "format": 7,
+  "format": 8,
   "robot": "stand_in",
   "urdf": "stand_in.urdf",
   "urdf_sha256": "none",

@@ -75,7 +75,7 @@ def test_a_model_is_shown_in_a_line_and_as_its_structure():
 def test_a_module_written_before_says_what_to_rebuild(tmp_path):
     path = tmp_path / "module.py"
     text = STAND_IN.read_text(encoding="utf-8")
-    line = '  "format": 7,\n'
+    line = '  "format": 8,\n'
     assert line in text
     path.write_text(text.replace(line, ""), encoding="utf-8")
     with pytest.raises(ModuleError) as caught:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from torch.autograd.functional import jacobian
-from torch.func import functional_call
 
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.parameters import parameters_of_kind
+from spelgen.fitting.functional_model import under_weights
 from spelgen.settings.tuning.servo import ServoPriorTuning
 
 if TYPE_CHECKING:
@@ -133,5 +133,6 @@ def body_directions(model: EmittedModel, q: torch.Tensor) -> torch.Tensor:
 
 def inertial_parameters(model: EmittedModel, raw: torch.Tensor) -> torch.Tensor:
     """Return the ten parameters of all bodies, (..., B, 10), made of trained ones (..., B, 10)."""
-    parameters: torch.Tensor = functional_call(model.bodies, {"raw": raw}, ())
+    (name,) = parameters_of_kind(model, "bodies")
+    parameters: torch.Tensor = under_weights(model, {name: raw}, lambda x: x.inertial_parameters)
     return parameters
