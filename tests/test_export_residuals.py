@@ -9,13 +9,12 @@ from exported_runs import arm_of, moved_model
 
 from spelgen.building import build
 from spelgen.errors import RunError
-from spelgen.exporting.c_library import called_by_c, compile_library
+from spelgen.exporting.c_export import called_by_c, compile_library
 from spelgen.exporting.c_source import c_functions, c_source, write_c
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
-from spelgen.exporting.describe import describe
+from spelgen.exporting.describe import Trained, describe
 from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.parity import check_parity
-from spelgen.exporting.trained import Trained
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
 ENTRIES = {name: entry for name, entry in ENTRY_POINTS.items() if name != "servo_torque"}
