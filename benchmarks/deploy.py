@@ -23,10 +23,11 @@ import pinocchio as pin
 import torch
 
 from spelgen.dynamics.pinocchio_arm import pinocchio_model
-from spelgen.exporting.c_library import called_by_c, compile_library, compiler
+from spelgen.exporting.c_export import called_by_c, compile_library, compiler
 from spelgen.exporting.c_source import c_functions, write_c
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
-from spelgen.exporting.description import FrictionLaw, TrainedModel
+from spelgen.exporting.describe import Trained
+from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.mjcf_export import check_mjcf
 from spelgen.exporting.mjcf_file import mjcf_text
@@ -35,7 +36,6 @@ from spelgen.exporting.onnx_export import called_by_onnx, onnx_model, onnx_sessi
 from spelgen.exporting.parity import Called, Parity, check_parity
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
 from spelgen.exporting.torch_export import PROGRAMS
-from spelgen.exporting.trained import Trained
 from spelgen.pipeline.build import build
 from spelgen.pipeline.loaded_arm import load_arm
 
@@ -168,10 +168,11 @@ def latency(robot: str = "ur10e") -> None:
         print(f"{preset}, C")
         time_c(model, beside_casadi=preset == "closed-form")
         if preset == "closed-form":
-            zero, one = np.zeros(model.n), np.ones(model.n)
-            none = FrictionLaw(zero, zero, one, zero, zero, one, one, zero, one, zero)
+            law = model.friction
+            torques = ("viscous", "saturation", "coulomb", "stribeck", "load_dependence", "bristle_fractions")
+            none = law._replace(**{name: 0 * getattr(law, name) for name in torques})
             print(f"{preset}, C, rigid bodies alone")
-            time_c(replace(model, friction=none, bristles=None), beside_casadi=True)
+            time_c(replace(model, friction=none), beside_casadi=True)
         prepared = each.model.prepared()
         q, qd, tau = 0.3 * torch.ones(3, model.n, dtype=torch.float64)
         batch = [x.expand(1024, -1).contiguous() for x in (q, qd, tau)]

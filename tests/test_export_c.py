@@ -15,16 +15,14 @@ from typer.testing import CliRunner
 from spelgen.cli.main import app
 from spelgen.errors import RunError
 from spelgen.exporting import friction_expressions, parity
-from spelgen.exporting.c_export import c_files
-from spelgen.exporting.c_library import called_by_c, compile_library
+from spelgen.exporting.c_export import c_files, called_by_c, compile_library
 from spelgen.exporting.c_source import c_functions, write_c
 from spelgen.exporting.casadi_export import called_by_state, export_casadi
-from spelgen.exporting.describe import identifier
+from spelgen.exporting.describe import Trained, identifier
 from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.export import export
 from spelgen.exporting.model_expressions import expression_functions
 from spelgen.exporting.parity import check_parity, random_inputs
-from spelgen.exporting.trained import Trained
 from spelgen.pipeline.build import build
 from spelgen.pipeline.loaded_arm import load_arm
 

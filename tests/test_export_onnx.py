@@ -6,10 +6,10 @@ import pytest
 import torch
 from exported_runs import COUPLED, MOTORS, arm_of, moved_model
 
+from spelgen.exporting.describe import Trained
 from spelgen.exporting.export import export
 from spelgen.exporting.onnx_export import called_by_onnx, onnx_model, onnx_session
 from spelgen.exporting.parity import check_parity
-from spelgen.exporting.trained import Trained
 from spelgen.pipeline.build import build
 from spelgen.pipeline.loaded_arm import load_arm
 

@@ -8,13 +8,12 @@ import torch
 from exported_runs import arm_of, moved_model
 
 from spelgen.errors import RunError
-from spelgen.exporting.c_library import called_by_c, compile_library
+from spelgen.exporting.c_export import called_by_c, compile_library
 from spelgen.exporting.c_source import c_functions, c_source, write_c
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
-from spelgen.exporting.describe import describe
+from spelgen.exporting.describe import Trained, describe
 from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.parity import check_parity
-from spelgen.exporting.trained import Trained
 from spelgen.pipeline.build import build
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")

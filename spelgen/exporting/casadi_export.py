@@ -9,13 +9,13 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
+from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.entry_points import ENTRY_POINTS, EntryPoint
 from spelgen.exporting.exported import Exported, folder_export
 from spelgen.exporting.model_expressions import expression_functions, residuals_needed
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.residual_expressions import residual_values
-from spelgen.exporting.trained import Trained
 from spelgen.settings.tuning.exporting import TUNING
 
 

@@ -1,10 +1,12 @@
-"""A torch model and its arm -> its description: facts of the arm, values of the model, no text of the module."""
+"""A trained model and its arm, the input of every exporter; its description: facts of the arm, values of the model."""
 
 from __future__ import annotations
 
 import copy
 import keyword
 import re
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from spelgen.dynamics.protocol import ResidualModel, has_residuals, has_rigid_bo
 from spelgen.dynamics.tip import last_link
 from spelgen.errors import RunError
 from spelgen.exporting.description import Harmonics, Network, Residuals, Servos, Tip, TrainedModel
+from spelgen.exporting.entry_points import EntryPoint, entry_points
 from spelgen.pipeline.loaded_arm import LoadedArm
 
 if TYPE_CHECKING:
@@ -27,6 +30,43 @@ if TYPE_CHECKING:
     from spelgen.runtime.residual_terms import ResidualTerms
 
 _LONGEST_NAME = 40
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """A trained model of an arm.
+
+    entries: names of the functions to export, for formats of functions; by default all but derivatives.
+    """
+
+    model: EmittedModel
+    arm: LoadedArm
+    entries: tuple[str, ...] = ()
+
+    @cached_property
+    def described(self) -> TrainedModel:
+        """The model as plain numbers. Raises RunError for a preset that has no such description."""
+        return describe(self.model, self.arm)
+
+    @cached_property
+    def entry_points(self) -> dict[str, EntryPoint]:
+        """The functions to export from the description, by name. Raises RunError for names of others."""
+        return entry_points(self.described, self.entries)
+
+    @property
+    def robot(self) -> str:
+        """The name of the robot in the URDF."""
+        return self.arm.arm.name
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """The names of the joints in the URDF."""
+        return self.arm.arm.joint_names
+
+    @property
+    def memory(self) -> int:
+        """How many numbers the memory of friction has."""
+        return self.model.n * int(getattr(self.model, "elements", 0))
 
 
 def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
@@ -80,7 +120,8 @@ def servos_of(model: EmittedModel) -> Servos | None:
     """Return the position servos of a model, None where it has none."""
     if input_of(model) == "torque":
         return None
-    return Servos(*map(array, model.servo.prepare()), delay=float(model.servo.delay))
+    kp, kd, limit, dead_zone = map(array, model.servo.prepare())
+    return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
 
 
 def tip_frame(loaded: LoadedArm) -> Tip:
@@ -107,7 +148,7 @@ def _residuals(model: ResidualModel) -> Residuals:
     """Return the residuals without those that are zero. Raises RunError for Kolmogorov-Arnold networks."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
-    entries = np.argwhere(np.tril(functions.any(axis=0).reshape(model.n, model.n)))
+    entries: np.ndarray = np.argwhere(np.tril(functions.any(axis=0).reshape(model.n, model.n)))
     mass = _network(terms.mass, weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
     if mass is None:
         entries = entries[:0]

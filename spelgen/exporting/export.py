@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spelgen.errors import RunError, suggestion
+from spelgen.exporting.describe import Trained
 from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
-from spelgen.exporting.trained import Trained
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.labels import listed
 from spelgen.pipeline.loaded_arm import LoadedArm, arm_of_module

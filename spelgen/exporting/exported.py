@@ -12,7 +12,7 @@ from spelgen.files import write_bytes
 from spelgen.labels import printable
 
 if TYPE_CHECKING:
-    from spelgen.exporting.trained import Trained
+    from spelgen.exporting.describe import Trained
 
 UNITS = "Units: rad and Nm for revolute joints, m and N for prismatic ones"
 

@@ -7,11 +7,11 @@ import numpy as np
 import torch
 
 from spelgen.arm.arm import Arm
+from spelgen.exporting.describe import Trained
 from spelgen.exporting.exported import UNITS, Exported, readme
 from spelgen.exporting.mjcf_file import mjcf_text
 from spelgen.exporting.parity import Parity, Values, random_inputs, relative, require_parity
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection, rigid_body_projection
-from spelgen.exporting.trained import Trained
 from spelgen.settings.tuning.exporting import TUNING
 
 

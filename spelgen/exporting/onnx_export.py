@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from spelgen.dynamics.prepared import PreparedModel
+from spelgen.exporting.describe import Trained
 from spelgen.exporting.entry_points import chosen
 from spelgen.exporting.exported import Exported, folder_export
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.torch_export import PROGRAMS, export_program, program_inputs, program_output
-from spelgen.exporting.trained import Trained
 from spelgen.settings.tuning.exporting import TUNING
 
 

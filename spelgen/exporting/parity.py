@@ -14,8 +14,8 @@ from torch import Tensor
 from spelgen.arm.arm import Coordinate
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import RunError
+from spelgen.exporting.describe import Trained
 from spelgen.exporting.entry_points import ENTRY_POINTS
-from spelgen.exporting.trained import Trained
 from spelgen.settings.tuning.exporting import TUNING
 from spelgen.structure.nominal import working_range
 

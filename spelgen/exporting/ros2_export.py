@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from spelgen.exporting.c_export import c_files
+from spelgen.exporting.describe import Trained
 from spelgen.exporting.exported import Exported, folder_export
-from spelgen.exporting.trained import Trained
 from spelgen.templates import render
 
 _CALLED = (

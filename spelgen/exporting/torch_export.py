@@ -11,10 +11,10 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from spelgen.dynamics.prepared import PreparedModel
+from spelgen.exporting.describe import Trained
 from spelgen.exporting.entry_points import ENTRY_POINTS, chosen
 from spelgen.exporting.exported import Exported, folder_export
 from spelgen.exporting.parity import Called, Values, check_parity
-from spelgen.exporting.trained import Trained
 from spelgen.settings.tuning.exporting import TUNING
 
 PROGRAMS: dict[str, Callable[..., Tensor]] = {
