@@ -132,6 +132,6 @@ def body_directions(model: EmittedModel, q: torch.Tensor) -> torch.Tensor:
 
 
 def inertial_parameters(model: EmittedModel, raw: torch.Tensor) -> torch.Tensor:
-    """Return the ten parameters of all bodies, (..., B, 10), made of trained ones (..., B, 10)."""
+    """Return the ten parameters of all bodies, (B, 10), made of trained ones (B, 10)."""
     parameters: torch.Tensor = functional_call(model.bodies, {"raw": raw}, ())
     return parameters
