@@ -132,7 +132,7 @@ def body_directions(model: EmittedModel, q: torch.Tensor) -> torch.Tensor:
 
 
 def inertial_parameters(model: EmittedModel, raw: torch.Tensor) -> torch.Tensor:
-    """Return the ten parameters of all bodies, (..., B, 10), made of trained ones (..., B, 10)."""
+    """Return the ten parameters of all bodies, (B, 10), made of trained ones (B, 10)."""
     (name,) = parameters_of_kind(model, "bodies")
     parameters: torch.Tensor = under_weights(model, {name: raw}, lambda x: x.inertial_parameters)
     return parameters

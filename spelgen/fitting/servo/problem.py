@@ -196,13 +196,20 @@ class ServoProblem:
         tensors = {name: tensor.detach() for name, tensor in named.items()}
         with torch.inference_mode():  # small operations, of which each takes a tenth less so
             drives, armature = under_weights(self.model, tensors, _drives)
-            inertial = inertial_parameters(self.model, self._bodies_at(bodies)).flatten(1)
-            change = torch.einsum("wkni,pi->pwkn", self.load.slopes, inertial - self._inertial)
+            change = torch.einsum("wkni,pi->pwkn", self.load.slopes, self._changed(bodies))
             return self._integrate(drives, armature, change, commands)
 
+    def _changed(self, bodies: torch.Tensor) -> torch.Tensor:
+        """Return by how much inertial parameters differ from those of the load, (P, 10 B), at bodies (P, r)."""
+        changes = []
+        for point in bodies:
+            inertial = inertial_parameters(self.model, self._bodies_at(point))
+            changes.append(inertial.flatten() - self._inertial)
+        return torch.stack(changes)
+
     def _bodies_at(self, bodies: torch.Tensor) -> torch.Tensor:
-        """Return the bodies' raw parameters, (..., B, 10), this far (..., r) along their directions."""
-        return self._raw_bodies + torch.unflatten(bodies @ self.directions.mT, -1, self._raw_bodies.shape)
+        """Return the bodies' raw parameters, (B, 10), this far (r,) along their directions."""
+        return self._raw_bodies + (self.directions @ bodies).view_as(self._raw_bodies)
 
     def _integrate(
         self, drives: ServoDrives, armature: torch.Tensor, change: torch.Tensor, commands: torch.Tensor
