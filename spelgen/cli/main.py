@@ -64,6 +64,8 @@ def _suggest(error: Any) -> None:
     nearest = list(getattr(error, "possibilities", None) or [])[:1]
     if nearest:
         error.possibilities = []
+    # typer checks choices by pydantic, which begins its messages so
+    error.message = error.message.replace("Value error, ", "")
     # click has no suggestion for values of a choice, which are misspelt as often as options
     choice = re.fullmatch(r"'(.*)' is not one of (.*)\.", error.message, re.DOTALL)
     if choice:
