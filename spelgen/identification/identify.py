@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from spelgen.settings.tuning.identification import TUNING
 
 
 def identify(
-    arm: ConfiguredArm,
+    arm: ConfiguredArm | Path | str,
     logs: Trajectory | Sequence[Trajectory],
     method: LeastSquares | None = None,
     *,
@@ -35,9 +36,11 @@ def identify(
 ) -> Identification:
     """Fit base parameters, friction and armature of ``arm`` to the torques in ``logs``.
 
-    arm: of ``load_arm``. Torques of motors are taken to the joints' by its input matrix.
+    arm: of ``load_arm``, or the path of a URDF. Torques of motors are taken to the joints' by its input matrix.
     preprocessing: its filter and gap. Raises LogError for logs that cannot be used.
     """
+    if not isinstance(arm, ConfiguredArm):
+        arm = ConfiguredArm.load(arm)
     logs = [logs] if isinstance(logs, Trajectory) else logs
     return identify_by(arm, logs, [method or LeastSquares()], preprocessing or Preprocessing())[0]
 

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spelgen.arm.actuation import derive_actuation
-from spelgen.arm.arm import make_arm
 from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.certificate.inspection import Inspection
 from spelgen.certificate.verification import Verification
 from spelgen.errors import Diagnostic
 from spelgen.labels import counted
-from spelgen.settings.settings import load_settings
 from spelgen.spec import Facts
 from spelgen.structure.base_parameters import BaseParameter, base_parameters
 from spelgen.structure.structure import Structure, derive
-from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:  # SymPy is read in only for formulas
@@ -96,25 +92,7 @@ def load_arm(
     Angles within ``angle_tolerance`` [rad] of a special one are that one; at 0 the file's numbers are taken as
     they stand. Raises UrdfError, ArmError or SettingsError.
     """
-    path = Path(path)
-    robot = read_urdf(path)
-    settings = load_settings(path, [joint.name for joint in robot.joints])
-    if joints is None and tip is None:
-        joints, tip = settings.moving_joints, settings.tip
-    arm = make_arm(robot, joints=joints, tip=tip, angle_tolerance=angle_tolerance, gravity=settings.gravity)
-    coordinates = tuple(
-        replace(coordinate, passive=not settings.joint(coordinate.name).actuated)
-        for coordinate in arm.coordinates
-    )
-    return LoadedArm(
-        robot=robot,
-        settings=settings,
-        arm=replace(arm, coordinates=coordinates),
-        actuation=derive_actuation(robot, settings, [coordinate.name for coordinate in coordinates]),
-        joints=None if joints is None else tuple(joints),
-        tip=tip,
-        angle_tolerance=angle_tolerance,
-    )
+    return LoadedArm.load(path, joints, tip, angle_tolerance)
 
 
 def arm_of_module(facts: Facts, urdf: str | Path) -> LoadedArm:

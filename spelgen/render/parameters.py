@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.parameters import parameters_of_kind
@@ -15,7 +16,7 @@ from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.dynamics.rigid_bodies import about_center
 from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
 from spelgen.identification.base_parameters import base_parameters
-from spelgen.labels import UNITS
+from spelgen.labels import UNITS, entry_name
 from spelgen.listing import Listing
 from spelgen.pipeline.loaded_arm import LoadedArm
 from spelgen.render.plots import Record
@@ -48,6 +49,8 @@ def parameter_tables(
         tables.append(_body_table(bodies, arm))
     if model is not None and hasattr(model, "armature"):
         tables.append(_joint_table(model, arm))
+    if len(getattr(getattr(model, "mass", None), "raw_constants", ())):
+        tables.append(_constant_table(model))
     return tables
 
 
@@ -183,3 +186,24 @@ def _joint_table(model: EmittedModel, arm: LoadedArm | None) -> Listing:
 
 def _with_units(values: Sequence[float] | np.ndarray, units: Sequence[str]) -> list[str]:
     return [f"{value:.3g} {unit}" for value, unit in zip(values, units, strict=True)]
+
+
+def _constant_table(model: Any) -> Listing:
+    """Return the learned constants of M, in the units of the first entries that they are in."""
+    mass = model.mass
+    count = len(mass.raw_constants)
+    # what each constant adds to M, (constants, n, n)
+    functions = torch.zeros(len(getattr(mass, "function_mean", ())), count, dtype=torch.float64)
+    units = torch.eye(count, dtype=torch.float64)
+    rows = []
+    for basis, value in zip(
+        mass.entries(functions.unbind(), units.unbind()), mass.constants().tolist(), strict=True
+    ):
+        indices = basis.tril().nonzero().tolist()
+        terms = [f"{basis[row, column].item():+.4g} {entry_name(row, column)}" for row, column in indices]
+        first, second = (UNITS[model.joint_types[k]].inertia for k in indices[0])
+        unit = first if first == second else "kg m"
+        entries = " ".join(terms).replace("+1 ", "+ ").removeprefix("+ ")
+        rows.append((entries, f"{value:.4g}", unit))
+    note = "An entry of M is the sum of its constants and learned functions."
+    return Listing("Constants of the mass matrix", ("entries", "learned", "unit"), tuple(rows), note)
