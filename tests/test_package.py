@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import spelgen
-from spelgen import pipeline
+from spelgen.pipeline import generate as pipeline
 
 ROOT = Path(__file__).parents[1]
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 from html_page import Page
 
-from spelgen import pipeline
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
+from spelgen.pipeline import generate as pipeline
 from spelgen.render.report_page import render_report, write_report
 from spelgen.settings.fits import Rollout
 
