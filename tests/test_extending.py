@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import spelgen
-from spelgen import design, pipeline
+from spelgen import design
 from spelgen.baselines import registry
 from spelgen.baselines.baseline import Baseline
 from spelgen.baselines.predictor import Predictor
@@ -24,6 +24,7 @@ from spelgen.logs import checks, formats
 from spelgen.logs.read import read_logs
 from spelgen.logs.tables import LogFormat
 from spelgen.logs.trajectory import Trajectory
+from spelgen.pipeline import generate as pipeline
 from spelgen.pipeline.loaded_arm import load_arm
 
 ROOT = Path(__file__).parents[1]
