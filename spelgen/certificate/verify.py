@@ -128,7 +128,7 @@ def _smallest_form(structure: Structure, samples: NumericSamples) -> _Fact:
         if term.joints:
             name = f"change of an output of {joints_in_ranges(term.joints)} with others"
         sizes.append(_Size(name, float(moves.max()), False))
-    sizes.append(_Size("what it leaves of M", float(np.abs(remainder).max(initial=0.0)), False))
+    sizes.append(_Size("remainder of M", float(np.abs(remainder).max(initial=0.0)), False))
     derived = f"{len(structure.outputs)} outputs and {len(structure.constants)} constants give M"
     return _Fact("smallest form", derived, sizes, TUNING.form_rounding)
 

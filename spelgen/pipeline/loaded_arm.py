@@ -28,7 +28,7 @@ class LoadedArm(ConfiguredArm):
 
     @property
     def structure(self) -> Structure:
-        """What holds for any inertial values: the kinematics alone are trusted."""
+        """Return the structure for any inertial values: by the kinematics alone."""
         return derive(self.arm)
 
     @cached_property
