@@ -56,7 +56,7 @@ _HOME = {
     "Identification": "identification.identification",
     "fit": "fitting.fit",
     "Fit": "fitting.fitted",
-    "RunOptions": "fitting.fit",
+    "RunOptions": "fitting.objective",
     "load_run": "fitting.fitted",
     "GaussianPrior": "settings.fits",
     "TorqueFit": "settings.fits",
