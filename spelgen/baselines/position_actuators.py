@@ -19,6 +19,7 @@ import numpy as np
 from mujoco import minimize, rollout
 
 from spelgen.arm.arm import Arm
+from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.rigid_bodies import about_center, quaternion
 from spelgen.fitting.servo.windows import ServoWindows
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
@@ -131,7 +132,7 @@ def fit_position_actuators(
 ) -> PositionActuators | None:
     """Fit to windows, starting with the drives of a ``trained`` model of the arm; None where joints are coupled."""
     n = len(arm.arm.coordinates)
-    if len(arm.arm.bodies) > n or (trained.motors.numpy() != np.eye(n)).any():
+    if len(arm.arm.bodies) > n or (motors_of(trained).numpy() != np.eye(n)).any():
         return None
     servo, friction = trained.servo.prepare(), trained.friction.prepare()
     # kv takes a joint's damping too: they are one number but where the torque is limited
