@@ -99,23 +99,20 @@ def validate(values: Mapping[str, Any], document: Document | None = None) -> Non
     def line(name: str) -> int | None:
         return None if document is None else document.line((name,))
 
-    errors = [
-        SettingsError(f"unknown key {name!r}", file=file, line=line(name), do=suggestion(str(name), CHOICES))
-        for name in values
-        if name not in CHOICES
-    ]
+    errors = []
+    for name in values:
+        if name not in CHOICES:
+            do = suggestion(str(name), CHOICES)
+            errors.append(SettingsError(f"unknown key {name!r}", file=file, line=line(name), do=do))
     for name, choices in CHOICES.items():
         got = repr(values[name]) if name in values else "nothing"
         if values.get(name) not in choices:
             expected = f"one of {', '.join(choices)}"
             errors.append(SettingsError(got, file=file, line=line(name), element=name, expected=expected))
     collect(errors)
-    errors = [
-        SettingsError(
-            f"{first}: {values[first]} with {second}: {values[second]}", file=file, line=line(first), do=do
-        )
-        for first, second, do in _conflicts(values)
-    ]
+    for first, second, do in _conflicts(values):
+        got = f"{first}: {values[first]} with {second}: {values[second]}"
+        errors.append(SettingsError(got, file=file, line=line(first), do=do))
     collect(errors)
 
 

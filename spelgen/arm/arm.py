@@ -122,12 +122,11 @@ def make_arm(
     chain = choose_chain(robot, joints, tip)
     _require_small(robot, chain)
     lumped = lump_links(robot, chain, angle_tolerance)
-    # all bodies of one coordinate move with it, so bodies are found by their leader
-    leaders = [joint.name for joint in chain.joints]
     locked = {joint.name for joint in lumped.held if joint.type != "fixed"}
     bodies = []
+    # all bodies of one coordinate move with it, so bodies are found by their leader
     for moved in lumped.moved:
-        bodies.append(_body(moved, leaders.index(moved.followed.leader.name)))
+        bodies.append(_body(moved, chain.names.index(moved.followed.leader.name)))
     # exact, so that a horizontal joint has no gravity torque at all and not one of 1e-17
     x, y, z = map(exact, map(float, gravity))
     return Arm(
@@ -147,10 +146,9 @@ def _require_small(robot: Robot, chain: Chain) -> None:
     if moving > MOST_JOINTS:
         do = "choose fewer with --joints or --tip"
         raise ArmError(f"{moving} joints", file=robot.told_as, expected=f"at most {MOST_JOINTS}", do=do)
-    leaders = {joint.name for joint in chain.joints}
     following = -moving  # each joint of the chain follows itself
     for follow in follows(robot).values():
-        following += follow.leader.name in leaders
+        following += follow.leader.name in chain.names
     if following > MOST_FOLLOWERS:
         got = f"{following} joints that follow others by <mimic>"
         raise ArmError(got, file=robot.told_as, expected=f"at most {MOST_FOLLOWERS}", do="fix some of them")

@@ -23,6 +23,11 @@ class Chain:
     joints: tuple[Joint, ...]
     diagnostics: tuple[Diagnostic, ...] = ()
 
+    @property
+    def names(self) -> list[str]:
+        """Names of the joints, as in the URDF."""
+        return [joint.name for joint in self.joints]
+
 
 @dataclass(frozen=True)
 class Follow:

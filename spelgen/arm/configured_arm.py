@@ -40,7 +40,7 @@ class ConfiguredArm:
         """Read a URDF and its sidecar, and take the arm from it; see ``load_arm``."""
         path = Path(path)
         robot = read_urdf(path)
-        settings = load_settings(path, [joint.name for joint in robot.joints])
+        settings = load_settings(path, robot.joint)
         if joints is None and tip is None:
             joints, tip = settings.moving_joints, settings.tip
         arm = make_arm(
@@ -54,7 +54,7 @@ class ConfiguredArm:
             robot=robot,
             settings=settings,
             arm=replace(arm, coordinates=coordinates),
-            actuation=derive_actuation(robot, settings, [coordinate.name for coordinate in coordinates]),
+            actuation=derive_actuation(robot, settings, arm.joint_names),
             joints=None if joints is None else tuple(joints),
             tip=tip,
             angle_tolerance=angle_tolerance,

@@ -48,12 +48,11 @@ def lump_links(robot: Robot, chain: Chain, angle_tolerance: float) -> LumpedLink
     # parents first: a link is placed in the frame of the body that carries it
     placement = Placement(robot.root, rounding)
     following = follows(robot)
-    leaders = {joint.name for joint in chain.joints}
     poses: list[tuple[Joint, Pose]] = []
     held: list[Joint] = []
     for joint in _chain_first(robot, chain):
         followed = following[joint.name]
-        if joint.moves and followed.leader.name in leaders and followed.multiplier:
+        if joint.moves and followed.leader.name in chain.names and followed.multiplier:
             poses.append((joint, placement.move(joint)))
         else:
             # a follower whose leader is held stands at its offset, all other joints at 0

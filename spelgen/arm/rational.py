@@ -15,7 +15,7 @@ Matrix = tuple[Vector, Vector, Vector]
 
 TUNING = GeometryTuning()
 
-IDENTITY = np.array([[Fraction(int(row == column)) for column in range(3)] for row in range(3)])
+IDENTITY: np.ndarray = np.eye(3, dtype=object) * Fraction(1)
 ZERO = np.array([Fraction(0)] * 3)
 
 

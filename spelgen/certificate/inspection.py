@@ -194,7 +194,9 @@ class Inspection:
         """Return the lower triangle of M with each entry's joints, its columns aligned."""
         cells, n = self._cells(), len(self.structure.joints)
         lines = ["Mass matrix: joints each entry depends on; C constant, 0 always zero"]
-        widths = [max(len(cells[row, column]) for row in range(column, n)) for column in range(n)]
+        widths = [0] * n
+        for (_, column), cell in cells.items():
+            widths[column] = max(widths[column], len(cell))
         for row in range(n):
             line = f"  {row + 1:>2}"
             for column in range(row + 1):

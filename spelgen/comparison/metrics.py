@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from pydantic import TypeAdapter, ValidationError
 
+from spelgen.dynamics.parameters import parameter_count
 from spelgen.dynamics.protocol import has_residuals
 from spelgen.errors import RunError
 from spelgen.evaluation.drawn_motions import PredictedMotion
@@ -116,8 +117,7 @@ def sizes(model: EmittedModel) -> Sizes:
     if friction is None:
         outputs[1] = model.n  # a function of each joint's own
     inputs = 0 if mass is None else int(mass.mask0.flatten(1).any(dim=0).sum())
-    parameters = sum(parameter.numel() for parameter in model.parameters())
-    return Sizes(tuple(outputs), inputs, parameters)
+    return Sizes(tuple(outputs), inputs, parameter_count(model))
 
 
 def _network(model: Any, name: str) -> Any:

@@ -41,6 +41,11 @@ def parameter_table(model: nn.Module) -> dict[str, ParameterInfo]:
     return table
 
 
+def parameter_count(model: nn.Module) -> int:
+    """Return how many numbers of a model are trained."""
+    return sum(parameter.numel() for parameter in model.parameters())
+
+
 def parameters_of_kind(model: nn.Module, *kinds: str) -> tuple[str, ...]:
     """Return the names of a model's parameters of these kinds, in its own order."""
     return tuple(name for name, info in parameter_table(model).items() if info.kind in kinds)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
+from spelgen.dynamics.parameters import parameter_count
 from spelgen.dynamics.prepared import PreparedModel
 from spelgen.errors import ModuleError
 from spelgen.labels import printable
@@ -89,10 +90,10 @@ def _private_name(source: str) -> str:
 
 
 def _summary(model: EmittedModel) -> str:
-    count = sum(parameter.numel() for parameter in model.parameters())
     options = model.facts.options
     preset = options.preset + (f", {options.net}" if options.net in ("mlp", "kan") else "")
-    return f"<Model of {printable(model.facts.robot)!r} ({preset}): {model.n} joints, {count} parameters>"
+    sizes = f"{model.n} joints, {parameter_count(model)} parameters"
+    return f"<Model of {printable(model.facts.robot)!r} ({preset}): {sizes}>"
 
 
 def _page(model: EmittedModel) -> str:

@@ -94,5 +94,5 @@ def read_test_logs(
     if mapping is None:
         mapping = LogMapping(**record["mapping"])
     elif isinstance(mapping, str | Path) and run.urdf.exists():  # it may speak of all joints of the URDF
-        mapping = load_mapping(mapping, [joint.name for joint in read_urdf(run.urdf).joints])
+        mapping = load_mapping(mapping, read_urdf(run.urdf).joint)
     return read_logs(paths, facts.joints, mapping, "test", joint_types=facts.joint_types)

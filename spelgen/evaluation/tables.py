@@ -174,10 +174,13 @@ def _replay_tables(results: Measurements) -> list[Table]:
         rows: dict[str, Numbers] = {}
         for log in replay.errors[MODEL].trajectories:
             rows[log] = {name: 1000 * errors.trajectories[log] for name, errors in replay.errors.items()}
-        rows["mean of all"] = {name: 1000 * errors.mean for name, errors in replay.errors.items()}
+        means, joints = {}, {}
+        for name, errors in replay.errors.items():
+            means[name] = 1000 * errors.mean
+            joints[name] = [1000 * rms for rms in errors.joints]
+        rows["mean of all"] = means
         title = f"Commands replayed, {replay.name}: RMS"
         tables.append(table(f"{title} of positions over all joints [{unit}]", rows))
-        joints = {name: [1000 * rms for rms in errors.joints] for name, errors in replay.errors.items()}
         title = f"{title} by joint, over all trajectories [{unit}]"
         tables.append(table(title, _joint_rows(results.joints, joints)))
     return tables

@@ -15,7 +15,7 @@ from spelgen.errors import Diagnostic
 from spelgen.evaluation.plain import finite
 from spelgen.log_checks.statistics import quantisation_step
 from spelgen.logs.dynamics_samples import DynamicsSamples, is_moving
-from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.trajectory import Trajectory, joined_column
 from spelgen.settings.tuning.identification import IdentificationTuning
 from spelgen.settings.tuning.log_checks import LogCheckTuning
 
@@ -111,7 +111,7 @@ def coarse_torques(
     for k, joint in enumerate(joints):
         # infinite where a log is not quantised: most of them must be
         step = float(np.median(np.nan_to_num([quantisation_step(log.tau[:, k]) for log in logs], nan=np.inf)))
-        torque = np.concatenate([log.tau[:, k] for log in logs])
+        torque = joined_column(logs, "tau")[:, k]
         if np.isfinite(step) and np.ptp(torque) < LEVELS * step:
             steps[joint] = step
             message = (

@@ -29,7 +29,7 @@ from spelgen.evaluation.horizons import JudgedLogs, Predictions, TipPosition
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.replay import Missed
 from spelgen.fitting.rollout import AT_REST, loss_scales, position_difference
-from spelgen.logs.trajectory import Trajectory, coverage
+from spelgen.logs.trajectory import Trajectory, coverage, joined_column
 from spelgen.settings.tuning.evaluation import TraceTuning
 
 if TYPE_CHECKING:
@@ -183,9 +183,9 @@ def _mass_trace(dynamics: Mapping[str, RigidDynamics], motion: DrawnMotion) -> M
 
 
 def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Trajectory]) -> FrictionTrace:
-    q = np.concatenate([piece.q for piece in pieces])
+    q = joined_column(pieces, "q")
     # the fastest samples are often spikes of differenced positions
-    fast = np.quantile(np.abs(np.concatenate([piece.qd for piece in pieces])), 0.995, axis=0)
+    fast = np.quantile(np.abs(joined_column(pieces, "qd")), 0.995, axis=0)
     grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)  # dense where friction turns around
     speeds = torch.from_numpy(grid[:, None] * fast)  # (81, n)
     alone = torch.diag_embed(speeds)  # one joint at a time

@@ -26,19 +26,20 @@ from spelgen.settings.tuning.exporting import TUNING
 def export_onnx(trained: Trained) -> Exported:
     """Return an .onnx for each entry point. Raises RunError where ONNX Runtime and the model differ."""
     model = trained.model.prepared()
-    files = {name: onnx_model(model, name) for name in chosen(trained.entries, PROGRAMS)}
-    parity = check_parity(called_by_onnx(files), trained, list(files), TUNING.onnx_tolerance)
+    models, files = {}, {}
+    for name in chosen(trained.entries, PROGRAMS):
+        models[name] = files[f"{name}.onnx"] = onnx_model(model, name)
+    parity = check_parity(called_by_onnx(models), trained, list(models), TUNING.onnx_tolerance)
     checked = f"Checked when exported, by ONNX Runtime {onnxruntime.__version__}: {parity.summary}."
     use = (
         "onnxruntime.InferenceSession('forward_dynamics.onnx').run(['qdd'], {'q': q, 'qd': qd, 'tau': tau}), "
         "float64 (batch, n), any batch."
     )
     size = model.n * model.elements
-    about = f"one file an entry point: {', '.join(files)}."
+    about = f"one file an entry point: {', '.join(models)}."
     if size:
         about = f"z, friction's memory, is (batch, {size}); {about}"
-    contents = {f"{name}.onnx": content for name, content in files.items()}
-    return folder_export(trained, "onnx", "in ONNX", contents, use=use, about=about, checked=checked)
+    return folder_export(trained, "onnx", "in ONNX", files, use=use, about=about, checked=checked)
 
 
 def onnx_model(model: PreparedModel, name: str) -> bytes:

@@ -31,7 +31,9 @@ PROGRAMS: dict[str, Callable[..., Tensor]] = {
 def export_torch(trained: Trained) -> Exported:
     """Return a .pt2 for each entry point, and model.safetensors. Raises RunError where they differ from the model."""
     model = trained.model.prepared()
-    programs = {name: _saved(export_program(model, name)) for name in chosen(trained.entries, PROGRAMS)}
+    programs, files = {}, {}
+    for name in chosen(trained.entries, PROGRAMS):
+        programs[name] = files[f"{name}.pt2"] = _saved(export_program(model, name))
     parity = check_parity(_called_by_torch(programs, model), trained, list(programs), TUNING.tolerance)
     checked = f"Checked when exported, by torch {torch.__version__}: {parity.summary}."
     # clones: some tables of an emitted module stand in two places
@@ -42,7 +44,6 @@ def export_torch(trained: Trained) -> Exported:
         "model.safetensors contains the trained weights by the names of the emitted module."
     )
     about = "the programs take no gradients by the weights."
-    files = {f"{name}.pt2": content for name, content in programs.items()}
     files["model.safetensors"] = save(weights)
     return folder_export(trained, "torch", "in torch", files, use=use, about=about, checked=checked)
 

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
+from spelgen.dynamics.parameters import parameter_count
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.files import write_json
 from spelgen.fitting.objective import Status
@@ -83,7 +84,7 @@ class Fit:
     @property
     def parameters(self) -> int:
         """Numbers that were fitted."""
-        return sum(parameter.numel() for parameter in self.model.parameters())
+        return parameter_count(self.model)
 
     def predict(self, trajectory: Trajectory) -> np.ndarray:
         """Joint torques (T, n) [Nm, N] of the model's inverse dynamics along a trajectory, at its own times.

@@ -16,7 +16,7 @@ from spelgen.fitting.rollout import loss_scales
 from spelgen.logs.checks import LogChecks
 from spelgen.logs.chunks import Chunk, scan
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import GAP, gap_ends
+from spelgen.logs.trajectory import GAP, gap_ends, set_aside
 from spelgen.logs.windows import Windows, joined, thinned
 from spelgen.settings.log_mapping import LogMapping
 
@@ -78,14 +78,15 @@ def prepare_streamed(
     contents = logs.contents
     resolved = preprocessing.resolved(contents.rates)
     span = choice.span(resolved)
-    usable = [k for k, longest in enumerate(contents.longest) if longest >= span]
+    usable = [
+        chunk for chunk, longest in zip(contents.chunks, contents.longest, strict=True) if longest >= span
+    ]
     if len(usable) < 2:
         raise LogError(f"no two chunks with {span} samples without a gap", expected="several")
     assert isinstance(choice.validation, float)
     size = min(max(1, round(choice.validation * len(usable))), len(usable) - 1)
-    validated = set(np.random.default_rng(choice.seed).permutation(usable)[:size].tolist())
-    training = [contents.chunks[k] for k in usable if k not in validated]
-    validating = [contents.chunks[k] for k in sorted(validated)]
+    order = np.random.default_rng(choice.seed).permutation(len(usable))
+    training, validating = set_aside(usable, order[:size])
     windows = _sample(training, resolved, choice)
     message = (
         f"larger than memory: read in {len(contents.chunks)} chunks; validation on {len(validating)} chunks, "

@@ -16,7 +16,7 @@ from spelgen.fleet.schema import FleetRobot
 from spelgen.logs.chunks import large_files
 from spelgen.logs.formats import log_files
 from spelgen.logs.read import read_logs, write_logs
-from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.trajectory import Trajectory, set_aside
 from spelgen.logs.windows import split_validation
 from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
 from spelgen.settings.log_mapping import LogMapping
@@ -53,7 +53,7 @@ def prepare(preparation: Preparation) -> list[SplitLogs]:
     arm = load_arm(robot.urdf, robot.joints, robot.tip)
     mapping = arm.settings.logs
     if robot.mapping is not None:
-        mapping = load_mapping(robot.mapping, [joint.name for joint in arm.robot.joints])
+        mapping = load_mapping(robot.mapping, arm.robot.joint)
     # reading logs takes longer than asking for their times of change
     files, errors = log_files(robot.data)
     collect(errors)
@@ -100,9 +100,7 @@ def _splits(robot: FleetRobot, arm: LoadedArm, mapping: LogMapping, count: int, 
     splits: list[Split] = []
     for fold in np.array_split(np.random.default_rng(0).permutation(len(logs)), count):
         # the order of the logs is kept, so that equal files give equal fits
-        tested = set(fold.tolist())
-        training = [log for k, log in enumerate(logs) if k not in tested]
-        splits.append((training, [logs[k] for k in sorted(tested)]))
+        splits.append(set_aside(logs, fold))
     return splits
 
 

@@ -75,7 +75,8 @@ def _medians(runs: Sequence[RunResult], predictor: str, horizons: Sequence[str])
 def _common(lists: Sequence[Iterable[str]]) -> list[str]:
     """Return the names that are in all lists, once, in the order of the first."""
     names = dict.fromkeys(lists[0]) if lists else {}
-    return [name for name in names if all(name in others for others in lists)]
+    common = set(names).intersection(*lists)
+    return [name for name in names if name in common]
 
 
 def _by_robot(fleet: FleetResults) -> dict[str, list[RunResult]]:

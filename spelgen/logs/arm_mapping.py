@@ -54,7 +54,7 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
     """Return what `read_logs` was given. Raises LogError for what is no arm, SettingsError for a wrong mapping."""
     if isinstance(arm, DescribedArm):
         mapping = arm.settings.logs if mapping is None else mapping
-        log_mapping = _mapping(mapping, [joint.name for joint in arm.robot.joints])
+        log_mapping = _mapping(mapping, list(arm.robot.joint))
         return LogSource(tuple(arm.arm.joint_names), tuple(arm.arm.joint_types), log_mapping)
     if isinstance(arm, JointNames):
         joints = logged_joints(arm)

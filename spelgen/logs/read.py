@@ -17,7 +17,7 @@ from spelgen.logs.arm_mapping import GivenMapping, LoggedArm, log_source
 from spelgen.logs.formats import log_files, read_tables
 from spelgen.logs.recording import in_time_order, make_trajectory
 from spelgen.logs.tables import UNITS, UNITS_KEY, Layout
-from spelgen.logs.trajectory import Trajectory, require_joints
+from spelgen.logs.trajectory import Trajectory, joined_column, require_joints
 from spelgen.logs.values import clock_start, values_in_si
 from spelgen.settings.tuning.logs import TUNING
 
@@ -70,9 +70,9 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
     for trajectory in trajectories:
         require_joints(trajectory, joints)
         names += [trajectory.name] * len(trajectory)
-    columns = {"trajectory": pa.array(names), "t": np.concatenate([x.t for x in trajectories])}
+    columns = {"trajectory": pa.array(names), "t": joined_column(trajectories, "t")}
     for quantity in trajectories[0].quantities:
-        values = np.concatenate([getattr(x, quantity) for x in trajectories])
+        values = joined_column(trajectories, quantity)
         columns |= {f"{quantity}_{joint}": column for joint, column in zip(joints, values.T, strict=True)}
     # the file says that it is in SI units, so that no mapping is applied when it is read back
     table = pa.table(columns).replace_schema_metadata({UNITS_KEY: UNITS})

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from spelgen.errors import LogError
 from spelgen.labels import counted
 from spelgen.listing import Listing
 from spelgen.settings.tuning.logs import TUNING
+
+T = TypeVar("T")
 
 QUANTITIES = ("q", "qd", "tau")
 GAP = TUNING.gap
@@ -182,13 +185,30 @@ def split_at_gaps(
     return [piece for piece in pieces if len(piece) >= shortest]
 
 
+def joined_column(trajectories: Sequence[Trajectory], name: str) -> np.ndarray:
+    """Return a column of all trajectories, one after the other, by its name: t, q, qd, tau or u."""
+    return np.concatenate([getattr(x, name) for x in trajectories])
+
+
+def set_aside(items: Sequence[T], numbers: np.ndarray) -> tuple[list[T], list[T]]:
+    """Return the items that do not have these numbers, and those that have, in their order."""
+    remaining: list[T] = []
+    chosen: list[T] = []
+    chosen_numbers = set(numbers.tolist())
+    for k, item in enumerate(items):
+        if k in chosen_numbers:
+            chosen.append(item)
+        else:
+            remaining.append(item)
+    return remaining, chosen
+
+
 def coverage(logs: Sequence[Trajectory]) -> dict[str, object]:
     """Return `seconds` of all logs; by joint `q` and `qd`: their range, and the samples in equal bins of it."""
     result: dict[str, object] = {"seconds": _rounded(sum(log.duration for log in logs))}
     for name in ("q", "qd"):
-        values = np.concatenate([getattr(log, name) for log in logs])
         joints = []
-        for column in values.T:
+        for column in joined_column(logs, name).T:
             counts = np.histogram(column, TUNING.bins)[0].tolist()
             joints.append({"low": _rounded(column.min()), "high": _rounded(column.max()), "counts": counts})
         result[name] = joints

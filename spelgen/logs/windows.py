@@ -12,7 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from spelgen.dynamics.bristles import BristleReach, bristles_along
 from spelgen.errors import Diagnostic, LogError
-from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.trajectory import Trajectory, set_aside
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,9 +133,7 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
         return Split((trajectory[:cut],), (last,), note)
     # whole trajectories: neighbouring windows share samples, and would tell the answer
     count = min(max(1, round(fraction * total)), total - 1)
-    chosen = set(np.random.default_rng(seed).permutation(total)[:count].tolist())
-    validation = tuple(trajectories[k] for k in sorted(chosen))
-    training = tuple(x for k, x in enumerate(trajectories) if k not in chosen)
+    training, validation = set_aside(trajectories, np.random.default_rng(seed).permutation(total)[:count])
     names = ", ".join(x.name for x in validation) if count <= 3 else f"{count} of {total} trajectories"
     note = Diagnostic("info", "validation-split", "logs", None, f"validation on whole trajectories: {names}")
-    return Split(training, validation, note)
+    return Split(tuple(training), tuple(validation), note)

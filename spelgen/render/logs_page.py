@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.labels import named_joints
 from spelgen.log_checks.report import LogReport
-from spelgen.logs.trajectory import Trajectory, split_at_gaps
+from spelgen.logs.trajectory import Trajectory, joined_column, split_at_gaps
 from spelgen.render.page import render_page
 from spelgen.render.plots import JointRow, Panel, stacks
 from spelgen.settings.tuning.render import TUNING
@@ -36,15 +34,15 @@ def charts(log: Trajectory, arm: Arm, inputs: np.ndarray) -> list[Panel]:
     """Return by joint q; qd beside dq/dt; torque beside the URDF's gravity torque. Of servos: q beside u."""
     # gaps are kept: no line is drawn over one by a slope across it
     pieces = [piece[:: -(-len(log.t) // TUNING.points)] for piece in split_at_gaps(log)]
-    t, q = _joined(pieces, "t"), _joined(pieces, "q")
+    t, q = joined_column(pieces, "t"), joined_column(pieces, "q")
     position = [("logged", q, "truth")]
     rows = [JointRow("position", "position", "position", position)]
     if log.u is not None:
-        position.append(("commanded", _joined(pieces, "u"), "predicted"))
+        position.append(("commanded", joined_column(pieces, "u"), "predicted"))
     else:
         slope = np.concatenate(list(map(_slope, pieces)))
-        velocity = [("logged", _joined(pieces, "qd"), "truth"), ("dq/dt", slope, "predicted")]
-        torque = [("logged", _joined(pieces, "tau") @ inputs.T, "truth")]
+        velocity = [("logged", joined_column(pieces, "qd"), "truth"), ("dq/dt", slope, "predicted")]
+        torque = [("logged", joined_column(pieces, "tau") @ inputs.T, "truth")]
         if any(body.inertia for body in arm.bodies):
             still = np.zeros_like(q)
             gravity = regressor(arm, q, still, still) @ urdf_parameters(arm)  # (T, n)
@@ -52,10 +50,6 @@ def charts(log: Trajectory, arm: Arm, inputs: np.ndarray) -> list[Panel]:
         rows.append(JointRow("velocity", "velocity", "velocity", velocity))
         rows.append(JointRow("torque", "torque", "torque", torque))
     return stacks(t, rows, named_joints(arm.joint_names, arm.joint_types))
-
-
-def _joined(pieces: Sequence[Trajectory], column: str) -> np.ndarray:
-    return np.concatenate([getattr(piece, column) for piece in pieces])
 
 
 def _slope(piece: Trajectory) -> np.ndarray:

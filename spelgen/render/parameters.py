@@ -68,7 +68,11 @@ def base_table(model: EmittedModel | None, arm: LoadedArm, identified: Record) -
     friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
     base = base_parameters(arm.arm, friction, arm.actuation.drives().speeds)
     parameters = identified["base_parameters"]
-    names = [parameter["name"] for parameter in parameters]
+    names, determined, formulas = [], [], []
+    for parameter in parameters:
+        names.append(parameter["name"])
+        determined.append(parameter["determined"])
+        formulas.append("" if parameter["formula"] == parameter["name"] else parameter["formula"])
     nominal = base.combination[:, : 10 * len(arm.arm.bodies)] @ urdf_parameters(arm.arm)
     # a file says nothing of friction and drives, and some say nothing of bodies
     nominal[base.bodies :] = np.nan
@@ -90,8 +94,7 @@ def base_table(model: EmittedModel | None, arm: LoadedArm, identified: Record) -
             "squares has no column for"
         )
     columns["least squares, 95 %"] = list(map(_interval, parameters))
-    columns["determined"] = [parameter["determined"] for parameter in parameters]
-    columns["made of"] = [x["formula"] if x["formula"] != x["name"] else "" for x in parameters]
+    columns["determined"], columns["made of"] = determined, formulas
     sure: list[tuple[str, ...]] = []
     unsure: list[tuple[str, ...]] = []
     for row in zip(*columns.values(), strict=True):
@@ -158,13 +161,14 @@ def _listed(values: np.ndarray) -> str:
 
 def _joint_table(model: EmittedModel, arm: LoadedArm | None) -> Listing:
     """Return armature, friction and torque offset of each joint of a model that has an armature."""
-    units = [UNITS[kind] for kind in model.joint_types]
-    torques = [unit.torque for unit in units]
-    slopes = [f"{unit.torque} s/{unit.position}" for unit in units]
-    columns = {
-        "joint": [f"joint {k + 1}" for k in range(len(units))],
-        "armature": _with_units(model.armature.tolist(), [unit.inertia for unit in units]),
-    }
+    names, inertias, torques, slopes = [], [], [], []
+    for number, kind in enumerate(model.joint_types, start=1):
+        unit = UNITS[kind]
+        names.append(f"joint {number}")
+        inertias.append(unit.inertia)
+        torques.append(unit.torque)
+        slopes.append(f"{unit.torque} s/{unit.position}")
+    columns = {"joint": names, "armature": _with_units(model.armature.tolist(), inertias)}
     note = ""
     if arm is not None:
         joints = arm.arm.coordinates

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
+from spelgen.dynamics.parameters import parameter_count
 from spelgen.errors import shortened
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import figures
@@ -39,8 +40,7 @@ def head_numbers(
     if summary is not None:
         numbers.append(summary.headline)
     elif model is not None:
-        count = sum(parameter.numel() for parameter in model.parameters())
-        numbers.append((f"{count:,}", "trained parameters"))
+        numbers.append((f"{parameter_count(model):,}", "trained parameters"))
     if metrics:
         label = f"of training, {metrics[-1]['step']:,} steps"
         numbers.append((f"{metrics[-1]['seconds']:,.0f} s", label))

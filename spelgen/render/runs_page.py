@@ -48,7 +48,7 @@ def render_runs(folders: Sequence[Path]) -> str:
 
 def _names(folders: Sequence[Path]) -> list[str]:
     """Return the folders' own names, or their paths where names are alike."""
-    paths = [folder.resolve() for folder in folders]
+    paths = list(map(Path.resolve, folders))
     names = [path.name for path in paths]
     if len(set(names)) < len(names):
         names = list(map(str, paths))

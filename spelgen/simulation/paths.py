@@ -19,14 +19,14 @@ def paths(arm: Arm, settings: Settings, t: np.ndarray) -> list[Motion]:
     """
     count = settings.simulation.trajectories
     seeds = np.random.SeedSequence(settings.simulation.seed).spawn(count)
-    randoms = [np.random.default_rng(seed) for seed in seeds]
+    randoms = list(map(np.random.default_rng, seeds))
     low, high = initial_range(arm, settings)
     if settings.tracking.paths == "excitation":
         # the middle of the ranges at moderate speeds: a first try at an arm that nobody knows
         middle, half = (low + high) / 2, SIMULATION.used_range * (high - low) / 2
-        speeds = [
-            min(SIMULATION.used_range * (x.velocity or np.inf), SPEEDS[x.kind]) for x in arm.coordinates
-        ]
+        speeds = []
+        for joint in arm.coordinates:
+            speeds.append(min(SIMULATION.used_range * (joint.velocity or np.inf), SPEEDS[joint.kind]))
         bounds = MotionBounds(middle - half, middle + half, np.array(speeds))
         motions = ExcitationTrajectory(float(t[-1]), EXCITATION.fewest_harmonics, bounds)
         return [motions.motion(random.standard_normal(motions.size), t) for random in randoms]

@@ -9,7 +9,7 @@ import numpy as np
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
-from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.trajectory import Trajectory, set_aside
 from spelgen.settings.settings import Settings
 from spelgen.simulation.integration import rollout
 from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction
@@ -53,7 +53,6 @@ def random_inputs(
         progress(number + 1, protocol.trajectories)
     # at least one is left to train on
     count = protocol.trajectories
-    order = np.random.default_rng(split_seed).permutation(count).tolist()
+    order = np.random.default_rng(split_seed).permutation(count)
     tests = min(round(protocol.test_fraction * count), count - 1)
-    train, test = ([trajectories[k] for k in sorted(numbers)] for numbers in (order[tests:], order[:tests]))
-    return SimulatedLogs(train, test)
+    return SimulatedLogs(*set_aside(trajectories, order[:tests]))

@@ -164,7 +164,7 @@ def _candidates(
     reduced = field.null_space(rows)
     kernel = np.zeros_like(reduced)
     kernel[:, order] = reduced
-    free = [index for index in range(len(spans.keys)) if index not in set(bound)]
+    free = np.setdiff1d(np.arange(len(spans.keys)), bound).tolist()
     samples = spans.float_changes(frozenset(range(spans.n)) - joints)
     coefficients = _solved(samples[:, bound], samples[:, free])
     sums = []

@@ -118,7 +118,7 @@ def null_space(basis: np.ndarray) -> np.ndarray:
     """
     width = basis.shape[1]
     bound = pivots(basis)
-    free = [column for column in range(width) if column not in set(bound)]
+    free = np.setdiff1d(np.arange(width), bound)
     kernel = np.zeros((len(free), width), dtype=np.uint64)
     for row, column in enumerate(free):
         kernel[row, column] = 1

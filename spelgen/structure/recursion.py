@@ -270,7 +270,9 @@ def _posed_inertia(pose: _Pose, inertia: _Inertia) -> _Inertia:
     x, y, z = pose.rotation
     xx, xy, xz, yy, yz, zz = inertia.tensor
     columns = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
-    half = tuple(tuple(_dot(row, column) for column in columns) for row in (x, y, z))
+    half = []
+    for row in (x, y, z):
+        half.append([_dot(row, column) for column in columns])
     tensor = tuple(_dot(pose.rotation[j], half[i]) for i, j in TENSOR)
     return _translated(pose.translation, _Inertia(inertia.mass, _turned(pose, inertia.moment), tensor))
 

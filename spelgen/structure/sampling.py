@@ -55,7 +55,7 @@ def field_samples(arm: Arm, assume: Assume, samples: int) -> tuple[np.ndarray, n
     for body in arm.bodies:
         # what holds for random inertial values of each sample holds for any of them
         if assume == "kinematics":
-            inertias.append([Residues(random_residues(rng, (samples,))) for _ in range(10)])
+            inertias.append(list(map(Residues, random_residues(rng, (10, samples)))))
         else:
             inertias.append(list(map(residue, body.inertia or (Fraction(0),) * 10)))
     result = energies(arm, positions, inertias, residue)
@@ -94,7 +94,7 @@ def float_samples(arm: Arm, assume: Assume, samples: int, seed: int = 2) -> np.n
     inertias: list[Ten] = []
     for body in arm.bodies:
         if assume == "kinematics":
-            inertias.append([rng.normal(size=samples) for _ in range(10)])
+            inertias.append(list(rng.normal(size=(10, samples))))
         else:
             inertias.append(list(map(float, body.inertia or (0,) * 10)))
     mass, _ = float_energies(arm, np.stack(q, axis=-1), inertias)

@@ -73,7 +73,7 @@ class ParameterRows:
         self.tensors = {name: tensors[name] for name in chain(*rows)}
         self._widths = [x[:1].numel() for x in self.tensors.values()]
         self.names = np.repeat(list(self.tensors), self._widths).tolist()
-        always = torch.tensor([name != DEAD_ZONE for name in self.names])
+        always = torch.from_numpy(np.array(self.names) != DEAD_ZONE)
         self.active = always.unsqueeze(-1).expand(-1, model.n)  # (p, n), at the start
         deviations = torch.full((len(self.names), 1), TUNING.logarithm).double()
         deviations[self.row(STRIBECK_VELOCITY)] = TUNING.stribeck_velocity

@@ -122,11 +122,13 @@ def servo_windows(
         parts += [(piece, slice(start, start + length)) for start in starts]
     parts = parts[:: -(-len(parts) // count)]  # of all motions, rather than the first ones
     smooth_velocities = {id(piece): velocities(piece) for piece in pieces if len(piece) >= length}
-    q = np.stack([log.q[rows] for log, rows in parts])
-    qd = np.stack([smooth_velocities[id(log)][rows] for log, rows in parts])
-    dt = np.stack([np.diff(log.t[rows]) for log, rows in parts])
-    steps = max(steps_between(log) for log, _ in parts)
-    tensors = torch.from_numpy(q), torch.from_numpy(qd), torch.from_numpy(dt)
+    q, qd, dt, steps = [], [], [], 0
+    for log, rows in parts:
+        q.append(log.q[rows])
+        qd.append(smooth_velocities[id(log)][rows])
+        dt.append(np.diff(log.t[rows]))
+        steps = max(steps, steps_between(log))
+    tensors = torch.from_numpy(np.stack(q)), torch.from_numpy(np.stack(qd)), torch.from_numpy(np.stack(dt))
     return ServoWindows(tuple(parts), *tensors, settling, steps)
 
 

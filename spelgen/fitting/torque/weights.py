@@ -35,12 +35,15 @@ class RigidWeights:
 
     def __init__(self, model: EmittedModel) -> None:
         tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
-        self.kinds = {name: x.kind for name, x in parameter_table(model).items() if x.kind in RIGID}
-        # parameters, and buffers that a fit may set
-        self.tensors = {name: tensors[name] for name in self.kinds}
+        self.kinds: dict[str, str] = {}
+        self.tensors: dict[str, torch.Tensor] = {}  # parameters, and buffers that a fit may set
+        self.start: dict[str, torch.Tensor] = {}
+        for name, info in parameter_table(model).items():
+            if info.kind in RIGID:
+                self.kinds[name], self.tensors[name] = info.kind, tensors[name]
+                self.start[name] = tensors[name].detach().clone()
         (self.bodies,) = self.of_kind("bodies")
         (self.compensation,) = self.of_kind("friction_compensation")
-        self.start = {name: x.detach().clone() for name, x in self.tensors.items()}
         self.sizes = [weight.numel() for weight in self.start.values()]
 
     def of_kind(self, *kinds: str) -> list[str]:
