@@ -653,6 +653,29 @@ def test_no_column_of_another_joint_is_offered(tmp_path):
         assert "rename the column '" not in str(caught.value)
 
 
+def joint_states(order=("b", "a")):
+    """Lines as `ros2 topic echo --csv` writes them, at 100 Hz."""
+    lines = []
+    for k in range(50):
+        values = {"a": (0.01 * k, 1.0, 5.0 + 0.1 * k), "b": (-0.02 * k, -2.0, 7.0)}
+        cells = [str(1_700_000_000 + k // 100), str(10_000_000 * (k % 100)), "base", *order]
+        for field in range(3):
+            cells += [f"{values[joint][field]:.6f}" for joint in order]
+        lines.append(",".join(cells))
+    return lines
+
+
+def test_what_ros2_topic_echo_writes_is_read(tmp_path):
+    (tmp_path / "log.csv").write_text("\n".join(joint_states()) + "\n")
+    (log,) = read_logs([tmp_path / "log.csv"], ("a", "b"))
+    np.testing.assert_allclose(log.t - log.t[0], 0.01 * np.arange(50), atol=1e-9)
+    np.testing.assert_allclose(log.q[:, 1], -0.02 * np.arange(50), atol=1e-9)
+    np.testing.assert_allclose(log.tau[:, 0], 5.0 + 0.1 * np.arange(50), atol=1e-9)
+    # the gripper that is logged beside the arm is left out
+    (arm_alone,) = read_logs([tmp_path / "log.csv"], ("a",))
+    assert arm_alone.q.shape == (50, 1)
+
+
 def test_a_headerless_csv_is_called_that(tmp_path):
     (tmp_path / "log.csv").write_text("0.00,0.1,0.2,0.3\n0.01,0.1,0.2,0.3\n")
     with pytest.raises(LogError) as caught:

@@ -126,3 +126,11 @@ def test_any_logs_are_told(arm, samples):
     for u in (ramp, 0 * ramp, 1e8 * ramp):
         log = Trajectory(t, ramp, np.full_like(ramp, 0.5) * [1, 0], np.zeros((samples, 0)), u=u)
         assert "Following" in spelgen.check_logs([log], arm).text()
+
+
+def test_commands_without_torques_ask_for_the_setting(tmp_path):
+    arm = spelgen.load_arm(write_servo_arm(tmp_path, ""))
+    names = [f"{quantity}_{joint}" for joint in ("shoulder", "elbow") for quantity in ("q", "u")]
+    (tmp_path / "log.csv").write_text(",".join(["t", *names]) + "\n0,0,0,0,0\n0.02,0,0,0,0\n")
+    with pytest.raises(spelgen.LogError, match="write 'input: position' into the YAML beside the URDF"):
+        spelgen.read_logs(tmp_path / "log.csv", arm)

@@ -7,13 +7,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.compute
 import pyarrow.csv
 
 from spelgen.errors import LogError
+from spelgen.logs.bags import FIELDS
 from spelgen.logs.tables import LogFormat, LogTable, table_layout
 from spelgen.logs.values import is_number
-from spelgen.settings.log_mapping import LogMapping
+from spelgen.settings.log_mapping import PLAIN, LogMapping
 from spelgen.settings.tuning.logs import TUNING
+
+STAMP = ("sec", "nanosec", "frame_id")  # of a message's header
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
@@ -25,26 +29,49 @@ def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 def csv_columns(file: Path) -> pa.Table:
     """Return a table of commas, semicolons or tabs, with decimal commas beside the latter two.
 
-    Text may be UTF-8, UTF-16 or Latin-1.
+    Text may be UTF-8, UTF-16 or Latin-1. What `ros2 topic echo --csv` wrote of joint states has no header.
     """
     encoding, head = _decoded_head(file)
-    names, _, rows = head.partition("\n")
-    delimiter = max(",;\t", key=names.count)
-    cells = names.split(delimiter)
-    if is_number(cells[0]):
+    first_line, _, rows = head.partition("\n")
+    delimiter = max(",;\t", key=first_line.count)
+    cells = first_line.split(delimiter)
+    names = _joint_state_columns(cells, file) if is_number(cells[0]) else None
+    decimal_commas = delimiter != "," and re.search(rf"(^|{delimiter}) *-?\d+,\d", rows, re.MULTILINE)
+    table = pa.csv.read_csv(
+        file,
+        pa.csv.ReadOptions(encoding=encoding, column_names=names),
+        pa.csv.ParseOptions(delimiter=delimiter),
+        pa.csv.ConvertOptions(decimal_point="," if decimal_commas else "."),
+    )
+    if names is None:
+        return table.rename_columns([name.strip() for name in table.column_names])
+    seconds, nanoseconds = table[STAMP[0]].cast(pa.int64()), table[STAMP[1]].cast(pa.int64())
+    times = pa.compute.add(pa.compute.multiply(seconds, 1_000_000_000), nanoseconds)
+    return table.append_column(PLAIN["t"], times.cast(pa.duration("ns")))
+
+
+def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
+    """Return names for the columns of joint states as `ros2 topic echo --csv` writes them, which has no header.
+
+    Raises LogError for any other file that begins with numbers.
+    """
+    columns = [*STAMP]
+    names: list[str] = []
+    for cell in cells[len(STAMP) :]:
+        if is_number(cell):
+            break
+        names.append(cell)
+        columns.append(f"name_{cell}")
+    for quantity in FIELDS:
+        if len(columns) < len(cells):
+            columns += [PLAIN[quantity].replace("{joint}", name) for name in names]
+    if not names or len(columns) != len(cells):
         raise LogError(
             f"numbers in the first line ({', '.join(cells[:3])}, ...)", file=file, line=1,
             expected="a header: the names of the columns",
             do="write one, t,q_<joint>,...,qd_<joint>,...,tau_<joint>,... for example",
         )  # fmt: skip
-    decimal_commas = delimiter != "," and re.search(rf"(^|{delimiter}) *-?\d+,\d", rows, re.MULTILINE)
-    table = pa.csv.read_csv(
-        file,
-        pa.csv.ReadOptions(encoding=encoding),
-        pa.csv.ParseOptions(delimiter=delimiter),
-        pa.csv.ConvertOptions(decimal_point="," if decimal_commas else "."),
-    )
-    return table.rename_columns([name.strip() for name in table.column_names])
+    return columns
 
 
 def _decoded_head(file: Path) -> tuple[str, str]:

@@ -141,6 +141,8 @@ def missing_columns(
             f"nothing was logged of {', '.join(unlogged)}: say which joints are the arm's, by --tip, --joints, or "
             "'tip' or 'moving_joints' in the robot's YAML, or map its columns under 'logs'"
         )
+    elif mapping.input == "torque" and _are_commands(columns, mapping, joints):
+        do = "write 'input: position' into the YAML beside the URDF if these are commands of position servos"
     # the usual gap of loggers, and the only one with a remedy of its own
     elif set(missing) <= set(of_quantity.get("qd", ())):
         do = "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
@@ -152,6 +154,13 @@ def missing_columns(
         element=f"missing column{'s' * (len(missing) > 1)} {shortened(missing, listed)}",
         expected=", ".join(expected), do=do,
     )  # fmt: skip
+
+
+def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequence[str]) -> bool:
+    """Whether a log has a command of each joint and no torque of any."""
+    commands = {mapping.column("u", joint) for joint in joints}
+    torques = {mapping.column("tau", joint) for joint in joints}
+    return commands <= set(columns) and torques.isdisjoint(columns)
 
 
 def _renaming(
