@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 import spelgen
 from spelgen.cli.main import app
+from spelgen.errors import LogError
 from spelgen.logs.trajectory import Trajectory
 
 SETTINGS = "input: position\njoints: {shoulder: {kp: 14.0}}\n"
@@ -132,5 +133,5 @@ def test_commands_without_torques_ask_for_the_setting(tmp_path):
     arm = spelgen.load_arm(write_servo_arm(tmp_path, ""))
     names = [f"{quantity}_{joint}" for joint in ("shoulder", "elbow") for quantity in ("q", "u")]
     (tmp_path / "log.csv").write_text(",".join(["t", *names]) + "\n0,0,0,0,0\n0.02,0,0,0,0\n")
-    with pytest.raises(spelgen.LogError, match="write 'input: position' into the YAML beside the URDF"):
+    with pytest.raises(LogError, match="write 'input: position' into the YAML beside the URDF"):
         spelgen.read_logs(tmp_path / "log.csv", arm)
