@@ -87,6 +87,16 @@ def test_each_part_goes_alone(parts, tmp_path):
     check_parity(casadi, trained, values, 1e-12, states=20)
 
 
+@needs_gcc
+@pytest.mark.parametrize("name", ENTRIES)
+def test_an_entry_goes_alone(name, tmp_path):
+    """What only other entries call raises no warning, which the export's own compilation refuses."""
+    model = with_parts("rpr", *PARTS)
+    described = describe(model, arm_of("rpr"))
+    functions = c_functions(described, {name: ENTRIES[name]})
+    compile_library(write_c(described, functions, tmp_path), "gcc")
+
+
 def test_a_function_of_one_joint_stays_with_it():
     model = with_parts("scara")
     functions = model.residuals

@@ -159,4 +159,4 @@ def _table(name: str, values: np.ndarray) -> str:
         # rows in braces of their own
         numbers = numbers.replace("[", "{").replace("]", "}")
     lines = wrap(numbers, _WIDTH, initial_indent="    ", subsequent_indent="    ")
-    return "\n".join([f"static const {kind} {name}[]{size} = {{", *lines, "};"])
+    return "\n".join([f"static UNUSED const {kind} {name}[]{size} = {{", *lines, "};"])
