@@ -216,7 +216,7 @@ def test_the_command_tells_80_columns_json_and_a_page(spelgen, robots, arm, log,
     assert shown.exit_code == 0, shown.stderr
     assert max(map(len, shown.stdout.splitlines())) <= 80
     told = json.loads(spelgen(*command, "--format", "json").stdout)
-    assert (told["schema"], told["samples"], [x["name"] for x in told["joints"]]) == (2, 2000, names)
+    assert (told["schema"], told["samples"], [x["name"] for x in told["joints"]]) == (3, 2000, names)
     assert spelgen(*command, "--html", "page.html").stderr == "wrote page.html\n"
     assert (tmp_path / "page.html").read_text().startswith("<!doctype html>")
     assert spelgen(*command, "--strict").exit_code == 0

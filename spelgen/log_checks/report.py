@@ -103,7 +103,7 @@ class LogReport:
     def to_dict(self) -> dict[str, object]:
         """Return the JSON form, versioned by `schema`."""
         return {
-            "schema": 2,
+            "schema": 3,
             "robot": self.robot,
             "files": self.files,
             "samples": self.samples,
@@ -217,12 +217,13 @@ def signal_tables(joints: Sequence[JointReport], quantities: Sequence[str]) -> t
             units.append(", ".join(dict.fromkeys(getattr(unit, MEASURES[name]) for name in quantities)))
     head = ("joint", quantities[0], "of its range", *quantities[1:])
     columns = [f"{name} {what}" for what in ("noise", "step") for name in quantities]
+    commands = "u: commanded positions" if "u" in quantities else ""
     note = (
         "noise: standard deviation between samples, for sample rates from 50 Hz; step: quantisation step; in the "
         "units above."
     )
     return (
-        Listing(f"Ranges [{'; '.join(units)}]", head, tuple(ranges)),
+        Listing(f"Ranges [{'; '.join(units)}]", head, tuple(ranges), commands),
         Listing("Signals", ("joint", *columns), tuple(signals), note),
     )
 
