@@ -26,7 +26,7 @@ from spelgen.fitting.torque.networks import adapt_networks
 from spelgen.fitting.torque.prior import ADAPTED, covariance, most_probable
 from spelgen.fitting.torque.problem import TorqueProblem
 from spelgen.fitting.torque.report import terms_in_use, torque_notes
-from spelgen.fitting.torque.residuals import FRICTION, select_residuals
+from spelgen.fitting.torque.residuals import FRICTION, select_functions
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.weights import NONE, RIGID, RigidWeights, moved_bodies
 from spelgen.fitting.train import train
@@ -577,9 +577,9 @@ def test_friction_that_is_nearly_nothing_does_not_vary(robots):
     for friction, gain in ((1.0, 0.9), (1e-9, None)):
         model = build(robots / "two_link.urdf", "hybrid")
         samples = ResidualSamples(q, qd, 0 * q, missing, friction * qd.sign())
-        still = dict.fromkeys(range(2), torch.zeros(0, 0).double())
+        still = (torch.zeros(0, 0).double(),) * 2
         bodies = RigidResponse((torch.zeros(len(q), 0).double(),) * 2, still)
-        found = select_residuals(model, samples, bodies, 5.0)
+        found = select_functions(model, samples, bodies, [], 5.0)
         varied = [x.gain for x in found if x.name == FRICTION]
         assert varied == [] if gain is None else min(varied) > gain and len(varied) == 2
 
@@ -664,3 +664,28 @@ def test_a_model_says_what_stands_beside_its_bodies(robots):
         model.residuals.raw_torque_splines[1, 3] = 1.0
         model.residuals.raw_constants += 0.1
     assert terms_in_use(model) == ["a torque by position (spring, cable) at joint2", "networks in M"]
+
+
+def test_functions_of_a_joint_and_bodies_are_fitted_together(emitted, robots):
+    """Friction that varies, ripple, and a spring that is like gravity: by turns each drove the others off."""
+    true = drawn(emitted["six_dof"][0], seed=3, deviation=0.3)
+    scale = recorded(true, 20.0, 0.0).tau.std(axis=0)
+
+    def moved(noise, seed):
+        sample = recorded(true, 20.0, noise, seed)
+        q, qd = torch.from_numpy(sample.q), torch.from_numpy(sample.qd)
+        with torch.no_grad():
+            friction = true.friction_torque(q, qd).numpy()
+        tau = sample.tau + 0.5 * np.sin(sample.q + 0.7) * friction + 0.1 * scale * np.sin(30 * sample.q)
+        tau[:, 1] += scale[1] * np.sin(sample.q[:, 1] - 0.4)
+        return replace(sample, tau=tau)
+
+    model = build(robots / "six_dof.urdf", "hybrid", width=8)
+    model.residuals.potential = model.residuals.mass = None
+    fit_torque(model, [moved(0.02, seed=0), moved(0.02, seed=1)])
+    test = moved(0.0, seed=9)
+    assert nmse(model, test) < 1e-3
+    q = torch.from_numpy(test.q)
+    with torch.no_grad():
+        expected, found = true.mass_matrix(q), model.mass_matrix(q)
+    assert (found - expected).norm() < 0.01 * expected.norm()

@@ -16,7 +16,13 @@ import torch
 from spelgen.dynamics.protocol import has_residuals
 from spelgen.fitting.torque.jacobian import TUNING, TorqueJacobian
 from spelgen.fitting.torque.problem import State, TorqueProblem
-from spelgen.fitting.torque.residuals import SelectedResidual, refit_residuals, select_residuals
+from spelgen.fitting.torque.residuals import (
+    SelectedResidual,
+    can_be_judged,
+    refit_residuals,
+    select_functions,
+    select_networks,
+)
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.weights import bound_friction
 from spelgen.logs.dynamics_samples import DynamicsSamples
@@ -104,18 +110,27 @@ def _with_residuals(
     model = problem.jacobian.model
     if samples is not problem.jacobian.samples:
         state = problem.refine(state, samples)
-    lasting = problem.lasting
     problem.jacobian.rigid.write(state.x)
-    residuals = select_residuals(model, *problem.around(state), lasting)
-    if not residuals:
+    residuals: list[SelectedResidual] = []
+    if not can_be_judged(samples.count, problem.lasting):
         return state, residuals
-    follow = True
-    for _ in range(TUNING.turns):
-        missed = problem.noise.log().sum()
-        state = problem.refine(state, samples)
-        problem.jacobian.rigid.write(state.x)
-        missing, rigid = problem.around(state)
-        # masses are positive: bodies that do not follow as their slopes promise would drive functions ever further
-        follow = follow and bool(problem.noise.log().sum() <= missed)
-        refit_residuals(model, missing, rigid if follow else None, residuals, lasting)
-    return problem.set_samples(state, TorqueJacobian(model, samples)), residuals
+    # bodies that were fitted without a function err by more than it: only then is seen what else is missed
+    while further := select_functions(model, *problem.around(state), residuals, problem.lasting):
+        residuals += further
+        state = _refit(problem, state, samples, residuals)
+    residuals += select_networks(model, problem.around(state)[0], problem.lasting)
+    for _ in range(TUNING.turns if residuals else 0):
+        state = _refit(problem, state, samples, residuals)
+    return state, residuals
+
+
+def _refit(
+    problem: TorqueProblem, state: State, samples: TorqueSamples, residuals: Sequence[SelectedResidual]
+) -> State:
+    """Fit the selected functions of joints, and bodies with them."""
+    model = problem.jacobian.model
+    following = refit_residuals(model, *problem.around(state), residuals, problem.lasting)
+    state = problem.refine(state, samples, following.by_joint())
+    problem.jacobian.rigid.write(state.x)
+    following.write(model, problem.jacobian.residual_samples(state.x).missing)
+    return problem.set_samples(state, TorqueJacobian(model, samples))

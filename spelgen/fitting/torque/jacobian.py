@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
 TUNING = TorqueTuning()
+NO_FUNCTIONS: Mapping[int, FollowingFunctions] = {}
 LOGARITHMS = ("armature", "sizes", "effects", "load_dependence")
 
 
@@ -56,6 +57,28 @@ class Slope(NamedTuple):
     missing: torch.Tensor
 
 
+class FollowingFunctions(NamedTuple):
+    """Functions of a joint's position, of which weights follow whatever else explains its torque: variable projection
+    (Golub and Pereyra, SIAM J. Numer. Anal. 10:413, 1973).
+
+    features: (T, P). penalty: (P,) of a weight's square, in squares of the torque.
+    """
+
+    features: torch.Tensor
+    penalty: torch.Tensor
+
+    def weights(self, torque: torch.Tensor) -> torch.Tensor:
+        """Return the weights (P, ...) that explain most of a torque (T, ...) at the least penalty."""
+        curvature = self.features.mT @ self.features + self.penalty.diag()
+        weights: torch.Tensor = torch.linalg.solve(curvature, self.features.mT @ torque)
+        return weights
+
+    def left(self, torque: torch.Tensor) -> torch.Tensor:
+        """Return (T + P, ...) what they leave of a torque (T, ...), then roots of the penalties."""
+        weights = self.weights(torque)
+        return torch.cat([torque - self.features @ weights, self.penalty.sqrt().diag() @ weights])
+
+
 class RigidResponse(NamedTuple):
     """How bodies, drives and friction laws follow a torque on each joint.
 
@@ -63,7 +86,7 @@ class RigidResponse(NamedTuple):
     """
 
     slopes: tuple[torch.Tensor, ...]
-    gains: dict[int, torch.Tensor]
+    gains: tuple[torch.Tensor, ...]
 
     def remaining(self, joint: int, torque: torch.Tensor) -> torch.Tensor:
         """Return what of torques (T, P) on a joint is left when these weights have taken over what they can."""
@@ -74,11 +97,17 @@ class RigidResponse(NamedTuple):
 class TorqueJacobian:
     """Of a model of rigid bodies on ``samples``; x is all their weights (K,), flattened one after the other.
 
-    Residuals beside bodies are taken as they are when this is made.
+    Residuals beside bodies are taken as they are when this is made, but for functions of joints that follow.
     """
 
-    def __init__(self, model: EmittedModel, samples: TorqueSamples) -> None:
+    def __init__(
+        self,
+        model: EmittedModel,
+        samples: TorqueSamples,
+        functions: Mapping[int, FollowingFunctions] = NO_FUNCTIONS,
+    ) -> None:
         self.model: Any = model
+        self.functions = functions
         self.samples = samples
         self.rigid = RigidWeights(model)
         self._of_bodies = self.rigid.mask("bodies")
@@ -91,11 +120,13 @@ class TorqueJacobian:
     def squares(self, x: torch.Tensor) -> torch.Tensor:
         """Return sums of squares (n,) of the missing torque [Nm^2, N^2], as logged where gains are trained."""
         weights = self.rigid.named(x)
-        total = torch.zeros(self.model.n).double()
         with torch.no_grad():
-            for block in self._blocks:
-                total += (self._missing(weights, block)[0] * self._per_gain(weights)).square().sum(dim=0)
-        return total
+            blocks = [self._missing(weights, block)[0] for block in self._blocks]
+        missing = torch.cat(blocks) * self.per_gain(x)
+        squares = missing.square().sum(dim=0)
+        for joint, functions in self.functions.items():
+            squares[joint] = functions.left(missing[:, joint]).square().sum()
+        return squares
 
     def per_gain(self, x: torch.Tensor) -> torch.Tensor:
         """Return what of a joint torque is logged (n,), relative to the start: 1, but where gains are trained."""
@@ -110,7 +141,10 @@ class TorqueJacobian:
 
     def normal_equations(self, x: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return J^T J (K, K) and J^T r (K,) of the missing torque r, in units of ``noise`` (n,)."""
-        curvature, descent = _normal_equations(self.slopes(x), noise, len(x))
+        slopes: Iterable[Slope] = self.slopes(x)
+        if self.functions:
+            slopes = self._left_by_functions(slopes)
+        curvature, descent = _normal_equations(slopes, noise, len(x))
         along = self._along(x)
         return along.mT @ curvature @ along, along.mT @ descent
 
@@ -144,6 +178,15 @@ class TorqueJacobian:
                 slope = torch.cat([bodies, by_weights[colour][:, moving]], dim=1)
                 yield Slope(joint, torch.cat([of_bodies, of_joints[moving]]), slope, missing[:, joint])
 
+    def _left_by_functions(self, slopes: Iterable[Slope]) -> Iterator[Slope]:
+        """Yield of each joint what its functions leave, of all samples."""
+        for joint, blocks in enumerate(_by_joint(slopes, self.model.n)):
+            slope = torch.cat([block.slope for block in blocks])
+            missing = torch.cat([block.missing for block in blocks])
+            if joint in self.functions:
+                slope, missing = (self.functions[joint].left(x) for x in (slope, missing))
+            yield Slope(joint, blocks[0].columns, slope, missing)
+
     def _along(self, x: torch.Tensor) -> torch.Tensor:
         """Return the derivative (K, K) of what torques are linear in by the weights: each body's are its own."""
         weights = self.rigid.named(x)
@@ -169,14 +212,14 @@ class TorqueJacobian:
 
     def response(self, x: torch.Tensor, noise: torch.Tensor, covariance: torch.Tensor) -> RigidResponse:
         """Return how the weights follow, that have this covariance (K, K) after a fit under this noise (n,)."""
-        blocks: list[list[torch.Tensor]] = [[] for _ in noise]
-        gains: dict[int, torch.Tensor] = {}
         along = self._along(x)
         covariance = along @ covariance @ along.mT
-        for joint, columns, slope, _ in self.slopes(x):
-            blocks[joint].append(slope)
-            gains[joint] = covariance[columns[:, None], columns] / noise[joint] ** 2
-        return RigidResponse(tuple(map(torch.cat, blocks)), gains)
+        slopes, gains = [], []
+        for joint, blocks in enumerate(_by_joint(self.slopes(x), len(noise))):
+            columns = blocks[0].columns
+            slopes.append(torch.cat([block.slope for block in blocks]))
+            gains.append(covariance[columns[:, None], columns] / noise[joint] ** 2)
+        return RigidResponse(tuple(slopes), tuple(gains))
 
     def torque_deviation(self) -> torch.Tensor:
         """Return standard deviations (n,) of the measured torque, as the joints feel it."""
@@ -275,6 +318,14 @@ class TorqueJacobian:
             by_load.append(slopes[0])
             by_weights.append(torch.cat([slope.flatten(1) for slope in slopes[1:]], dim=1))
         return missing.detach(), by_weights, by_load
+
+
+def _by_joint(slopes: Iterable[Slope], joints: int) -> list[list[Slope]]:
+    """Return the slopes of blocks by joint."""
+    blocks: list[list[Slope]] = [[] for _ in range(joints)]
+    for slope in slopes:
+        blocks[slope.joint].append(slope)
+    return blocks
 
 
 def _normal_equations(

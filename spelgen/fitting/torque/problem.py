@@ -13,13 +13,20 @@ be trusted (see ``most_probable``).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import torch
 
 from spelgen.fitting.levenberg_marquardt import NormalEquations, SolverState, levenberg_marquardt, start
-from spelgen.fitting.torque.jacobian import TUNING, ResidualSamples, RigidResponse, TorqueJacobian
+from spelgen.fitting.torque.jacobian import (
+    NO_FUNCTIONS,
+    TUNING,
+    FollowingFunctions,
+    ResidualSamples,
+    RigidResponse,
+    TorqueJacobian,
+)
 from spelgen.fitting.torque.prior import ADAPTED, covariance, most_probable
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.weights import NONE
@@ -63,9 +70,11 @@ class TorqueProblem:
         self._use(jacobian)
         return replace(state, residuals=jacobian.squares(state.x))
 
-    def refine(self, state: State, samples: TorqueSamples) -> State:
+    def refine(
+        self, state: State, samples: TorqueSamples, functions: Mapping[int, FollowingFunctions] = NO_FUNCTIONS
+    ) -> State:
         """Go on from a fit near by with other samples, or beside other residuals: only the last digits are fitted."""
-        state = self.set_samples(state, TorqueJacobian(self.jacobian.model, samples))
+        state = self.set_samples(state, TorqueJacobian(self.jacobian.model, samples, functions))
         self.set_noise(state.residuals)
         return self.solve(state, TUNING.last_rounds)
 

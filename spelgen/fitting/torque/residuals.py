@@ -5,9 +5,10 @@ therefore compared as far as they cannot: a partial regression (Frisch and Waugh
 
 A function of one joint is fitted without each tenth of the samples in turn, and without a gap beside it, since errors
 of neighbours are alike. It can be selected where the tenths gain, beyond luck, and where the last half of the samples
-gains by it, too, after a fit of it and of those before it to the first half: one motion often repeats what another does
-not. If none gains so, they are judged between the positions that they were fitted to, since a function is known nowhere
-else. The function that gains most comes first. Networks of several joints are judged on the last half alone.
+gains by it, too, after a fit to the first half: one motion often repeats what another does not. If none of a joint
+gains so, they are judged between the positions that they were fitted to, since a function is known nowhere else. The
+one that gains most is selected; bodies are fitted beside it before others are judged. Networks of several joints are
+judged on the last half alone.
 
 Functions are linear in their weights, which are found with their scale by maximising the marginal likelihood (MacKay,
 Neural Computation 4:415, 1992); networks are found by L-BFGS from a normal distribution of their weights.
@@ -27,7 +28,7 @@ import torch.nn.functional as F
 from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.residuals import residual_torque
 from spelgen.fitting.optimizers import minimise
-from spelgen.fitting.torque.jacobian import ResidualSamples, RigidResponse
+from spelgen.fitting.torque.jacobian import FollowingFunctions, ResidualSamples, RigidResponse
 from spelgen.runtime.residual_terms import LARGEST, SPLINES
 from spelgen.settings.tuning.fitting import ResidualTuning
 
@@ -56,7 +57,8 @@ class _Candidate:
     The model's parameter of that name has a row (W,) for it, in units of ``scale``. Weights are those of ``lines``,
     (W, L), which are sums over the row, and then the row's own: P = L + W.
     position: (T,) of the joint.
-    features: (T, P); in a selection, of torques what bodies and laws cannot take over.
+    columns: (T, P) its torque by these weights.
+    features: (T, P) of torques by position, what bodies and laws cannot take over of that.
     force: (n,) how its torque acts on the joints.
     groups: (P,) which weights have a scale in common.
     friction: (T,) what the function varies, with weights of its logarithm, to which features are the linear answer.
@@ -66,6 +68,7 @@ class _Candidate:
     joint: int
     scale: float
     position: torch.Tensor
+    columns: torch.Tensor
     features: torch.Tensor
     force: torch.Tensor
     lines: torch.Tensor
@@ -104,89 +107,114 @@ class _Candidate:
         return (missing @ weight) / (self.force @ weight)
 
 
-def select_residuals(
-    model: Any, samples: ResidualSamples, rigid: RigidResponse, correlation: float
+def can_be_judged(count: int, correlation: float) -> bool:
+    """Return whether of so many samples both halves are more than the gap between them."""
+    first, last = _halves(count, correlation)
+    gap: int = last.start - first.stop
+    return gap <= first.stop
+
+
+def select_functions(
+    model: Any,
+    samples: ResidualSamples,
+    rigid: RigidResponse,
+    selected: Sequence[SelectedResidual],
+    correlation: float,
 ) -> list[SelectedResidual]:
-    """Give the model all parts that held-out samples gain by; return these. correlation: samples that err alike."""
-    first, last = _halves(len(samples.q), correlation)
-    if first.stop < last.start - first.stop:  # the gap leaves next to nothing of so few samples
-        return []
-    noise, selected = _noise(samples.missing), []
-    missing = missing_early = samples.missing  # the latter by the same parts, fitted to the first half
-    candidates = list(_candidates(model, samples, rigid))
-    while best := _best(candidates, missing, missing_early, noise, correlation):
-        candidate, gain, torque_early = best
-        weights = _fit_candidate(candidate, candidate.target(missing, noise), correlation)
-        candidate.write(model.residuals, weights)
-        missing = missing - candidate.torque(weights).unsqueeze(-1) * candidate.force
-        missing_early = missing_early - torque_early.unsqueeze(-1) * candidate.force
-        candidates.remove(candidate)
-        selected.append(SelectedResidual(candidate.parameter, candidate.joint, gain))
-    return [*selected, *_select_networks(model, samples._replace(missing=missing), correlation)]
+    """Return, of each joint, the function beside those selected by which held-out samples gain most, if any do.
+
+    correlation: samples that err alike.
+    """
+    noise, joints = _noise(samples.missing), range(samples.q.shape[1])
+    known = {(residual.name, residual.joint) for residual in selected}
+    candidates: list[list[_Candidate]] = [[] for _ in joints]
+    for candidate in _candidates(model, samples, rigid):
+        if (candidate.parameter, candidate.joint) not in known:
+            candidates[candidate.joint].append(candidate)
+    best = (_best(of_joint, samples.missing, noise, correlation) for of_joint in candidates)
+    return [residual for residual in best if residual is not None]
+
+
+class FollowingResiduals(NamedTuple):
+    """Torques by position that are to follow bodies, with the penalties (P,) of their weights."""
+
+    penalties: tuple[tuple[_Candidate, torch.Tensor], ...]
+
+    def by_joint(self) -> dict[int, FollowingFunctions]:
+        """Return all functions of each joint as one."""
+        functions: dict[int, FollowingFunctions] = {}
+        for candidate, penalty in self.penalties:
+            columns, joint = candidate.columns, candidate.joint
+            if joint in functions:
+                columns = torch.cat([functions[joint].features, columns], dim=1)
+                penalty = torch.cat([functions[joint].penalty, penalty])
+            functions[joint] = FollowingFunctions(columns, penalty)
+        return functions
+
+    def write(self, model: Any, missing: torch.Tensor) -> None:
+        """Give the model what they explain of the torque that bodies leave (T, n)."""
+        weights = {
+            joint: functions.weights(missing[:, joint]) for joint, functions in self.by_joint().items()
+        }
+        for candidate, penalty in self.penalties:
+            own, weights[candidate.joint] = weights[candidate.joint].tensor_split((len(penalty),))
+            candidate.write(model.residuals, own)
 
 
 def refit_residuals(
     model: Any,
     samples: ResidualSamples,
-    rigid: RigidResponse | None,
+    rigid: RigidResponse,
     selected: Sequence[SelectedResidual],
     correlation: float,
-) -> None:
+) -> FollowingResiduals:
     """Fit the selected functions of single joints anew, beside what else has changed since.
 
-    To all that is missed where ``rigid`` is None, else as far as bodies and laws cannot follow.
+    Friction is fitted to all that is missed. Torques by position are as large as what bodies and laws cannot explain
+    says; the model is left without them, and they are to follow bodies.
     """
     noise, missing, functions = _noise(samples.missing), samples.missing, model.residuals
     chosen = {(residual.name, residual.joint) for residual in selected}
+    penalties = []
     for candidate in _candidates(model, samples, rigid, chosen):
         present = (candidate.features @ candidate.weights(functions)).unsqueeze(-1) * candidate.force
         target = candidate.target(missing + present, noise)
-        weights = _fit_candidate(candidate, target, correlation)
-        candidate.write(functions, weights)
+        weights, penalty = _fit_candidate(candidate, target, correlation)
         changed = (candidate.features @ weights).unsqueeze(-1) * candidate.force
         missing = missing + present - changed
-
-
-class _Gaining(NamedTuple):
-    """A candidate that gains where it was not seen. torque_early: (T,) after a fit to the first half."""
-
-    candidate: _Candidate
-    gain: float
-    torque_early: torch.Tensor
+        if candidate.friction is None:
+            penalties.append((candidate, penalty))
+            weights = torch.zeros_like(weights)
+        candidate.write(functions, weights)
+    return FollowingResiduals(tuple(penalties))
 
 
 def _best(
-    candidates: Sequence[_Candidate],
-    missing: torch.Tensor,
-    missing_early: torch.Tensor,
-    noise: torch.Tensor,
-    correlation: float,
-) -> _Gaining | None:
-    """Return the candidate that gains most where it was not seen, the first of nearly equal ones; None: none gains.
-
-    missing_early: (T, n) after fits to the first half.
-    """
+    candidates: Sequence[_Candidate], missing: torch.Tensor, noise: torch.Tensor, correlation: float
+) -> SelectedResidual | None:
+    """Return the function that gains most where it was not seen, the first of nearly equal ones; None: none gains."""
     first, last = _halves(len(missing), correlation)
     best = best_between = None
     for candidate in candidates:
-        target, target_early = candidate.target(missing, noise), candidate.target(missing_early, noise)
+        target = candidate.target(missing, noise)
         error, between = _held_out_errors(candidate, target, correlation)
         gain = _significant_gain(_by_block(target), _by_block(error))
         gain_between = _significant_gain(_by_block(target * between), _by_block(error * between))
         if gain is None and gain_between is None:
             continue
-        torque_early = candidate.torque(_fit_candidate(candidate, target_early, correlation, first))
-        before, after = target_early[last].square(), (target_early - torque_early)[last].square()
+        weights, _ = _fit_candidate(candidate, target, correlation, first)
+        before, after = target[last].square(), (target - candidate.torque(weights))[last].square()
         if gain is not None and after.sum() < before.sum():
-            best = _better(best, _Gaining(candidate, gain, torque_early))
+            best = _better(best, SelectedResidual(candidate.parameter, candidate.joint, gain))
         between = _between(candidate.position[last], candidate.position[first])
         if gain_between is not None and after[between].sum() < before[between].sum():
-            best_between = _better(best_between, _Gaining(candidate, gain_between, torque_early))
+            gaining = SelectedResidual(candidate.parameter, candidate.joint, gain_between)
+            best_between = _better(best_between, gaining)
     # beyond the positions that it was fitted to a spring may be far off, and what is not one usually is
     return best or best_between
 
 
-def _better(first: _Gaining | None, other: _Gaining) -> _Gaining:
+def _better(first: SelectedResidual | None, other: SelectedResidual) -> SelectedResidual:
     """Return the one of two that gains more, the first where they are nearly equal."""
     # splines of a straight spring gain nearly what ripple does, and go on as the spring does
     if first is None or 1 - other.gain <= TUNING.clearly_less * (1 - first.gain):
@@ -202,12 +230,12 @@ def _between(position: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
 def _candidates(
     model: Any,
     samples: ResidualSamples,
-    rigid: RigidResponse | None,
+    rigid: RigidResponse,
     chosen: Collection[tuple[str, int | None]] | None = None,
 ) -> Iterator[_Candidate]:
     """Yield what could be selected: smooth torques, friction that varies, and ripple.
 
-    Torques by position are those that ``rigid`` leaves, where it is given. chosen: parameters and joints; None: all.
+    chosen: parameters and joints; None: all.
     """
     functions, motors = model.residuals, motors_of(model)
     with torch.no_grad():
@@ -230,21 +258,18 @@ def _candidates(
             if not columns.any() or scale[joint] <= 0:
                 continue
             columns = torch.cat([columns @ lines, columns], dim=1)
-            friction = None
-            if parameter == FRICTION:
-                friction = samples.friction[:, joint]
-            elif rigid is not None:
-                columns = rigid.remaining(joint, columns)
+            of_friction = parameter == FRICTION
             yield _Candidate(
                 parameter=parameter,
                 joint=joint,
                 scale=float(scale[joint]),
                 position=samples.q[:, joint],
-                features=columns,
+                columns=columns,
+                features=columns if of_friction else rigid.remaining(joint, columns),
                 force=force[joint],
                 lines=lines,
                 groups=groups,
-                friction=friction,
+                friction=samples.friction[:, joint] if of_friction else None,
             )
 
 
@@ -278,7 +303,7 @@ def _held_out_errors(
         near = slice(max(0, block.start - gap), block.stop + gap)
         others = torch.cat([position[: near.start], position[near.stop :]])
         sums = everything - rows[near].mT @ rows[near]
-        weights = _most_probable(sums, len(others), candidate.groups, correlation)
+        weights, _ = _most_probable(sums, len(others), candidate.groups, correlation)
         errors.append(target[block] - candidate.torque(weights, block))
         between.append(_between(position[block], others))
     return torch.cat(errors), torch.cat(between)
@@ -308,8 +333,8 @@ def _significant_gain(squares: torch.Tensor, missed: torch.Tensor) -> float | No
 
 def _fit_candidate(
     candidate: _Candidate, target: torch.Tensor, correlation: float, rows: slice = EVERY
-) -> torch.Tensor:
-    """Return the most probable weights (P,) after these samples."""
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the most probable weights (P,) after these samples, with their penalties, see `_most_probable`."""
     samples = _beside(candidate.features[rows], target[rows])
     return _most_probable(samples.mT @ samples, len(samples), candidate.groups, correlation)
 
@@ -319,9 +344,11 @@ def _beside(features: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     return torch.cat([features, target.unsqueeze(-1)], dim=1)
 
 
-def _most_probable(sums: torch.Tensor, count: int, groups: torch.Tensor, correlation: float) -> torch.Tensor:
+def _most_probable(
+    sums: torch.Tensor, count: int, groups: torch.Tensor, correlation: float
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Return weights (P,) of a linear model, with the noise and the deviation of each group of weights at which the
-    samples are most probable.
+    samples are most probable; and penalties (P,) of the weights' squares, in squares of the target, which lead there.
 
     sums: (P + 1, P + 1) of products of so many samples' features and target, see `_beside`.
     """
@@ -333,6 +360,7 @@ def _most_probable(sums: torch.Tensor, count: int, groups: torch.Tensor, correla
     precision = 10 * height * size / max(noise, 1e-300)  # a tenth of the torque, at first
     weights = torch.zeros_like(moment)
     for _ in range(TUNING.rounds):
+        penalty = noise * correlation * (member @ precision)
         curvature = gram / (noise * correlation) + torch.diag(member @ precision)
         covariance = torch.linalg.inv(curvature)
         weights = covariance @ moment / (noise * correlation) * seen
@@ -342,10 +370,10 @@ def _most_probable(sums: torch.Tensor, count: int, groups: torch.Tensor, correla
         previous, noise = noise, max(missed, 1e-12 * square) / count
         if abs(noise - previous) < TUNING.converged * previous:
             break
-    return weights
+    return weights, penalty
 
 
-def _select_networks(model: Any, samples: ResidualSamples, correlation: float) -> Iterator[SelectedResidual]:
+def select_networks(model: Any, samples: ResidualSamples, correlation: float) -> Iterator[SelectedResidual]:
     """Select the potential's network, then that of the mass matrix."""
     step = -(-len(samples.q) // TUNING.network_samples)
     subset = ResidualSamples(*(column[::step] for column in samples))
