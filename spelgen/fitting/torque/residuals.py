@@ -110,8 +110,7 @@ class _Candidate:
 def can_be_judged(count: int, correlation: float) -> bool:
     """Return whether of so many samples both halves are more than the gap between them."""
     first, last = _halves(count, correlation)
-    gap: int = last.start - first.stop
-    return gap <= first.stop
+    return bool(last.start - first.stop <= first.stop)
 
 
 def select_functions(
