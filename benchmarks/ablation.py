@@ -29,12 +29,15 @@ import arms
 import truth
 from real_logs import first, mean, samples_of, torque_of, trained
 
+import spelgen
+from spelgen.dynamics.residuals import residual_torque
 from spelgen.fitting import levenberg_marquardt
 from spelgen.fitting.torque import fit as torque_fit
 from spelgen.fitting.torque import jacobian as torque_jacobian
 from spelgen.fitting.torque import prior as torque_prior
 from spelgen.fitting.torque import problem as torque_problem
 from spelgen.fitting.torque import residuals as residual_fit
+from spelgen.fitting.torque.fit import fit_torque
 from spelgen.logs import dynamics_samples
 
 NEVER = float("inf")
@@ -99,6 +102,26 @@ def nothing(response: Any, joint: int, torque: Any) -> Any:
     return torque
 
 
+class Held:
+    """Stand in for `FollowingResiduals`: functions stay while bodies are fitted."""
+
+    def by_joint(self) -> dict[int, Any]:
+        return {}
+
+    def write(self, model: Any, missing: Any) -> None:
+        pass
+
+
+def in_turns(model: Any, samples: Any, *rest: Any) -> Held:
+    """Stand in for `refit_residuals`: functions are fitted to what bodies leave, and then bodies beside them."""
+    with torch.no_grad():
+        torque = residual_torque(model, *samples[:3])
+        following = residual_fit.refit_residuals(model, samples, *rest)
+        torque = torque - residual_torque(model, *samples[:3])
+    following.write(model, samples.missing + torque)
+    return Held()
+
+
 def mechanisms() -> list[Mechanism]:
     """All that are switched off."""
     return [
@@ -126,6 +149,7 @@ def mechanisms() -> list[Mechanism]:
         Mechanism("few samples first", tuned(torque_jacobian, subset=2**40)),
         Mechanism("steps in the bodies' parameters", tuned(levenberg_marquardt, kept_promise=-NEVER)),
         Mechanism("turns of bodies and residuals", tuned(torque_jacobian, turns=1)),
+        Mechanism("functions that follow bodies", ((torque_fit, "refit_residuals", in_turns),)),
         Mechanism("residuals beside rigid bodies", tuned(residual_fit, standard_errors=NEVER)),
         Mechanism(
             "what bodies take over of springs", ((torque_jacobian.RigidResponse, "remaining", nothing),)
@@ -133,7 +157,7 @@ def mechanisms() -> list[Mechanism]:
         Mechanism("significance of residuals", tuned(residual_fit, standard_errors=0.0)),
         Mechanism("gaps between blocks", tuned(residual_fit, gap=0.0)),
         Mechanism("least gain of residuals", tuned(residual_fit, least_gain=0.0)),
-        Mechanism("networks among residuals", ((residual_fit, "_select_networks", lambda *_: iter(())),)),
+        Mechanism("networks among residuals", ((torque_fit, "select_networks", lambda *_: iter(())),)),
     ]
 
 
@@ -172,6 +196,18 @@ def simulated_cases(folder: Path) -> Iterator[tuple[str, Callable[[], dict[str, 
         yield f"{case.arm}, {case.friction}{springs}", lambda case=case: fit_truth(case, folder)
 
 
+def effect_cases() -> Iterator[tuple[str, Callable[[], dict[str, float]]]]:
+    """Fits to a simulated UR10e that has what rigid bodies do not."""
+    for effect, logs, test in arms.with_effects():
+
+        def run(logs: Any = logs, test: Any = test) -> dict[str, float]:
+            model = spelgen.build(arms.ROBOT, "hybrid")
+            fit_torque(model, logs)
+            return {"nMSE": mean(torque_of(model), [test])}
+
+        yield f"simulated UR10e, {effect}", run
+
+
 def fit_truth(case: truth.Case, folder: Path) -> dict[str, float]:
     """Errors of `hybrid` on one simulated arm."""
     rng = np.random.default_rng([case.number, 1])
@@ -198,12 +234,12 @@ def main() -> None:
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     chosen = [each for each in mechanisms() if options.only in each.name]
-    cases = [*real_cases(options.logs), *simulated_cases(options.logs.parent / "arms")]
+    cases = [*real_cases(options.logs), *effect_cases(), *simulated_cases(options.logs.parent / "arms")]
     for name, run in cases:
         if options.case not in name:
             continue
         reference = run()
-        shown = ", ".join(f"{key} {value:.5f}" for key, value in reference.items())
+        shown = ", ".join(f"{key} {value:.6f}" for key, value in reference.items())
         print(f"\n{name}: {shown}", flush=True)
         for mechanism in chosen:
             with switched_off(mechanism):

@@ -176,6 +176,17 @@ def real(folder: Path) -> Iterator[Case]:
 
 def simulated() -> Iterator[Case]:
     """A UR10e other than its URDF says, with one effect and with all of them."""
+    for name, logs, test in with_effects():
+        models = {}
+        for preset in PRESETS:
+            model, since = build(ROBOT, preset), time.perf_counter()
+            fit_torque(model, logs)
+            models[preset] = model, time.perf_counter() - since
+        yield Case(name, ROBOT, logs, [test], models)
+
+
+def with_effects() -> Iterator[tuple[str, list[DynamicsSamples], DynamicsSamples]]:
+    """Names of effects, with the training logs and the test of an arm that has them."""
     true = build(ROBOT, "closed-form")
     rng = np.random.default_rng(0)
     with torch.no_grad():
@@ -183,14 +194,9 @@ def simulated() -> Iterator[Case]:
             deviation = 0.1 if "inertial" in name else 0.3
             weight += deviation * torch.from_numpy(rng.normal(size=weight.shape))
     for chosen in (*((x,) for x in EFFECTS), tuple(EFFECTS)):
-        logs = [recorded(true, chosen, seed, noise=0.02) for seed in (1, 2)]
-        models = {}
-        for preset in PRESETS:
-            model, since = build(ROBOT, preset), time.perf_counter()
-            fit_torque(model, logs)
-            models[preset] = model, time.perf_counter() - since
         name = " + ".join(chosen) if len(chosen) < 2 else "all"
-        yield Case(name, ROBOT, logs, [recorded(true, chosen, 9)], models)
+        logs = [recorded(true, chosen, seed, noise=0.02) for seed in (1, 2)]
+        yield name, logs, recorded(true, chosen, 9)
 
 
 def recorded(model: Any, effects: Sequence[str], seed: int, noise: float = 0.0) -> DynamicsSamples:
