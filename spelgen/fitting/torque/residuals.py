@@ -156,8 +156,8 @@ class FollowingResiduals(NamedTuple):
             joint: functions.weights(missing[:, joint]) for joint, functions in self.by_joint().items()
         }
         for candidate, penalty in self.penalties:
-            own, weights[candidate.joint] = weights[candidate.joint].tensor_split((len(penalty),))
-            candidate.write(model.residuals, own)
+            of_candidate, weights[candidate.joint] = weights[candidate.joint].tensor_split((len(penalty),))
+            candidate.write(model.residuals, of_candidate)
 
 
 def refit_residuals(
