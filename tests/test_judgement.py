@@ -97,7 +97,7 @@ def test_the_first_half_is_judged_where_it_has_been(hybrid):
     noise = 0.02 * torch.randn(4000, 2, generator=torch.Generator().manual_seed(0)).double()
     missed = samples(torque + noise, q)
     spline = next(residual_fit._candidates(hybrid, missed, ALONE))
-    first, last = residual_fit._halves(4000, 1.0)
+    first, last = residual_fit.halves(4000, 1.0)
     weights, _ = residual_fit._fit_candidate(spline, missed.missing[:, 0], 1.0, first)
     error = missed.missing[last, 0] - spline.torque(weights, last)
     assert error.square().sum() > missed.missing[last, 0].square().sum()

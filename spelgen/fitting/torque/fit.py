@@ -6,6 +6,7 @@ pays (see ``residuals``), and then both in turn.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -18,7 +19,10 @@ from spelgen.fitting.torque.jacobian import TUNING, TorqueJacobian
 from spelgen.fitting.torque.problem import State, TorqueProblem
 from spelgen.fitting.torque.residuals import (
     SelectedResidual,
+    between_positions,
     can_be_judged,
+    clear_functions,
+    halves,
     refit_residuals,
     select_functions,
     select_networks,
@@ -114,14 +118,51 @@ def _with_residuals(
     residuals: list[SelectedResidual] = []
     if not can_be_judged(samples.count, problem.lasting):
         return state, residuals
+    alone, found = state, problem.found()
     # bodies that were fitted without a function err by more than it: only then is seen what else is missed
     while further := select_functions(model, *problem.around(state), residuals, problem.lasting):
         residuals += further
         state = _refit(problem, state, samples, residuals)
+    if residuals:
+        losing = _losing_joints(problem, alone, state, residuals)
+        residuals = [residual for residual in residuals if residual.joint not in losing]
+        clear_functions(model, losing)
+        if not residuals:
+            state = alone
+            problem.restore(found)
+        state = problem.set_samples(state, TorqueJacobian(model, samples))
     residuals += select_networks(model, problem.around(state)[0], problem.lasting)
     for _ in range(TUNING.turns if residuals else 0):
         state = _refit(problem, state, samples, residuals)
     return state, residuals
+
+
+def _losing_joints(
+    problem: TorqueProblem, alone: State, state: State, residuals: Sequence[SelectedResidual]
+) -> list[int]:
+    """Return the joints whose last half of the samples is met as well or better by bodies alone, after fits to the first half.
+
+    alone: of a fit of bodies. state: of one beside functions.
+    """
+    model, samples, found = problem.jacobian.model, problem.jacobian.samples, problem.found()
+    first, last = halves(samples.count, problem.lasting)
+    early, late = samples.rows(first), samples.rows(last)
+    weights = copy.deepcopy(model.residuals.state_dict())
+
+    def missed(state: State, residuals: Sequence[SelectedResidual]) -> torch.Tensor:
+        state = problem.set_samples(state, TorqueJacobian(model, early))
+        state = _refit(problem, state, early, residuals)
+        return TorqueJacobian(model, late).residual_samples(state.x).missing.square()
+
+    beside = missed(state, residuals)
+    clear_functions(model, range(model.n))
+    gain = missed(alone, []) - beside
+    model.residuals.load_state_dict(weights)
+    problem.restore(found)
+    # functions are known between the positions that they were fitted to
+    between = between_positions(late.columns.q, early.columns.q)
+    loses = (gain.sum(dim=0) <= 0) & ((gain * between).sum(dim=0) <= 0)
+    return loses.nonzero()[:, 0].tolist()
 
 
 def _refit(

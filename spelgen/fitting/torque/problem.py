@@ -145,13 +145,13 @@ class TorqueProblem:
         Bristles turn around after a displacement, and so late: where friction turns around at once, they pass for
         inertia. The gears of an arm are mostly alike: weak evidence of a joint yields to that of all.
         """
-        laws, before = self.jacobian.model.friction, self._found()
+        laws, before = self.jacobian.model.friction, self.found()
         laws.memoryless.fill_(0.0)
         remembering = self.solve(self._first_fit(state.x, state.steps), TUNING.rounds)
         evidence = self._evidence(remembering, state) - self._fractions_narrowed()
         laws.memoryless.copy_(_unlikely(evidence))
         if laws.memoryless.all():
-            self._restore(before)
+            self.restore(before)
             return state
         if laws.memoryless.any():
             return self.solve(self.set_samples(remembering, self.jacobian), TUNING.rounds)
@@ -172,23 +172,24 @@ class TorqueProblem:
             self.start[rows] = x[rows] = NONE
             return self.solve(replace(state, x=x, residuals=self.jacobian.squares(x)), TUNING.rounds)
 
-        before = self._found()
+        before = self.found()
         plain = without(torch.ones(len(effects), dtype=torch.bool))
         unlikely = _unlikely(self._evidence(state, plain) - TUNING.effects_evidence)
         if unlikely.all():
             return plain
-        self._restore(before)
+        self.restore(before)
         return without(unlikely) if unlikely.any() else state
 
     def _evidence(self, state: State, other: State) -> torch.Tensor:
         """Return how much more likely the samples of each joint (n,) are after a fit: twice the logarithm."""
         return self.count / self.lasting * (other.residuals / state.residuals).log()
 
-    def _found(self) -> Found:
+    def found(self) -> Found:
         """Return what rounds have found, to be restored."""
         return self.start, self.noise, self.prior, self.covariance.clone()
 
-    def _restore(self, found: Found) -> None:
+    def restore(self, found: Found) -> None:
+        """Go on from what rounds had found before."""
         self.start, self.noise, prior, self.covariance = found
         self.set_prior(prior)
 

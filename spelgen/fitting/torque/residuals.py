@@ -17,7 +17,7 @@ Neural Computation 4:415, 1992); networks are found by L-BFGS from a normal dist
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -109,7 +109,7 @@ class _Candidate:
 
 def can_be_judged(count: int, correlation: float) -> bool:
     """Return whether of so many samples both halves are more than the gap between them."""
-    first, last = _halves(count, correlation)
+    first, last = halves(count, correlation)
     return bool(last.start - first.stop <= first.stop)
 
 
@@ -132,6 +132,18 @@ def select_functions(
             candidates[candidate.joint].append(candidate)
     best = (_best(of_joint, samples.missing, noise, correlation) for of_joint in candidates)
     return [residual for residual in best if residual is not None]
+
+
+def clear_functions(model: Any, joints: Iterable[int]) -> None:
+    """Leave the model without functions of these joints."""
+    functions = model.residuals
+    with torch.no_grad():
+        for weights in (
+            functions.raw_torque_splines,
+            functions.raw_friction_splines,
+            functions.raw_torque_ripple,
+        ):
+            weights[list(joints)] = 0.0
 
 
 class FollowingResiduals(NamedTuple):
@@ -192,7 +204,7 @@ def _best(
     candidates: Sequence[_Candidate], missing: torch.Tensor, noise: torch.Tensor, correlation: float
 ) -> SelectedResidual | None:
     """Return the function that gains most where it was not seen, the first of nearly equal ones; None: none gains."""
-    first, last = _halves(len(missing), correlation)
+    first, last = halves(len(missing), correlation)
     best = best_between = None
     for candidate in candidates:
         target = candidate.target(missing, noise)
@@ -205,7 +217,7 @@ def _best(
         before, after = target[last].square(), (target - candidate.torque(weights))[last].square()
         if gain is not None and after.sum() < before.sum():
             best = _better(best, SelectedResidual(candidate.parameter, candidate.joint, gain))
-        between = _between(candidate.position[last], candidate.position[first])
+        between = between_positions(candidate.position[last], candidate.position[first])
         if gain_between is not None and after[between].sum() < before[between].sum():
             gaining = SelectedResidual(candidate.parameter, candidate.joint, gain_between)
             best_between = _better(best_between, gaining)
@@ -221,9 +233,9 @@ def _better(first: SelectedResidual | None, other: SelectedResidual) -> Selected
     return first
 
 
-def _between(position: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
-    """Return which positions lie between others."""
-    return (position >= others.min()) & (position <= others.max())
+def between_positions(position: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
+    """Return which positions (T, ...) lie between others (T', ...)."""
+    return (position >= others.amin(dim=0)) & (position <= others.amax(dim=0))
 
 
 def _candidates(
@@ -277,7 +289,7 @@ def _noise(missing: torch.Tensor) -> torch.Tensor:
     return deviation.clamp(min=1e-12 * float(deviation.max()) + 1e-300)
 
 
-def _halves(count: int, correlation: float) -> tuple[slice, slice]:
+def halves(count: int, correlation: float) -> tuple[slice, slice]:
     """Return the first half of the samples without the gap before the last half, and the last half."""
     middle = count // 2
     return slice(0, max(0, middle - round(TUNING.gap * correlation))), slice(middle, count)
@@ -304,7 +316,7 @@ def _held_out_errors(
         sums = everything - rows[near].mT @ rows[near]
         weights, _ = _most_probable(sums, len(others), candidate.groups, correlation)
         errors.append(target[block] - candidate.torque(weights, block))
-        between.append(_between(position[block], others))
+        between.append(between_positions(position[block], others))
     return torch.cat(errors), torch.cat(between)
 
 
@@ -412,7 +424,7 @@ def _fit_network(
         network.load_state_dict(start)
         minimise(network, lambda: [cost()], evaluations, weight_decay=1.0)
 
-    first, last = _halves(len(samples.q), correlation)
+    first, last = halves(len(samples.q), correlation)
     # most networks explain nothing, which few evaluations show
     for evaluations in (TUNING.network_first_look, TUNING.network_evaluations):
         fit(first, evaluations)

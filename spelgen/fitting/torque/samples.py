@@ -62,6 +62,10 @@ class TorqueSamples:
             return self
         return TorqueSamples(self.columns.rows(slice(None, None, step)), self.seen, step * self.step)
 
+    def rows(self, rows: slice) -> TorqueSamples:
+        """Return these samples alone."""
+        return TorqueSamples(self.columns.rows(rows), self.seen, self.step)
+
     def blocks(self, size: int) -> Iterator[Block]:
         """Yield all samples in order, at most ``size`` at a time."""
         for start in range(0, self.count, size):
