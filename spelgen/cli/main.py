@@ -9,6 +9,8 @@ from __future__ import annotations
 import os
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import Annotated, Any
 
@@ -49,13 +51,25 @@ class Command(TyperCommand):
 class Group(TyperGroup):
     """All commands: a mistake in the words of one is answered with what may have been meant."""
 
+    def make_context(self, *arguments: Any, **options: Any) -> Any:
+        """Read the program's own options."""
+        with _suggestions():
+            return super().make_context(*arguments, **options)
+
     def invoke(self, ctx: Any) -> Any:
         """Run a command."""
-        try:
+        with _suggestions():
             return super().invoke(ctx)
-        except UsageError as error:
-            _suggest(error)
-            raise
+
+
+@contextmanager
+def _suggestions() -> Iterator[None]:
+    """Add suggestions to usage errors."""
+    try:
+        yield
+    except UsageError as error:
+        _suggest(error)
+        raise
 
 
 def _suggest(error: Any) -> None:

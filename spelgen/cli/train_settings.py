@@ -151,7 +151,8 @@ def resumed_run(folder: Path, request: Request) -> Start:
             file=folder,
             do="resume it by spelgen.fit(..., folder=..., options=spelgen.RunOptions(resume=True))",
         )
-    settings = TrainingSettings(seed=record["seed"], **record["preprocessing"])
+    # not validated again: Python allows more than files of settings do
+    settings = TrainingSettings().model_copy(update={"seed": record["seed"], **record["preprocessing"]})
     if fraction is not None:
         settings = settings.model_copy(update={"validation_fraction": fraction})
 

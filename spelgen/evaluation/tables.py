@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from spelgen.baselines.names import MODEL, observed
@@ -60,10 +60,10 @@ class Table:
 
     @property
     def columns(self) -> list[str]:
-        """Return the names of the columns that have a number, in the order in which rows have them."""
+        """Return the names of all columns, in the order in which rows have them."""
         names: dict[str, None] = {}
         for row in self.rows:
-            names |= {name: None for name, value in row.values.items() if value is not None or name == MODEL}
+            names |= dict.fromkeys(row.values)
         return list(names)
 
     def text(self) -> str:
@@ -72,13 +72,13 @@ class Table:
 
     def listing(self) -> Listing:
         """Return the same as text."""
-        lines = []
+        lines, columns = [], self.columns
         for row in self.rows:
-            texts = [row.label]
-            for name in self.columns:
-                texts.append(f"{row.text(name)} {'*' if name in row.best else ' '}")
+            texts, best = [row.label], row.best
+            for name in columns:
+                texts.append(f"{row.text(name)} {'*' if name in best else ' '}")
             lines.append(tuple(texts))
-        head = ("", *(f"{name}  " for name in self.columns))
+        head = ("", *(f"{name}  " for name in columns))
         return Listing(self.title, head, tuple(lines), self.note)
 
 
@@ -89,7 +89,19 @@ def table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Table:
 
 def result_tables(results: Measurements) -> list[Table]:
     """Return the tables of an evaluation: commands replayed, errors by horizon and by joint, torques."""
-    return [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
+    tables = [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
+    return list(map(_without_empty_baselines, tables))
+
+
+def _without_empty_baselines(full: Table) -> Table:
+    """Return the table without the columns of baselines that have no number."""
+    columns = {MODEL}
+    for row in full.rows:
+        columns |= {name for name, value in row.values.items() if value is not None}
+    rows = []
+    for row in full.rows:
+        rows.append(replace(row, values={name: row.values[name] for name in row.values if name in columns}))
+    return replace(full, rows=tuple(rows))
 
 
 def joined(runs: Mapping[str, Measurements]) -> list[Table]:

@@ -126,6 +126,9 @@ class ServoLogs:
             if coordinate.effort and kp:
                 saturation[k] = coordinate.effort / kp
         following = measure_following(self._logs, saturation)
+        if following is None:
+            message = f"no {FILTER_SAMPLES} samples without a gap: no servo is determined"
+            summary.notes.append(Diagnostic("warning", "idle-command", "logs", None, message))
         completed = []
         for k, (coordinate, report) in enumerate(zip(self._arm.arm.coordinates, reports, strict=True)):
             odd = None

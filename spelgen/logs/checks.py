@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.labels import counted
@@ -80,6 +79,9 @@ def run_checks(
 
 def velocity_products(trajectory: Trajectory) -> np.ndarray:
     """Return sums of products (2n, 2n) of increments over some steps: of the integrals of qd, then of q."""
+    # loaded where it is called: half a second
+    from scipy.integrate import cumulative_trapezoid
+
     products = np.zeros((2 * trajectory.q.shape[1],) * 2)
     for piece in split_at_gaps(trajectory, shortest=2):
         # over several steps: from one sample to the next quantisation of q is larger than its change
@@ -150,6 +152,8 @@ def find_degrees(signals: JointSignals) -> str | None:
 
 def find_frozen(signals: JointSignals) -> str | None:
     """Find a position or a velocity that never changes while the other one does."""
+    from scipy.integrate import cumulative_trapezoid
+
     q, qd = signals.q, signals.qd
     if np.ptp(qd) == 0 and np.ptp(q) > TUNING.drift:
         return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"

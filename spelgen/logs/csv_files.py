@@ -62,10 +62,11 @@ def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
             break
         names.append(cell)
         columns.append(f"name_{cell}")
+    labels = len(columns)
     for quantity in FIELDS:
         if len(columns) < len(cells):
             columns += [PLAIN[quantity].replace("{joint}", name) for name in names]
-    if not names or len(columns) != len(cells):
+    if not names or len(columns) == labels or len(columns) != len(cells):
         raise LogError(
             f"numbers in the first line ({', '.join(cells[:3])}, ...)", file=file, line=1,
             expected="a header: the names of the columns",

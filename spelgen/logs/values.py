@@ -55,10 +55,11 @@ def values_in_si(table: Table, layout: Layout, start: pa.Scalar | None, row: int
 def clock_start(table: Table, layout: Layout) -> pa.Scalar | None:
     """Return from where times count: the first one of a clock that shows the date, else None."""
     times, _ = _clock(table.slice(0, 1), layout)
+    is_stamp = pa.types.is_temporal(_column(table, layout.columns[0]).type)
     if pa.types.is_integer(times.type) or pa.types.is_floating(times.type):
         first = times[0].as_py()
         # seconds since 1970 leave floating-point numbers no digits for what follows
-        if first is not None and TUNING.longest_clock < abs(first) < np.inf:
+        if first is not None and (is_stamp or TUNING.longest_clock < abs(first) < np.inf):
             return times[0]
     return None
 
@@ -104,7 +105,9 @@ def _column(table: Table, name: str) -> Column:
 def _floats(values: Column, name: str, layout: Layout, row: int) -> np.ndarray:
     """Return a column as float64 (T,)."""
     try:
-        return np.asarray(values.cast(pa.float64()).to_numpy(zero_copy_only=False))
+        # integers beyond 2^53, times in nanoseconds, are rounded
+        floats = values.cast(pa.float64(), safe=not pa.types.is_integer(values.type))
+        return np.asarray(floats.to_numpy(zero_copy_only=False))
     except (pa.ArrowException, ValueError) as error:
         # Arrow does not say which row
         texts = values.to_pylist() if pa.types.is_string(values.type) else []

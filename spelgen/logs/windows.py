@@ -102,7 +102,8 @@ def cut_windows(
 
 def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> torch.Tensor:
     """(T, n) -> (W, window, n)."""
-    windows = torch.tensor(values).unfold(0, (window - 1) * decimation + 1, stride)
+    # torch takes no reversed views
+    windows = torch.tensor(np.ascontiguousarray(values)).unfold(0, (window - 1) * decimation + 1, stride)
     return windows[..., ::decimation].transpose(1, 2)
 
 

@@ -55,6 +55,9 @@ class Coupling(Group):
     def _invertible(self) -> Coupling:
         if {len(self.matrix), *map(len, self.matrix)} != {len(self.joints)}:
             raise ValueError("as many rows, and as many numbers in each, as joints")
-        if np.linalg.matrix_rank(np.array(self.matrix)) < len(self.joints):
+        rows = np.array(self.matrix)
+        # motors in other units than their neighbours' are not dependent
+        largest = np.abs(rows).max(axis=1, keepdims=True, initial=0.0)
+        if np.linalg.matrix_rank(rows / np.where(largest > 0, largest, 1.0)) < len(self.joints):
             raise ValueError("a matrix with an inverse: as many independent motors as joints")
         return self

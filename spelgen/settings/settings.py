@@ -125,7 +125,7 @@ def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) ->
         for wrong in errors:
             group = (wrong.element or "").partition(".")[0]
             if group not in OF_A_STEP:
-                collect(errors)
+                collect([*errors, *(x for other in unusable.values() for x in other.errors)])
             earlier = unusable.get(group, Unusable(()))
             unusable[group] = Unusable((*earlier.errors, wrong))
             content.pop(group, None)

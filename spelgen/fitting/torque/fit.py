@@ -140,7 +140,7 @@ def _with_residuals(
 def _losing_joints(
     problem: TorqueProblem, alone: State, state: State, residuals: Sequence[SelectedResidual]
 ) -> list[int]:
-    """Return the joints whose last half of the samples is met as well or better by bodies alone, after fits to the first half.
+    """Return the joints whose last half of the samples bodies alone meet as well or better, after fits to the first.
 
     alone: of a fit of bodies. state: of one beside functions.
     """

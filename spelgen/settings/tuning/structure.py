@@ -10,7 +10,6 @@ class GeometryTuning:
     """Hold what decides which exact number a rounded one of a URDF stands for."""
 
     # [rad] from pi/12, pi/8, pi/5: 0.26, 0.39, 0.63 are as often meant as they are
-
     fine_tolerance: float = 2e-5
     fine_divisors: tuple[int, ...] = (12, 8, 5)  # of pi: the special angles on CAD drawings of the 189 arms
     offset_noise: float = 1e-9  # [m] below it an offset is 0: what composed rotations leave
