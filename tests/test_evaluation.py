@@ -21,6 +21,7 @@ from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.rollout import rollout
 from spelgen.evaluation.subject import read_test_logs
+from spelgen.evaluation.tables import table
 from spelgen.evaluation.torque import coarse_torques, torque_errors
 from spelgen.fitting.train import train
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
@@ -435,3 +436,8 @@ def test_logs_that_never_move_have_no_torque_errors(robots):
     )
     assert found.torque == {}
     assert found.horizons
+
+
+def test_what_diverged_keeps_its_column():
+    text = table("Prediction loss", {"seed 0": {"phnode": None, "spel": 1.0}}).text()
+    assert "phnode" in text and text.splitlines()[-1].split() == ["seed", "0", "-", "1", "*"]

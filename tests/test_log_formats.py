@@ -128,6 +128,17 @@ def test_timestamps_count_from_the_first(tmp_path):
         check(read_logs([path], JOINTS, mapping=mapping)[0], "x", rtol=1e-15)
 
 
+def test_typed_times_count_from_the_first_however_small_it_is(tmp_path):
+    stamps = 50_000_000 + np.array([0, 10_000_000, 20_000_000, 30_000_000])
+    path = parquet(tmp_path / "x.parquet", columns(t=pa.array(stamps, pa.duration("ns"))))
+    check(read_logs([path], JOINTS)[0], "x", rtol=1e-15)
+    # an unset first stamp leaves a gap behind it
+    stamps = 1_700_000_000_000_000_001 + np.array([0, 10_000_000, 20_000_000, 30_000_000])
+    stamps[0] = 0
+    path = parquet(tmp_path / "x.parquet", columns(t=pa.array(stamps, pa.timestamp("ns"))))
+    assert np.diff(read_logs([path], JOINTS)[0].t)[1:] == pytest.approx(0.01)
+
+
 def test_measured_currents_times_gains_are_the_recorded_torques(shared):
     gains = {"shoulder_pan": 14.87, "shoulder_lift": 13.26, "elbow": 11.13, "wrist_1": 10.62}
     gains |= {"wrist_2": 11.03, "wrist_3": 11.47}  # [Nm/A], logs/README.md
@@ -683,6 +694,12 @@ def test_a_headerless_csv_is_called_that(tmp_path):
     assert "log.csv:1: got numbers in the first line (0.00, 0.1, 0.2, ...), expected a header" in str(
         caught.value
     )
+
+
+def test_numbers_before_words_are_no_joint_states(tmp_path):
+    (tmp_path / "log.csv").write_text("1,2,foo,bar\n1,2,3,4\n")
+    with pytest.raises(LogError, match="got numbers in the first line"):
+        read_logs([tmp_path / "log.csv"], ("a",))
 
 
 def test_rows_out_of_order_repeated_rows_and_dates_are_mended(tmp_path):

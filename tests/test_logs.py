@@ -508,3 +508,10 @@ def test_what_is_said_of_many_recordings_is_said_once():
     (note,) = check([slow, replace(slow, name="b")], JOINTS, ("revolute", "revolute"))
     assert (note.code, note.where) == ("low-rate", "trajectory a")
     assert note.message.startswith("20 Hz: ") and note.message.endswith(" (and in 1 more trajectory)")
+
+
+def test_reversed_columns_are_cut_into_windows():
+    t = 0.02 * np.arange(120)
+    q = np.sin(t[:, None] * [1.0, 1.7])[:, ::-1]
+    windows = cut_windows([Trajectory(t, q, q, q, "x")], 5, measured=False)
+    assert windows.q.shape == (116, 5, 2)

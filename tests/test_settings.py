@@ -223,6 +223,13 @@ def test_a_group_of_one_step_refuses_that_step_alone(urdf):
     assert str(error.value) == message
 
 
+def test_errors_of_a_step_are_listed_beside_those_of_the_arm(urdf):
+    with pytest.raises(SpelgenErrors) as error:
+        load_settings(urdf("joints: {zz: {gear: 2}}\nlogs: {bogus: 1}\n"), ["shoulder"])
+    first, second = str(error.value).splitlines()
+    assert "unknown joint 'zz'" in first and "unknown key 'bogus'" in second
+
+
 def test_a_mapping_may_have_a_file_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "logger.yaml").write_text("units: {q: deg}\njoints:\n  a: {sign: -1}\n  b: {}\n")
