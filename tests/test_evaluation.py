@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 import torch
 import typer
@@ -81,6 +82,16 @@ def test_the_urdf_baseline_has_the_dynamics_of_the_urdf(cart):
     tau = cart_torque(q, qd, qdd)
     torch.testing.assert_close(dynamics.inverse_dynamics(q, qd, qdd), tau, atol=1e-12, rtol=0)
     torch.testing.assert_close(dynamics.forward_dynamics(q, qd, tau), qdd, atol=1e-11, rtol=0)
+
+
+def test_pinocchios_configurations_of_any_batch_are_those_of_each_state(cart):
+    dynamics = urdf_dynamics(cart, ("slide", "swing"))
+    q = draw(3, 4, 2).numpy()
+    neutral = pin.neutral(dynamics.model)
+    each = np.apply_along_axis(lambda moved: pin.integrate(dynamics.model, neutral, moved), -1, q)
+    np.testing.assert_allclose(dynamics.configuration(q), each, atol=1e-15)
+    np.testing.assert_allclose(dynamics.configuration(q[0, 0]), each[0, 0], atol=1e-15)
+    assert dynamics.configuration(q[:0]).shape == (0, 4, 3)
 
 
 def test_the_urdf_baseline_follows_the_order_of_joints_asked_for(cart):

@@ -22,7 +22,7 @@ from spelgen.exporting.describe import Trained, identifier
 from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.export import export
 from spelgen.exporting.model_expressions import expression_functions
-from spelgen.exporting.parity import check_parity, random_inputs
+from spelgen.exporting.parity import check_parity, random_inputs, require_parity
 from spelgen.pipeline.build import build
 from spelgen.pipeline.loaded_arm import load_arm
 
@@ -158,6 +158,16 @@ def test_a_wrong_export_is_refused():
     nothing = lambda name, inputs: {"tau": np.full_like(inputs["q"], np.nan)}  # noqa: E731
     with pytest.raises(RunError, match="differs from the model by nan"):
         check_parity(nothing, trained, ["inverse_dynamics"], 1e-12)
+
+
+def test_parity_names_the_entry_point_that_uses_most_of_its_own_tolerance():
+    parity_of_tip = require_parity({"bias": 1e-14, "tip_pose": 1e-6}, 1e-12, 9)
+    assert parity_of_tip.differences["tip_pose"] == 1e-6
+    assert "at most 1.0e-06 (tip_pose)" in parity_of_tip.summary
+    assert "; 3e-06 is allowed" in parity_of_tip.summary
+    assert "(bias)" in require_parity({"bias": 5e-13, "tip_pose": 1e-6}, 1e-12, 9).summary
+    with pytest.raises(RunError, match="tip_pose differs"):
+        require_parity({"tip_pose": 4e-6}, 1e-12, 9)
 
 
 DRIVER = r"""

@@ -48,6 +48,7 @@ def test_a_joint_that_friction_holds_does_not_creep():
     """Under half of its friction, after a second [rad/s, m/s]; with MuJoCo's default it still moves."""
     found = export(moved_model("rpr", "closed-form"), "mjcf", arm=arm_of("rpr"))
     text = found.files[".xml"].decode()
+    assert 'solimpfriction="0.9999 0.9999 0.001 0.5 2"' in text
     speeds = []
     for each in (text, re.sub(' solimpfriction="[^"]*"', "", text)):
         simulated = mujoco.MjModel.from_xml_string(each)

@@ -1,5 +1,7 @@
 """ONNX Runtime gives what the model gives, at any batch size."""
 
+import logging
+
 import numpy as np
 import onnx
 import pytest
@@ -51,6 +53,7 @@ def test_the_files_are_plain_onnx_of_equal_bytes():
     onnx.checker.check_model(graph)
     assert {node.domain for node in graph.graph.node} == {""}
     assert not any(node.metadata_props for node in graph.graph.node)
+    assert logging.getLogger("torch.onnx").level == logging.NOTSET
     shapes = {x.name: len(x.type.tensor_type.shape.dim) for x in graph.graph.input}
     assert shapes == {"q": 2, "qd": 2, "tau": 2, "z": 2}
 
@@ -61,3 +64,5 @@ def test_networks_go_to_onnx(preset):
     trained = Trained(moved_model("two_link", preset), arm_of("two_link"))
     files = {"forward_dynamics": onnx_model(trained.model.prepared(), "forward_dynamics")}
     check_parity(called_by_onnx(files), trained, list(files), 1e-10)
+    large = [x.raw_data for x in onnx.load_from_string(*files.values()).graph.initializer if x.raw_data[512:]]
+    assert len(large) == len({bytes(sorted(x)) for x in large}), "the same weights, or their transpose, twice"

@@ -79,6 +79,19 @@ def test_linearize_is_the_slope_of_rate_and_step(pair):
             torch.testing.assert_close(found[..., k], slope, rtol=1e-4, atol=1e-5)
 
 
+def test_a_batch_is_linearized_alike_without_autograd_and_when_compiled(pair):
+    _, prepared = pair
+    inputs = states(4)
+    expected = prepared.linearize(*inputs)
+    for modes, model in (
+        (torch.no_grad(), prepared),
+        (torch.inference_mode(), prepared),
+        (torch.enable_grad(), prepared.compile()),
+    ):
+        with modes:
+            torch.testing.assert_close(model.linearize(*inputs), expected)
+
+
 def test_rollout_is_steps_and_converges_to_the_fourth_order():
     prepared = moved_model("two_link", "closed-form").prepared()
     q, qd = (

@@ -109,9 +109,14 @@ class PinocchioDynamics:
             q = q @ self.jacobian.T + self.offset
         if self.model.nq == self.model.nv:
             return q
-        # a continuous joint is (cos, sin) in Pinocchio
-        neutral = pin.neutral(self.model)
-        return np.apply_along_axis(lambda moved: pin.integrate(self.model, neutral, moved), -1, q)
+        # planar and floating joints, which no coordinate moves, stay there
+        configuration = np.tile(pin.neutral(self.model), (*q.shape[:-1], 1))
+        for joint in self.model.joints[1:]:
+            position = q[..., joint.idx_v]
+            if joint.nq <= 2:  # a continuous joint is (cos, sin) in Pinocchio
+                values = [position] if joint.nq == 1 else [np.cos(position), np.sin(position)]
+                configuration[..., joint.idx_q : joint.idx_q + joint.nq] = np.stack(values, axis=-1)
+        return configuration
 
     def _by_joint(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
         """What the algorithm gives of states (..., nq), (..., nv), ...; it takes one at a time."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -128,18 +129,20 @@ class PreparedModel:
         """
         n = self.n
         z = self.memory(qd) if z is None else z
+        # compiled functions take no derivative from outside
+        plain = copy.copy(self)
+        vars(plain).pop("forward_dynamics", None)
 
         def function(state: Tensor, tau: Tensor, z: Tensor) -> Tensor:
             position, speed = state.split(n)
             if dt is None:
-                return torch.cat([speed, self.forward_dynamics(position, speed, tau, z)])
-            return torch.cat(self.step(position, speed, tau, dt, z, substeps=substeps)[:2])
+                return torch.cat([speed, plain.forward_dynamics(position, speed, tau, z)])
+            return torch.cat(plain.step(position, speed, tau, dt, z, substeps=substeps)[:2])
 
         batch, elements = q.shape[:-1], z.shape[-1]
         states = torch.cat([q, qd], dim=-1).reshape(-1, 2 * n)
         rows = states, tau.reshape(-1, n), z.reshape(len(states), n, elements)
-        # backwards: vmap of a forward derivative of linalg.solve is wrong in torch 2.13
-        by_state, by_input = torch.func.vmap(torch.func.jacrev(function, argnums=(0, 1)))(*rows)
+        by_state, by_input = batched_jacobians(function, 2, *rows)
         return by_state.reshape(*batch, 2 * n, 2 * n), by_input.reshape(*batch, 2 * n, n)
 
     def pose(self, q: Tensor) -> Tensor:
@@ -167,3 +170,14 @@ class PreparedModel:
         if self._tip is None:
             raise ValueError("no tip: give model.prepared(tip=spelgen.tip_kinematics(arm))")
         return self._tip
+
+
+def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: Tensor) -> tuple[Tensor, ...]:
+    """Return a state's function's derivatives by its first inputs, for a batch of states."""
+    if not torch.is_grad_enabled():
+        states = tuple(x.detach() for x in states)
+    # vmap of a derivative of linalg.solve is wrong in torch 2.13 if it is forward, or without autograd
+    with torch.inference_mode(False), torch.enable_grad():
+        jacobian = torch.func.vmap(torch.func.jacrev(function, argnums=tuple(range(variables))))
+        derivatives: tuple[Tensor, ...] = jacobian(*(x.clone() for x in states))
+    return derivatives

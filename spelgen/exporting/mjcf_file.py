@@ -79,7 +79,7 @@ def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> d
         "damping": friction.viscous[k],
         # MuJoCo has one Coulomb friction for both directions
         "frictionloss": (friction.forward[k] - friction.backward[k]) / 2,
-        "solimpfriction": TUNING.friction_impedance,
+        "solimpfriction": " ".join(f"{number:g}" for number in TUNING.friction_impedance),
         "range": projection.arm.arm.coordinates[k].limits,
     }
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import cast
 
 import numpy as np
@@ -44,12 +45,12 @@ def export_onnx(trained: Trained) -> Exported:
 
 def onnx_model(model: PreparedModel, name: str) -> bytes:
     """Return the serialised ONNX model of an entry point."""
-    # torch tells that torchvision is absent, and that it uses what is deprecated
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    with warnings.catch_warnings(action="ignore"):
+    with _silent_exporter():
         program = export_program(model, name, flat_memory=True)
         decompositions = torch.export.default_decompositions()
         decompositions.update(_WRITTEN_OUT)
+        # ONNX's own takes the weights as they are, in place of a transposed copy
+        decompositions.pop(torch.ops.aten.linear.default)
         exported = torch.onnx.export(
             program.run_decompositions(decompositions),
             dynamo=True,
@@ -65,6 +66,19 @@ def onnx_model(model: PreparedModel, name: str) -> bytes:
         described.ClearField("metadata_props")
     serialised: bytes = content.SerializeToString()
     return serialised
+
+
+@contextmanager
+def _silent_exporter() -> Iterator[None]:
+    """Silence torch, which tells that torchvision is absent, and that it uses what is deprecated."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            yield
+    finally:
+        logger.setLevel(level)
 
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
