@@ -41,6 +41,17 @@ def test_triangles_without_common_corners_stay_one_surface(tmp_path):
     assert drawn.area == pytest.approx(ball.area, rel=0.02)
 
 
+def test_an_arm_of_fine_meshes_is_drawn(tmp_path):
+    trimesh.creation.icosphere(subdivisions=7, radius=0.1).export(tmp_path / "m.stl")  # 327,680 faces
+    visual = '<visual><geometry><mesh filename="m.stl"/></geometry></visual>'
+    links = [f"l{k}" for k in range(6)]
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(
+        f'<robot name="r">{"".join(f"""<link name="{x}">{visual}</link>""" for x in links)}</robot>'
+    )
+    assert list(shapes.visual_shapes(urdf, links)) == links
+
+
 def gltf(buffer: dict[str, object], count: int = 3, view: int | None = 0) -> str:
     """A mesh of positions in a buffer; view None: as many zeros as it says."""
     positions = {"componentType": 5126, "count": count, "type": "VEC3"}

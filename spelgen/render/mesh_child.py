@@ -3,6 +3,7 @@
 Readers of a dozen formats unpack archives, follow names of other files and repeat parts as often as a file says.
 """
 
+import gc
 import io
 import json
 import os
@@ -68,6 +69,7 @@ def main(urdf: str, links: list[str], output: IO[bytes]) -> None:
     for link in model.robot.links:
         if link.name not in links or not link.visuals:
             continue
+        gc.collect()  # meshes refer to themselves: those of other links would fill the memory
         mesh: Any = trimesh.util.concatenate([_shape(visual, Path(urdf)) for visual in link.visuals])
         # a box without size has an area of 0, corners that are no numbers or too far away have none
         if not (np.isfinite(mesh.vertices).all() and mesh.area < np.inf) or len(mesh.faces) > FACES:
