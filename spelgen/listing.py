@@ -36,8 +36,8 @@ class Listing:
 
     def text(self) -> str:
         """Return the table for a terminal or a file, without a line end."""
-        columns = self._columns()
-        tables = "\n\n".join(self._layout(columns, group) for group in _groups(columns))
+        columns = list(map(list, zip(self.head, *self.rows, strict=True)))
+        tables = "\n\n".join(self._layout(columns, group) for group in _groups(_fitted(columns)))
         note = textwrap.wrap(self.note, WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
         return "\n".join([*textwrap.wrap(self.title, WIDTH), tables, *note])
 
@@ -65,20 +65,12 @@ class Listing:
             return "left"
         return "right"
 
-    def _columns(self) -> list[list[str]]:
-        """Return the columns, the names above them folded where the table would be too wide."""
-        columns = list(map(list, zip(self.head, *self.rows, strict=True)))
-        if sum(2 + _width(column) for column in columns) > WIDTH:
-            for column in columns[1:]:
-                column[0] = _folded(column[0], max(HEAD, _width(column[1:])))
-        return columns
-
     def _layout(self, columns: Sequence[Sequence[str]], group: Sequence[int]) -> str:
         """Return the table of the names of rows, and these columns."""
-        chosen = [columns[column] for column in group]
+        names, *chosen = _fitted([columns[column] for column in (0, *group)])
         # names may be folded, numbers never are
         room = WIDTH - 2 * (1 + len(group)) - sum(map(_width, chosen))
-        chosen.insert(0, [_folded(name, max(SHORTEST, room)) for name in columns[0]])
+        chosen.insert(0, [_folded(name, max(SHORTEST, room)) for name in names])
         lines = []
         for row in zip(*chosen, strict=True):
             for cells in zip_longest(*(cell.split("\n") for cell in row), fillvalue=""):
@@ -88,6 +80,16 @@ class Listing:
                     line += f"  {cell}{blanks}" if side == "left" else f"  {blanks}{cell}"
                 lines.append(line.rstrip())
         return "\n".join(lines)
+
+
+def _fitted(columns: Sequence[Sequence[str]]) -> list[Sequence[str]]:
+    """Return the columns, the heads above numbers folded where the table would be too wide."""
+    if sum(2 + _width(column) for column in columns) <= WIDTH:
+        return list(columns)
+    fitted = [columns[0]]
+    for head, *cells in columns[1:]:
+        fitted.append([_folded(head, max(HEAD, _width(cells))), *cells])
+    return fitted
 
 
 def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
@@ -124,9 +126,14 @@ def _folded(name: str, width: int) -> str:
 
 
 def number(value: float | None) -> str:
-    """Return three significant digits, whole numbers from 1000 on; a dash for None and for what is not finite."""
+    """Return three significant digits, whole numbers from 1000 on, and all digits of a count.
+
+    A dash stands for None and for what is not finite.
+    """
     if value is None or not math.isfinite(value):
         return "-"
+    if isinstance(value, int):
+        return f"{value:,}"
     if value == 0 or 1e-3 <= abs(value) < 1e3:
         return f"{value:.3g}"
     if 1e3 <= abs(value) < 1e6:

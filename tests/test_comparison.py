@@ -208,6 +208,7 @@ def test_tables_stand_beside_published_figures(study):
     tables = comparison_tables(results, time_steps(study), study.settings.published)
     rows = {row.label: list(map(row.text, table.columns)) for table in tables for row in table.rows}
     assert rows["outputs of M"] == ["21", "1"]
+    assert rows["parameters"] == [f"{result.sizes.parameters:,}" for result in results]
     assert rows["published: prediction loss"] == ["0.194", ""]
     base, ours = (result.prediction.loss for result in results)
     assert rows["phnode's prediction loss / this"] == ["1", f"{base / ours:.3g}"]

@@ -67,6 +67,17 @@ def test_three_digits():
     ]
 
 
+def test_counts_keep_all_digits():
+    assert [number(x) for x in (0, 52_611, 1_234_567)] == ["0", "52,611", "1,234,567"]
+
+
+def test_heads_are_folded_only_where_a_part_is_too_wide():
+    head = ("", *(f"a head of {k} many words" for k in range(6)))
+    folded, whole = Listing("", head, (("name", *["1"] * 6),)).text().split("\n\n")
+    assert folded.count("a head of") == 5 and "0 many words" not in folded
+    assert whole.splitlines() == ["        a head of 5 many words", "  name                       1"]
+
+
 def test_a_table_too_wide_for_the_words_of_its_names_is_cut_into_several():
     head = ("", *(f"variant {k}" for k in range(6)))
     rows = (("published: parameters", *["1.80e-05 *"] * 6), ("training step [ms]", *["100.0 *"] * 6))

@@ -5,6 +5,7 @@ import json
 import os
 import resource
 import struct
+import subprocess
 import time
 import zipfile
 from pathlib import Path
@@ -14,6 +15,8 @@ import pytest
 import trimesh
 from machine import in_time
 
+from spelgen.render import shapes
+from spelgen.render.mesh_child import mesh_file
 from spelgen.render.scene import scene
 
 ARM = """<robot name="r"><link name="a"/><link name="b"><visual><geometry><mesh filename="FILE"/></geometry></visual>
@@ -36,6 +39,17 @@ def test_triangles_without_common_corners_stay_one_surface(tmp_path):
     assert len(drawn.faces) < 0.5 * len(ball.faces)
     assert drawn.is_watertight
     assert drawn.area == pytest.approx(ball.area, rel=0.02)
+
+
+def test_an_arm_of_fine_meshes_is_drawn(tmp_path):
+    trimesh.creation.icosphere(subdivisions=7, radius=0.1).export(tmp_path / "m.stl")  # 327,680 faces
+    visual = '<visual><geometry><mesh filename="m.stl"/></geometry></visual>'
+    links = [f"l{k}" for k in range(6)]
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(
+        f'<robot name="r">{"".join(f"""<link name="{x}">{visual}</link>""" for x in links)}</robot>'
+    )
+    assert list(shapes.visual_shapes(urdf, links)) == links
 
 
 def gltf(buffer: dict[str, object], count: int = 3, view: int | None = 0) -> str:
@@ -144,7 +158,13 @@ def triangle_beyond_all_areas(folder: Path) -> str:
     return plain_obj(folder) + '" scale="1e200 1e200 1e200'
 
 
-DRAWN = (plain_obj, plain_gltf, gltf_with_a_file, obj_whose_material_is_a_pipe)
+def box_without_size(folder: Path) -> str:
+    shown = '"/></geometry></visual><visual><geometry><box size="0 0 0"/></geometry></visual>'
+    balls = '<visual><geometry><sphere radius="0'
+    return f"{plain_obj(folder)}{shown}{balls}"
+
+
+DRAWN = (box_without_size, plain_obj, plain_gltf, gltf_with_a_file, obj_whose_material_is_a_pipe)
 LEFT_OUT = (
     pipe, gltf_whose_buffer_is_a_pipe, gltf_whose_buffer_lies_elsewhere, gltf_of_gigabytes, archive_of_gigabytes,
     stl_that_says_more_than_it_has, ply_that_says_more_than_it_has, corners_that_are_no_numbers,
@@ -164,3 +184,30 @@ def test_meshes_are_drawn_or_left_out_in_bounds(tmp_path, make):
     # kB, of the largest process so far: another test's may have been larger
     assert after.ru_maxrss <= max(used.ru_maxrss, 1_100_000)
     assert time.monotonic() - begin < 60  # what waits for a pipe uses no processor
+
+
+@pytest.mark.parametrize(
+    "name", ["package://arm/meshes/m.obj", "../meshes/m.obj", "file://FOLDER/meshes/m.obj"]
+)
+def test_meshes_are_found_by_each_way_to_name_them(tmp_path, name):
+    (tmp_path / "meshes").mkdir()
+    plain_obj(tmp_path / "meshes")
+    (tmp_path / "urdf").mkdir()
+    urdf = tmp_path / "urdf" / "arm.urdf"
+    assert mesh_file(urdf, name.replace("FOLDER", str(tmp_path))).samefile(tmp_path / "meshes" / "m.obj")
+    for missing in ("package://arm/m.obj", "package://arm", "", "m" * 5000, "m\0"):
+        with pytest.raises(FileNotFoundError):
+            mesh_file(urdf, missing)
+
+
+@pytest.mark.parametrize("printed", [b"", b"a warning\n", b"PK\x03\x04", None])
+def test_no_answer_of_the_process_is_an_error(tmp_path, monkeypatch, printed):
+    """Tubes are drawn; printed None: it is not even started, for a mesh that is missing."""
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(ARM.replace("FILE", "m.obj"))
+    answers = []
+    if printed is not None:
+        plain_obj(tmp_path)
+        answers.append(subprocess.CompletedProcess([], 0, printed))
+    monkeypatch.setattr(shapes.subprocess, "run", lambda *_, **__: answers.pop())
+    assert not scene(urdf, ["j"]).has_meshes and not answers

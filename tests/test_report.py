@@ -9,11 +9,16 @@ import pytest
 import torch
 from html_page import Page
 
+from spelgen.design import PRESETS
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
+from spelgen.fitting.run_folder import RunFolder
 from spelgen.pipeline import generate as pipeline
+from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.render.report_page import render_report, write_report
+from spelgen.render.run_facts import commands
 from spelgen.settings.fits import Rollout
+from spelgen.spec import read_facts
 
 
 def errors(share, tip=None):
@@ -125,7 +130,25 @@ def test_numbers_are_those_of_the_run(run):
     assert "But URDF is better after 1 step." in text
     assert "34 for training, 17 for validation" in text
     assert "--objective rollout --set seed=7 --set epochs=30 --set cutoff=8.0 --set decimation=1" in text
-    assert "2,000 steps on the momentum" in text
+    assert "2,000 steps on the momentum" in text and "rk4, 4 steps between samples" in text
+    assert "spelgen build rpr.urdf --net mlp -o module.py spelgen train module.py --data LOGS" in text
+
+
+def test_a_run_of_one_s_own_preset_says_which_file_it_needs(run, robots, tmp_path):
+    preset = tmp_path / "mine.yaml"
+    preset.write_text((PRESETS / "minimal.yaml").read_text())
+    module = pipeline.generate(load_arm(robots / "rpr.urdf", joints=["joint1", "joint2"]), preset, net="kan")
+    (run / "module.py").write_text(module, encoding="utf-8")
+    first = commands(RunFolder(run), read_facts(run / "module.py"), None)[0]
+    assert first == "spelgen build rpr.urdf --preset mine.yaml --net kan --joints joint1,joint2 -o module.py"
+
+
+def test_long_trainings_are_told_in_minutes_and_hours(run):
+    lines = (run / "metrics.jsonl").read_text().splitlines()
+    for seconds, said in ((150, "2.5 min"), (9000, "2.5 h")):
+        last = json.loads(lines[-1]) | {"seconds": seconds}
+        (run / "metrics.jsonl").write_text("\n".join([*lines[:-1], json.dumps(last)]))
+        assert f"30 epochs, 600 steps, {said}" in render_report(run)
 
 
 def test_a_run_that_never_got_better_says_so(run):
@@ -210,7 +233,7 @@ def test_names_from_files_are_escaped(run):
 
 @pytest.mark.parametrize("preset", ["closed-form", "spel", "spel-kan", "phnode"])
 def test_a_run_of_any_preset_has_its_page(run, robots, preset):
-    (run / "module.py").write_text(pipeline.generate(robots / "rpr.urdf", preset), encoding="utf-8")
+    (run / "module.py").write_text(pipeline.generate(robots / "rpr.urdf", preset, width=8), encoding="utf-8")
     (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
     (run / "robot.yaml").write_bytes((robots / "rpr.yaml").read_bytes())
     torch.save(load_module(run / "module.py").state_dict(), run / "model.pt")
@@ -219,7 +242,9 @@ def test_a_run_of_any_preset_has_its_page(run, robots, preset):
     assert "canvas" in page.tags and len(text) < 2_000_000
     told = " ".join(" ".join(page.text).split())
     assert ("Masses, centres of mass" in told) == (preset == "closed-form")
-    assert f"Preset {preset} ," in told and "train RUN/module.py --robot RUN/robot.urdf" in told
+    assert f"Preset {preset} ," in told
+    build = told[told.index(f"spelgen build RUN/robot.urdf --preset {preset} ") :]
+    assert "--width 8 -o module.py spelgen train module.py --robot RUN/robot.urdf --data LOGS" in build
     units = {"Nm": "joint1", "N": "joint2"}
     for unit, joint in units.items():
         assert f"Torque of {joint}" in text and f"torque [{unit}]" in text

@@ -58,6 +58,14 @@ def test_a_run_without_evaluation_cannot_be_set_beside_others(run):  # noqa: F81
         render_runs([run, run])
 
 
+def test_runs_of_one_name_are_told_apart_by_the_folders_that_differ(run, tmp_path):  # noqa: F811
+    again = tmp_path / "again" / "run"
+    shutil.copytree(run, again)
+    page = render_runs([run, again])
+    assert f"{tmp_path.name}/run" in page and "again/run" in page
+    assert str(tmp_path) not in page
+
+
 def test_the_table_holds_every_figure_once_with_its_unit():
     head, *rows = csv.reader(io.StringIO(csv_text(Results.from_dict(EVALUATION))))
     assert tuple(head) == CSV_HEAD

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import product
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -36,9 +35,6 @@ from spelgen.settings.fits import DEFAULTS, Rollout
 from spelgen.settings.tuning.comparison import ComparisonTuning
 from spelgen.structure.nominal import working_range
 from spelgen.tasks import RunTasks
-
-if TYPE_CHECKING:
-    pass
 
 TUNING = ComparisonTuning()
 

@@ -1,9 +1,12 @@
-"""Reads what a URDF shows, in a process of bounded time and memory: URDF LINK... -> NPZ on stdout.
+"""Reads what a URDF shows, in a process of bounded time and memory: [URDF, LINK...] as JSON -> NPZ on stdout.
 
 Readers of a dozen formats unpack archives, follow names of other files and repeat parts as often as a file says.
 """
 
+import gc
 import io
+import json
+import os
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -16,7 +19,7 @@ from spelgen.files import read_bytes
 from spelgen.settings.tuning.render import TUNING
 
 MEMORY = 1_073_741_824  # bytes
-SECONDS = 8  # of processor time
+SECONDS = 30  # of processor time: imports and simplification of fine meshes take most of it
 LARGEST = 50_000_000  # bytes of a file
 FACES = 2_000_000  # of a link: more are an archive that unpacks to no end
 
@@ -32,6 +35,20 @@ class Neighbours:
         return read_bytes(self._folder / Path(name.strip()).name, SpelgenError, largest=LARGEST)
 
     __getitem__ = get
+
+
+def mesh_file(urdf: Path, name: str) -> Path:
+    """Return the file of a mesh by what the URDF calls it. Raises FileNotFoundError.
+
+    It is looked for beside the URDF and in all folders above, which a package's name may stand for.
+    """
+    scheme, _, rest = name.rpartition("://")
+    path = Path(rest)
+    inner = Path(*path.parts[scheme == "package" :])
+    for place in (urdf.parent / inner, path, *(folder / inner for folder in urdf.parents)):
+        if os.path.isfile(place):  # unlike Path.is_file it answers for names that no system takes
+            return place
+    raise FileNotFoundError(name)
 
 
 def main(urdf: str, links: list[str], output: IO[bytes]) -> None:
@@ -52,9 +69,11 @@ def main(urdf: str, links: list[str], output: IO[bytes]) -> None:
     for link in model.robot.links:
         if link.name not in links or not link.visuals:
             continue
-        mesh: Any = trimesh.util.concatenate([_shape(visual, model) for visual in link.visuals])
-        if not 0 < mesh.area < np.inf or len(mesh.faces) > FACES:
-            raise ValueError(f"{link.name}: none or too many triangles, or corners that are no numbers")
+        gc.collect()  # meshes refer to themselves: those of other links would fill the memory
+        mesh: Any = trimesh.util.concatenate([_shape(visual, Path(urdf)) for visual in link.visuals])
+        # a box without size has an area of 0, corners that are no numbers or too far away have none
+        if not (np.isfinite(mesh.vertices).all() and mesh.area < np.inf) or len(mesh.faces) > FACES:
+            raise ValueError(f"{link.name}: too many triangles, or corners that are no numbers")
         if len(mesh.faces) > TUNING.faces // len(links):
             mesh = mesh.simplify_quadric_decimation(face_count=TUNING.faces // len(links), aggression=3)
         index = links.index(link.name)
@@ -65,7 +84,7 @@ def main(urdf: str, links: list[str], output: IO[bytes]) -> None:
     output.write(buffer.getbuffer())
 
 
-def _shape(visual: Any, model: Any) -> Any:
+def _shape(visual: Any, urdf: Path) -> Any:
     """Return a visual of the URDF as a mesh in its link's frame."""
     from trimesh import creation
 
@@ -77,7 +96,7 @@ def _shape(visual: Any, model: Any) -> Any:
     elif geometry.sphere is not None:
         shape = creation.uv_sphere(geometry.sphere.radius, count=[8, 10])
     else:
-        shape = _read(Path(model._filename_handler(geometry.mesh.filename)))
+        shape = _read(mesh_file(urdf, geometry.mesh.filename))
         if geometry.mesh.scale is not None:
             shape.apply_scale(geometry.mesh.scale)
     if visual.origin is not None:
@@ -94,8 +113,11 @@ def _read(path: Path) -> Any:
     mesh: Any = trimesh.load(content, file_type=kind, resolver=neighbours, force="mesh")  # type: ignore[arg-type]
     # files give each triangle or patch corners of its own: apart, they would tear when they are simplified
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    if not len(mesh.faces):
+        raise ValueError(f"{path}: no triangles")
     return mesh
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2:], sys.stdout.buffer)
+    urdf, *links = json.load(sys.stdin)
+    main(urdf, links, sys.stdout.buffer)

@@ -186,5 +186,5 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         under_servos=config.get("mapping", {}).get("input") == "position",
         summary=servo_summary(config),
         parameters=parameter_tables(model, run.arm, run.identified),
-        commands=commands(run.folder, run.config),
+        commands=commands(run.folder, facts, run.config),
     )

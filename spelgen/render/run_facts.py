@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spelgen.dynamics.parameters import parameter_count
@@ -20,6 +21,7 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.render.plots import Record
 from spelgen.settings.fits import CONFIGS
 from spelgen.settings.training import TrainingSettings
+from spelgen.spec import Facts, Options
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -43,7 +45,7 @@ def head_numbers(
         numbers.append((f"{parameter_count(model):,}", "trained parameters"))
     if metrics:
         label = f"of training, {metrics[-1]['step']:,} steps"
-        numbers.append((f"{metrics[-1]['seconds']:,.0f} s", label))
+        numbers.append((_duration(metrics[-1]["seconds"]), label))
     return numbers
 
 
@@ -76,8 +78,10 @@ def training_facts(
         origin = f"epoch {best}"
         if not best:
             origin = "the start: no epoch was better"
-        facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {last['seconds']:,.0f} s"
+        facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}"
         facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"
+        if config["config"].get("solver", "rk4") == "rk4":
+            facts["integrator"] = f"rk4, {counted(last['substeps'], 'step')} between samples"
     if config["config"].get("momentum_steps"):
         facts["start"] = f"{config['config']['momentum_steps']:,} steps on the momentum along the logs"
     return facts
@@ -97,18 +101,44 @@ def _names(trajectories: Sequence[str]) -> str:
     )
 
 
-def commands(run: RunFolder, record: Record | None) -> list[str]:
+def _duration(seconds: float) -> str:
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    minutes = seconds / 60
+    return f"{minutes:.1f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
+
+
+def commands(run: RunFolder, facts: Facts, record: Record | None) -> list[str]:
     """Return what makes a run again, from its module and its config.json; the logs' place is not known to the run."""
-    lines = []
+    options = asdict(facts.options)
+    if facts.options.design is not None:  # of a file that the run does not keep
+        options["preset"] += ".yaml"
+    # the module may name a folder of another machine before its URDF
+    robot, known = shlex.quote(Path(facts.urdf).name), ""
+    if run.urdf.exists():
+        robot = f"RUN/{run.urdf.name}"
+        known = f" --robot {robot}"
+    build = f"spelgen build {robot}"
+    for key, value in _changed(options, asdict(Options())).items():
+        words = ",".join(value) if isinstance(value, (list, tuple)) else str(value)
+        build += f" --{key.replace('_', '-')} {shlex.quote(words)}"
+    lines = [f"{build} -o module.py"]
     if record:
         objective, chosen = record["objective"], ("validation_fraction", "seed")
-        robot = f" --robot RUN/{run.urdf.name}" if run.urdf.exists() else ""
-        train = f"spelgen train RUN/{run.module.name}{robot} --data LOGS -o RUN2 --objective {objective}"
+        train = f"spelgen train module.py{known} --data LOGS -o RUN2 --objective {objective}"
         defaults = CONFIGS[objective]().model_dump(mode="json") | asdict(Preprocessing())
         defaults |= TrainingSettings().model_dump(include=set(chosen))
         options = {key: record[key] for key in chosen} | record["config"] | record["preprocessing"]
-        for key, value in options.items():
-            if value is not None and value != defaults.get(key) and not isinstance(value, Mapping):
-                train += f" --set {shlex.quote(f'{key}={value}')}"
+        for key, value in _changed(options, defaults).items():
+            train += f" --set {shlex.quote(f'{key}={value}')}"
         lines.append(train)
     return [*lines, "spelgen evaluate RUN2 --data LOGS", "spelgen report RUN2"]
+
+
+def _changed(options: Mapping[str, object], defaults: Mapping[str, object]) -> dict[str, object]:
+    """Return the options that are set to something else than by default."""
+    changed = {}
+    for key, value in options.items():
+        if value is not None and value != defaults.get(key) and not isinstance(value, Mapping):
+            changed[key] = value
+    return changed

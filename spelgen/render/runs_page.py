@@ -47,11 +47,13 @@ def render_runs(folders: Sequence[Path]) -> str:
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Return the folders' own names, or their paths where names are alike."""
+    """Return the folders' own names, with as many parents' as tell them apart: a page names no one's home."""
     paths = list(map(Path.resolve, folders))
-    names = [path.name for path in paths]
-    if len(set(names)) < len(names):
-        names = list(map(str, paths))
+    names: list[str] = []
+    for count in range(1, max(len(path.parts) for path in paths) + 1):
+        names = ["/".join(path.parts[-count:]) for path in paths]
+        if len(set(names)) == len(names):
+            break
     return names
 
 
