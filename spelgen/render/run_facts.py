@@ -114,10 +114,10 @@ def commands(run: RunFolder, facts: Facts, record: Record | None) -> list[str]:
     if facts.options.design is not None:  # of a file that the run does not keep
         options["preset"] += ".yaml"
     # the module may name a folder of another machine before its URDF
-    robot, known = shlex.quote(Path(facts.urdf).name), ""
+    robot, option = shlex.quote(Path(facts.urdf).name), ""
     if run.urdf.exists():
         robot = f"RUN/{run.urdf.name}"
-        known = f" --robot {robot}"
+        option = f" --robot {robot}"
     build = f"spelgen build {robot}"
     for key, value in _changed(options, asdict(Options())).items():
         words = ",".join(value) if isinstance(value, (list, tuple)) else str(value)
@@ -125,7 +125,7 @@ def commands(run: RunFolder, facts: Facts, record: Record | None) -> list[str]:
     lines = [f"{build} -o module.py"]
     if record:
         objective, chosen = record["objective"], ("validation_fraction", "seed")
-        train = f"spelgen train module.py{known} --data LOGS -o RUN2 --objective {objective}"
+        train = f"spelgen train module.py{option} --data LOGS -o RUN2 --objective {objective}"
         defaults = CONFIGS[objective]().model_dump(mode="json") | asdict(Preprocessing())
         defaults |= TrainingSettings().model_dump(include=set(chosen))
         options = {key: record[key] for key in chosen} | record["config"] | record["preprocessing"]
