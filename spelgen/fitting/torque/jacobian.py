@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -57,7 +59,8 @@ class Slope(NamedTuple):
     missing: torch.Tensor
 
 
-class FollowingFunctions(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class FollowingFunctions:
     """Functions of a joint's position, of which weights follow whatever else explains its torque: variable projection
     (Golub and Pereyra, SIAM J. Numer. Anal. 10:413, 1973).
 
@@ -67,11 +70,16 @@ class FollowingFunctions(NamedTuple):
     features: torch.Tensor
     penalty: torch.Tensor
 
+    @cached_property
+    def gains(self) -> torch.Tensor:
+        """Return the weights by the torque of each sample (P, T)."""
+        curvature = self.features.mT @ self.features + self.penalty.diag()
+        gains: torch.Tensor = torch.linalg.solve(curvature, self.features.mT)
+        return gains
+
     def weights(self, torque: torch.Tensor) -> torch.Tensor:
         """Return the weights (P, ...) that explain most of a torque (T, ...) at the least penalty."""
-        curvature = self.features.mT @ self.features + self.penalty.diag()
-        weights: torch.Tensor = torch.linalg.solve(curvature, self.features.mT @ torque)
-        return weights
+        return self.gains @ torque
 
     def left(self, torque: torch.Tensor) -> torch.Tensor:
         """Return (T + P, ...) what they leave of a torque (T, ...), then roots of the penalties."""
