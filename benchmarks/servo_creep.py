@@ -71,11 +71,12 @@ def main() -> None:
         found += creep(piece, q, math.radians(options.encoder_step))
         if any(piece.name == test.name for test in tests):
             missed.append(np.sqrt(np.square(q - piece.q).mean()))
-    print(f"{'creep [mrad]':20}{'holds':>8}{'measured':>12}{'model':>12}")
+    print(f"{'creep [mrad]':20}{'holds':>8}{'measured':>12}{'model':>12}{'model, where measured is 0':>30}")
     for joint, name in enumerate(model.joint_names):
         own = np.array([row[1:] for row in found if row[0] == joint]).reshape(-1, 2)
+        at_rest = own[own[:, 0] == 0, 1]
         farthest = "".join(f"{1000 * x:12.2f}" for x in own.max(axis=0, initial=0.0))
-        print(f"{name:20}{len(own):8}{farthest}")
+        print(f"{name:20}{len(own):8}{farthest}{1000 * at_rest.max(initial=0.0):24.2f} ({len(at_rest)})")
     print(f"root mean square over the tests, whole logs: {1000 * np.mean(missed):.2f} mrad")
 
 
