@@ -181,8 +181,9 @@ def test_meshes_are_drawn_or_left_out_in_bounds(tmp_path, make):
     assert scene(path, ["j"]).has_meshes == (make in DRAWN)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert in_time(after.ru_utime + after.ru_stime - used.ru_utime - used.ru_stime, 10)
-    # kB, of the largest process so far: another test's may have been larger
-    assert after.ru_maxrss <= max(used.ru_maxrss, 1_100_000)
+    # kB, of the largest process so far: another test's may have been larger, and each begins as a copy of this one
+    copied = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert after.ru_maxrss <= max(used.ru_maxrss, copied, 1_100_000)
     assert time.monotonic() - begin < 60  # what waits for a pipe uses no processor
 
 
