@@ -34,9 +34,9 @@ from spelgen.dynamics.residuals import residual_torque
 from spelgen.fitting import levenberg_marquardt
 from spelgen.fitting.torque import fit as torque_fit
 from spelgen.fitting.torque import jacobian as torque_jacobian
+from spelgen.fitting.torque import joint_functions, selection
 from spelgen.fitting.torque import prior as torque_prior
 from spelgen.fitting.torque import problem as torque_problem
-from spelgen.fitting.torque import residuals as residual_fit
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.logs import dynamics_samples
 
@@ -102,24 +102,14 @@ def nothing(response: Any, joint: int, torque: Any) -> Any:
     return torque
 
 
-class Held:
-    """Stand in for `FollowingResiduals`: functions stay while bodies are fitted."""
-
-    def by_joint(self) -> dict[int, Any]:
-        return {}
-
-    def write(self, model: Any, missing: Any) -> None:
-        pass
-
-
-def in_turns(model: Any, samples: Any, *rest: Any) -> Held:
+def in_turns(model: Any, samples: Any, *rest: Any) -> joint_functions.FollowingResiduals:
     """Stand in for `refit_residuals`: functions are fitted to what bodies leave, and then bodies beside them."""
     with torch.no_grad():
         torque = residual_torque(model, *samples[:3])
-        following = residual_fit.refit_residuals(model, samples, *rest)
+        following = joint_functions.refit_residuals(model, samples, *rest)
         torque = torque - residual_torque(model, *samples[:3])
     following.write(model, samples.missing + torque)
-    return Held()
+    return joint_functions.FollowingResiduals({}, ())
 
 
 def mechanisms() -> list[Mechanism]:
@@ -150,13 +140,13 @@ def mechanisms() -> list[Mechanism]:
         Mechanism("steps in the bodies' parameters", tuned(levenberg_marquardt, kept_promise=-NEVER)),
         Mechanism("turns of bodies and residuals", tuned(torque_jacobian, turns=1)),
         Mechanism("functions that follow bodies", ((torque_fit, "refit_residuals", in_turns),)),
-        Mechanism("residuals beside rigid bodies", tuned(residual_fit, standard_errors=NEVER)),
+        Mechanism("residuals beside rigid bodies", tuned(selection, standard_errors=NEVER)),
         Mechanism(
             "what bodies take over of springs", ((torque_jacobian.RigidResponse, "remaining", nothing),)
         ),
-        Mechanism("significance of residuals", tuned(residual_fit, standard_errors=0.0)),
-        Mechanism("gaps between blocks", tuned(residual_fit, gap=0.0)),
-        Mechanism("least gain of residuals", tuned(residual_fit, least_gain=0.0)),
+        Mechanism("significance of residuals", tuned(selection, standard_errors=0.0)),
+        Mechanism("gaps between blocks", tuned(selection, gap=0.0)),
+        Mechanism("least gain of residuals", tuned(selection, least_gain=0.0)),
         Mechanism("networks among residuals", ((torque_fit, "select_networks", lambda *_: iter(())),)),
     ]
 

@@ -16,12 +16,12 @@ from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo import laws
 from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.torque import jacobian as torque_jacobian
+from spelgen.fitting.torque import joint_functions, selection
 from spelgen.fitting.torque import objective as torque_objective
 from spelgen.fitting.torque import problem as torque_problem
-from spelgen.fitting.torque import residuals as residual_fit
 from spelgen.fitting.torque.jacobian import ResidualSamples
 from spelgen.fitting.torque.objective import fit_torques
-from spelgen.fitting.torque.residuals import select_functions
+from spelgen.fitting.torque.selection import select_functions
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.fitting.window.momentum import MomentumObjective
 from spelgen.fleet import jobs
@@ -71,8 +71,8 @@ def test_neighbours_of_what_is_held_out_are_not_fitted_to(hybrid):
     missing = levels.repeat_interleave(200, dim=0)[100:2100] * torch.tensor([[1.0, 0.0]]).double()
     q = torch.stack([torch.linspace(-2, 2, 2000), torch.zeros(2000)], dim=1).double()
     missed = samples(missing, q)
-    spline = next(residual_fit._candidates(hybrid, missed, ALONE))
-    errors, _ = residual_fit._held_out_errors(spline, missing[:, 0], 20.0)
+    spline = next(joint_functions.joint_functions(hybrid, missed, ALONE))
+    errors, _ = selection._held_out_errors(spline, missing[:, 0], 20.0)
     assert errors.square().sum() > missing.square().sum()
     assert select_functions(hybrid, missed, ALONE, [], 20.0) == []
 
@@ -96,9 +96,9 @@ def test_the_first_half_is_judged_where_it_has_been(hybrid):
     torque = torch.stack([q[:, 0].square(), torch.zeros_like(t)], dim=1)
     noise = 0.02 * torch.randn(4000, 2, generator=torch.Generator().manual_seed(0)).double()
     missed = samples(torque + noise, q)
-    spline = next(residual_fit._candidates(hybrid, missed, ALONE))
-    first, last = residual_fit.halves(4000, 1.0)
-    weights, _ = residual_fit._fit_candidate(spline, missed.missing[:, 0], 1.0, first)
+    spline = next(joint_functions.joint_functions(hybrid, missed, ALONE))
+    first, last = selection.halves(4000, 1.0)
+    weights, _ = joint_functions.fit_function(spline, missed.missing[:, 0], 1.0, first)
     error = missed.missing[last, 0] - spline.torque(weights, last)
     assert error.square().sum() > missed.missing[last, 0].square().sum()
     selected = select_functions(hybrid, missed, ALONE, [], 1.0)
@@ -124,14 +124,14 @@ def test_a_stretch_without_torque_hides_no_gain():
     squares, missed = torch.full((10,), 100.0), torch.full((10,), 10.0)
     squares[3], missed[3] = 0.0, 1e-9
     # nine of ten stretches fall to a tenth
-    assert residual_fit._significant_gain(squares, missed) == pytest.approx(0.85, abs=0.01)
+    assert selection._significant_gain(squares, missed) == pytest.approx(0.85, abs=0.01)
 
 
 def test_a_stretch_that_goes_farther_than_all_others_hides_no_gain():
     """Splines of a spring know nothing of where a joint has been once, and that is where its torque is largest."""
     squares, missed = torch.full((10,), 50.0), torch.full((10,), 1.0)
     squares[0], missed[0] = 400.0, 2e6
-    assert residual_fit._significant_gain(squares, missed) > 0.8
+    assert selection._significant_gain(squares, missed) > 0.8
 
 
 def test_a_network_is_fitted_to_what_functions_of_joints_leave(robots, monkeypatch):
@@ -141,12 +141,12 @@ def test_a_network_is_fitted_to_what_functions_of_joints_leave(robots, monkeypat
     left = []
 
     def fitted(model, network, samples, *_):
-        left.append(residual_fit._still_missing(model, samples))
+        left.append(selection._still_missing(model, samples))
         return 0.5
 
-    monkeypatch.setattr(residual_fit, "_fit_network", fitted)
+    monkeypatch.setattr(selection, "_fit_network", fitted)
     q = torch.linspace(-1, 1, 2000).double().unsqueeze(-1).expand(-1, 2)
-    assert len(list(residual_fit.select_networks(model, samples(q.sin(), q), 1.0))) == 2
+    assert len(list(selection.select_networks(model, samples(q.sin(), q), 1.0))) == 2
     for missing in left:
         torch.testing.assert_close(missing, q.sin())
 
@@ -154,13 +154,13 @@ def test_a_network_is_fitted_to_what_functions_of_joints_leave(robots, monkeypat
 def test_gains_have_to_be_beyond_their_own_scatter():
     squares = torch.ones(10).double()
     steady = torch.full((10,), 0.9).double()
-    assert residual_fit._significant_gain(squares, steady + 0.001 * torch.arange(10)) == pytest.approx(
+    assert selection._significant_gain(squares, steady + 0.001 * torch.arange(10)) == pytest.approx(
         0.0955, rel=2e-3
     )
     # as sure as can be, and next to nothing: no function is worth that
-    assert residual_fit._significant_gain(squares, 0.9999 * squares) is None
+    assert selection._significant_gain(squares, 0.9999 * squares) is None
     lucky = torch.tensor([0.1] + [1.0] * 9).double()
-    assert residual_fit._significant_gain(squares, lucky) is None
+    assert selection._significant_gain(squares, lucky) is None
 
 
 def test_samples_that_err_alike_count_once():
@@ -171,8 +171,8 @@ def test_samples_that_err_alike_count_once():
     groups = torch.zeros(4)
 
     def weights(times: int) -> torch.Tensor:
-        rows = residual_fit._beside(x, y).repeat_interleave(times, dim=0)
-        return residual_fit._most_probable(rows.mT @ rows, len(rows), groups, float(times))[0]
+        rows = joint_functions.beside(x, y).repeat_interleave(times, dim=0)
+        return joint_functions.most_probable(rows.mT @ rows, len(rows), groups, float(times))[0]
 
     torch.testing.assert_close(weights(20), weights(1), rtol=1e-6, atol=1e-9)
     assert (

@@ -22,12 +22,13 @@ from spelgen.fitting.torque import fit as torque_fit
 from spelgen.fitting.torque import jacobian as torque_jacobian
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import ResidualSamples, RigidResponse, TorqueJacobian
+from spelgen.fitting.torque.joint_functions import FRICTION
 from spelgen.fitting.torque.networks import adapt_networks
 from spelgen.fitting.torque.prior import ADAPTED, covariance, most_probable
 from spelgen.fitting.torque.problem import TorqueProblem
 from spelgen.fitting.torque.report import terms_in_use, torque_notes
-from spelgen.fitting.torque.residuals import FRICTION, select_functions
 from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.fitting.torque.selection import select_functions
 from spelgen.fitting.torque.weights import NONE, RIGID, RigidWeights, moved_bodies
 from spelgen.fitting.train import train
 from spelgen.logs import chunks

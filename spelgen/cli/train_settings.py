@@ -152,9 +152,10 @@ def resumed_run(folder: Path, request: Request) -> Start:
             do="resume it by spelgen.fit(..., folder=..., options=spelgen.RunOptions(resume=True))",
         )
     # not validated again: Python allows more than files of settings do
-    settings = TrainingSettings().model_copy(update={"seed": record["seed"], **record["preprocessing"]})
+    recorded = {"seed": record["seed"], **record["preprocessing"]}
     if fraction is not None:
-        settings = settings.model_copy(update={"validation_fraction": fraction})
+        recorded["validation_fraction"] = fraction
+    settings = TrainingSettings().model_copy(update=recorded)
 
     def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig:
         rigid_bodies = has_rigid_bodies(model)

@@ -54,8 +54,9 @@ def values_in_si(table: Table, layout: Layout, start: pa.Scalar | None, row: int
 
 def clock_start(table: Table, layout: Layout) -> pa.Scalar | None:
     """Return from where times count: the first one of a clock that shows the date, else None."""
-    times, _ = _clock(table.slice(0, 1), layout)
-    is_stamp = pa.types.is_temporal(_column(table, layout.columns[0]).type)
+    first_row = table.slice(0, 1)
+    times, _ = _clock(first_row, layout)
+    is_stamp = pa.types.is_temporal(_column(first_row, layout.columns[0]).type)
     if pa.types.is_integer(times.type) or pa.types.is_floating(times.type):
         first = times[0].as_py()
         # seconds since 1970 leave floating-point numbers no digits for what follows

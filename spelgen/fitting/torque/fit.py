@@ -1,7 +1,7 @@
 """Fit rigid bodies to torques: their most probable weights, by Levenberg-Marquardt steps.
 
 Few samples come near, all of them finish. What a model has beside rigid bodies is fitted to what these leave, where it
-pays (see ``residuals``), and then both in turn.
+pays (see ``selection``), and both are fitted together.
 """
 
 from __future__ import annotations
@@ -16,18 +16,17 @@ import torch
 
 from spelgen.dynamics.protocol import has_residuals
 from spelgen.fitting.torque.jacobian import TUNING, TorqueJacobian
+from spelgen.fitting.torque.joint_functions import clear_functions, refit_residuals
 from spelgen.fitting.torque.problem import State, TorqueProblem
-from spelgen.fitting.torque.residuals import (
+from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.fitting.torque.selection import (
     SelectedResidual,
     between_positions,
     can_be_judged,
-    clear_functions,
     halves,
-    refit_residuals,
     select_functions,
     select_networks,
 )
-from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.weights import bound_friction
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import Adaptation, GaussianPrior
@@ -110,7 +109,7 @@ def _most_samples(model: EmittedModel) -> int:
 def _with_residuals(
     problem: TorqueProblem, state: State, samples: TorqueSamples
 ) -> tuple[State, list[SelectedResidual]]:
-    """Select what stands beside rigid bodies, and fit both in turn."""
+    """Select what stands beside rigid bodies, and fit both."""
     model = problem.jacobian.model
     if samples is not problem.jacobian.samples:
         state = problem.refine(state, samples)
@@ -118,9 +117,9 @@ def _with_residuals(
     residuals: list[SelectedResidual] = []
     if not can_be_judged(samples.count, problem.lasting):
         return state, residuals
-    alone, found = state, problem.found()
+    alone, snapshot = state, problem.snapshot()
     # bodies that were fitted without a function err by more than it: only then is seen what else is missed
-    while further := select_functions(model, *problem.around(state), residuals, problem.lasting):
+    while further := select_functions(model, *problem.around(state), _chosen(residuals), problem.lasting):
         residuals += further
         state = _refit(problem, state, samples, residuals)
     if residuals:
@@ -129,9 +128,9 @@ def _with_residuals(
         clear_functions(model, losing)
         if not residuals:
             state = alone
-            problem.restore(found)
+            problem.restore(snapshot)
         state = problem.set_samples(state, TorqueJacobian(model, samples))
-    residuals += select_networks(model, problem.around(state)[0], problem.lasting)
+    residuals += select_networks(model, problem.jacobian.residual_samples(state.x), problem.lasting)
     for _ in range(TUNING.turns if residuals else 0):
         state = _refit(problem, state, samples, residuals)
     return state, residuals
@@ -144,7 +143,7 @@ def _losing_joints(
 
     alone: of a fit of bodies. state: of one beside functions.
     """
-    model, samples, found = problem.jacobian.model, problem.jacobian.samples, problem.found()
+    model, samples, snapshot = problem.jacobian.model, problem.jacobian.samples, problem.snapshot()
     first, last = halves(samples.count, problem.lasting)
     early, late = samples.rows(first), samples.rows(last)
     weights = copy.deepcopy(model.residuals.state_dict())
@@ -158,7 +157,7 @@ def _losing_joints(
     clear_functions(model, range(model.n))
     gain = missed(alone, []) - beside
     model.residuals.load_state_dict(weights)
-    problem.restore(found)
+    problem.restore(snapshot)
     # functions are known between the positions that they were fitted to
     between = between_positions(late.columns.q, early.columns.q)
     loses = (gain.sum(dim=0) <= 0) & ((gain * between).sum(dim=0) <= 0)
@@ -170,8 +169,13 @@ def _refit(
 ) -> State:
     """Fit the selected functions of joints, and bodies with them."""
     model = problem.jacobian.model
-    following = refit_residuals(model, *problem.around(state), residuals, problem.lasting)
-    state = problem.refine(state, samples, following.by_joint())
+    following = refit_residuals(model, *problem.around(state), _chosen(residuals), problem.lasting)
+    state = problem.refine(state, samples, following.functions)
     problem.jacobian.rigid.write(state.x)
     following.write(model, problem.jacobian.residual_samples(state.x).missing)
     return problem.set_samples(state, TorqueJacobian(model, samples))
+
+
+def _chosen(residuals: Sequence[SelectedResidual]) -> set[tuple[str, int | None]]:
+    """Return which residuals these are: parameters and joints."""
+    return {(residual.name, residual.joint) for residual in residuals}

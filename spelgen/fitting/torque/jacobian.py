@@ -188,12 +188,12 @@ class TorqueJacobian:
 
     def _left_by_functions(self, slopes: Iterable[Slope]) -> Iterator[Slope]:
         """Yield of each joint what its functions leave, of all samples."""
-        for joint, blocks in enumerate(_by_joint(slopes, self.model.n)):
-            slope = torch.cat([block.slope for block in blocks])
-            missing = torch.cat([block.missing for block in blocks])
-            if joint in self.functions:
-                slope, missing = (self.functions[joint].left(x) for x in (slope, missing))
-            yield Slope(joint, blocks[0].columns, slope, missing)
+        for slope in _by_joint(slopes, self.model.n):
+            functions = self.functions.get(slope.joint)
+            if functions is None:
+                yield slope
+            else:
+                yield slope._replace(slope=functions.left(slope.slope), missing=functions.left(slope.missing))
 
     def _along(self, x: torch.Tensor) -> torch.Tensor:
         """Return the derivative (K, K) of what torques are linear in by the weights: each body's are its own."""
@@ -222,12 +222,11 @@ class TorqueJacobian:
         """Return how the weights follow, that have this covariance (K, K) after a fit under this noise (n,)."""
         along = self._along(x)
         covariance = along @ covariance @ along.mT
-        slopes, gains = [], []
-        for joint, blocks in enumerate(_by_joint(self.slopes(x), len(noise))):
-            columns = blocks[0].columns
-            slopes.append(torch.cat([block.slope for block in blocks]))
+        slopes = _by_joint(self.slopes(x), len(noise))
+        gains = []
+        for joint, columns, _, _ in slopes:
             gains.append(covariance[columns[:, None], columns] / noise[joint] ** 2)
-        return RigidResponse(tuple(slopes), tuple(gains))
+        return RigidResponse(tuple(of_joint.slope for of_joint in slopes), tuple(gains))
 
     def torque_deviation(self) -> torch.Tensor:
         """Return standard deviations (n,) of the measured torque, as the joints feel it."""
@@ -328,12 +327,18 @@ class TorqueJacobian:
         return missing.detach(), by_weights, by_load
 
 
-def _by_joint(slopes: Iterable[Slope], joints: int) -> list[list[Slope]]:
-    """Return the slopes of blocks by joint."""
+def _by_joint(slopes: Iterable[Slope], joints: int) -> list[Slope]:
+    """Return the slope of each joint, of the samples of all blocks."""
     blocks: list[list[Slope]] = [[] for _ in range(joints)]
     for slope in slopes:
         blocks[slope.joint].append(slope)
-    return blocks
+    return [
+        of_joint[0]._replace(
+            slope=torch.cat([block.slope for block in of_joint]),
+            missing=torch.cat([block.missing for block in of_joint]),
+        )
+        for of_joint in blocks
+    ]
 
 
 def _normal_equations(

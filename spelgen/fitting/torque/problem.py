@@ -39,7 +39,7 @@ State = SolverState[torch.Tensor]
 EFFECTS = ("effects", "load_dependence")
 """Kinds of what varies friction, which not every joint has."""
 
-Found = tuple[torch.Tensor, torch.Tensor, GaussianPrior, torch.Tensor]
+Snapshot = tuple[torch.Tensor, torch.Tensor, GaussianPrior, torch.Tensor]
 
 
 class TorqueProblem:
@@ -145,7 +145,7 @@ class TorqueProblem:
         Bristles turn around after a displacement, and so late: where friction turns around at once, they pass for
         inertia. The gears of an arm are mostly alike: weak evidence of a joint yields to that of all.
         """
-        laws, before = self.jacobian.model.friction, self.found()
+        laws, before = self.jacobian.model.friction, self.snapshot()
         laws.memoryless.fill_(0.0)
         remembering = self.solve(self._first_fit(state.x, state.steps), TUNING.rounds)
         evidence = self._evidence(remembering, state) - self._fractions_narrowed()
@@ -172,7 +172,7 @@ class TorqueProblem:
             self.start[rows] = x[rows] = NONE
             return self.solve(replace(state, x=x, residuals=self.jacobian.squares(x)), TUNING.rounds)
 
-        before = self.found()
+        before = self.snapshot()
         plain = without(torch.ones(len(effects), dtype=torch.bool))
         unlikely = _unlikely(self._evidence(state, plain) - TUNING.effects_evidence)
         if unlikely.all():
@@ -184,13 +184,13 @@ class TorqueProblem:
         """Return how much more likely the samples of each joint (n,) are after a fit: twice the logarithm."""
         return self.count / self.lasting * (other.residuals / state.residuals).log()
 
-    def found(self) -> Found:
+    def snapshot(self) -> Snapshot:
         """Return what rounds have found, to be restored."""
         return self.start, self.noise, self.prior, self.covariance.clone()
 
-    def restore(self, found: Found) -> None:
+    def restore(self, snapshot: Snapshot) -> None:
         """Go on from what rounds had found before."""
-        self.start, self.noise, prior, self.covariance = found
+        self.start, self.noise, prior, self.covariance = snapshot
         self.set_prior(prior)
 
     def _fractions_narrowed(self) -> torch.Tensor:

@@ -121,7 +121,7 @@ class TorqueTuning:
 
 @dataclass(frozen=True)
 class ResidualTuning:
-    """Selection of what stands beside rigid bodies (`fitting.torque.residuals`)."""
+    """Selection of what stands beside rigid bodies (`fitting.torque.selection`)."""
 
     folds: int = 10  # blocks of samples that are held out in turn
     gap: float = 5.0  # [1] of the samples that err alike, 0.3 s: left out between fitted and held-out samples
