@@ -129,6 +129,8 @@ def _with_residuals(
         if not residuals:
             state = alone
             problem.restore(snapshot)
+        # the model has the bodies of a half: its armature bounds the networks of M
+        problem.jacobian.rigid.write(state.x)
         state = problem.set_samples(state, TorqueJacobian(model, samples))
     residuals += select_networks(model, problem.jacobian.residual_samples(state.x), problem.lasting)
     for _ in range(TUNING.turns if residuals else 0):
