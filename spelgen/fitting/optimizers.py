@@ -6,6 +6,7 @@ logs have many digits to find, and an engineer's first log has few windows.
 
 from __future__ import annotations
 
+import inspect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
@@ -102,6 +103,15 @@ class MiniBatchAdamW(WindowOptimizer):
         return value.detach() + 0.0 * norm
 
 
+class _EagerLBFGS(torch.optim.LBFGS):
+    """Step as torch's do, without the compiler that they import first: 5 s of a fit that may take 10."""
+
+    add_param_group = inspect.unwrap(torch.optim.Optimizer.add_param_group)
+    zero_grad = inspect.unwrap(torch.optim.Optimizer.zero_grad)
+    load_state_dict = inspect.unwrap(torch.optim.Optimizer.load_state_dict)
+    state_dict = inspect.unwrap(torch.optim.Optimizer.state_dict)
+
+
 class LBFGS(WindowOptimizer):
     """L-BFGS (Liu and Nocedal, Math. Programming 45, 1989) with a strong-Wolfe line search on all windows.
 
@@ -114,7 +124,7 @@ class LBFGS(WindowOptimizer):
     def __init__(self, model: torch.nn.Module, weight_decay: float) -> None:
         self._parameters, self._weights = _moving(model)
         self._decay, self._finite = weight_decay, True
-        self._optimizer = torch.optim.LBFGS(
+        self._optimizer = _EagerLBFGS(
             self._parameters,
             history_size=TUNING.history,
             line_search_fn="strong_wolfe",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,8 +14,9 @@ import torch
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import has_rigid_bodies, motors_of
+from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.errors import Diagnostic, LogError
-from spelgen.fitting.dataset import TrainingData, Validation
+from spelgen.fitting.dataset import Measured, TrainingData, Validation
 from spelgen.fitting.objective import Logs, PreparedLogs, TorqueLogObjective
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.torque.fit import fit_torque
@@ -27,6 +29,7 @@ from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay, find_torq
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
+from spelgen.logs.windows import thinned
 from spelgen.settings.fits import TorqueFit
 from spelgen.settings.tuning.identification import HINTS
 
@@ -76,17 +79,22 @@ class TorqueObjective(TorqueLogObjective):
         if not has_rigid_bodies(model):  # the torques of rigid bodies have a prior of their own
             regularizer = self._regularizer(self.data, self.config.urdf_weight, notes)
         notes += fit_torques(model, samples, self.config, regularizer)
-        measured = Validation(model, self.data, self.request.options.device).measure()
+        measured = self._measured()
         self._checkpoint = {
             "epoch": 0,
             "step": 0,
             "best_epoch": 0,
             "best_loss": measured.loss,
-            "best_weights": measured.weights,
+            "best_weights": copy.deepcopy(model.state_dict()),
             "seconds": time.monotonic() - self.request.began,
             "substeps": measured.substeps,
         }
         return notes
+
+    def _measured(self) -> Measured:
+        """Return what a few windows of validation say of the model, without residuals that were not selected."""
+        few = replace(self.data, validation=thinned(self.data.validation, TUNING.measured_windows))
+        return Validation(without_idle_residuals(self.model), few, self.request.options.device).measure()
 
 
 def torque_delay(model: EmittedModel, logs: Logs, preprocessing: Preprocessing) -> TorqueDelay:
