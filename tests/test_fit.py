@@ -191,6 +191,18 @@ def test_a_fit_tells_what_it_is():
     assert "momentum steps" in found._repr_html_()
 
 
+def test_a_fit_to_torques_tells_their_error(tmp_path):
+    log = swings(1)
+    found = spelgen.fit(spelgen.load_module(STAND_IN), log, TorqueFit(evaluations=20))
+    nmse = found.torque_nmse
+    assert list(nmse) == list(found.model.joint_names)
+    judged = spelgen.evaluate(found, log, steps=(1,), seconds=()).torque["model"]
+    assert list(nmse.values()) == pytest.approx(judged.joint_nmse)
+    assert found.result.startswith(f"torque nMSE {judged.mean_nmse:.3g}, at worst {judged.worst_nmse:.3g} (")
+    found.save(tmp_path / "run")
+    assert found.result in repr(spelgen.load_run(tmp_path / "run"))
+
+
 @pytest.mark.parametrize("samples, preset", [(4, "spel"), (4, "closed-form"), (22, "phnode")])
 def test_both_solvers_agree(tmp_path, samples, preset, monkeypatch):
     """In what they predict and in its gradient."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -151,7 +152,9 @@ def _tell(fit: Fit, folder: Path, paths: Sequence[Path], format: str, *, resume:
         "steps": fit.steps,
         "epochs": fit.epochs,
         "seconds": fit.seconds,
-        "validation_loss": fit.best_validation,
+        # a rollout may have left all bounds, and JSON has no word for that
+        "validation_loss": fit.best_validation if math.isfinite(fit.best_validation) else None,
+        "torque_nmse": fit.torque_nmse,
         "findings": [finding.to_dict() for finding in fit.diagnostics],
     }
     answer(format, record, *_outcome(fit), f"run folder: {folder}")
@@ -164,23 +167,23 @@ def _outcome(fit: Fit) -> tuple[str, str]:
     """Return how a fit ended, with the reason where its status does not say it, and what it came to."""
     from spelgen.fitting.servo.report import servo_summary
 
-    config, loss = fit.config, f"validation loss {fit.best_validation:.3g}"
+    config, result = fit.config, fit.result
     reason = ""
     if fit.status == "out of time" and isinstance(config, WindowConfig):
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
     if not isinstance(config, Rollout):  # windows only judge
         summary = servo_summary(fit.record)
         if summary is not None:
-            loss = summary.text
+            result = summary.text
         elif not fit.record["validation_windows"]:
-            loss = f"{fit.steps} steps were taken"
-        return f"{fit.status}: {config.objective} fitted in {fit.seconds:.0f} s{reason}", loss
+            result = f"{fit.steps} steps were taken"
+        return f"{fit.status}: {config.objective} fitted in {fit.seconds:.0f} s{reason}", result
     if fit.status == "stopped early":
         reason = f": no better validation loss since epoch {fit.best_epoch}"
     elif fit.status == "finished":
         reason = ": all epochs are run" if fit.epochs >= config.epochs else ": no way further down"
     end = f"{fit.status} after {counted(fit.epochs, 'epoch')}, {fit.steps} steps, {fit.seconds:.0f} s{reason}"
-    return end, f"best {loss}, at epoch {fit.best_epoch}"
+    return end, f"best {result}, at epoch {fit.best_epoch}"
 
 
 def _warm_start(request: Request) -> Request:

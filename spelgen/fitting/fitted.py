@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -70,6 +71,24 @@ class Fit:
     def best_validation(self) -> float:
         """`rollout_loss` of the validation windows, without unit."""
         return float(self.checkpoint["best_loss"])
+
+    @property
+    def torque_nmse(self) -> dict[str, float]:
+        """Mean squared error by variance of the torques that were fitted, by joint; of a joint without any, none."""
+        by_joint = zip(self.model.joint_names, self.checkpoint.get("torque_nmse", ()), strict=False)
+        return {joint: nmse for joint, nmse in by_joint if math.isfinite(nmse)}
+
+    @property
+    def result(self) -> str:
+        """The outcome in words: the error of torques that were fitted, else the validation loss."""
+        nmse = self.torque_nmse
+        if not nmse:
+            return f"validation loss {self.best_validation:.3g}"
+        worst = max(nmse, key=nmse.__getitem__)
+        mean = sum(nmse.values()) / len(nmse)
+        return (
+            f"torque nMSE {mean:.3g}, at worst {nmse[worst]:.3g} ({worst}), of the samples that were fitted"
+        )
 
     @property
     def seconds(self) -> float:
@@ -148,7 +167,7 @@ class Fit:
             return self.model.inverse_dynamics(*inputs).cpu().double().numpy()
 
     def __repr__(self) -> str:
-        end = f"{self.epochs} epochs, validation loss {self.best_validation:.3g}"
+        end = f"{self.epochs} epochs, {self.result}"
         if self.status:
             end = f"{self.status} after {end}"
         return f"<Fit of {self.record['robot']!r} to {self.config.objective}: {end}>"
@@ -159,7 +178,7 @@ class Fit:
             ("objective", self.config.objective),
             ("parameters", f"{self.parameters}"),
             ("epochs", f"{self.epochs}"),
-            ("validation loss", f"{self.best_validation:.3g}"),
+            ("result", self.result),
             *((name.replace("_", " "), f"{value}") for name, value in self.record["config"].items()),
         ]
         return Listing("Fit", ("", ""), tuple(rows), left=(0, 1)).html()

@@ -13,7 +13,7 @@ import torch
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.bristles import bristle_reach
-from spelgen.dynamics.protocol import has_rigid_bodies, motors_of
+from spelgen.dynamics.protocol import has_rigid_bodies, known_past, motors_of
 from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import Measured, TrainingData, Validation
@@ -21,7 +21,7 @@ from spelgen.fitting.objective import Logs, PreparedLogs, TorqueLogObjective
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import TUNING
-from spelgen.fitting.torque.networks import adapt_networks, fit_networks
+from spelgen.fitting.torque.networks import BLOCK, adapt_networks, fit_networks
 from spelgen.fitting.torque.report import torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
@@ -88,6 +88,7 @@ class TorqueObjective(TorqueLogObjective):
             "best_weights": copy.deepcopy(model.state_dict()),
             "seconds": time.monotonic() - self.request.began,
             "substeps": measured.substeps,
+            "torque_nmse": torque_nmse(model, samples),
         }
         return notes
 
@@ -95,6 +96,19 @@ class TorqueObjective(TorqueLogObjective):
         """Return what a few windows of validation say of the model, without residuals that were not selected."""
         few = replace(self.data, validation=thinned(self.data.validation, TUNING.measured_windows))
         return Validation(without_idle_residuals(self.model), few, self.request.options.device).measure()
+
+
+def torque_nmse(model: EmittedModel, samples: TorqueSamples) -> list[float]:
+    """Return the mean squared torque error of the samples by joint, relative to the variance of the torque."""
+    tau = samples.columns.tau
+    squares = torch.zeros(model.n, dtype=torch.float64)
+    with torch.no_grad():
+        for block in samples.blocks(BLOCK):
+            past = known_past(model, block.z, block.direction)
+            error = model.inverse_dynamics(block.q, block.qd, block.qdd, *past) - block.tau
+            squares += error.square().sum(dim=0)
+    nmse: list[float] = (squares / len(tau) / tau.var(dim=0, correction=0)).tolist()
+    return nmse
 
 
 def torque_delay(model: EmittedModel, logs: Logs, preprocessing: Preprocessing) -> TorqueDelay:
