@@ -82,6 +82,20 @@ def test_where_it_fails_follows_the_residuals(slow, fast, place):
     assert verdict(evaluation(traces=torques(slow, fast))).sentence.endswith(place)
 
 
+@pytest.mark.parametrize("nmse, worst", [(0.004, "a"), (0.2, "b")])
+def test_where_motion_alone_fails_its_joint_is_named(nmse, worst):
+    judged = evaluation(0.7, nmse)
+    missed = judged.horizons[-1].errors
+    missed["model"] = replace(missed["model"], q_relative_rms=(1.3, 0.1))
+    assert f"; worst at {worst}." in verdict(judged).sentence
+
+
+def test_a_terminal_shows_the_verdict_last():
+    text, judged = evaluation(0.7).text(), verdict(evaluation(0.7))
+    assert " ".join(text.split("\n\n")[-1].split()) == f"{judged.sentence} {judged.because}"
+    assert max(map(len, text.splitlines())) <= 80
+
+
 def of_torques(by_joint, steps=None):
     mean = sum(by_joint) / len(by_joint)
     judged = results(

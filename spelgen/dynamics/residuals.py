@@ -6,7 +6,7 @@ import copy
 from typing import TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from spelgen.dynamics.protocol import has_residuals
 from spelgen.runtime.masked_kan import MaskedKAN
@@ -27,6 +27,12 @@ def idle_residuals(model: object) -> list[str]:
         if _is_idle(getattr(terms, part)):
             idle += [name for name, _ in terms.named_parameters() if name.startswith(f"{part}.")]
     return [f"residuals.{name}" for name in idle]
+
+
+def used_parameter_count(model: nn.Module) -> int:
+    """Return how many numbers make a model: those of residuals that add nothing do not count."""
+    idle = idle_residuals(model)
+    return sum(weights.numel() for name, weights in model.named_parameters() if name not in idle)
 
 
 def without_residuals(model: Model) -> Model:

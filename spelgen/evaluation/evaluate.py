@@ -11,9 +11,8 @@ from spelgen.baselines.baseline import CommandFollower, JudgedArm
 from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import Predictor, accurate_solver, of_dynamics
 from spelgen.baselines.registry import BASELINES
-from spelgen.dynamics.parameters import parameter_count
 from spelgen.dynamics.protocol import input_of
-from spelgen.dynamics.residuals import without_idle_residuals
+from spelgen.dynamics.residuals import used_parameter_count, without_idle_residuals
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import Diagnostic, LogError, in_one_line
 from spelgen.evaluation.horizons import (
@@ -175,7 +174,7 @@ def _results(
         joints=tuple(judged.joints),
         joint_types=tuple(judged.model.joint_types),
         trajectories=tuple(trajectory.name for trajectory in logs),
-        parameters=parameter_count(judged.model),
+        parameters=used_parameter_count(judged.model),
         diagnostics=tuple(notes),
         traces=traces,
         **figures,

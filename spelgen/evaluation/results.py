@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import dataclass
 from html import escape
 
@@ -10,16 +11,19 @@ from spelgen.evaluation.measurements import Measurements
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.verdict import verdict
 from spelgen.labels import counted
+from spelgen.listing import WIDTH
 
 
 @dataclass(frozen=True, repr=False)
 class Results(Measurements):
-    """Show what `evaluate` measures: `text` in a terminal, the same tables under a verdict in a notebook."""
+    """Show what `evaluate` measures: the same tables and verdict as `text` in a terminal and in a notebook."""
 
     def text(self) -> str:
-        """Return every table for a terminal, the best of each row starred."""
+        """Return every table for a terminal, the best of each row starred, then the verdict."""
         tables = [table.text() for table in result_tables(self)]
-        return "\n\n".join([f"{self._heading()}; * marks the best of a row", *tables])
+        judged = verdict(self)
+        conclusion = textwrap.fill(f"{judged.sentence} {judged.because}", WIDTH, break_on_hyphens=False)
+        return "\n\n".join([f"{self._heading()}; * marks the best of a row", *tables, conclusion])
 
     def __repr__(self) -> str:
         heading = self._heading()

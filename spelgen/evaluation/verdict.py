@@ -183,19 +183,32 @@ def _better_baselines(results: Measurements) -> list[str]:
 
 
 def _worst_joint(results: Measurements) -> tuple[str, str, str]:
-    """Return the joint whose torque is explained least, else that whose motion is; when; and a sentence about it."""
+    """Return the joint whose torque is explained least, or whose motion is where that alone fails; when; and a sentence
+    about it.
+    """
     joint, error = _worst_torque(results)
-    if joint:
-        amount = share(math.sqrt(error), "the torque's standard deviation")
-        speed = _slow_or_fast(results, results.joints.index(joint))
-        return joint, speed, f"At {joint} the torque residual is {amount}."
+    moved, motion_error = _worst_motion(results)
+    motion_alone = error <= 1 - TUNING.explained_for_contacts and motion_error > TUNING.close_prediction
+    if moved and (motion_alone or not joint):
+        amount = share(motion_error, "the motion")
+        return moved, "", f"At {moved} the error after {results.horizons[-1].name} is {amount}."
+    if not joint:
+        return "", "", ""
+    amount = share(math.sqrt(error), "the torque's standard deviation")
+    return (
+        joint,
+        _slow_or_fast(results, results.joints.index(joint)),
+        f"At {joint} the torque residual is {amount}.",
+    )
+
+
+def _worst_motion(results: Measurements) -> tuple[str, float]:
+    """Return the joint that the longest rollouts miss by most of its motion, and by how much of it."""
     for last in results.horizons[-1:]:
         errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # NaN of None
         if np.isfinite(errors).all():
-            joint = results.joints[errors.argmax()]
-            amount = share(errors.max(), "the motion")
-            return joint, "", f"At {joint} the error after {last.name} is {amount}."
-    return "", "", ""
+            return results.joints[errors.argmax()], errors.max()
+    return "", math.inf
 
 
 def _slow_or_fast(results: Measurements, k: int) -> str:

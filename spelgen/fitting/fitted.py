@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
-from spelgen.dynamics.parameters import parameter_count
+from spelgen.dynamics.residuals import used_parameter_count
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.files import write_json
 from spelgen.fitting.objective import Status
@@ -103,7 +103,7 @@ class Fit:
     @property
     def parameters(self) -> int:
         """Numbers that were fitted."""
-        return parameter_count(self.model)
+        return used_parameter_count(self.model)
 
     def predict(self, trajectory: Trajectory) -> np.ndarray:
         """Joint torques (T, n) [Nm, N] of the model's inverse dynamics along a trajectory, at its own times.

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spelgen.dynamics.parameters import parameter_count
+from spelgen.dynamics.residuals import used_parameter_count
 from spelgen.errors import shortened
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import figures
@@ -42,7 +42,7 @@ def head_numbers(
     if summary is not None:
         numbers.append(summary.headline)
     elif model is not None:
-        numbers.append((f"{parameter_count(model):,}", "trained parameters"))
+        numbers.append((f"{used_parameter_count(model):,}", "trained parameters"))
     if metrics:
         label = f"of training, {metrics[-1]['step']:,} steps"
         numbers.append((_duration(metrics[-1]["seconds"]), label))
