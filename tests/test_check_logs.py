@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from html_page import Page
+from scipy.integrate import cumulative_trapezoid
 from typer.testing import CliRunner
 
 from spelgen.arm.actuation import Drives
@@ -307,7 +308,8 @@ def test_a_new_check_is_a_function_and_its_row(loaded, log, monkeypatch, registr
 def test_a_few_samples_are_told_without_judgement(loaded, arm, log):
     result = check_logs([log[:20]], loaded)
     assert [x.gravity.explained for x in result.joints] == [None] * 3
-    assert "No findings." in result.text()
+    # in a fifth of a second no joint turns around
+    assert {x.code for x in result.findings} == {"one-way"}
 
 
 def test_real_arms_are_believed(shared):
@@ -386,6 +388,17 @@ def test_a_quantised_signal_and_a_stop_are_told(loaded, arm, log):
     q[:, 2] = np.minimum(q[:, 2] + arm.coordinates[2].upper - q[:, 2].max(), arm.coordinates[2].upper)
     codes = {x.code for x in check_logs([replace(log, tau=tau, q=q)], loaded).findings}
     assert {"coarse", "at-a-stop"} <= codes
+
+
+def test_a_joint_that_never_moves_back_is_told(loaded, log):
+    forward = np.abs(log.qd[:, 0])
+    q = np.column_stack([cumulative_trapezoid(forward, log.t, initial=0.0), log.q[:, 1:]])
+    moved = replace(log, q=q, qd=np.column_stack([forward, log.qd[:, 1:]]))
+    one_way = [x.where for x in check_logs([moved], loaded).findings if x.code == "one-way"]
+    assert one_way == [f"joint {loaded.arm.joint_names[0]!r}"]
+    # another log in which it does is enough
+    back = replace(log, name="back")
+    assert "one-way" not in {x.code for x in check_logs([moved, back], loaded).findings}
 
 
 @pytest.mark.parametrize("samples_held", [1, 20])

@@ -110,6 +110,18 @@ def find_stop(joint: JointEvidence) -> str | None:
     return None
 
 
+def find_one_way(joint: JointEvidence) -> str | None:
+    """Find joints that move one way only: by it dry friction is one number with what loads the joint."""
+    slower, faster = sorted((-joint.report.low["qd"], joint.report.high["qd"]))
+    if slower >= TUNING.one_way * faster:
+        return None
+    unit = UNITS[joint.coordinate.kind].velocity
+    return (
+        f"moves one way only, qd from {joint.report.low['qd']:.3g} to {joint.report.high['qd']:.3g} {unit}: its dry "
+        "friction is indistinguishable from gravity and a torque offset; record its motion both ways"
+    )
+
+
 def find_no_gravity(joint: JointEvidence) -> str | None:
     """Find torques without gravity in them."""
     correlation = joint.gravity_in_torque()[1]
@@ -149,6 +161,7 @@ CHECKS: list[Check[JointEvidence]] = [
     Check("beyond-effort-limit", "warning", partial(find_above, "effort", "tau")),
     Check("at-a-stop", "warning", find_stop),
     Check("coarse", "warning", find_coarse),
+    Check("one-way", "warning", find_one_way),
     Check("torque-without-gravity", "warning", find_no_gravity, unless=TORQUE_ERRORS),
     Check(
         "torque-against-gravity", "warning",

@@ -14,6 +14,7 @@ class LogCheckTuning:
     agreement: float = 0.9  # correlation from which two signals are one; their factor may differ by the rest
     unit_factor: float = 1.25  # a factor this near to that of a unit is that of the unit
     limit_rounding: float = 1e-3  # [rad, m] a position limit overrun by less is rounding
+    one_way: float = 0.1  # of a joint's fastest velocity: that of a joint that never moves back is less
     limit_noise: float = 0.01  # of a velocity or effort limit: overrun by less is noise of the signal
     loaded: float = 0.2  # deviation of gravity's torque, of the torque's: from here it must be seen (UR10e)
     # of inertial power that is negative beyond what is positive; +0.3 to +1 on recorded arms
