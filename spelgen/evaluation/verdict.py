@@ -194,12 +194,9 @@ def _worst_joint(results: Measurements) -> tuple[str, str, str]:
         return moved, "", f"At {moved} the error after {results.horizons[-1].name} is {amount}."
     if not joint:
         return "", "", ""
+    speed = _slow_or_fast(results, results.joints.index(joint))
     amount = share(math.sqrt(error), "the torque's standard deviation")
-    return (
-        joint,
-        _slow_or_fast(results, results.joints.index(joint)),
-        f"At {joint} the torque residual is {amount}.",
-    )
+    return joint, speed, f"At {joint} the torque residual is {amount}."
 
 
 def _worst_motion(results: Measurements) -> tuple[str, float]:
