@@ -124,14 +124,11 @@ def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Ten
     The rise is the sum of strength (z(x) - z). strength, z, reach: (K, ..., n), the shortest reach first. Bristles that
     are bent one way slide in that order, so x is the largest zero of K + 1 straight lines: in the k-th, k slide.
     """
-    way, remaining = push.sign(), push.abs()
-    stiffness = slope + strength.sum(dim=0)
-    displacement = remaining / stiffness
-    for spring, bent, longest in zip(strength, z, reach, strict=True):
-        remaining = remaining - spring * (longest - way * bent)
-        stiffness = stiffness - spring
-        displacement = torch.maximum(displacement, remaining / stiffness)
-    return way * displacement
+    way, stiffness = push.sign(), slope + strength.sum(dim=0)
+    # running sums: of what remains of the push, and of what resists, when k slide
+    remaining = torch.cat([push.abs().unsqueeze(0), -strength * (reach - way * z)]).cumsum(dim=0)
+    resisting = torch.cat([stiffness.unsqueeze(0), -strength]).cumsum(dim=0)
+    return way * (remaining / resisting).amax(dim=0)
 
 
 def replayed(model: ServoArm, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) -> Tensor:

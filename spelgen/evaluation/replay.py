@@ -11,6 +11,7 @@ import torch
 
 from spelgen.baselines.baseline import CommandFollower
 from spelgen.baselines.names import MODEL
+from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import Diagnostic
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
@@ -54,7 +55,7 @@ class ServoModel:
     about = "the model"
 
     def __init__(self, model: EmittedModel) -> None:
-        self._model = model
+        self._model = without_idle_residuals(model)
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return positions (K, n) of each part; all run beside each other, the shorter ones on and on."""
