@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 import onnx
@@ -14,6 +14,7 @@ import onnxruntime
 import onnxscript
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from spelgen.dynamics.prepared import PreparedModel
 from spelgen.exporting.describe import Trained
@@ -46,13 +47,10 @@ def export_onnx(trained: Trained) -> Exported:
 def onnx_model(model: PreparedModel, name: str) -> bytes:
     """Return the serialised ONNX model of an entry point."""
     with _silent_exporter():
-        program = export_program(model, name, flat_memory=True)
-        decompositions = torch.export.default_decompositions()
-        decompositions.update(_WRITTEN_OUT)
-        # ONNX's own takes the weights as they are, in place of a transposed copy
-        decompositions.pop(torch.ops.aten.linear.default)
+        with _WrittenOut():
+            program = export_program(model, name, flat_memory=True)
         exported = torch.onnx.export(
-            program.run_decompositions(decompositions),
+            program,
             dynamo=True,
             input_names=program_inputs(model, name),
             output_names=[program_output(name)],
@@ -81,6 +79,13 @@ def _silent_exporter() -> Iterator[None]:
         logger.setLevel(level)
 
 
+def _cross(left: Tensor, right: Tensor, *, dim: int) -> Tensor:
+    """Return the cross product of vectors along a dimension."""
+    following, last = torch.tensor([1, 2, 0]), torch.tensor([2, 0, 1])
+    forward = left.index_select(dim, following) * right.index_select(dim, last)
+    return forward - left.index_select(dim, last) * right.index_select(dim, following)
+
+
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     """Return matrix^-1 right by Gauss and Jordan; M is positive definite and needs no pivoting."""
     n = matrix.shape[-1]  # a constant of the program, so that the loop is written out
@@ -101,7 +106,12 @@ def _solve_triangular(matrix: Tensor, right: Tensor, *, upper: bool, unitriangul
     return _solve(matrix - matrix * identity + identity, right)
 
 
-def _cholesky_ex(matrix: Tensor) -> tuple[Tensor, Tensor]:
+class _Cholesky(NamedTuple):
+    L: Tensor
+    info: Tensor
+
+
+def _cholesky_ex(matrix: Tensor) -> _Cholesky:
     """Return in place of a Cholesky factor the matrix, and 1 where it is not positive definite, else 0.
 
     Networks of M use the second alone.
@@ -113,7 +123,7 @@ def _cholesky_ex(matrix: Tensor) -> tuple[Tensor, Tensor]:
         # a pivot that is NaN counts as not positive
         info = torch.where(pivot[..., 0, 0] > 0, info, 1)
         rows = rows - rows[..., k : k + 1] * rows[..., k : k + 1, :] / pivot
-    return matrix, info
+    return _Cholesky(matrix, info)
 
 
 def _scalar_tensor(s: float, dtype: int = onnx.TensorProto.DOUBLE, **options: object) -> onnxscript.ir.Value:
@@ -123,12 +133,31 @@ def _scalar_tensor(s: float, dtype: int = onnx.TensorProto.DOUBLE, **options: ob
     return cast("onnxscript.ir.Value", constant)
 
 
-_WRITTEN_OUT = {
-    torch.ops.aten.linalg_solve.default: _solve,
-    torch.ops.aten.linalg_solve_triangular.default: _solve_triangular,
-    torch.ops.aten.linalg_cholesky_ex.default: _cholesky_ex,
-}
-"""What ONNX has no operators for, written out by others."""
+def _softplus(x: Tensor) -> Tensor:
+    """Return log(1 + exp x), and x where that is it to all digits: ONNX Runtime has it in float32 alone."""
+    return torch.where(x > 20.0, x, x.exp().log1p())
+
+
+class _WrittenOut(TorchFunctionMode):
+    """Write out by others, while a program is traced, what ONNX has no operators for."""
+
+    functions: ClassVar[dict[Callable[..., Any], Callable[..., Any]]] = {
+        torch.nn.functional.softplus: _softplus,
+        torch.linalg.cross: _cross,
+        torch.linalg.solve: _solve,
+        torch.linalg.solve_triangular: _solve_triangular,
+        torch.linalg.cholesky_ex: _cholesky_ex,
+    }
+
+    def __torch_function__(
+        self,
+        func: Callable[..., Any],
+        types: Sequence[type],
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
+    ) -> Any:
+        """Call in place of a function the one that stands for it."""
+        return self.functions.get(func, func)(*args, **(kwargs or {}))
 
 
 def called_by_onnx(files: Mapping[str, bytes]) -> Called:
