@@ -305,7 +305,7 @@ def test_a_new_check_is_a_function_and_its_row(loaded, log, monkeypatch, registr
         assert {(x.code, x.message) for x in report.findings} == {("odd-name", "it is called odd")}
 
 
-def test_a_few_samples_are_told_without_judgement(loaded, arm, log):
+def test_a_few_samples_tell_nothing_of_gravity(loaded, arm, log):
     result = check_logs([log[:20]], loaded)
     assert [x.gravity.explained for x in result.joints] == [None] * 3
     # in a fifth of a second no joint turns around

@@ -6,7 +6,7 @@ import logging
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, ClassVar, NamedTuple, cast
+from typing import ClassVar, NamedTuple, cast
 
 import numpy as np
 import onnx
@@ -141,7 +141,7 @@ def _softplus(x: Tensor) -> Tensor:
 class _WrittenOut(TorchFunctionMode):
     """Write out by others, while a program is traced, what ONNX has no operators for."""
 
-    functions: ClassVar[dict[Callable[..., Any], Callable[..., Any]]] = {
+    functions: ClassVar[dict[object, Callable[..., object]]] = {
         torch.nn.functional.softplus: _softplus,
         torch.linalg.cross: _cross,
         torch.linalg.solve: _solve,
@@ -151,11 +151,11 @@ class _WrittenOut(TorchFunctionMode):
 
     def __torch_function__(
         self,
-        func: Callable[..., Any],
+        func: Callable[..., object],
         types: Sequence[type],
-        args: tuple[Any, ...] = (),
-        kwargs: dict[str, Any] | None = None,
-    ) -> Any:
+        args: tuple[object, ...] = (),
+        kwargs: dict[str, object] | None = None,
+    ) -> object:
         """Call in place of a function the one that stands for it."""
         return self.functions.get(func, func)(*args, **(kwargs or {}))
 

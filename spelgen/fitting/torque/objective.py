@@ -16,7 +16,7 @@ from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import has_rigid_bodies, known_past, motors_of
 from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.errors import Diagnostic, LogError
-from spelgen.fitting.dataset import Measured, TrainingData, Validation
+from spelgen.fitting.dataset import TrainingData, Validation
 from spelgen.fitting.objective import Logs, PreparedLogs, TorqueLogObjective
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.torque.fit import fit_torque
@@ -79,23 +79,21 @@ class TorqueObjective(TorqueLogObjective):
         if not has_rigid_bodies(model):  # the torques of rigid bodies have a prior of their own
             regularizer = self._regularizer(self.data, self.config.urdf_weight, notes)
         notes += fit_torques(model, samples, self.config, regularizer)
-        measured = self._measured()
+        # residuals that were not selected add nothing but time
+        few = replace(self.data, validation=thinned(self.data.validation, TUNING.measured_windows))
+        validation = Validation(without_idle_residuals(model), few, self.request.options.device)
+        substeps = validation.substeps()
         self._checkpoint = {
             "epoch": 0,
             "step": 0,
             "best_epoch": 0,
-            "best_loss": measured.loss,
+            "best_loss": validation.loss(substeps),
             "best_weights": copy.deepcopy(model.state_dict()),
             "seconds": time.monotonic() - self.request.began,
-            "substeps": measured.substeps,
+            "substeps": substeps,
             "torque_nmse": torque_nmse(model, samples),
         }
         return notes
-
-    def _measured(self) -> Measured:
-        """Return what a few windows of validation say of the model, without residuals that were not selected."""
-        few = replace(self.data, validation=thinned(self.data.validation, TUNING.measured_windows))
-        return Validation(without_idle_residuals(self.model), few, self.request.options.device).measure()
 
 
 def torque_nmse(model: EmittedModel, samples: TorqueSamples) -> list[float]:

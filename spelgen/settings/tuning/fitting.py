@@ -92,9 +92,7 @@ class TorqueTuning:
     turns: int = 3  # of rigid bodies and what stands beside them
     subset: int = 2**10  # samples, evenly spread, that come near; all of them finish
     windows: int = 2**12  # at most, of 5 samples, that say how far joints move
-    measured_windows: int = (
-        2**8
-    )  # at most, of those of validation, on which the model is measured after the fit
+    measured_windows: int = 2**8  # at most, of validation, that the model is measured on after the fit
     residual_samples: int = 2**14  # that what stands beside rigid bodies is selected on
     seen: float = 1e-10  # [1] of the largest curvature: directions with less are not seen in the samples
     # [1] of it: noise-free samples are fitted to four digits of their torque's range
