@@ -218,7 +218,7 @@ def test_a_dead_zone_of_a_servo_is_worth_more_than_luck(monkeypatch):
     without = ServoParameters(torch.ones(1, 1), torch.zeros(0), 0.0, torch.zeros(1, 1, dtype=torch.bool))
     problem = SimpleNamespace(
         rows=SimpleNamespace(row=lambda name: 0),
-        residuals=lambda x: None,
+        residual=lambda x: None,
         weigh=lambda errors: None,
     )
     with_zone = replace(without, joints=2 * torch.ones(1, 1))
@@ -310,7 +310,7 @@ def test_a_joint_of_servos_goes_no_step_uphill():
     """Residuals arctan 10 x of two joints: a step from 0.3 goes far beyond zero, and is not taken."""
     seen = []
 
-    def residuals(x):
+    def residual(x):
         seen.append(x.joints)
         return (10 * x.joints).atan()
 
@@ -319,7 +319,7 @@ def test_a_joint_of_servos_goes_no_step_uphill():
         return NormalEquations(torch.diag(slope.square()), -slope * errors.flatten())
 
     problem = SimpleNamespace(
-        residuals=residuals,
+        residual=residual,
         normal_equations=normal_equations,
         joint_costs=lambda x, errors: errors.square().sum(dim=0) / 2,
     )
