@@ -34,10 +34,11 @@ from spelgen.dynamics.residuals import residual_torque
 from spelgen.fitting import levenberg_marquardt
 from spelgen.fitting.torque import fit as torque_fit
 from spelgen.fitting.torque import jacobian as torque_jacobian
-from spelgen.fitting.torque import joint_functions, selection
+from spelgen.fitting.torque import joint_functions, residual_stage, selection, stages
 from spelgen.fitting.torque import prior as torque_prior
 from spelgen.fitting.torque import problem as torque_problem
 from spelgen.fitting.torque.fit import fit_torque
+from spelgen.fitting.torque.linearization import RigidProjection
 from spelgen.logs import dynamics_samples
 
 NEVER = float("inf")
@@ -73,43 +74,44 @@ def tuned(module: Any, **changes: Any) -> tuple[tuple[Any, str, Any], ...]:
 
 
 def keep_prior(prior: Any, *_: Any) -> Any:
-    """Stand in for `most_probable`: the prior stays as it is."""
-    return prior
+    """Replace `update_widths`: the prior's standard deviations are the initial ones."""
+    return prior.widths
 
 
-def remember_always(problem: Any, state: Any) -> Any:
-    """Stand in for `select_memory`: friction of every joint has memory."""
-    problem.jacobian.model.friction.memoryless.fill_(0.0)
-    return problem.solve(problem._first_fit(state.x, state.steps), torque_jacobian.TUNING.rounds)
+def always_hysteretic(estimate: Any) -> Any:
+    """Replace `choose_friction_state`: friction of every joint has bristle states."""
+    estimate.problem.jacobian.model.friction.memoryless.fill_(0.0)
+    problem, state = stages._least_squares_noise_fit(estimate.problem, estimate.state)
+    return torque_problem.alternate(problem, state, torque_jacobian.TUNING.rounds)
 
 
-def keep_all(problem: Any, state: Any) -> Any:
-    """Stand in for `select_effects`: friction has all effects at every joint."""
-    return state
+def keep_all(estimate: Any) -> Any:
+    """Replace `choose_friction_effects`: friction has all effects at every joint."""
+    return estimate
 
 
-def freedom_is_free(problem: Any) -> float:
-    """Stand in for `_fractions_narrowed`: memory is likely by what it explains alone."""
+def no_occam_factor(estimate: Any) -> float:
+    """Replace `fraction_occam_factor`: the friction state is chosen by its likelihood only."""
     return 0.0
 
 
 def leave(model: Any, samples: Any) -> None:
-    """Stand in for `bound_friction`: friction is guessed by efforts alone."""
+    """Replace `limit_friction`: nominal friction depends on effort limits only."""
 
 
 def nothing(response: Any, joint: int, torque: Any) -> Any:
-    """Stand in for `remaining`: bodies take over nothing of a torque by position."""
+    """Replace `orthogonalize`: rigid bodies absorb no torque of position."""
     return torque
 
 
-def in_turns(model: Any, samples: Any, *rest: Any) -> joint_functions.FollowingResiduals:
-    """Stand in for `refit_residuals`: functions are fitted to what bodies leave, and then bodies beside them."""
+def in_turns(model: Any, samples: Any, *rest: Any) -> joint_functions.ProjectedTerms:
+    """Replace `refit_terms`: residual terms and rigid bodies are fitted alternately, without variable projection."""
     with torch.no_grad():
         torque = residual_torque(model, *samples[:3])
-        following = joint_functions.refit_residuals(model, samples, *rest)
+        projected = joint_functions.refit_terms(model, samples, *rest)
         torque = torque - residual_torque(model, *samples[:3])
-    following.write(model, samples.missing + torque)
-    return joint_functions.FollowingResiduals({}, ())
+    projected.write(model, samples.torque_residual + torque)
+    return joint_functions.ProjectedTerms({}, ())
 
 
 def mechanisms() -> list[Mechanism]:
@@ -120,34 +122,30 @@ def mechanisms() -> list[Mechanism]:
         Mechanism("steps under the noise of least squares", tuned(torque_jacobian, first_steps=0)),
         Mechanism("noise that falls with what is missed", tuned(torque_jacobian, first_rounds=0)),
         Mechanism("more rounds while noise falls", tuned(torque_jacobian, longer=1)),
-        Mechanism("priors that yield", ((torque_problem, "most_probable", keep_prior),)),
-        Mechanism("that of armatures", ((torque_prior, "ADAPTED", ("bodies", "offset")),)),
-        Mechanism("memory by evidence", ((torque_problem.TorqueProblem, "select_memory", remember_always),)),
+        Mechanism("priors that yield", ((torque_problem, "update_widths", keep_prior),)),
+        Mechanism("that of armatures", ((torque_prior, "ESTIMATED_GROUPS", ("bodies", "offset")),)),
+        Mechanism("memory by evidence", ((torque_fit, "choose_friction_state", always_hysteretic),)),
         Mechanism(
             "less what its freedom explains",
-            ((torque_problem.TorqueProblem, "_fractions_narrowed", freedom_is_free),),
+            ((stages, "fraction_occam_factor", no_occam_factor),),
         ),
         Mechanism("weak evidence yields to all joints'", tuned(torque_jacobian, strong_evidence=0.0)),
-        Mechanism(
-            "effects of friction by evidence", ((torque_problem.TorqueProblem, "select_effects", keep_all),)
-        ),
+        Mechanism("effects of friction by evidence", ((torque_fit, "choose_friction_effects", keep_all),)),
         Mechanism("bristles that joints share", ((torque_prior, "SHARED", OWN_BRISTLES),)),
         Mechanism("errors that weights take", tuned(torque_jacobian, least_left=1.0)),
-        Mechanism("no more friction than torque", ((torque_fit, "bound_friction", leave),)),
+        Mechanism("no more friction than torque", ((torque_fit, "limit_friction", leave),)),
         Mechanism("friction compensated unseen", tuned(torque_jacobian, compensation_explained=NEVER)),
         Mechanism("every second sample alone", tuned(torque_jacobian, decimation=1)),
         Mechanism("few samples first", tuned(torque_jacobian, subset=2**40)),
         Mechanism("steps in the bodies' parameters", tuned(levenberg_marquardt, kept_promise=-NEVER)),
         Mechanism("turns of bodies and residuals", tuned(torque_jacobian, turns=1)),
-        Mechanism("functions that follow bodies", ((torque_fit, "refit_residuals", in_turns),)),
+        Mechanism("functions that follow bodies", ((residual_stage, "refit_terms", in_turns),)),
         Mechanism("residuals beside rigid bodies", tuned(selection, standard_errors=NEVER)),
-        Mechanism(
-            "what bodies take over of springs", ((torque_jacobian.RigidResponse, "remaining", nothing),)
-        ),
+        Mechanism("what bodies take over of springs", ((RigidProjection, "orthogonalize", nothing),)),
         Mechanism("significance of residuals", tuned(selection, standard_errors=0.0)),
         Mechanism("gaps between blocks", tuned(selection, gap=0.0)),
         Mechanism("least gain of residuals", tuned(selection, least_gain=0.0)),
-        Mechanism("networks among residuals", ((torque_fit, "select_networks", lambda *_: iter(())),)),
+        Mechanism("networks among residuals", ((residual_stage, "select_networks", lambda *_: iter(())),)),
     ]
 
 

@@ -1,5 +1,6 @@
 """Levenberg-Marquardt steps lead to known minima, and every run states why it ended."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -62,16 +63,17 @@ def test_a_fit_is_resumed_from_any_of_its_states():
 
 
 def test_an_ascent_direction_ends_the_solver():
-    """With the sign of the gradient wrong, no damping lowers the cost."""
+    """With the sign of the step wrong no damping lowers the cost, until it is so large that no step is left."""
 
     class Ascending(Rosenbrock):
         def candidates(self, x, step):
             yield x - step
 
     problem = Ascending()
-    first = first_state(problem)
-    result = levenberg_marquardt(problem, first, max_steps=5)
-    assert result.termination is Termination.NO_DECREASE and result.state is first
+    for damping, termination in ((1e-9, Termination.NO_DECREASE), (1.0, Termination.SMALL_PREDICTION)):
+        first = replace(first_state(problem), damping=damping)
+        result = levenberg_marquardt(problem, first, max_steps=5)
+        assert result.termination is termination and result.state is first and result.log == ()
 
 
 def test_systems_of_a_batch_have_their_own_damping():

@@ -21,7 +21,7 @@ from spelgen.dynamics.protocol import has_friction_state, sliding_memory
 from spelgen.emission.bundle import bundle, load_runtime, names_in
 from spelgen.emission.tailored import kinds
 from spelgen.emission.unit_joints import hidden_units
-from spelgen.fitting.torque.weights import body_weights, upper_cholesky
+from spelgen.fitting.torque.parameters import log_cholesky_parameters, upper_cholesky
 from spelgen.pipeline.build import build
 from spelgen.pipeline.generate import make_spec
 from spelgen.pipeline.loaded_arm import load_arm
@@ -359,7 +359,7 @@ def weights_of_first_stage(bodies):
     entries = 0.01 * torch.ones(4, 4).double().tril(-1)
     root = torch.linalg.cholesky(nominal) @ (entries + math.exp(0.01) * torch.eye(4).double())
     relative = torch.linalg.solve(bodies.factors, root)
-    return body_weights(upper_cholesky(relative @ relative.mT))
+    return log_cholesky_parameters(upper_cholesky(relative @ relative.mT))
 
 
 def rotation_inputs(joint_types, axes):
