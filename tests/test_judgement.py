@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import minimize
 
 from spelgen.evaluation import invariants
 from spelgen.evaluation.horizons import end_errors
@@ -19,6 +20,7 @@ from spelgen.fitting.torque import jacobian as torque_jacobian
 from spelgen.fitting.torque import joint_functions, network_selection, selection, stages
 from spelgen.fitting.torque import objective as torque_objective
 from spelgen.fitting.torque import problem as torque_problem
+from spelgen.fitting.torque.bayesian_ridge import append_target, bayesian_ridge
 from spelgen.fitting.torque.jacobian import ResidualSamples
 from spelgen.fitting.torque.objective import fit_torques
 from spelgen.fitting.torque.selection import select_functions
@@ -171,13 +173,41 @@ def test_samples_that_err_alike_count_once():
     groups = torch.zeros(4)
 
     def weights(times: int) -> torch.Tensor:
-        rows = joint_functions.beside(x, y).repeat_interleave(times, dim=0)
-        return joint_functions.most_probable(rows.mT @ rows, len(rows), groups, float(times))[0]
+        rows = append_target(x, y).repeat_interleave(times, dim=0)
+        return bayesian_ridge(rows.mT @ rows, len(rows), groups, float(times)).coef
 
     torch.testing.assert_close(weights(20), weights(1), rtol=1e-6, atol=1e-9)
     assert (
         weights(1) - torch.linalg.lstsq(x, y).solution
     ).abs().max() > 1e-3  # drawn to nothing by the prior
+
+
+def test_bayesian_ridge_maximizes_the_marginal_likelihood():
+    """Two groups of weights, one of them without effect, against a numerical maximum over the prior's precisions."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(2000, 12))
+    y = x[:, :6] @ rng.normal(scale=0.3, size=6) + 0.5 * rng.normal(size=2000)
+    groups = torch.tensor([0] * 6 + [1] * 6)
+    rows = append_target(torch.from_numpy(x), torch.from_numpy(y))
+    found = bayesian_ridge(rows.mT @ rows, len(rows), groups, 1.0)
+
+    def minus_log_evidence(logarithms: np.ndarray) -> float:
+        alpha, *precisions = np.exp(logarithms)
+        prior = np.repeat(precisions, 6)
+        hessian = alpha * x.T @ x + np.diag(prior)
+        coef = alpha * np.linalg.solve(hessian, x.T @ y)
+        energy = alpha * np.square(y - x @ coef).sum() + prior @ np.square(coef)
+        likelihood = len(y) * np.log(alpha) + np.log(prior).sum() - np.linalg.slogdet(hessian)[1]
+        return float(energy - likelihood) / 2
+
+    best = minimize(minus_log_evidence, np.zeros(3), method="Nelder-Mead", options={"maxiter": 2000})
+    assert found.converged and found.n_iter > 1
+    assert found.alpha == pytest.approx(np.exp(best.x[0]), rel=0.01)
+    assert float(found.lambda_[0]) == pytest.approx(np.exp(best.x[1]), rel=0.01)
+    # of the group without effect only a lower bound is known: its weights are near zero
+    assert found.gamma[0] > 5.9 and found.gamma[1] < 2.0
+    expected = np.linalg.solve(x.T @ x + np.diag(found.penalty.numpy()), x.T @ y)
+    np.testing.assert_allclose(found.coef.numpy(), expected, rtol=1e-9)
 
 
 def test_intervals_of_errors_that_last_are_wider():
