@@ -86,7 +86,7 @@ class SolverResult(Generic[Parameters]):
     normal_equations: NormalEquations
 
 
-class LeastSquares(Protocol[Parameters]):
+class LeastSquaresProblem(Protocol[Parameters]):
     """Cost of parameters x, computed from a residual (or from its sums of squares, if the residual is too large)."""
 
     def residual(self, x: Parameters) -> torch.Tensor:
@@ -107,7 +107,7 @@ class LeastSquares(Protocol[Parameters]):
 
 
 def initial_state(
-    problem: LeastSquares[Parameters], x: Parameters, damping: float = TUNING.first, steps: int = 0
+    problem: LeastSquaresProblem[Parameters], x: Parameters, damping: float = TUNING.first, steps: int = 0
 ) -> SolverState[Parameters]:
     """Return the state at x before the first step."""
     residual = problem.residual(x)
@@ -115,7 +115,7 @@ def initial_state(
 
 
 def levenberg_marquardt(
-    problem: LeastSquares[Parameters],
+    problem: LeastSquaresProblem[Parameters],
     state: SolverState[Parameters],
     *,
     max_steps: int,
@@ -150,7 +150,7 @@ def levenberg_marquardt(
 
 
 def _accepted_step(
-    problem: LeastSquares[Parameters],
+    problem: LeastSquaresProblem[Parameters],
     state: SolverState[Parameters],
     normal: NormalEquations,
     min_decrease: float,
@@ -171,7 +171,10 @@ def _accepted_step(
 
 
 def _best_candidate(
-    problem: LeastSquares[Parameters], state: SolverState[Parameters], step: torch.Tensor, predicted: float
+    problem: LeastSquaresProblem[Parameters],
+    state: SolverState[Parameters],
+    step: torch.Tensor,
+    predicted: float,
 ) -> SolverState[Parameters]:
     """Return the state of minimum cost among the candidates of a step, up to the first with a high gain ratio."""
     best = replace(state, cost=float("inf"))

@@ -71,7 +71,7 @@ class Likelihood:
 
 
 class ServoProblem:
-    """A `LeastSquares` problem of `ServoParameters`: windows, a model, and the errors that it makes on them.
+    """A `LeastSquaresProblem` of `ServoParameters`: windows, a model, and the errors that it makes on them.
 
     nudge: of finite differences.
     """

@@ -103,6 +103,7 @@ class TorqueJacobian:
         return self._logged_scale(self.rigid.unflatten(x)).detach()
 
     def _logged_scale(self, parameters: NamedTensors) -> torch.Tensor:
+        """Return `logged_scale`, (..., n), differentiable; parameters: one set, or (...) sets."""
         ones = torch.ones(self.model.n).double()
         for name in self.rigid.names("gains"):  # logarithms of joint torque per logged torque
             change = parameters[name] - self.rigid.initial[name]
@@ -119,7 +120,7 @@ class TorqueJacobian:
         return change.mT @ curvature @ change, change.mT @ descent
 
     def joint_rows(self, x: torch.Tensor) -> Iterator[JointRows]:
-        """Yield the Jacobian of each joint and block with respect to theta.
+        """Yield the Jacobian of each joint and block with respect to theta (K,), at x (K,).
 
         theta is x with the inertial parameters in place of their log-Cholesky parameters: there the Jacobian is the
         regressor, without a derivative to compute. `_theta_jacobian` is d theta / d x.

@@ -94,7 +94,7 @@ class NoiseEstimator:
 
 @dataclass(frozen=True, eq=False)
 class TorqueProblem:
-    """Negative log posterior of x (K,) for a given noise and prior: a `LeastSquares` problem.
+    """Negative log posterior of x (K,) for a given noise and prior: a `LeastSquaresProblem`.
 
     noise: (n,) standard deviations, scaled as if the errors of all samples were independent. adapt: see `TorqueFit`.
     compensated: (n,) joints whose drives compensate friction (see `stages.find_compensation`).
@@ -140,30 +140,33 @@ class TorqueProblem:
         return replace(self, noise=noise)
 
     def residual(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the squared torque residual per joint (n,) [Nm^2, N^2]; see `LeastSquares`."""
+        """Return the squared torque residual per joint (n,) [Nm^2, N^2]; see `LeastSquaresProblem`."""
         return self.jacobian.squared_residual(x)
 
     def cost(self, x: torch.Tensor, residual: torch.Tensor) -> float:
-        """Return the negative log posterior, except for a constant."""
+        """Return the negative log posterior of x (K,), except for a constant; residual: squared, (n,) [Nm^2, N^2]."""
         deviation = x - self.prior.mean
         penalty = deviation @ self.prior.precision @ deviation
         return float(((residual / self.noise.square()).sum() + penalty) / 2)
 
     def normal_equations(self, x: torch.Tensor, residual: torch.Tensor) -> NormalEquations:
-        """Return Gauss-Newton Hessian and negative gradient with respect to the free parameters."""
+        """Return Gauss-Newton Hessian (k, k) and negative gradient (k,) with respect to the k free parameters."""
         curvature, descent = self.jacobian.normal_equations(x, self.noise)
         penalty_gradient = self.prior.precision @ (x - self.prior.mean)
         curvature = (curvature + self.prior.precision)[self.free][:, self.free]
         return NormalEquations(curvature, (descent - penalty_gradient)[self.free])
 
     def candidates(self, x: torch.Tensor, step: torch.Tensor) -> Iterator[torch.Tensor]:
-        """Yield x + step, then the step that is straight in the inertial parameters (`curved_step`)."""
+        """Yield x + step, (K,), then the step that is straight in the inertial parameters (`curved_step`).
+
+        step: (k,) of the free parameters.
+        """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
         yield x + change
         yield self.jacobian.curved_step(x, change)
 
     def minimize(self, state: State, max_steps: int) -> SolverResult[torch.Tensor]:
-        """Return the result of Levenberg-Marquardt steps from a state, whose cost is recomputed."""
+        """Return the result of Levenberg-Marquardt steps from a state of x (K,), whose cost is recomputed."""
         state = replace(state, cost=self.cost(state.x, state.residual))
         return levenberg_marquardt(self, state, max_steps=max_steps, min_relative_decrease=TUNING.gain)
 

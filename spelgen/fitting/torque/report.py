@@ -121,6 +121,7 @@ def _inertia(model: EmittedModel, q: torch.Tensor, covariance: torch.Tensor) -> 
     parameters = RigidParameters(model).initial
 
     def diagonal(*tensors: torch.Tensor) -> torch.Tensor:
+        """Return the mean diagonal of M, (n,), for parameters in the order of their names."""
         named = dict(zip(parameters, tensors, strict=True))
         mass: torch.Tensor = evaluate_with(model, named, lambda other: other.mass_matrix(q))
         return mass.diagonal(dim1=-2, dim2=-1).mean(dim=0)

@@ -96,6 +96,7 @@ def _losing_joints(
     def fit_first(
         estimate: TorqueEstimate, selected: Sequence[SelectedTerm]
     ) -> tuple[TorqueEstimate, torch.Tensor]:
+        """Return the fit to the first half, and its squared torque residual (T, n) on the last half."""
         estimate = estimate.with_jacobian(TorqueJacobian(model, first)).with_current_covariance()
         estimate = _refit(estimate, first, selected)
         held_out = TorqueJacobian(model, last).residual_samples(estimate.state.x)
