@@ -75,7 +75,7 @@ def tuned(module: Any, **changes: Any) -> tuple[tuple[Any, str, Any], ...]:
 
 def keep_prior(prior: Any, *_: Any) -> Any:
     """Replace `update_widths`: the prior's standard deviations are the initial ones."""
-    return prior.widths
+    return prior
 
 
 def always_hysteretic(estimate: Any) -> Any:

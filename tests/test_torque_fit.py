@@ -166,8 +166,8 @@ def test_deviations_are_those_of_the_largest_marginal_likelihood():
     rigid = SimpleNamespace(mask=masks.get)
 
     def updated(widths, hyperprior, x, covariance):
-        prior = ParameterPrior(widths, hyperprior, torch.zeros(25).double(), torch.zeros(25, 25))
-        return update_widths(prior, rigid, x, covariance)
+        prior = ParameterPrior(rigid, widths, hyperprior, torch.zeros(25).double())
+        return update_widths(prior, x, covariance).widths
 
     guess = prior = GaussianPrior(armature=0.1, bodies=0.1, offset=0.1, degrees_of_freedom=1e-9)
     for _ in range(200):

@@ -87,8 +87,8 @@ class Identification:
             z: (T, n, K) [rad, m], bristle states of a friction model with hysteresis.
         """
         past = None if z is None else torch.from_numpy(z)
-        motion = map(torch.from_numpy, (q, qd, qdd))
-        return self.dynamics.joint_torque(*motion, past).numpy()
+        position, velocity, acceleration = map(torch.from_numpy, (q, qd, qdd))
+        return self.dynamics.joint_torque(position, velocity, acceleration, past).numpy()
 
     @property
     def determined(self) -> tuple[str, ...]:

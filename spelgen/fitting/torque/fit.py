@@ -122,9 +122,9 @@ def _run_stages(
     if problem.adapt is None:
         estimate = choose_friction_effects(estimate)
         done("friction effects", estimate)
-    if problem.adapt is None and has_residuals(model):
-        estimate, selected = fit_residual_terms(estimate, samples.subsampled(TUNING.residual_samples))
-        done("residual terms", estimate)
+        if has_residuals(model):
+            estimate, selected = fit_residual_terms(estimate, samples.subsampled(TUNING.residual_samples))
+            done("residual terms", estimate)
     if estimate.problem.jacobian.samples is not samples:
         estimate = refine(estimate, samples)
         done("final fit", estimate)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 
@@ -30,24 +31,21 @@ SHARED = {
 class ParameterPrior:
     """Gaussian prior of the parameters x.
 
-    widths: standard deviations per group. hyperprior: their values before the fit. mean: (K,). precision: (K, K).
+    rigid: names and groups of x. widths: standard deviations per group. hyperprior: their values before the fit. mean:
+    (K,).
     """
 
+    rigid: RigidParameters
     widths: GaussianPrior
     hyperprior: GaussianPrior
     mean: torch.Tensor
-    precision: torch.Tensor
 
-    @classmethod
-    def of(cls, rigid: RigidParameters, widths: GaussianPrior) -> ParameterPrior:
-        """Return the prior whose mean is the initial x."""
-        covariance = prior_covariance(widths, rigid.initial, rigid.groups)
-        return cls(widths, widths, rigid.flatten(rigid.initial), torch.linalg.inv(covariance))
-
-    def with_widths(self, rigid: RigidParameters, widths: GaussianPrior) -> ParameterPrior:
-        """Return the prior with other standard deviations."""
-        covariance = prior_covariance(widths, rigid.initial, rigid.groups)
-        return replace(self, widths=widths, precision=torch.linalg.inv(covariance))
+    @cached_property
+    def precision(self) -> torch.Tensor:
+        """Inverse covariance, (K, K)."""
+        covariance = prior_covariance(self.widths, self.rigid.initial, self.rigid.groups)
+        precision: torch.Tensor = torch.linalg.inv(covariance)
+        return precision
 
 
 def prior_covariance(
@@ -71,10 +69,8 @@ def prior_covariance(
     return matrix + friction.outer(friction)
 
 
-def update_widths(
-    prior: ParameterPrior, rigid: RigidParameters, x: torch.Tensor, covariance: torch.Tensor
-) -> GaussianPrior:
-    """Return the standard deviations after one fixed-point step of evidence maximization, for `ESTIMATED_GROUPS`.
+def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tensor) -> ParameterPrior:
+    """Return the prior after one fixed-point step of evidence maximization for the widths of `ESTIMATED_GROUPS`.
 
     MacKay, Bayesian Interpolation, Neural Computation 4:415 (1992): the fixed point s^2 = |x - mean|^2 / gamma, with
     the effective number of parameters gamma = k - tr(covariance) / s^2 of the group's k parameters, maximizes the
@@ -83,7 +79,6 @@ def update_widths(
 
     Args:
         prior: current prior.
-        rigid: names and groups of x.
         x: (K,) MAP estimate.
         covariance: (K, K) posterior covariance of x.
     """
@@ -91,7 +86,7 @@ def update_widths(
     initial: dict[str, float] = dict(prior.hyperprior)
     updated, freedom, deviation = {}, prior.widths.degrees_of_freedom, x - prior.mean
     for group in ESTIMATED_GROUPS:
-        mask = rigid.mask(group)
+        mask = prior.rigid.mask(group)
         count = int(mask.sum())
         centring = torch.eye(count).double()
         if group in SHARED and count:
@@ -102,7 +97,7 @@ def update_widths(
         gamma = float(centring.trace() - spread.trace() / current[group] ** 2)
         squares = float((centring @ deviation[mask]).square().sum()) + freedom * initial[group] ** 2
         updated[group] = (squares / (max(gamma, 0.0) + freedom)) ** 0.5
-    return prior.widths.model_copy(update=updated)
+    return replace(prior, widths=prior.widths.model_copy(update=updated))
 
 
 def width_option(group: str) -> str:

@@ -12,6 +12,7 @@ are estimated from the data: outer iterations alternate Levenberg-Marquardt step
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -67,8 +68,7 @@ class NoiseEstimator:
 
     def upper_bound(self) -> torch.Tensor:
         """Return the noise (n,) [Nm, N] of a model that explains nothing."""
-        bound: torch.Tensor = self.correlation_length**0.5 * self.torque_std
-        return bound
+        return self.torque_std * math.sqrt(self.correlation_length)
 
     def estimate(
         self, squared_residual: torch.Tensor, effective_parameters: torch.Tensor | float = 0.0
@@ -83,9 +83,7 @@ class NoiseEstimator:
         errors = self.count / self.correlation_length
         fraction = torch.as_tensor(1.0 - effective_parameters / errors).clamp(min=TUNING.least_left)
         rms = (squared_residual / self.count / fraction).sqrt()
-        rms = torch.maximum(rms, TUNING.least_noise * self.torque_std)
-        noise: torch.Tensor = self.correlation_length**0.5 * rms
-        return noise
+        return torch.maximum(rms, TUNING.least_noise * self.torque_std) * math.sqrt(self.correlation_length)
 
     def annealed(self, squared_residual: torch.Tensor) -> torch.Tensor:
         """Return the noise (n,) [Nm, N] of an early iteration: a fraction of its residual (n,) [Nm^2, N^2]."""
@@ -111,10 +109,9 @@ class TorqueProblem:
         cls, jacobian: TorqueJacobian, widths: GaussianPrior, adapt: Adaptation | None = None
     ) -> TorqueProblem:
         """Return the problem whose prior mean is the current x of the model."""
-        rigid = jacobian.rigid
-        noise = NoiseEstimator.of(jacobian).upper_bound()
-        compensated = rigid.initial[rigid.compensation] != 0
-        return cls(jacobian, noise, ParameterPrior.of(rigid, widths), adapt, compensated)
+        rigid, noise = jacobian.rigid, NoiseEstimator.of(jacobian).upper_bound()
+        prior = ParameterPrior(rigid, widths, widths, rigid.flatten(rigid.initial))
+        return cls(jacobian, noise, prior, adapt, rigid.initial[rigid.compensation] != 0)
 
     @cached_property
     def free(self) -> torch.Tensor:
@@ -185,11 +182,9 @@ class TorqueProblem:
         free, joints = self.free, len(state.residual)
         gamma = float(free.sum() - (covariance * self.prior.precision)[free][:, free].sum())
         noise = NoiseEstimator.of(self.jacobian).estimate(state.residual, gamma / joints)
-        if self.adapt == "load":  # the prior of a load is no estimate from other bodies
-            return replace(self, noise=noise)
-        rigid = self.jacobian.rigid
-        widths = update_widths(self.prior, rigid, state.x, covariance)
-        return replace(self, noise=noise, prior=self.prior.with_widths(rigid, widths))
+        # one body is too little data for the widths of a load
+        prior = self.prior if self.adapt == "load" else update_widths(self.prior, state.x, covariance)
+        return replace(self, noise=noise, prior=prior)
 
 
 @dataclass(frozen=True, eq=False)
