@@ -15,7 +15,6 @@ from spelgen.fitting.dataset import digest
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.servo.windows import servo_windows
-from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 
@@ -82,7 +81,7 @@ def _fitted_to_files(run: RunFolder, files: Sequence[str]) -> dict[str, object]:
         logs = run_logs(run, files)
     except LogError:  # moved or removed
         return {}
-    if isinstance(logs, LargeLogs) or digest(logs) != run.read_config()["data_digest"]:
+    if digest(logs) != run.read_config()["data_digest"]:
         return {}
     return fitted_actuators(run, logs)
 

@@ -25,7 +25,6 @@ class ValidationTuning:
 
     windows: int = 2048  # at most: validation is a measurement, it needs no more
     probe: int = 64  # training windows on which the integrator's error is watched
-    chunks: int = 16  # of logs larger than memory, which windows are taken from
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,13 @@ from dataclasses import dataclass
 class LogTuning:
     """Numbers that decide how logs are read, cut, filtered and differentiated."""
 
-    in_memory: int = 100_000_000  # [bytes] of numbers above which logs are streamed; windows take five times
-    chunk_samples: int = 2**16  # of a streamed log held at once: of 7 joints 12 MB, as windows 53 MB
+    # [bytes] Numbers that a fit keeps of all logs together. Of seven joints at 1 kHz these are 25 minutes or 76,000
+    # samples of a torque fit, as many as its final iterations use; windows of five samples take five times the memory.
+    kept_bytes: int = 2**28
+    # [1] Samples of a segment of logs that exceed `kept_bytes`: 16 s at 1 kHz, long beside filter transients.
+    segment_samples: int = 2**14
+    # [1] Rows of a row group of the Parquet files that are written.
+    row_group: int = 2**16
     npz_bytes: int = 2**30  # unpacked at most from one NPZ archive, which zeros pack a thousandfold
     largest_value: float = 1e9  # [rad, rad/s, Nm; m, m/s, N] no arm has more: what is beyond is a wrong unit
     # [usual steps] next to which a signal's 0 is no value: smooth signals come nearer first

@@ -60,7 +60,6 @@ class TorqueTuning:
     compensation_visible: float = 0.05
     block: int = 2**13  # samples at a time: of seven joints some 100 MB with their derivatives
     regressor_bytes: float = 4e8  # [B] of regressors: 70,000 samples of six joints; of more, every so many
-    in_memory: int = 2**18  # samples of logs larger than memory: 140 MB of six joints
     body_step: float = 0.3  # [1] of the way to the border of the possible bodies, at most in a step
     # by what is adapted, about the run. Load: known to a factor of twenty in mass (10 in place of 3 let half a second
     # of motion err by 27 times the variance of the torque, UR10e). Friction: warmth changes that of all joints by tens
