@@ -7,13 +7,18 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ComparisonTuning:
-    """Numbers that decide how `compare` measures its runs."""
+    """Measurements of the runs of `compare`."""
 
-    windows: int = 512  # at most, evenly spread, that a model is measured on
-    timed_steps: int = 9  # of training, whose median is told: other programs run beside
-    horizon: float = 1.0  # [s] over which trajectories are predicted, as in the paper
-    massless: float = 1e-9  # [kg] links of no more than this keep their inertials
-    seed: int = 0  # of the wrong inertials, the same in every call
+    # [1] Largest number of windows on which a model is measured, evenly spread.
+    windows: int = 512
+    # [1] Training steps whose median time is reported: other programs may run at the same time.
+    timed_steps: int = 9
+    # [s] Time over which trajectories are predicted, as in the paper.
+    horizon: float = 1.0
+    # [kg] Links of at most this mass keep their inertials.
+    massless: float = 1e-9
+    # [1] Seed of the perturbed inertials, the same in every call.
+    seed: int = 0
 
 
 TUNING = ComparisonTuning()
