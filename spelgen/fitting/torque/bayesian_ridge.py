@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 
-from spelgen.settings.tuning.fitting import ResidualTuning
+from spelgen.fitting.torque.tuning import ResidualTuning
 
 TUNING = ResidualTuning()
 

@@ -23,7 +23,7 @@ from spelgen.fitting.torque.linearization import (
 )
 from spelgen.fitting.torque.parameters import RigidParameters, joint_torque, step_in_inertial_parameters
 from spelgen.fitting.torque.samples import SampleBlock, TorqueSamples
-from spelgen.settings.tuning.fitting import TorqueTuning
+from spelgen.fitting.torque.tuning import TorqueTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import torch
 
-from spelgen.settings.tuning.fitting import TorqueTuning
+from spelgen.fitting.torque.tuning import TorqueTuning
 
 TUNING = TorqueTuning()
 

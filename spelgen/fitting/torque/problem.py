@@ -35,8 +35,8 @@ from spelgen.fitting.torque.linearization import (
 )
 from spelgen.fitting.torque.prior import ParameterPrior, update_widths
 from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.fitting.torque.tuning import TorqueTuning
 from spelgen.settings.fits import Adaptation, GaussianPrior
-from spelgen.settings.tuning.fitting import TorqueTuning
 
 TUNING = TorqueTuning()
 

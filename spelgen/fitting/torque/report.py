@@ -17,7 +17,7 @@ from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.torque.fit import TorqueSolution
 from spelgen.fitting.torque.parameters import RigidParameters
 from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.settings.tuning.fitting import TorqueReportTuning
+from spelgen.fitting.torque.tuning import TorqueReportTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

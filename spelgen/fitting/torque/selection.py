@@ -21,7 +21,7 @@ from spelgen.fitting.torque.bayesian_ridge import append_target, bayesian_ridge
 from spelgen.fitting.torque.jacobian import ResidualSamples
 from spelgen.fitting.torque.joint_functions import JointFunction, TermKey, joint_functions, rms_per_joint
 from spelgen.fitting.torque.linearization import RigidProjection
-from spelgen.settings.tuning.fitting import ResidualTuning
+from spelgen.fitting.torque.tuning import ResidualTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

@@ -15,7 +15,7 @@ from spelgen.fitting.torque.problem import (
     TorqueProblem,
     alternate,
 )
-from spelgen.settings.tuning.fitting import TorqueTuning
+from spelgen.fitting.torque.tuning import TorqueTuning
 
 TUNING = TorqueTuning()
 EFFECT_GROUPS = ("effects", "load_dependence")
