@@ -555,7 +555,7 @@ def test_few_of_very_many_samples_come_near_first(emitted, monkeypatch):
     samples = [recorded(drawn(module, seed=2, deviation=0.3), 6.0, 0.05, seed=seed) for seed in range(3)]
     plain, quick = module.Model(), module.Model()
     expected = fit_torque(plain, samples)
-    monkeypatch.setattr(torque_fit, "TUNING", TorqueTuning(subset=200))
+    monkeypatch.setattr(torque_fit, "TUNING", TorqueTuning(initial_samples=200))
     found = fit_torque(quick, samples)
     assert found.steps != expected.steps
     assert found.cost == pytest.approx(expected.cost, rel=1e-3)

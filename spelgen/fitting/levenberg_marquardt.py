@@ -107,7 +107,7 @@ class LeastSquaresProblem(Protocol[Parameters]):
 
 
 def initial_state(
-    problem: LeastSquaresProblem[Parameters], x: Parameters, damping: float = TUNING.first, steps: int = 0
+    problem: LeastSquaresProblem[Parameters], x: Parameters, damping: float = TUNING.initial, steps: int = 0
 ) -> SolverState[Parameters]:
     """Return the state at x before the first step."""
     residual = problem.residual(x)
@@ -157,14 +157,14 @@ def _accepted_step(
 ) -> tuple[SolverState[Parameters], Iteration] | Termination:
     """Return the state after one step that lowers the cost, with its log entry, or the reason why there is none."""
     damping = state.damping
-    for _ in range(TUNING.tries):
+    for _ in range(TUNING.max_trials):
         step = normal.step(damping)
         predicted = normal.predicted_decrease(step)
-        if predicted < max(TUNING.least_promise * state.cost, min_decrease):
+        if predicted < max(TUNING.min_predicted_decrease * state.cost, min_decrease):
             return Termination.SMALL_PREDICTION
         best = _best_candidate(problem, state, step, predicted)
         if best.cost < state.cost:
-            next_damping = max(damping / TUNING.factor, TUNING.least)
+            next_damping = max(damping / TUNING.factor, TUNING.min_damping)
             return replace(best, damping=next_damping), Iteration(best.cost, predicted, damping)
         damping *= TUNING.factor
     return Termination.NO_DECREASE
@@ -182,6 +182,6 @@ def _best_candidate(
         candidate = initial_state(problem, x, state.damping, state.steps + 1)
         if candidate.cost < best.cost:
             best = candidate
-        if state.cost - best.cost >= TUNING.kept_promise * predicted:
+        if state.cost - best.cost >= TUNING.min_gain_ratio * predicted:
             break
     return best

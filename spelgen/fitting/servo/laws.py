@@ -48,7 +48,7 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
     """
     errors = problem.residual(x)
     costs = problem.joint_costs(x, errors)
-    damping, active = torch.full_like(costs, DAMPING.first), torch.ones_like(costs).bool()
+    damping, active = torch.full_like(costs, DAMPING.initial), torch.ones_like(costs).bool()
     p, n = x.joints.shape
     for _ in range(TUNING.steps):
         normal = problem.normal_equations(x, errors)

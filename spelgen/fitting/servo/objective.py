@@ -103,7 +103,7 @@ class ServoObjective(Objective):
         while True:
             number = len(self._rounds)
             show = partial(_show_progress, progress, number)
-            x, damping = self._rounds[-1], DAMPING.first
+            x, damping = self._rounds[-1], DAMPING.initial
             if number > 1:  # near the minimum from where the round before ended
                 damping = TUNING.later_damping
             result = levenberg_marquardt(

@@ -11,9 +11,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 
-from spelgen.fitting.torque.tuning import ResidualTuning
-
-TUNING = ResidualTuning()
+from spelgen.fitting.torque.tuning import SELECTION
 
 
 class BayesianRidge(NamedTuple):
@@ -56,7 +54,7 @@ def bayesian_ridge(
     # initially each group has 10 % of the variance of the target
     lambda_ = 10 * feature_square * size / max(variance, 1e-300)
     n_iter, converged = 0, False
-    while n_iter < TUNING.rounds and not converged:
+    while n_iter < SELECTION.max_iter and not converged:
         n_iter += 1
         tempered = variance * correlation_length
         penalty = tempered * (member @ lambda_)
@@ -66,7 +64,7 @@ def bayesian_ridge(
         lambda_ = (gamma / (member.mT @ coef.square()).clamp(min=1e-300)).clamp(max=1e14)
         residual_square = square - float(2 * coef @ moment - coef @ gram @ coef)
         previous, variance = variance, max(residual_square, 1e-12 * square) / count
-        converged = abs(variance - previous) < TUNING.converged * previous
+        converged = abs(variance - previous) < SELECTION.tolerance * previous
     return BayesianRidge(coef, penalty, 1 / max(variance, 1e-300), lambda_, gamma, n_iter, converged)
 
 

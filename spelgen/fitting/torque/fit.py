@@ -16,13 +16,14 @@ import torch
 
 from spelgen.dynamics.protocol import has_residuals
 from spelgen.fitting.levenberg_marquardt import Termination
-from spelgen.fitting.torque.jacobian import TUNING, TorqueJacobian
+from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import limit_friction
 from spelgen.fitting.torque.problem import TorqueEstimate, TorqueProblem, refine
 from spelgen.fitting.torque.residual_stage import fit_residual_terms
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.selection import SelectedTerm
 from spelgen.fitting.torque.stages import choose_friction_effects, choose_friction_state, initial_fit
+from spelgen.fitting.torque.tuning import TUNING
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
@@ -79,7 +80,7 @@ def fit_torque(
     if not isinstance(samples, TorqueSamples):
         samples = TorqueSamples.of(samples, TUNING.decimation)
     samples = samples.subsampled(_max_samples(model))
-    subset = samples.subsampled(TUNING.subset)
+    subset = samples.subsampled(TUNING.initial_samples)
     if adapt is None:
         limit_friction(model, subset.columns)
     if prior is None:
@@ -134,4 +135,4 @@ def _run_stages(
 def _max_samples(model: EmittedModel) -> int:
     """Return the maximum number of samples: their two regressors are kept in memory."""
     numbers = 2 * model.n * model.inertial_parameters.numel()
-    return max(TUNING.subset, int(TUNING.regressor_bytes / (8 * numbers)))
+    return max(TUNING.initial_samples, int(TUNING.regressor_bytes / (8 * numbers)))

@@ -23,12 +23,11 @@ from spelgen.fitting.torque.linearization import (
 )
 from spelgen.fitting.torque.parameters import RigidParameters, joint_torque, step_in_inertial_parameters
 from spelgen.fitting.torque.samples import SampleBlock, TorqueSamples
-from spelgen.fitting.torque.tuning import TorqueTuning
+from spelgen.fitting.torque.tuning import TUNING
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-TUNING = TorqueTuning()
 LOGARITHMIC_GROUPS = ("armature", "sizes", "effects", "load_dependence")
 
 

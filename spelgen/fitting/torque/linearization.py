@@ -9,9 +9,7 @@ from typing import NamedTuple
 
 import torch
 
-from spelgen.fitting.torque.tuning import TorqueTuning
-
-TUNING = TorqueTuning()
+from spelgen.fitting.torque.tuning import TUNING
 
 
 class JointRows(NamedTuple):
@@ -137,5 +135,7 @@ def _pseudo_inverse(curvature: torch.Tensor) -> torch.Tensor:
     length = curvature.diagonal().sqrt()
     scale = torch.where(length > 0, 1 / length, 0.0)
     scale = scale * scale[:, None]
-    inverse: torch.Tensor = torch.linalg.pinv(curvature * scale, rtol=TUNING.seen, hermitian=True)
+    inverse: torch.Tensor = torch.linalg.pinv(
+        curvature * scale, rtol=TUNING.min_relative_curvature, hermitian=True
+    )
     return inverse * scale

@@ -13,12 +13,12 @@ from spelgen.fitting.optimizers import minimise
 from spelgen.fitting.torque.jacobian import ResidualSamples
 from spelgen.fitting.torque.joint_functions import ALL, rms_per_joint
 from spelgen.fitting.torque.selection import (
-    TUNING,
     SelectedTerm,
     block_squares,
     significant_reduction,
     split_halves,
 )
+from spelgen.fitting.torque.tuning import SELECTION
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -34,7 +34,7 @@ def select_networks(
         samples: torque residual of the model with its current terms.
         correlation_length: number of samples per independent error.
     """
-    step = -(-len(samples.q) // TUNING.network_samples)
+    step = -(-len(samples.q) // SELECTION.network_samples)
     subset = ResidualSamples(*(column[::step] for column in samples))
     # the target of all residual terms together, single-joint terms included
     with torch.no_grad():
@@ -74,7 +74,7 @@ def _fit_network(
 
     first, last = split_halves(len(samples.q), correlation_length)
     # most networks explain nothing, which a few evaluations show
-    for evaluations in (TUNING.network_first_look, TUNING.network_evaluations):
+    for evaluations in (SELECTION.network_probe_evaluations, SELECTION.network_evaluations):
         fit(first, evaluations)
         error = _remaining_residual(model, samples)
         before, after = block_squares((residual / noise)[last]), block_squares((error / noise)[last])
@@ -83,7 +83,7 @@ def _fit_network(
             break
     network.load_state_dict(initial)
     if reduction is not None:
-        fit(ALL, TUNING.network_evaluations)
+        fit(ALL, SELECTION.network_evaluations)
     model.zero_grad(set_to_none=True)
     return reduction
 

@@ -19,10 +19,10 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import TrainingData, Validation
 from spelgen.fitting.objective import PreparedLogs, TorqueLogObjective
 from spelgen.fitting.torque.fit import fit_torque
-from spelgen.fitting.torque.jacobian import TUNING
 from spelgen.fitting.torque.networks import BLOCK, adapt_networks, fit_networks
 from spelgen.fitting.torque.report import torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.fitting.torque.tuning import TUNING
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay, find_torque_delay
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
@@ -57,7 +57,7 @@ class TorqueObjective(TorqueLogObjective):
             preprocessing = replace(preprocessing, torque_delay=self._delay.delay)
             self.request = replace(self.request, preprocessing=preprocessing)
         # windows are for validation only: few suffice
-        stride = -(-sum(map(len, self.request.logs)) // TUNING.windows)
+        stride = -(-sum(map(len, self.request.logs)) // TUNING.max_windows)
         self.data = self._cut_windows(SAMPLES, stride)
         return self._prepared(self.data, self.config)
 
@@ -78,7 +78,7 @@ class TorqueObjective(TorqueLogObjective):
             regularizer = self._regularizer(self.data, self.config.urdf_weight, notes)
         notes += fit_torques(model, samples, self.config, regularizer)
         # residual terms that were not selected are zero, and take time
-        subset = replace(self.data, validation=thinned(self.data.validation, TUNING.measured_windows))
+        subset = replace(self.data, validation=thinned(self.data.validation, TUNING.validation_windows))
         validation = Validation(without_idle_residuals(model), subset, self.request.options.device)
         substeps = validation.substeps()
         self._checkpoint = {

@@ -10,7 +10,7 @@ from spelgen.dynamics.parameters import parameter_table
 from spelgen.dynamics.protocol import motors_of
 from spelgen.fitting.functional_model import NamedTensors
 from spelgen.fitting.torque.samples import SampleBlock
-from spelgen.fitting.torque.tuning import TorqueTuning
+from spelgen.fitting.torque.tuning import TUNING
 from spelgen.logs.tuning import SAMPLES
 from spelgen.runtime.rigid_body import body_factor
 from spelgen.settings.fits import Adaptation
@@ -18,7 +18,6 @@ from spelgen.settings.fits import Adaptation
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-TUNING = TorqueTuning()
 MIN_SPEED = SAMPLES.moving
 RIGID_GROUPS = (
     "bodies", "friction_compensation", "gains", "armature", "offset", "sizes", "effects", "velocities",

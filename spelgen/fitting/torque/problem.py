@@ -35,10 +35,8 @@ from spelgen.fitting.torque.linearization import (
 )
 from spelgen.fitting.torque.prior import ParameterPrior, update_widths
 from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.fitting.torque.tuning import TorqueTuning
+from spelgen.fitting.torque.tuning import TUNING
 from spelgen.settings.fits import Adaptation, GaussianPrior
-
-TUNING = TorqueTuning()
 
 State = SolverState[torch.Tensor]
 """Parameters x (K,), and as residual the squared torque residual per joint (n,)."""
@@ -81,13 +79,13 @@ class NoiseEstimator:
                 degrees of freedom of the residual by one independent error.
         """
         errors = self.count / self.correlation_length
-        fraction = torch.as_tensor(1.0 - effective_parameters / errors).clamp(min=TUNING.least_left)
+        fraction = torch.as_tensor(1.0 - effective_parameters / errors).clamp(min=TUNING.min_error_fraction)
         rms = (squared_residual / self.count / fraction).sqrt()
-        return torch.maximum(rms, TUNING.least_noise * self.torque_std) * math.sqrt(self.correlation_length)
+        return torch.maximum(rms, TUNING.min_noise * self.torque_std) * math.sqrt(self.correlation_length)
 
     def annealed(self, squared_residual: torch.Tensor) -> torch.Tensor:
         """Return the noise (n,) [Nm, N] of an early iteration: a fraction of its residual (n,) [Nm^2, N^2]."""
-        return TUNING.first_noise * (self.correlation_length * squared_residual / self.count).sqrt()
+        return TUNING.annealing_fraction * (self.correlation_length * squared_residual / self.count).sqrt()
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +119,7 @@ class TorqueProblem:
     @property
     def evidence_samples(self) -> float:
         """Samples per independent error in the choice of friction models and residual terms."""
-        return max(1.0, TUNING.lasting_errors / self.jacobian.samples.stride)
+        return max(1.0, TUNING.selection_correlation_length / self.jacobian.samples.stride)
 
     def with_least_squares_noise(self, x: torch.Tensor) -> TorqueProblem:
         """Return the problem under the noise of unconstrained least squares, linearized at x (K,).
@@ -132,7 +130,9 @@ class TorqueProblem:
         """
         estimator = NoiseEstimator.of(self.jacobian)
         noise, rows = estimator.upper_bound(), list(self.jacobian.joint_rows(x))
-        for _ in range(TUNING.last_rounds):  # the noise weights the joints, whose torques share parameters
+        for _ in range(
+            TUNING.final_iterations
+        ):  # the noise weights the joints, whose torques share parameters
             noise = estimator.estimate(*least_squares_residual(rows, noise, self.free))
         return replace(self, noise=noise)
 
@@ -165,7 +165,9 @@ class TorqueProblem:
     def minimize(self, state: State, max_steps: int) -> SolverResult[torch.Tensor]:
         """Return the result of Levenberg-Marquardt steps from a state of x (K,), whose cost is recomputed."""
         state = replace(state, cost=self.cost(state.x, state.residual))
-        return levenberg_marquardt(self, state, max_steps=max_steps, min_relative_decrease=TUNING.gain)
+        return levenberg_marquardt(
+            self, state, max_steps=max_steps, min_relative_decrease=TUNING.min_relative_decrease
+        )
 
     def covariance(self, curvature: torch.Tensor) -> torch.Tensor:
         """Return the posterior covariance (K, K), zero for fixed parameters, from the curvature of the free ones."""
@@ -225,11 +227,11 @@ def alternate(problem: TorqueProblem, state: State, iterations: int) -> TorqueEs
         state: first iterate.
         iterations: number of outer iterations; more, up to a multiple, follow while the noise of a joint decreases.
     """
-    for number in range(TUNING.longer * iterations):
-        result = problem.minimize(state, TUNING.steps)
+    for number in range(TUNING.max_extension * iterations):
+        result = problem.minimize(state, TUNING.iteration_steps)
         state, covariance = result.state, problem.covariance(result.normal_equations.curvature)
         previous, problem = problem, problem.updated(state, covariance)
-        if number + 1 >= iterations and (problem.noise > TUNING.noise_settled * previous.noise).all():
+        if number + 1 >= iterations and (problem.noise > TUNING.noise_converged * previous.noise).all():
             break
     return TorqueEstimate(problem, state, covariance, result.termination)
 
@@ -241,4 +243,4 @@ def refine(
     jacobian = TorqueJacobian(estimate.problem.jacobian.model, samples, terms)
     estimate = estimate.with_jacobian(jacobian)
     noise = NoiseEstimator.of(jacobian).estimate(estimate.state.residual)
-    return alternate(replace(estimate.problem, noise=noise), estimate.state, TUNING.last_rounds)
+    return alternate(replace(estimate.problem, noise=noise), estimate.state, TUNING.final_iterations)

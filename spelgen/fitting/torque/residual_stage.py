@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import torch
 
-from spelgen.fitting.torque.jacobian import TUNING, TorqueJacobian
+from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.joint_functions import TermKey, clear_terms, refit_terms
 from spelgen.fitting.torque.network_selection import select_networks
 from spelgen.fitting.torque.problem import TorqueEstimate, refine
@@ -20,6 +20,7 @@ from spelgen.fitting.torque.selection import (
     split_halves,
     within_range,
 )
+from spelgen.fitting.torque.tuning import TUNING
 
 
 def fit_residual_terms(
@@ -47,7 +48,7 @@ def fit_residual_terms(
         estimate, selected = _without_losing_joints(rigid_only, estimate, selected)
     residual_samples = estimate.problem.jacobian.residual_samples(estimate.state.x)
     selected += select_networks(model, residual_samples, correlation_length)
-    for _ in range(TUNING.turns if selected else 0):
+    for _ in range(TUNING.alternations if selected else 0):
         estimate = _refit(estimate.with_current_covariance(), samples, selected)
     return estimate, selected
 

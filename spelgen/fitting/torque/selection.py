@@ -21,12 +21,10 @@ from spelgen.fitting.torque.bayesian_ridge import append_target, bayesian_ridge
 from spelgen.fitting.torque.jacobian import ResidualSamples
 from spelgen.fitting.torque.joint_functions import JointFunction, TermKey, joint_functions, rms_per_joint
 from spelgen.fitting.torque.linearization import RigidProjection
-from spelgen.fitting.torque.tuning import ResidualTuning
+from spelgen.fitting.torque.tuning import SELECTION
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
-
-TUNING = ResidualTuning()
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ def split_halves(count: int, correlation_length: float) -> tuple[slice, slice]:
 
 def _gap(correlation_length: float) -> int:
     """Return the number of samples between fitted and held-out samples."""
-    return round(TUNING.gap * correlation_length)
+    return round(SELECTION.gap * correlation_length)
 
 
 def within_range(position: torch.Tensor, fitted: torch.Tensor) -> torch.Tensor:
@@ -126,14 +124,14 @@ def _best(
 def _better(first: SelectedTerm | None, other: SelectedTerm) -> SelectedTerm:
     """Return the other term if its error is clearly smaller, else the first."""
     # splines of a linear spring reduce the error nearly as much as ripple does, and they extrapolate
-    if first is None or 1 - other.error_reduction <= TUNING.clearly_less * (1 - first.error_reduction):
+    if first is None or 1 - other.error_reduction <= SELECTION.preference_ratio * (1 - first.error_reduction):
         return other
     return first
 
 
 def _blocks(count: int) -> list[slice]:
     """Return contiguous blocks of `count` samples, one per fold."""
-    edges = torch.linspace(0, count, TUNING.folds + 1).long().tolist()
+    edges = torch.linspace(0, count, SELECTION.folds + 1).long().tolist()
     return [slice(start, stop) for start, stop in pairwise(edges)]
 
 
@@ -169,11 +167,11 @@ def significant_reduction(before: torch.Tensor, after: torch.Tensor) -> float | 
     large torques nor a block of extrapolation dominates the variance. A negligible part of the mean square is added to
     the denominator, so that blocks without torque count as zero.
     """
-    negligible = 2 * TUNING.least_gain * before.mean()
+    negligible = 2 * SELECTION.min_reduction * before.mean()
     g = (before - after) / (before + after + negligible)
     standard_error = g.std() / len(g) ** 0.5
-    if not g.isfinite().all() or g.mean() <= TUNING.standard_errors * standard_error:
+    if not g.isfinite().all() or g.mean() <= SELECTION.standard_errors * standard_error:
         return None
     mean = float(g.mean())
     reduction = 2 * mean / (1 + mean)  # (before - after) / before of a block with the mean g
-    return reduction if reduction > TUNING.least_gain else None
+    return reduction if reduction > SELECTION.min_reduction else None

@@ -15,9 +15,8 @@ from spelgen.fitting.torque.problem import (
     TorqueProblem,
     alternate,
 )
-from spelgen.fitting.torque.tuning import TorqueTuning
+from spelgen.fitting.torque.tuning import TUNING
 
-TUNING = TorqueTuning()
 EFFECT_GROUPS = ("effects", "load_dependence")
 """Groups of the Stribeck effect, saturation and load dependence of friction, which not every joint has."""
 
@@ -32,7 +31,7 @@ def initial_fit(problem: TorqueProblem) -> TorqueEstimate:
     while problem.adapt is None and (further := find_compensation(problem, state.x)).any():
         problem = replace(problem, compensated=problem.compensated | further)
         problem, state = _annealed_fit(problem, state.steps)
-    return alternate(problem, state, TUNING.rounds)
+    return alternate(problem, state, TUNING.iterations)
 
 
 def _annealed_fit(problem: TorqueProblem, steps: int) -> tuple[TorqueProblem, State]:
@@ -46,11 +45,11 @@ def _annealed_fit(problem: TorqueProblem, steps: int) -> tuple[TorqueProblem, St
     problem = problem.with_least_squares_noise(mean)
     min_noise = problem.noise
     state = initial_state(problem, mean, steps=steps)
-    for _ in range(TUNING.first_rounds):
+    for _ in range(TUNING.annealing_iterations):
         problem = replace(problem, noise=torch.maximum(min_noise, estimator.annealed(state.residual)))
         if (problem.noise == min_noise).all():
             break
-        state = problem.minimize(state, TUNING.steps).state
+        state = problem.minimize(state, TUNING.iteration_steps).state
     return _least_squares_noise_fit(problem, state)
 
 
@@ -58,7 +57,7 @@ def _least_squares_noise_fit(problem: TorqueProblem, state: State) -> tuple[Torq
     """Return the fit from a state under the noise of least squares, linearized there."""
     problem = problem.with_least_squares_noise(state.x)
     state = initial_state(problem, state.x, steps=state.steps)
-    return problem, problem.minimize(state, TUNING.first_steps).state
+    return problem, problem.minimize(state, TUNING.initial_steps).state
 
 
 def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
@@ -76,10 +75,10 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     # share of the squared residual that the regression line explains (coefficient of determination)
     explained = slope * products / residual.square().sum(dim=0).clamp(min=1e-300)
     errors = estimator.count / estimator.correlation_length
-    significant = explained * errors > TUNING.compensation_deviations**2 * (1 - explained)
+    significant = explained * errors > TUNING.min_significance**2 * (1 - explained)
     amplitude = (slope * products / estimator.count).sqrt()
-    visible = amplitude > TUNING.compensation_visible * estimator.torque_std
-    decreasing = (slope < 0) & (explained > TUNING.compensation_explained) & visible
+    visible = amplitude > TUNING.min_compensation * estimator.torque_std
+    decreasing = (slope < 0) & (explained > TUNING.min_explained) & visible
     return decreasing & significant & ~problem.compensated
 
 
@@ -92,7 +91,7 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
     friction = estimate.problem.jacobian.model.friction
     friction.memoryless.fill_(0.0)
     problem, state = _least_squares_noise_fit(estimate.problem, estimate.state)
-    hysteretic = alternate(problem, state, TUNING.rounds)
+    hysteretic = alternate(problem, state, TUNING.iterations)
     evidence = log_likelihood_ratio(hysteretic, estimate) - fraction_occam_factor(hysteretic)
     rate_only = _rejected(evidence)
     friction.memoryless.copy_(rate_only)
@@ -100,7 +99,7 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
         return estimate
     if rate_only.any():
         mixed = hysteretic.with_jacobian(hysteretic.problem.jacobian)
-        return alternate(mixed.problem, mixed.state, TUNING.rounds)
+        return alternate(mixed.problem, mixed.state, TUNING.iterations)
     return hysteretic
 
 
@@ -126,7 +125,7 @@ def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
     mean[indices] = x[indices] = NEGLIGIBLE
     problem = replace(problem, prior=replace(problem.prior, mean=mean))
     state = replace(estimate.state, x=x, residual=problem.residual(x))
-    return alternate(problem, state, TUNING.rounds)
+    return alternate(problem, state, TUNING.iterations)
 
 
 def log_likelihood_ratio(estimate: TorqueEstimate, other: TorqueEstimate) -> torch.Tensor:
