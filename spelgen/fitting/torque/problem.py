@@ -117,7 +117,7 @@ class TorqueProblem:
         return self.jacobian.rigid.free_mask(self.adapt, self.compensated)
 
     @property
-    def evidence_samples(self) -> float:
+    def selection_correlation_length(self) -> float:
         """Samples per independent error in the choice of friction models and residual terms."""
         return max(1.0, TUNING.selection_correlation_length / self.jacobian.samples.stride)
 
@@ -130,9 +130,8 @@ class TorqueProblem:
         """
         estimator = NoiseEstimator.of(self.jacobian)
         noise, rows = estimator.upper_bound(), list(self.jacobian.joint_rows(x))
-        for _ in range(
-            TUNING.final_iterations
-        ):  # the noise weights the joints, whose torques share parameters
+        # iterated: the noise is the weight of the joints, whose torques have common parameters
+        for _ in range(TUNING.final_iterations):
             noise = estimator.estimate(*least_squares_residual(rows, noise, self.free))
         return replace(self, noise=noise)
 

@@ -35,7 +35,7 @@ def fit_residual_terms(
     if samples is not estimate.problem.jacobian.samples:
         estimate = refine(estimate, samples)
     estimate.problem.jacobian.rigid.write(estimate.state.x)
-    correlation_length = estimate.problem.evidence_samples
+    correlation_length = estimate.problem.selection_correlation_length
     if not can_split(samples.count, correlation_length):
         return estimate, []
     rigid_only = estimate
@@ -57,7 +57,7 @@ def _refit(
     estimate: TorqueEstimate, samples: TorqueSamples, selected: Sequence[SelectedTerm]
 ) -> TorqueEstimate:
     """Refit the selected single-joint terms and the rigid-body parameters, with torques of position eliminated."""
-    model, correlation_length = estimate.problem.jacobian.model, estimate.problem.evidence_samples
+    model, correlation_length = estimate.problem.jacobian.model, estimate.problem.selection_correlation_length
     projected = refit_terms(model, *estimate.linearize(), _keys(selected), correlation_length)
     estimate = refine(estimate, samples, projected.terms)
     jacobian, x = estimate.problem.jacobian, estimate.state.x
@@ -89,7 +89,7 @@ def _losing_joints(
     rigid_only: TorqueEstimate, estimate: TorqueEstimate, selected: Sequence[SelectedTerm]
 ) -> list[int]:
     """Return the joints at which the terms do not lower the error on the last half, after fits to the first half."""
-    jacobian, correlation_length = estimate.problem.jacobian, estimate.problem.evidence_samples
+    jacobian, correlation_length = estimate.problem.jacobian, estimate.problem.selection_correlation_length
     model, samples = jacobian.model, jacobian.samples
     first, last = (samples.select(rows) for rows in split_halves(samples.count, correlation_length))
     terms = copy.deepcopy(model.residuals.state_dict())

@@ -130,7 +130,7 @@ def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
 
 def log_likelihood_ratio(estimate: TorqueEstimate, other: TorqueEstimate) -> torch.Tensor:
     """Return twice the log likelihood ratio of two estimates per joint (n,), with the noise maximized out."""
-    errors = estimate.problem.jacobian.samples.count / estimate.problem.evidence_samples
+    errors = estimate.problem.jacobian.samples.count / estimate.problem.selection_correlation_length
     return errors * (other.state.residual / estimate.state.residual).log()
 
 
