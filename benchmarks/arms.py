@@ -54,8 +54,8 @@ from spelgen.dynamics.pinocchio_urdf import has_drives, urdf_dynamics
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import build
+from spelgen.arm.configured_arm import load_arm
 
 Split = tuple[str, Path, list[Trajectory], list[Trajectory]]
 

@@ -24,8 +24,8 @@ import torch
 
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.read import write_logs
-from spelgen.pipeline.generate import generate
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import generate
+from spelgen.arm.configured_arm import load_arm
 from spelgen.simulation.simulate import simulate
 
 URDF = Path(__file__).parents[1] / "robots" / "rpr.urdf"

@@ -45,8 +45,8 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows, joined
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import build
+from spelgen.arm.configured_arm import load_arm
 
 Torque = Callable[[DynamicsSamples], np.ndarray]
 

@@ -23,8 +23,8 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from spelgen.dynamics.regressor import regressor, urdf_parameters
-from spelgen.pipeline.generate import generate
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import generate
+from spelgen.arm.configured_arm import load_arm
 from spelgen.settings.tuning.logs import LogTuning
 
 ROOT = Path(__file__).parents[1]

@@ -25,23 +25,25 @@ if TYPE_CHECKING:
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs, write_logs
     from spelgen.logs.trajectory import Trajectory
-    from spelgen.pipeline.build import build
-    from spelgen.pipeline.generate import check, generate, inspect
-    from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
+    from spelgen.emission.build import build
+    from spelgen.certificate.inspection import inspect
+    from spelgen.certificate.module_check import check
+    from spelgen.emission.build import generate
+    from spelgen.arm.configured_arm import ConfiguredArm, load_arm
     from spelgen.settings.fits import GaussianPrior, MomentumFit, Rollout, TorqueFit
     from spelgen.simulation.simulate import simulate
 
 
 _HOME = {
-    "load_arm": "pipeline.loaded_arm",
-    "LoadedArm": "pipeline.loaded_arm",
-    "inspect": "pipeline.generate",
+    "load_arm": "arm.configured_arm",
+    "ConfiguredArm": "arm.configured_arm",
+    "inspect": "certificate.inspection",
     "Inspection": "certificate.inspection",
-    "generate": "pipeline.generate",
+    "generate": "emission.build",
     "Design": "design",
-    "build": "pipeline.build",
+    "build": "emission.build",
     "load_module": "emission.loading",
-    "check": "pipeline.generate",
+    "check": "certificate.module_check",
     "read_logs": "logs.read",
     "write_logs": "logs.read",
     "Trajectory": "logs.trajectory",
@@ -79,7 +81,7 @@ __all__ = [
     "Identification",
     "Inspection",
     "LeastSquares",
-    "LoadedArm",
+    "ConfiguredArm",
     "MomentumFit",
     "Preprocessing",
     "Results",

@@ -19,8 +19,8 @@ from torch import nn
 
 from spelgen.design import Design
 from spelgen.emission.emit import emit
-from spelgen.pipeline.generate import make_spec
-from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
+from spelgen.emission.build import make_spec
+from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.spec import Options
 from spelgen.structure.structure import Structure
 
@@ -66,7 +66,7 @@ def built(
 
 
 @cache
-def _loaded(robot: str) -> LoadedArm:
+def _loaded(robot: str) -> ConfiguredArm:
     return load_arm(ROBOTS / f"{robot}.urdf")
 
 

@@ -13,7 +13,7 @@ from spelgen.errors import LogError, SpelgenError
 from spelgen.files import local
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.read import read_logs, write_logs
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.simulation.simulate import simulate
 
 JOINTS = ("joint1", "joint2")

@@ -21,8 +21,8 @@ from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.fitting.fitted import load_run
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows
-from spelgen.pipeline.generate import generate
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import generate
+from spelgen.arm.configured_arm import load_arm
 
 
 class Slider:

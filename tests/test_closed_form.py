@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 
 from spelgen.cli.main import app
 from spelgen.dynamics.body_regressor import regressor_of
-from spelgen.pipeline.generate import generate
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import generate
+from spelgen.arm.configured_arm import load_arm
 from spelgen.structure.pseudo_inertia import pseudo_inertia
 from spelgen.structure.sampling import float_energies
 

@@ -13,7 +13,8 @@ import pytest
 from emitted import GANTRY, built, import_source
 
 from spelgen.design import Preset
-from spelgen.pipeline.generate import check, generate
+from spelgen.certificate.module_check import check
+from spelgen.emission.build import generate
 from spelgen.spec import read_facts
 
 ROOT = Path(__file__).parents[1]

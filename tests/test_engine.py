@@ -15,7 +15,7 @@ from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import ArmError, SpelgenErrors
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.settings.joint import JointSettings
 from spelgen.settings.settings import Settings, load_settings
 from spelgen.urdf.read import read_urdf

@@ -23,8 +23,8 @@ from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.export import export
 from spelgen.exporting.model_expressions import expression_functions
 from spelgen.exporting.parity import check_parity, random_inputs, require_parity
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import build
+from spelgen.arm.configured_arm import load_arm
 
 ONE_JOINT = """<robot name="one"><link name="base"/>
 <link name="arm"><inertial><origin xyz="0.1 0 0"/><mass value="1"/>

@@ -17,8 +17,8 @@ from spelgen.errors import RunError
 from spelgen.exporting.export import export
 from spelgen.exporting.mjcf_export import check_mjcf
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import build
+from spelgen.arm.configured_arm import load_arm
 
 
 @pytest.mark.parametrize("robot", ["rpr", "scara", "panda"])

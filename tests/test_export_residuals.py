@@ -14,7 +14,7 @@ from spelgen.exporting.casadi_export import called_by_state, casadi_functions
 from spelgen.exporting.describe import Trained, describe
 from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.parity import check_parity
-from spelgen.pipeline.build import build
+from spelgen.emission.build import build
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
 ENTRIES = {name: entry for name, entry in ENTRY_POINTS.items() if name != "servo_torque"}

@@ -25,7 +25,7 @@ from spelgen.logs.read import read_logs
 from spelgen.logs.tables import LogFormat
 from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline import generate as pipeline
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.arm.configured_arm import load_arm
 
 ROOT = Path(__file__).parents[1]
 JOINTS = ["joint1", "joint2"]

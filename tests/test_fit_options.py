@@ -11,8 +11,8 @@ from spelgen.errors import OptionError, SettingsError
 from spelgen.fitting.fit import fit
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import write_logs
-from spelgen.pipeline.build import build
-from spelgen.pipeline.generate import generate
+from spelgen.emission.build import build
+from spelgen.emission.build import generate
 from spelgen.settings.fits import CONFIGS, OWNERS, MomentumFit, Rollout, TorqueFit, fit_config
 from spelgen.settings.settings import load_settings
 from spelgen.settings.training import TrainingSettings

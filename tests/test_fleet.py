@@ -16,7 +16,7 @@ from spelgen.fleet.prepare import Preparation, prepare
 from spelgen.fleet.ranking import fleet_listings, winners
 from spelgen.fleet.schema import FleetRobot, load_fleet
 from spelgen.logs.read import read_logs, write_logs
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.render.fleet_page import write_fleet
 from spelgen.simulation.simulate import simulate
 from spelgen.tasks import run_here, workers

@@ -20,8 +20,8 @@ from spelgen.certificate.formula_text import text, to_dict
 from spelgen.certificate.formulas import formulas
 from spelgen.cli.main import app
 from spelgen.errors import SpelgenError
-from spelgen.pipeline.generate import inspect
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.certificate.inspection import inspect
+from spelgen.arm.configured_arm import load_arm
 from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf
 

@@ -22,8 +22,8 @@ from spelgen.identification.identify import least_squares
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import build
+from spelgen.arm.configured_arm import load_arm
 from spelgen.runtime.friction_laws import FrictionLaws
 from spelgen.runtime.sliding_friction import SlidingFriction
 

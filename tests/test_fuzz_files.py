@@ -23,8 +23,8 @@ from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.chunks import scan
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import build
+from spelgen.arm.configured_arm import load_arm
 from spelgen.render.report_page import render_report
 from spelgen.render.scene import scene
 from spelgen.settings.fits import TorqueFit

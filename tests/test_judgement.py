@@ -27,8 +27,8 @@ from spelgen.fitting.window.momentum import MomentumObjective
 from spelgen.fleet import jobs
 from spelgen.identification.least_squares import deviations
 from spelgen.logs.windows import Windows
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import build
+from spelgen.arm.configured_arm import load_arm
 from spelgen.settings.fits import Rollout, TorqueFit
 
 

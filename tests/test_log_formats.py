@@ -22,7 +22,7 @@ from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.suggest import suggest_mapping
 from spelgen.logs.tables import LogFormat, table_layout
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.settings.log_mapping import LogMapping
 
 JOINTS = ("shoulder", "elbow")

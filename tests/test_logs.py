@@ -20,8 +20,8 @@ from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.trajectory import split_at_gaps
 from spelgen.logs.windows import cut_windows, split_validation
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import build
+from spelgen.arm.configured_arm import load_arm
 
 JOINTS = ("a", "b")
 

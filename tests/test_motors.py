@@ -27,9 +27,10 @@ from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.build import build
-from spelgen.pipeline.generate import generate, inspect
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import build
+from spelgen.certificate.inspection import inspect
+from spelgen.emission.build import generate
+from spelgen.arm.configured_arm import load_arm
 from spelgen.settings.log_mapping import LogMapping
 
 WRIST = np.array([[50.0, 50.0], [40.0, -40.0]])  # joint torques by motor torques of the last two joints

@@ -7,7 +7,7 @@ from exported_runs import arm_of, moved_model
 
 from spelgen.dynamics.protocol import has_residuals
 from spelgen.dynamics.tip import tip_kinematics
-from spelgen.pipeline.build import build
+from spelgen.emission.build import build
 
 
 @pytest.fixture(scope="module", params=["closed-form", "hybrid", "spel"])

@@ -25,8 +25,8 @@ from test_model import bias
 from spelgen.design import Preset, load_design
 from spelgen.dynamics.protocol import has_friction_state
 from spelgen.fitting.rollout import position_difference
-from spelgen.pipeline.generate import generate, make_spec
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import generate, make_spec
+from spelgen.arm.configured_arm import load_arm
 from spelgen.spec import Options
 from tests.lie_group import to_group
 

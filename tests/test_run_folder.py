@@ -32,7 +32,8 @@ from spelgen.fitting.window import momentum
 from spelgen.logs import chunks
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.generate import generate, require_own_module
+from REMOVED import require_own_module
+from spelgen.emission.build import generate
 from spelgen.render.report_page import render_report
 from spelgen.settings.fits import Rollout
 from spelgen.settings.tuning.fitting import WindowTuning

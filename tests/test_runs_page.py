@@ -17,7 +17,7 @@ from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import CSV_HEAD, csv_text
 from spelgen.identification.identify import identify
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.render.identification_page import page
 from spelgen.render.runs_page import render_runs
 

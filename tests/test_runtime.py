@@ -22,9 +22,9 @@ from spelgen.emission.bundle import bundle, load_runtime, names_in
 from spelgen.emission.tailored import kinds
 from spelgen.emission.unit_joints import hidden_units
 from spelgen.fitting.torque.weights import body_weights, upper_cholesky
-from spelgen.pipeline.build import build
-from spelgen.pipeline.generate import make_spec
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import build
+from spelgen.emission.build import make_spec
+from spelgen.arm.configured_arm import load_arm
 from spelgen.runtime.derived_mass import DerivedMass
 from spelgen.runtime.encoding import JointEncoding
 from spelgen.runtime.friction_laws import turning

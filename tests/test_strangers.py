@@ -28,9 +28,9 @@ from spelgen.log_checks.gravity import find_opposed_inertia, state_samples
 from spelgen.logs import bags
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.build import build
-from spelgen.pipeline.generate import generate
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import build
+from spelgen.emission.build import generate
+from spelgen.arm.configured_arm import load_arm
 from spelgen.settings.fits import MomentumFit, Rollout
 from spelgen.settings.messages import validated
 

@@ -35,9 +35,9 @@ from spelgen.logs import chunks
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.build import build
-from spelgen.pipeline.generate import generate
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import build
+from spelgen.emission.build import generate
+from spelgen.arm.configured_arm import load_arm
 from spelgen.settings.fits import GaussianPrior, Rollout, TorqueFit
 from spelgen.settings.tuning.fitting import TorqueTuning
 from tests.test_closed_form import FOLLOWED, drawn

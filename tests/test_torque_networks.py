@@ -8,7 +8,7 @@ from spelgen.fitting.torque import networks as torque_networks
 from spelgen.fitting.torque.networks import fit_networks
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.logs.dynamics_samples import DynamicsSamples
-from spelgen.pipeline.generate import generate
+from spelgen.emission.build import generate
 
 
 def recorded(model, seed, count=150):

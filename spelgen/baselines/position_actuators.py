@@ -23,13 +23,13 @@ from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.rigid_bodies import about_center, quaternion
 from spelgen.fitting.servo.windows import ServoWindows
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import LoadedArm
+from spelgen.emission.build import build
+from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.settings.tuning.exporting import TUNING as EXPORT_TUNING
 from spelgen.settings.tuning.servo import PositionActuatorTuning
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = PositionActuatorTuning()
 FARTHEST, OFFSET, LATEST = 4.0, 0.3, 0.4  # bounds: of logarithms from their start; rad, m; s
@@ -44,7 +44,7 @@ class PositionActuators:
     """
 
     arm: Arm
-    untrained: EmittedModel
+    untrained: ArmModel
     drives: np.ndarray
     offset: np.ndarray
     delay: float
@@ -54,7 +54,7 @@ class PositionActuators:
     )
 
     @classmethod
-    def of_arm(cls, arm: LoadedArm, drives: object, offset: object, delay: float) -> PositionActuators:
+    def of_arm(cls, arm: ConfiguredArm, drives: object, offset: object, delay: float) -> PositionActuators:
         """Return such actuators of an arm. Raises TypeError or ValueError for numbers of other joints."""
         n = len(arm.arm.coordinates)
         untrained = build(arm, "closed-form").requires_grad_(False)
@@ -128,7 +128,7 @@ def _rollout(model: mujoco.MjModel, q: np.ndarray, qd: np.ndarray, commands: np.
 
 
 def fit_position_actuators(
-    arm: LoadedArm, windows: ServoWindows, trained: EmittedModel
+    arm: ConfiguredArm, windows: ServoWindows, trained: ArmModel
 ) -> PositionActuators | None:
     """Fit to windows, starting with the drives of a ``trained`` model of the arm; None where joints are coupled."""
     n = len(arm.arm.coordinates)

@@ -10,16 +10,17 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.train import open_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.loaded_arm import LoadedArm, arm_of_module
+from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.emission.build import arm_of_spec
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.spec import read_facts
 
 
-def run_arm(run: RunFolder) -> LoadedArm:
+def run_arm(run: RunFolder) -> ConfiguredArm:
     """Return the arm that a run's module was built from. Raises RunError where the run has no URDF."""
     if not run.urdf.exists():
         raise RunError("no robot.urdf", file=run.path, do="train with --robot")
-    return arm_of_module(read_facts(run.module), run.urdf)
+    return arm_of_spec(read_facts(run.module), run.urdf)
 
 
 def run_logs(run: RunFolder, paths: Iterable[Path | str]) -> Sequence[Trajectory] | LargeLogs:

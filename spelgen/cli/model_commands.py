@@ -81,7 +81,7 @@ def build(
     # an option without effect would pass for one that was applied
     if net is not None and preset == "closed-form":
         raise typer.BadParameter("closed-form has no networks", param_hint="'--net'")
-    from spelgen.pipeline.generate import generate
+    from spelgen.emission.build import generate
 
     arm = options.load(robot, joints, tip, angle_tolerance)
     path = output or Path(f"{robot.stem}_spel.py")
@@ -97,7 +97,7 @@ def build(
 
 def check(module: Module, robot: RobotOption = None) -> None:
     """Check whether a module is up to date with its URDF."""
-    from spelgen.pipeline.generate import check as check_module
+    from spelgen.certificate.module_check import check as check_module
 
     result = check_module(module, robot)
     for reason in result.reasons:

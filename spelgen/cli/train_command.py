@@ -102,11 +102,11 @@ def train(
     urdf = None if resume else robot or _unchanged_urdf(module)
     start = resumed_run(folder, request) if resume else new_run(module, urdf, request)
     from spelgen.log_checks.check_logs import require_sound_logs
-    from spelgen.pipeline.loaded_arm import arm_of_module
+    from spelgen.emission.build import arm_of_spec
 
     facts = read_facts(start.module)
     # the mapping may speak of all joints of a URDF, and logs are checked beside the arm
-    arm = None if urdf is None else arm_of_module(facts, urdf)
+    arm = None if urdf is None else arm_of_spec(facts, urdf)
     log_mapping = options.log_mapping(arm or facts.joints, mapping or start.mapping, accept)
     # torch is imported where it is needed: --help and mistakes are answered at once
     from spelgen.fitting.fit import RunOptions
@@ -198,7 +198,7 @@ def _warm_start(request: Request) -> Request:
 
 def _unchanged_urdf(module: Path) -> Path | None:
     """Return the URDF of the module's name near it, where it is still the one the module was built from."""
-    from spelgen.pipeline.generate import find_urdf
+    from spelgen.emission.build import find_urdf
     from spelgen.urdf.document import urdf_bytes
 
     facts = read_facts(module)

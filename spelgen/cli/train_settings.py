@@ -18,7 +18,7 @@ from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Count
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
     from spelgen.settings.log_mapping import LogMapping
 
 TIME_LIMIT = "max_minutes"
@@ -68,7 +68,7 @@ class Start:
     """Hold what is fitted and how. config: makes the configuration once the logs' sample rates [Hz] are known."""
 
     module: Path
-    config: Callable[[EmittedModel, Sequence[float] | None], FitConfig | None]
+    config: Callable[[ArmModel, Sequence[float] | None], FitConfig | None]
     settings: TrainingSettings
     mapping: LogMapping | None = None
 
@@ -112,7 +112,7 @@ def new_run(module: Path, urdf: Path | None, request: Request) -> Start:
 
 
 def _new_config(
-    settings: TrainingSettings, request: Request, model: EmittedModel, rates: Sequence[float] | None
+    settings: TrainingSettings, request: Request, model: ArmModel, rates: Sequence[float] | None
 ) -> FitConfig | None:
     """Return the configuration for a model; None where the logs' rates decide and are not known yet."""
     from spelgen.dynamics.protocol import has_rigid_bodies
@@ -157,7 +157,7 @@ def resumed_run(folder: Path, request: Request) -> Start:
         recorded["validation_fraction"] = fraction
     settings = TrainingSettings().model_copy(update=recorded)
 
-    def config(model: EmittedModel, rates: Sequence[float] | None) -> FitConfig:
+    def config(model: ArmModel, rates: Sequence[float] | None) -> FitConfig:
         rigid_bodies = has_rigid_bodies(model)
         if request.objective not in (None, record["objective"]):
             return fit_config(request.objective, rigid_bodies=rigid_bodies, options=request.values_of(OWNERS))

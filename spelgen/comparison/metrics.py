@@ -20,11 +20,11 @@ from spelgen.files import read_json, write_json
 from spelgen.fitting.rollout import position_difference, roll_out
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.settings.tuning.comparison import ComparisonTuning
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = ComparisonTuning()
 
@@ -92,7 +92,7 @@ def thinned(pieces: Sequence[Trajectory], samples: int, decimation: int) -> Wind
     return cut_windows(pieces, samples, stride, decimation, measured=False)
 
 
-def predict(model: EmittedModel, windows: Windows, substeps: int) -> Prediction:
+def predict(model: ArmModel, windows: Windows, substeps: int) -> Prediction:
     """Return the errors of these windows, each predicted from its first sample."""
     with torch.no_grad():
         q, qd = roll_out(model, windows, substeps)
@@ -102,7 +102,7 @@ def predict(model: EmittedModel, windows: Windows, substeps: int) -> Prediction:
     return Prediction(*finite(torch.stack([position + velocity, position, velocity])))
 
 
-def sizes(model: EmittedModel) -> Sizes:
+def sizes(model: ArmModel) -> Sizes:
     """Return how many numbers the model's networks give and read, and how many are trained."""
     energies: Any = model.residuals if has_residuals(model) else model  # beside rigid bodies
     mass, friction = _network(energies, "mass"), _network(model, "friction")

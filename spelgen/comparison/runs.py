@@ -30,7 +30,7 @@ from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.train import train
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.settings.fits import DEFAULTS, Rollout
 from spelgen.settings.tuning.comparison import ComparisonTuning
 from spelgen.structure.nominal import working_range

@@ -25,8 +25,9 @@ from spelgen.fitting.window.momentum import TUNING
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.generate import generate, require_own_module
-from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
+from REMOVED import require_own_module
+from spelgen.emission.build import generate
+from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.fits import Rollout, fit_config
 from spelgen.settings.settings import Settings
@@ -189,7 +190,7 @@ def prepare_study(
     return study
 
 
-def _write_modules(study: Study, loaded: LoadedArm) -> None:
+def _write_modules(study: Study, loaded: ConfiguredArm) -> None:
     """Write the URDF that the models know, and a module of each variant."""
     study.urdf.write_bytes(known_urdf(study.source, study.urdf_error))
     gravity = yaml.safe_dump({"gravity": list(loaded.settings.gravity)})
@@ -212,7 +213,7 @@ def _training(settings: Settings, comparison: ComparisonSettings) -> Rollout:
     return cast("Rollout", fit_config("rollout", rigid_bodies=False, options=options, defaults=defaults))
 
 
-def _description(study: Study, loaded: LoadedArm) -> dict[str, object]:
+def _description(study: Study, loaded: ConfiguredArm) -> dict[str, object]:
     """Return what must be the same for a comparison to go on; seeds may be added."""
     apart: Any = {"folder": True, "source": True, "settings": {"seeds"}, "variants": {"__all__": {"preset"}}}
     return {
@@ -224,7 +225,7 @@ def _description(study: Study, loaded: LoadedArm) -> dict[str, object]:
     }
 
 
-def _write_logs(study: Study, loaded: LoadedArm, progress: Callable[[int, int], None] | None) -> None:
+def _write_logs(study: Study, loaded: ConfiguredArm, progress: Callable[[int, int], None] | None) -> None:
     from spelgen.simulation.simulate import simulate
 
     result = simulate(loaded, progress=progress)

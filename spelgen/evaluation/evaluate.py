@@ -37,9 +37,9 @@ from spelgen.settings.tuning.evaluation import EvaluationTuning
 
 if TYPE_CHECKING:
     from spelgen.dynamics.protocol import RigidDynamics
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
     from spelgen.fitting.fitted import Fit
-    from spelgen.pipeline.loaded_arm import LoadedArm
+    from spelgen.arm.configured_arm import ConfiguredArm
 
 TUNING = EvaluationTuning()
 STEPS: Sequence[int] = (1, 10)
@@ -48,10 +48,10 @@ Progress = Callable[[int, int, str], None]
 
 
 def evaluate(
-    model: EmittedModel | Fit | Path | str,
+    model: ArmModel | Fit | Path | str,
     logs: Trajectory | Sequence[Trajectory],
     *,
-    arm: LoadedArm | Path | str | None = None,
+    arm: ConfiguredArm | Path | str | None = None,
     baselines: Mapping[str, RigidDynamics] | None = None,
     preprocessing: Preprocessing | None = None,
     steps: Sequence[int] = STEPS,

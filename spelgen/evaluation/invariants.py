@@ -14,7 +14,7 @@ from spelgen.logs.windows import Windows
 from spelgen.settings.tuning.evaluation import EvaluationTuning
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = EvaluationTuning()
 
@@ -31,13 +31,13 @@ class Invariants:
     energy_rise: float | None
 
 
-def invariants(model: EmittedModel, windows: Windows, low: Tensor, high: Tensor) -> Invariants:
+def invariants(model: ArmModel, windows: Windows, low: Tensor, high: Tensor) -> Invariants:
     """Measure them over q in low..high (n,), and from the windows' first states."""
     with torch.no_grad():
         return Invariants(_least_eigenvalue(model, low, high), _energy_rise(model, windows))
 
 
-def _least_eigenvalue(model: EmittedModel, low: Tensor, high: Tensor) -> float:
+def _least_eigenvalue(model: ArmModel, low: Tensor, high: Tensor) -> float:
     """Return that of M over random positions, in units of the mean eigenvalue."""
     generator = torch.Generator().manual_seed(0)
     count = TUNING.sampled_positions
@@ -47,7 +47,7 @@ def _least_eigenvalue(model: EmittedModel, low: Tensor, high: Tensor) -> float:
     return (eigenvalues.min() / eigenvalues.mean().abs()).item()
 
 
-def _energy_rise(model: EmittedModel, windows: Windows) -> float | None:
+def _energy_rise(model: ArmModel, windows: Windows) -> float | None:
     """Return the largest relative rise of H over steps of 1 ms without input."""
     q, qd = windows.q[: TUNING.started_states, 0], windows.qd[: TUNING.started_states, 0]
     no_input = q.new_zeros(len(q), TUNING.free_steps, model.n)

@@ -20,7 +20,7 @@ from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.settings.tuning.evaluation import EvaluationTuning
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = EvaluationTuning()
 
@@ -54,7 +54,7 @@ class ServoModel:
 
     about = "the model"
 
-    def __init__(self, model: EmittedModel) -> None:
+    def __init__(self, model: ArmModel) -> None:
         self._model = without_idle_residuals(model)
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
@@ -74,7 +74,7 @@ class ServoModel:
 
 
 def replays(
-    model: EmittedModel,
+    model: ArmModel,
     logs: Sequence[Trajectory],
     baselines: Mapping[str, CommandFollower],
     notes: list[Diagnostic],

@@ -23,8 +23,8 @@ from spelgen.spec import Facts, logged_joints, read_facts
 from spelgen.urdf.read import read_urdf
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
-    from spelgen.pipeline.loaded_arm import LoadedArm
+    from spelgen.emission.assemble import ArmModel
+    from spelgen.arm.configured_arm import ConfiguredArm
 
 
 TUNING = EvaluationTuning()
@@ -34,7 +34,7 @@ TUNING = EvaluationTuning()
 class Subject:
     """A model with its joints as the URDF and logs name them; urdf: its robot's, fit: what found it, where known."""
 
-    model: EmittedModel
+    model: ArmModel
     joints: Sequence[str]
     urdf: Path | None
     fit: Fit | None
@@ -71,7 +71,7 @@ class Subject:
         return RunFolder(self.fit.folder)
 
 
-def subject(judged: EmittedModel | Fit | Path | str, arm: LoadedArm | Path | str | None = None) -> Subject:
+def subject(judged: ArmModel | Fit | Path | str, arm: ConfiguredArm | Path | str | None = None) -> Subject:
     """Return what is judged: a model, a fit or the folder of a run, on an arm or the URDF of this path."""
     if isinstance(judged, str | Path):
         judged = load_run(judged)

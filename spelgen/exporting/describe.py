@@ -22,10 +22,10 @@ from spelgen.dynamics.tip import last_link
 from spelgen.errors import RunError
 from spelgen.exporting.description import Harmonics, Network, Residuals, Servos, Tip, TrainedModel
 from spelgen.exporting.entry_points import EntryPoint, entry_points
-from spelgen.pipeline.loaded_arm import LoadedArm
+from spelgen.arm.configured_arm import ConfiguredArm
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
     from spelgen.runtime.parts import Layers
     from spelgen.runtime.residual_terms import ResidualTerms
 
@@ -39,8 +39,8 @@ class Trained:
     entries: names of the functions to export, for formats of functions; by default all but derivatives.
     """
 
-    model: EmittedModel
-    arm: LoadedArm
+    model: ArmModel
+    arm: ConfiguredArm
     entries: tuple[str, ...] = ()
 
     @cached_property
@@ -69,7 +69,7 @@ class Trained:
         return self.model.n * int(getattr(self.model, "elements", 0))
 
 
-def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
+def describe(model: ArmModel, loaded: ConfiguredArm) -> TrainedModel:
     """Return the numbers of a trained model of this arm. Raises RunError for a preset without rigid bodies."""
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
     if not has_rigid_bodies(exact):
@@ -116,7 +116,7 @@ def array(value: Tensor) -> np.ndarray:
     return values
 
 
-def servos_of(model: EmittedModel) -> Servos | None:
+def servos_of(model: ArmModel) -> Servos | None:
     """Return the position servos of a model, None where it has none."""
     if input_of(model) == "torque":
         return None
@@ -124,7 +124,7 @@ def servos_of(model: EmittedModel) -> Servos | None:
     return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
 
 
-def tip_frame(loaded: LoadedArm) -> Tip:
+def tip_frame(loaded: ConfiguredArm) -> Tip:
     """Return the frame of the tip's link behind the body that carries it, by the angles that the URDF has."""
     names = loaded.arm.joint_names
     link = loaded.tip or last_link(loaded.robot, names)

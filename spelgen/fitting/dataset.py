@@ -25,7 +25,7 @@ from spelgen.settings.fits import DEFAULTS, Solver
 from spelgen.settings.tuning.fitting import ValidationTuning
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = ValidationTuning()
 
@@ -158,7 +158,7 @@ class Validation:
 
     def __init__(
         self,
-        model: EmittedModel,
+        model: ArmModel,
         data: TrainingData,
         device: str = "cpu",
         *,

@@ -24,7 +24,7 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import FitConfig
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
     from spelgen.urdf.robot import Robot
 
 __all__ = ["Fit", "RunOptions", "fit", "load_run"]
@@ -43,7 +43,7 @@ QUIET = RunOptions()
 
 
 def fit(
-    model: EmittedModel,
+    model: ArmModel,
     logs: Trajectory | Logs,
     config: FitConfig | None = None,
     *,
@@ -119,7 +119,7 @@ def fit(
     )
 
 
-def _config(model: EmittedModel, logs: Logs, config: FitConfig | None) -> FitConfig:
+def _config(model: ArmModel, logs: Logs, config: FitConfig | None) -> FitConfig:
     """Return the configuration, by default what suits the model and its logs. Raises what `fit` raises for it."""
     if config is None:
         config = chosen_config(model, sample_rates(logs))

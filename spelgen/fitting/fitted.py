@@ -29,7 +29,7 @@ from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.settings.fits import FitConfig
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -41,7 +41,7 @@ class Fit:
     urdf: of the robot, where it is known. folder: of the run, where there is one.
     """
 
-    model: EmittedModel
+    model: ArmModel
     config: FitConfig
     preprocessing: Preprocessing
     history: Sequence[Content]

@@ -22,7 +22,7 @@ from spelgen.settings.log_mapping import LogMapping
 from spelgen.spec import logged_joints
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
     from spelgen.fitting.progress import TrainingProgress
 
 Logs = Sequence[Trajectory] | LargeLogs
@@ -56,7 +56,7 @@ class FitRequest:
     began: from when the allowed time counts (`time.monotonic`). folder: of the run.
     """
 
-    model: EmittedModel
+    model: ArmModel
     logs: Logs
     config: FitConfig
     preprocessing: Preprocessing

@@ -16,7 +16,7 @@ from spelgen.logs.rates import shows_accelerations
 from spelgen.settings.fits import FitConfig, fit_config
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 ALL: tuple[type[Objective], ...] = (TorqueObjective, MomentumObjective, RolloutObjective, ServoObjective)
 OBJECTIVES = {objective.name: objective for objective in ALL}
@@ -35,7 +35,7 @@ def objective_of(request: FitRequest) -> Objective:
     return objective(request)
 
 
-def default_objective(model: EmittedModel, rates: Sequence[float]) -> str:
+def default_objective(model: ArmModel, rates: Sequence[float]) -> str:
     """Return the objective that is fitted where nobody names one.
 
     It is that of position servos for an arm under these, "torque" for a model of rigid bodies where logs are sampled
@@ -49,7 +49,7 @@ def default_objective(model: EmittedModel, rates: Sequence[float]) -> str:
 
 
 def chosen_config(
-    model: EmittedModel,
+    model: ArmModel,
     rates: Sequence[float] | None,
     objective: str | None = None,
     options: Mapping[str, object] | None = None,

@@ -20,7 +20,7 @@ from spelgen.spec import read_source
 from spelgen.urdf.document import urdf_bytes
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 
 LARGEST_STATE = 2**29  # bytes of model.pt or checkpoint.pt, unpacked
@@ -143,7 +143,7 @@ class RunFolder:
             raise RunError(type(found).__name__, file=path, expected="a file of `spelgen train`")
         return found
 
-    def load_module(self, *, trust: bool = False) -> EmittedModel:
+    def load_module(self, *, trust: bool = False) -> ArmModel:
         """Return the run's module with the weights that it starts with.
 
         Raises ModuleError, and RunError unless it is trusted, ran in this process before, or is what spelgen itself
@@ -185,7 +185,7 @@ def write_state(path: Path, state: Content) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def fitted_model(run: RunFolder, *, trust: bool = False) -> EmittedModel:
+def fitted_model(run: RunFolder, *, trust: bool = False) -> ArmModel:
     """A run's module (see `RunFolder.load_module`) with its best weights."""
     model = run.load_module(trust=trust)
     weights = run.load_state(run.weights)
@@ -197,7 +197,7 @@ def fitted_model(run: RunFolder, *, trust: bool = False) -> EmittedModel:
     return model
 
 
-def trained_model(run: RunFolder, *, trust: bool = False) -> EmittedModel:
+def trained_model(run: RunFolder, *, trust: bool = False) -> ArmModel:
     """A run's module with its best weights, which take no gradients."""
     model = fitted_model(run, trust=trust)
     model.requires_grad_(False).eval()

@@ -26,7 +26,7 @@ from spelgen.spec import Facts
 from spelgen.urdf.document import urdf_bytes
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 
 Choice = Callable[[Any, Sequence[float] | None], FitConfig | None]
@@ -86,7 +86,7 @@ def train(
 
 
 def open_logs(
-    model: EmittedModel,
+    model: ArmModel,
     paths: Iterable[Path | str],
     mapping: LogMapping | None = None,
     preprocessing: Preprocessing = AUTOMATIC,

@@ -25,8 +25,8 @@ from spelgen.fitting.train import train
 from spelgen.fleet.prepare import SplitLogs
 from spelgen.fleet.schema import Fleet, FleetRobot
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.pipeline.generate import generate
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import generate
+from spelgen.arm.configured_arm import load_arm
 from spelgen.settings.fits import FitConfig
 from spelgen.settings.settings import load_settings
 from spelgen.settings.training import TrainingSettings
@@ -34,7 +34,7 @@ from spelgen.settings.values import Group
 from spelgen.version import __version__
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 RunResult = dict[str, Any]
 """The content of result.json."""
@@ -149,7 +149,7 @@ def _remove_foreign_run(job: Job, run: RunFolder) -> None:
 
 
 def _config(
-    training: TrainingSettings, model: EmittedModel, rates: Sequence[float] | None
+    training: TrainingSettings, model: ArmModel, rates: Sequence[float] | None
 ) -> FitConfig | None:
     """Return the objective that is asked for, or that suits the model and its logs, with its own options."""
     objective = training.objective

@@ -18,7 +18,7 @@ from spelgen.logs.formats import log_files
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory, set_aside
 from spelgen.logs.windows import split_validation
-from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
+from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.settings import load_mapping
 from spelgen.settings.values import Group
@@ -85,7 +85,7 @@ def prepare(preparation: Preparation) -> list[SplitLogs]:
     return splits
 
 
-def _splits(robot: FleetRobot, arm: LoadedArm, mapping: LogMapping, count: int, element: str) -> list[Split]:
+def _splits(robot: FleetRobot, arm: ConfiguredArm, mapping: LogMapping, count: int, element: str) -> list[Split]:
     """Return the trajectories of each split; whole ones are drawn by a fixed seed where the logs do not say."""
     train, test = _roles(robot, arm, mapping)
     if count == 1 and test:
@@ -104,7 +104,7 @@ def _splits(robot: FleetRobot, arm: LoadedArm, mapping: LogMapping, count: int, 
     return splits
 
 
-def _roles(robot: FleetRobot, arm: LoadedArm, mapping: LogMapping) -> Split:
+def _roles(robot: FleetRobot, arm: ConfiguredArm, mapping: LogMapping) -> Split:
     """Return training and test trajectories; none of the latter where the logs do not say which they are."""
     if not robot.data:
         from spelgen.simulation.simulate import simulate

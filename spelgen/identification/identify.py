@@ -40,7 +40,7 @@ def identify(
     preprocessing: its filter and gap. Raises LogError for logs that cannot be used.
     """
     if not isinstance(arm, ConfiguredArm):
-        arm = ConfiguredArm.load(arm)
+        arm = load_arm(arm)
     logs = [logs] if isinstance(logs, Trajectory) else logs
     return identify_by(arm, logs, [method or LeastSquares()], preprocessing or Preprocessing())[0]
 

@@ -21,7 +21,7 @@ from spelgen.settings.tuning.log_checks import TUNING as CHECK_TUNING
 from spelgen.settings.tuning.servo import ServoLogTuning
 
 if TYPE_CHECKING:
-    from spelgen.pipeline.loaded_arm import LoadedArm
+    from spelgen.arm.configured_arm import ConfiguredArm
 
 TUNING = ServoLogTuning()
 MOVING = IdentificationTuning().moving
@@ -106,7 +106,7 @@ def _midpoints(x: np.ndarray) -> np.ndarray:
 class ServoLogs:
     """Check logs of commanded positions beside their arm."""
 
-    def __init__(self, arm: LoadedArm) -> None:
+    def __init__(self, arm: ConfiguredArm) -> None:
         self._arm = arm
         self._logs: list[Trajectory] = []
 

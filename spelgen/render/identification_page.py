@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from spelgen.identification.identification import Identification
-from spelgen.pipeline.loaded_arm import LoadedArm
+from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import render_page
 from spelgen.render.parameters import DETERMINED, base_table
 from spelgen.render.plots import Record
 
 
-def page(identification: Identification, arm: LoadedArm) -> str:
+def page(identification: Identification, arm: ConfiguredArm) -> str:
     """The page about an identification: what was determined and how surely, the arm, and the torque that is left."""
     record: Record = identification.to_dict()
     words = [parameter["determined"] for parameter in record["base_parameters"]]

@@ -20,7 +20,7 @@ from spelgen.files import write_json, write_text
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.labels import UNITS, named_joints
-from spelgen.pipeline.loaded_arm import LoadedArm
+from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.curves import curves
 from spelgen.render.page import render_page
@@ -36,7 +36,7 @@ from spelgen.render.run_facts import (
 from spelgen.spec import Facts, read_facts
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 SCHEMA = 1
 """Of the page as data."""
@@ -55,13 +55,13 @@ class Run:
     config: Record | None
     results: Results | None
     identified: Record | None
-    arm: LoadedArm | None
+    arm: ConfiguredArm | None
 
     @property
     def limits(self) -> Limits:
         """Return the joints' limits, None of a joint without."""
         if self.arm is None:
-            return [None] * len(self.facts.joints)
+            return [None] * len(self.joint_names)
         return [joint.limits for joint in self.arm.arm.coordinates]
 
     @property
@@ -126,7 +126,7 @@ def report_data(folder: Path | str) -> Record:
     }
 
 
-def _trained(run: Run) -> EmittedModel | None:
+def _trained(run: Run) -> ArmModel | None:
     """Return the trained model."""
     return trained_model(run.folder) if run.folder.weights.is_file() else None
 

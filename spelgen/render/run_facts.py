@@ -24,11 +24,11 @@ from spelgen.settings.training import TrainingSettings
 from spelgen.spec import Facts, Options
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 
 def head_numbers(
-    model: EmittedModel | None, config: Record, metrics: Sequence[Record], results: Results | None
+    model: ArmModel | None, config: Record, metrics: Sequence[Record], results: Results | None
 ) -> list[tuple[str, str]]:
     """Return the figures a reader wants first, with what they are, as far as the run has come.
 
@@ -56,7 +56,7 @@ def best_epoch(metrics: Sequence[Record]) -> int:
 
 
 def training_facts(
-    config: Record, metrics: Sequence[Record], identified: Record | None, model: EmittedModel | None
+    config: Record, metrics: Sequence[Record], identified: Record | None, model: ArmModel | None
 ) -> dict[str, str]:
     """Return how the run was trained, from its config.json, metrics.jsonl and the model that came of it."""
     preprocessing = Preprocessing(**config["preprocessing"])

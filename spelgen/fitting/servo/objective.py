@@ -65,9 +65,9 @@ class ServoObjective(Objective):
             raise LogError("logs of positions larger than memory", expected=expected)
         self._logs = request.logs
         for log in self._logs:
-            require_joints(log, model.facts.joints)
+            require_joints(log, model.joint_names)
             require_commands(log)
-        notes = check(self._logs, model.facts.joints, model.joint_types)
+        notes = check(self._logs, model.joint_names, model.joint_types)
         self._windows = servo_windows(self._logs, request.preprocessing)
         return PreparedLogs(
             config=request.config,

@@ -24,7 +24,7 @@ from spelgen.listing import Listing, number
 from spelgen.settings.tuning.servo import ServoIntervalTuning
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = ServoIntervalTuning()
 QUANTILE = 0.975  # of an interval of 95 %, of Student's t: windows are few
@@ -132,7 +132,7 @@ def identifiable(windows: NormalEquations, precision: torch.Tensor, unknowns: to
     return inflation < TUNING.variance_inflation
 
 
-def ratios(model: EmittedModel, qd: torch.Tensor, gravity: torch.Tensor) -> dict[str, torch.Tensor]:
+def ratios(model: ArmModel, qd: torch.Tensor, gravity: torch.Tensor) -> dict[str, torch.Tensor]:
     """Return the ratios to kp, each (n,), of a model that moved at qd under gravity's torques, (..., n)."""
     dead_zone = model.servo.dead_zone
     dry = sliding_friction(model.friction, qd, gravity) / model.kp
@@ -184,7 +184,7 @@ def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Recor
     values = ratios_with_deviations(problem, solution)
     dead_zones = problem.rows.row(DEAD_ZONE) * model.n + torch.arange(model.n)
     distinct = identifiable(solution.windows, solution.precision, dead_zones).tolist()
-    for joint, name in enumerate(model.facts.joints):
+    for joint, name in enumerate(model.joint_names):
         kp = {"value": float(model.kp[joint].detach()), "known": not float(model.servo.trained[joint])}
         record: Record = {"joint": name, "kp": kp}
         for ratio, (of_joints, deviations) in values.items():

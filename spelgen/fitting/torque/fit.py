@@ -32,7 +32,7 @@ from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class TorqueSolution:
 
 
 def fit_torque(
-    model: EmittedModel,
+    model: ArmModel,
     samples: TorqueSamples | Sequence[DynamicsSamples],
     prior: GaussianPrior | None = None,
     adapt: Adaptation | None = None,
@@ -100,7 +100,7 @@ def fit_torque(
     )
 
 
-def _most_samples(model: EmittedModel) -> int:
+def _most_samples(model: ArmModel) -> int:
     """Return how many samples there may be: their two regressors stay in memory from step to step."""
     numbers = 2 * model.n * model.inertial_parameters.numel()
     return max(TUNING.subset, int(TUNING.regressor_bytes / (8 * numbers)))

@@ -34,7 +34,7 @@ from spelgen.settings.fits import TorqueFit
 from spelgen.settings.tuning.identification import HINTS
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 SAMPLES = 5  # of a window that the model is measured on
 MOVED = {
@@ -96,7 +96,7 @@ class TorqueObjective(TorqueLogObjective):
         return notes
 
 
-def torque_nmse(model: EmittedModel, samples: TorqueSamples) -> list[float]:
+def torque_nmse(model: ArmModel, samples: TorqueSamples) -> list[float]:
     """Return the mean squared torque error of the samples by joint, relative to the variance of the torque."""
     tau = samples.columns.tau
     squares = torch.zeros(model.n, dtype=torch.float64)
@@ -109,7 +109,7 @@ def torque_nmse(model: EmittedModel, samples: TorqueSamples) -> list[float]:
     return nmse
 
 
-def torque_delay(model: EmittedModel, logs: Logs, preprocessing: Preprocessing) -> TorqueDelay:
+def torque_delay(model: ArmModel, logs: Logs, preprocessing: Preprocessing) -> TorqueDelay:
     """Return how much later than positions these logs show torques, by the bodies of a model."""
     if isinstance(logs, LargeLogs):
         chunks = logs.contents.chunks
@@ -120,7 +120,7 @@ def torque_delay(model: EmittedModel, logs: Logs, preprocessing: Preprocessing) 
     return find_torque_delay(logs, model.joint_types, drives, model.chain, preprocessing)
 
 
-def torque_samples(model: EmittedModel, data: TrainingData) -> TorqueSamples | None:
+def torque_samples(model: ArmModel, data: TrainingData) -> TorqueSamples | None:
     """Return the samples of all logs, those of validation included; None: no log has samples that move, and densely.
 
     Of logs larger than memory, of which a chunk is read at a time, they are as many as memory holds, evenly spread.
@@ -142,7 +142,7 @@ def torque_samples(model: EmittedModel, data: TrainingData) -> TorqueSamples | N
 
 
 def fit_torques(
-    model: EmittedModel, samples: TorqueSamples, config: TorqueFit, regularizer: UrdfRegularizer | None = None
+    model: ArmModel, samples: TorqueSamples, config: TorqueFit, regularizer: UrdfRegularizer | None = None
 ) -> list[Diagnostic]:
     """Fit the model to samples; return what there is to tell."""
     notes: list[Diagnostic] = []

@@ -20,7 +20,7 @@ from spelgen.fitting.torque.weights import RigidWeights
 from spelgen.settings.tuning.fitting import TorqueReportTuning
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = TorqueReportTuning()
 
@@ -34,7 +34,7 @@ EFFECTS = {
 
 
 def torque_notes(
-    model: EmittedModel, samples: TorqueSamples, solution: TorqueSolution
+    model: ArmModel, samples: TorqueSamples, solution: TorqueSolution
 ) -> Iterator[Diagnostic]:
     """Yield what there is to tell of rigid bodies that were fitted to samples."""
     names = np.array(model.joint_names)
@@ -63,7 +63,7 @@ def torque_notes(
         yield Diagnostic("warning", "acceleration-unseen", "logs", None, message)
 
 
-def _compensation(model: EmittedModel, solution: TorqueSolution, names: np.ndarray) -> Diagnostic:
+def _compensation(model: ArmModel, solution: TorqueSolution, names: np.ndarray) -> Diagnostic:
     value = model.friction_compensation.detach().numpy()
     joints = ", ".join(f"{names[k]} {value[k]:.3g}" for k in np.flatnonzero(solution.compensated))
     message = (
@@ -89,7 +89,7 @@ def _selected(solution: TorqueSolution, names: np.ndarray) -> str:
     )
 
 
-def terms_in_use(model: EmittedModel) -> list[str]:
+def terms_in_use(model: ArmModel) -> list[str]:
     """Return what stands beside the rigid bodies of a model, by effect and joint."""
     names = model.joint_names
     if not has_residuals(model):
@@ -111,7 +111,7 @@ def terms_in_use(model: EmittedModel) -> list[str]:
     return terms
 
 
-def _inertia(model: EmittedModel, q: torch.Tensor, covariance: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+def _inertia(model: ArmModel, q: torch.Tensor, covariance: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean diagonal of M at q (n,) [kg m^2, kg], and the standard deviations of its logarithm (n,)."""
     weights = RigidWeights(model).start
 

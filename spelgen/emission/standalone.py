@@ -1,21 +1,21 @@
-"""The parts of ``spelgen/runtime`` that a module uses, and the imports they need."""
+"""The part of ``spelgen.runtime`` that a standalone module contains, and the imports that it needs."""
 
 from __future__ import annotations
 
 import ast
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from graphlib import TopologicalSorter
 from importlib.resources import files
+from typing import NamedTuple
 
 _OURS = "spelgen.runtime."
 
 
 @dataclass(frozen=True)
 class Definition:
-    """A class, function or constant of the runtime: its text, comments above it included, and the names it uses."""
+    """A class, function or constant of the runtime: its text with the comments above it, and the names that it uses."""
 
     text: str
     uses: frozenset[str]
@@ -24,68 +24,85 @@ class Definition:
 
 @dataclass(frozen=True)
 class Runtime:
-    """Hold all of the runtime.
+    """The source of the runtime.
 
-    definitions: by name, in an order in which they can be executed. imports: by the name that they bind.
+    definitions: by name, each after those that it uses when it is executed. imports: statements by the name that they
+    bind. rows: names of the definitions that the rows of an arm need. public: names that a module imports.
     """
 
     definitions: dict[str, Definition]
     imports: dict[str, str]
+    rows: frozenset[str]
+    public: frozenset[str]
 
 
-def bundle(tailored: str, kinds: Mapping[str, str]) -> tuple[str, str]:
-    """Return the imports, and the runtime's definitions, that the source text ``tailored`` needs.
+class Bundle(NamedTuple):
+    """The runtime that a standalone module contains: import statements, definitions before and after the arm."""
 
-    ``kinds``: the runtime's class by kind of part, such as MaskedMLP for Network. A module has one class of each kind,
-    which therefore has the kind's name there.
-    """
+    imports: str
+    rows: str
+    runtime: str
+    contents: tuple[str, ...]  # names of the classes and functions of the runtime
+
+
+def bundle(arm: str, model: str) -> Bundle:
+    """Return the part of the runtime that the source texts of an arm and its model need."""
     runtime = load_runtime()
-    tree = ast.parse(tailored)
-    defined_here = {*map(_defined, tree.body), *kinds}
-    used = names_in(tree) | set(kinds.values())
+    used = names_in(ast.parse(f"{arm}\n{model}"))
     pending = list(used)
     while pending:
         name = pending.pop()
-        if name in defined_here or name not in runtime.definitions:
-            continue
-        new = runtime.definitions[name].uses - used
-        used |= new
-        pending += new
+        if name in runtime.definitions:
+            new = runtime.definitions[name].uses - used
+            used |= new
+            pending += new
+    names = [name for name in runtime.definitions if name in used]
+    # what the rows are made of must be defined before them; aliases of types that these use as well
+    before = [name for name in names if name in runtime.rows]
+    after = [name for name in names if name not in runtime.rows]
+    blocks = tuple(name for name in after if runtime.definitions[name].is_block)
+    return Bundle(_imports(used, runtime.imports), _joined(runtime, before), _joined(runtime, after), blocks)
+
+
+def _joined(runtime: Runtime, names: Iterable[str]) -> str:
+    """Return these definitions, constants on consecutive lines."""
     text, previous_is_block = "", True
-    for name, definition in runtime.definitions.items():
-        if name in used and name not in defined_here:
-            # constants stand line below line, as a person writes them
-            separate = definition.is_block or previous_is_block
-            text += ("\n\n\n" if separate else "\n") + definition.text
-            previous_is_block = definition.is_block
-    for kind, name in kinds.items():
-        text = re.sub(rf"\b{name}\b", kind, text)
-    return _imports(used, runtime.imports), text.strip()
+    for name in names:
+        definition = runtime.definitions[name]
+        separate = definition.is_block or previous_is_block
+        text += ("\n\n\n" if separate else "\n") + definition.text
+        previous_is_block = definition.is_block
+    return text.strip()
 
 
 @cache
 def load_runtime() -> Runtime:
-    """Read the runtime's source."""
+    """Read the source of the runtime."""
     texts: dict[str, str] = {}
     trees: dict[str, ast.Module] = {}
     order: TopologicalSorter[str] = TopologicalSorter()
+    public: set[str] = set()
     for path in sorted((files("spelgen") / "runtime").iterdir(), key=lambda path: path.name):
         name = path.name.removesuffix(".py")
-        if path.name.endswith(".py") and name != "__init__":
-            texts[name] = path.read_text(encoding="utf-8")
-            trees[name] = ast.parse(texts[name])
-            order.add(name, *_needs(trees[name]))
-    runtime = Runtime({}, {})
+        if not path.name.endswith(".py"):
+            continue
+        texts[name] = path.read_text(encoding="utf-8")
+        if name == "__init__":
+            public = {alias.name for node in ast.walk(ast.parse(texts[name])) if isinstance(node, ast.ImportFrom) for alias in node.names}
+            continue
+        trees[name] = ast.parse(texts[name])
+        order.add(name, *_needs(trees[name]))
+    definitions: dict[str, Definition] = {}
+    imports: dict[str, str] = {}
     for name in order.static_order():
         for node in trees[name].body:
             if isinstance(node, ast.Import | ast.ImportFrom):
-                runtime.imports.update(_bound(node))
+                imports.update(_bound(node))
             elif (defined := _defined(node)) is not None:
                 uses = frozenset(names_in(node))
-                runtime.definitions[defined] = Definition(
-                    _text(node, texts[name]), uses, not isinstance(node, ast.Assign)
-                )
-    return runtime
+                definitions[defined] = Definition(_text(node, texts[name]), uses, not isinstance(node, ast.Assign))
+    rows = frozenset(name for node in trees["rows"].body if (name := _defined(node)) is not None)
+    return Runtime(definitions, imports, rows, frozenset(public))
 
 
 def names_in(tree: ast.AST) -> set[str]:
