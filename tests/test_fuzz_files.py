@@ -20,7 +20,6 @@ from spelgen.evaluation.evaluate import evaluate
 from spelgen.fitting.fit import fit
 from spelgen.fitting.fitted import load_run
 from spelgen.log_checks.check_logs import check_logs
-from spelgen.logs.chunks import scan
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.emission.build import build
@@ -68,8 +67,6 @@ def arm(robots):
 def used(path: Path, arm, mapping=None) -> None:
     """A log as the commands use it."""
     check_logs(read_logs(path, arm, mapping), arm)
-    if path.suffix == ".parquet":
-        list(scan([path], JOINTS))
 
 
 @st.composite

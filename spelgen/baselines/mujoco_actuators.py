@@ -15,7 +15,6 @@ from spelgen.fitting.dataset import digest
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.servo.windows import servo_windows
-from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 
@@ -82,7 +81,7 @@ def _fitted_to_files(run: RunFolder, files: Sequence[str]) -> dict[str, object]:
         logs = run_logs(run, files)
     except LogError:  # moved or removed
         return {}
-    if isinstance(logs, LargeLogs) or digest(logs) != run.read_config()["data_digest"]:
+    if digest(logs) != run.read_config()["data_digest"]:
         return {}
     return fitted_actuators(run, logs)
 
@@ -91,10 +90,11 @@ def fitted_actuators(run: RunFolder, logs: Sequence[Trajectory]) -> dict[str, ob
     """Return actuators fitted to these logs; none where MuJoCo is not installed or cannot have the arm's servos."""
     if not _has_mujoco():
         return {}
-    from spelgen.baselines.position_actuators import TUNING, fit_position_actuators
+    from spelgen.baselines.position_actuators import fit_position_actuators
+    from spelgen.baselines.tuning import ACTUATORS
 
     preprocessing = Preprocessing(**run.read_config()["preprocessing"])
-    windows = servo_windows(logs, preprocessing, TUNING.windows)
+    windows = servo_windows(logs, preprocessing, ACTUATORS.windows)
     actuators = fit_position_actuators(run_arm(run), windows, trained_model(run))
     return {} if actuators is None else {KEPT: actuators.to_dict()}
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from spelgen.errors import RunError
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.train import open_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.arm.configured_arm import ConfiguredArm
@@ -23,6 +22,6 @@ def run_arm(run: RunFolder) -> ConfiguredArm:
     return arm_of_spec(read_facts(run.module), run.urdf)
 
 
-def run_logs(run: RunFolder, paths: Iterable[Path | str]) -> Sequence[Trajectory] | LargeLogs:
+def run_logs(run: RunFolder, paths: Iterable[Path | str]) -> Sequence[Trajectory]:
     """Return log files read as those that the run was trained on. Raises LogError."""
-    return open_logs(run.load_module(), paths, LogMapping(**run.read_config()["mapping"]))
+    return open_logs(run.load_module(), paths, LogMapping(**run.read_config()["mapping"])).trajectories

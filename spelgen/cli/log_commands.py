@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -128,7 +129,7 @@ def logs(
     The logs are not changed. The exit code is 1 if they cannot be used for training.
     """
     from spelgen.log_checks.check_logs import check_logs
-    from spelgen.logs.chunks import stream_logs
+    from spelgen.logs.read import read_bounded_logs
     from spelgen.render.logs_page import page
 
     # the URDF says which joints a mapping must name
@@ -137,7 +138,9 @@ def logs(
         options.require_free(suggest, force=force)
         mapping = _suggested(paths, arm, suggest)
     log_mapping = options.log_mapping(arm, mapping, accept)
-    result = check_logs(stream_logs(paths, arm, log_mapping), arm, log_mapping)
+    logs, notes = read_bounded_logs(paths, arm, log_mapping)
+    result = check_logs(logs, arm, log_mapping)
+    result = replace(result, findings=(*notes, *result.findings))
     if format == "text":
         say(result.text())
     else:

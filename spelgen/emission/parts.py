@@ -9,7 +9,7 @@ from spelgen.design import BRISTLE_REACH, SERVO_STRIBECK_ROUNDING
 from spelgen.emission.entry_sums import mean_mass
 from spelgen.emission.source import Call, Code, call
 from spelgen.runtime.rows import Joint
-from spelgen.settings.tuning.emission import TUNING
+from spelgen.emission.tuning import TUNING
 from spelgen.spec import JointSpec, LinkSpec, ModelSpec
 
 GENERATOR, JOINTS, LINKS = Code("generator"), Code("JOINTS"), Code("LINKS")

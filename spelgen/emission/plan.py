@@ -15,7 +15,7 @@ from spelgen.emission.entry_sums import mean_mass
 from spelgen.emission.links import link_specs
 from spelgen.errors import SettingsError
 from spelgen.settings.joint import JointSettings
-from spelgen.settings.tuning.emission import TUNING
+from spelgen.emission.tuning import TUNING
 from spelgen.spec import (
     ConstantSpec,
     Entries,

@@ -10,17 +10,15 @@ from spelgen.baselines.registry import BASELINES
 from spelgen.baselines.run_arm import run_logs
 from spelgen.files import write_json
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.trajectory import Trajectory, coverage
 
 
 def keep_baseline(folder: Path | str, logs: Iterable[Path | str] | Sequence[Trajectory]) -> None:
     """Fit baselines to the logs, or log files, that a run was trained on, those of validation included.
 
-    What the logs cover is kept beside them. A run without URDF and logs larger than memory are left as they are; logs
-    that are too sparse for accelerations give no parameters of least squares. Of an arm under position servos MuJoCo's
-    actuators are fitted, where MuJoCo is installed: to files when an evaluation first needs them, for it takes as long
-    as the fit.
+    What the logs cover is kept beside them. A run without URDF is left as it is; logs that are too sparse for
+    accelerations give no parameters of least squares. Of an arm under position servos MuJoCo's actuators are fitted,
+    where MuJoCo is installed: to files when an evaluation first needs them, for it takes as long as the fit.
     """
     run = RunFolder(folder)
     sources = list(logs)
@@ -28,10 +26,7 @@ def keep_baseline(folder: Path | str, logs: Iterable[Path | str] | Sequence[Traj
     files = [os.fspath(log) for log in sources if not isinstance(log, Trajectory)]
     only_files = not trajectories
     if files:
-        opened = run_logs(run, files)
-        if isinstance(opened, LargeLogs):  # least squares takes all samples at once
-            return
-        trajectories += opened
+        trajectories += run_logs(run, files)
     if not run.urdf.exists():  # without an arm there is nothing to identify
         return
     baselines: dict[str, object] = {"coverage": coverage(trajectories)}

@@ -16,13 +16,12 @@ from spelgen.dynamics.bristles import BristleReach
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.rollout import LossScales, choose_substeps, loss_scales, rollout_loss
 from spelgen.fitting.run_record import Content
+from spelgen.fitting.tuning import ValidationTuning
 from spelgen.logs.checks import check
-from spelgen.logs.chunks import Chunk
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 from spelgen.logs.windows import Split, Windows, cut_windows, split_validation, thinned
 from spelgen.settings.fits import DEFAULTS, Solver
-from spelgen.settings.tuning.fitting import ValidationTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
@@ -67,9 +66,8 @@ DEFAULT_CHOICE = WindowChoice()
 class TrainingData:
     """Windows of the logs, ready to fit.
 
-    training: all of them, or of logs larger than memory an even sample. preprocessing: as it was resolved.
-    digest: of every number, to resume on the same data only. recordings: what all was cut from, validation included; of
-    logs larger than memory chunks.
+    preprocessing: the resolved one. digest: of all numbers, so that a fit resumes on the same data only. recordings:
+    all trajectories, those of validation included.
     """
 
     training: Windows
@@ -81,7 +79,6 @@ class TrainingData:
     diagnostics: tuple[Diagnostic, ...]
     digest: str
     recordings: Sequence[Trajectory] = ()
-    chunks: Sequence[Chunk] = ()
 
 
 def prepare_data(

@@ -11,13 +11,12 @@ from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.errors import Diagnostic, RunError, SettingsError
 from spelgen.files import write_json
 from spelgen.fitting.fitted import Fit, load_run
-from spelgen.fitting.objective import FitRequest, Logs, Objective, RunOptions, Status, record_of
+from spelgen.fitting.objective import FitRequest, Objective, RunOptions, Status, record_of
 from spelgen.fitting.objectives import chosen_config, objective_of
 from spelgen.fitting.process import locked, require_device, termination_as_interrupt, threads_of_torch
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_record import require_same
-from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.dynamics_samples import SHORTEST
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
@@ -44,7 +43,7 @@ QUIET = RunOptions()
 
 def fit(
     model: ArmModel,
-    logs: Trajectory | Logs,
+    logs: Trajectory | Sequence[Trajectory],
     config: FitConfig | None = None,
     *,
     preprocessing: Preprocessing = AUTOMATIC,
@@ -119,7 +118,7 @@ def fit(
     )
 
 
-def _config(model: ArmModel, logs: Logs, config: FitConfig | None) -> FitConfig:
+def _config(model: ArmModel, logs: Sequence[Trajectory], config: FitConfig | None) -> FitConfig:
     """Return the configuration, by default what suits the model and its logs. Raises what `fit` raises for it."""
     if config is None:
         config = chosen_config(model, sample_rates(logs))
@@ -132,10 +131,8 @@ def _config(model: ArmModel, logs: Logs, config: FitConfig | None) -> FitConfig:
     return config
 
 
-def sample_rates(logs: Logs) -> list[float]:
+def sample_rates(logs: Sequence[Trajectory]) -> list[float]:
     """Return those of all logs [Hz] that are long enough for accelerations."""
-    if isinstance(logs, LargeLogs):
-        return logs.contents.rates
     return [log.sample_rate for log in logs if log.duration >= SHORTEST]
 
 

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import has_rigid_bodies, input_of
-from spelgen.errors import Diagnostic, RunError
+from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import TrainingData, WindowChoice, prepare_data
 from spelgen.fitting.run_record import Content
-from spelgen.fitting.streaming import LargeLogs, prepare_streamed
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
     from spelgen.fitting.progress import TrainingProgress
 
-Logs = Sequence[Trajectory] | LargeLogs
 Status = Literal["finished", "stopped early", "out of time", "interrupted"]
 
 
@@ -57,7 +55,7 @@ class FitRequest:
     """
 
     model: ArmModel
-    logs: Logs
+    logs: Sequence[Trajectory]
     config: FitConfig
     preprocessing: Preprocessing
     validation: float | Sequence[Trajectory]
@@ -136,14 +134,8 @@ class TorqueLogObjective(Objective):
         request = self.request
         reach = bristle_reach(self.model)
         choice = WindowChoice(window, stride, request.validation, request.seed, reach)
-        if not isinstance(request.logs, LargeLogs):
-            joints, kinds = logged_joints(self.model), self.model.joint_types
-            return prepare_data(request.logs, joints, kinds, request.preprocessing, choice)
-        if not isinstance(request.validation, float):
-            raise RunError(
-                "trajectories to validate logs larger than memory on", expected="a fraction of these logs"
-            )
-        return prepare_streamed(request.logs, request.preprocessing, choice)
+        joints, kinds = logged_joints(self.model), self.model.joint_types
+        return prepare_data(request.logs, joints, kinds, request.preprocessing, choice)
 
     def _prepared(self, data: TrainingData, config: FitConfig) -> PreparedLogs:
         """Return what windows tell of the logs."""

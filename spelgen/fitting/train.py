@@ -14,11 +14,8 @@ from spelgen.fitting.fit import AUTOMATIC, QUIET, RunOptions, fit, sample_rates
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import recorded_config
-from spelgen.fitting.streaming import LargeLogs
-from spelgen.logs.arm_mapping import log_source
-from spelgen.logs.chunks import large_files
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.read import read_logs
+from spelgen.logs.read import BoundedLogs, read_bounded_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import FitConfig
 from spelgen.settings.log_mapping import LogMapping
@@ -53,9 +50,9 @@ def train(
     urdf: the robot the module was built from, for the regularizer and the baselines of `evaluate`; by default the file
     of that name beside the module. source: a run whose module and weights are where the fit starts. trust: the module
     of a run folder is run whatever it is (see `RunFolder.load_module`). config: may also be a function that chooses.
-    require: raises where it finds logs wrong, before anything is fitted, or returns what it finds; logs larger than
-    memory are not shown to it. validation: 0.25 by default, seed: 0. What is not said of a run that is resumed is as
-    before, and logs are read as spelgen writes them where ``options`` has no mapping.
+    require: raises where it finds logs wrong, before anything is fitted, or returns what it finds. validation: 0.25 by
+    default, seed: 0. What is not said of a run that is resumed is as before, and logs are read as spelgen writes them
+    where ``options`` has no mapping. Of logs of more than `LogTuning.kept_bytes` evenly spread segments are fitted.
     Raises ModuleError, LogError, and RunError when the folder holds a run or cannot be resumed with this.
     """
     run, module = RunFolder(folder), Path(module)
@@ -74,8 +71,9 @@ def train(
         model = load_module(module) if source is None else fitted_model(RunFolder(source), trust=trust)
         robot, notes = robot_of(module, urdf, model.facts)
     chosen = config(model, None) if callable(config) else config  # before logs, which may take long to read
-    logs = open_logs(model, data, options.mapping, preprocessing)
-    if require is not None and not isinstance(logs, LargeLogs):
+    logs, reading_notes = open_logs(model, data, options.mapping)
+    notes += reading_notes
+    if require is not None:
         notes += require(logs)
     if chosen is None and callable(config):
         chosen = config(model, sample_rates(logs))
@@ -86,21 +84,13 @@ def train(
 
 
 def open_logs(
-    model: ArmModel,
-    paths: Iterable[Path | str],
-    mapping: LogMapping | None = None,
-    preprocessing: Preprocessing = AUTOMATIC,
-) -> Sequence[Trajectory] | LargeLogs:
-    """Return the training part of log files; of Parquet larger than memory one chunk at a time.
+    model: ArmModel, paths: Iterable[Path | str], mapping: LogMapping | None = None
+) -> BoundedLogs:
+    """Return the training part of log files, within the bound of memory of `read_bounded_logs`.
 
-    Raises LogError, and SettingsError where the mapping does not fit.
+    Raises LogError, and SettingsError if the mapping does not fit the joints.
     """
-    paths, source = list(paths), log_source(model, mapping)
-    large = large_files(paths, source.joints, role="train")
-    if large:
-        kinds = tuple(model.joint_types)
-        return LargeLogs(tuple(large), source.joints, kinds, source.mapping, preprocessing.gap)
-    return read_logs(paths, model, mapping, role="train")
+    return read_bounded_logs(list(paths), model, mapping, role="train")
 
 
 def robot_of(module: Path, urdf: Path | str | None, facts: Facts) -> tuple[Path | None, list[Diagnostic]]:

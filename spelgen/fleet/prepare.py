@@ -13,7 +13,6 @@ import numpy as np
 from spelgen.errors import LogError, RunError, collect
 from spelgen.files import read_json, write_json
 from spelgen.fleet.schema import FleetRobot
-from spelgen.logs.chunks import large_files
 from spelgen.logs.formats import log_files
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory, set_aside
@@ -65,10 +64,6 @@ def prepare(preparation: Preparation) -> list[SplitLogs]:
     digest = hashlib.sha256(json.dumps(sources, default=str).encode()).hexdigest()[:16]
     names = arm.arm.joint_names
     element = f"robots.{preparation.name}.data"
-    if robot.data and large_files(robot.data, names):
-        if count > 1:
-            raise LogError("logs larger than memory", element=element, expected="splits: 1 of them")
-        return [SplitLogs(train=robot.data, test=robot.data, digest=digest, mapping=mapping)]
     splits = []
     for number in range(count):
         train, test = (folder / f"split{number}" / f"{role}.parquet" for role in ("train", "test"))
