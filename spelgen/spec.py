@@ -292,7 +292,13 @@ def _texts(tree: ast.Module, name: str) -> Iterator[str]:
             yield str(node.value.value)
 
 
+def facts_of(model: object) -> Facts | None:
+    """Return the facts of a model; None of a model that was not built from a URDF."""
+    facts: Facts | None = getattr(model, "facts", None)
+    return facts
+
+
 def logged_joints(model: Any) -> tuple[str, ...]:
-    """The joints of a model by the names that logs use: the URDF's, or its own where it comes from none."""
-    facts = getattr(model, "facts", None)
+    """Return the joint names that logs use: those of the URDF, or the model's own if it was not built from a URDF."""
+    facts = facts_of(model)
     return tuple(model.joint_names) if facts is None else facts.joints

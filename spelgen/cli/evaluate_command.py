@@ -1,4 +1,4 @@
-"""Commands about trained runs: `evaluate`, how good one is, and `report`, all about it on a page."""
+"""Commands about trained runs: `evaluate` measures one on test logs, `report` writes a page about it."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ def evaluate(
     quick: Annotated[bool, typer.Option("--quick", help="Torque errors alone, without rollouts.")] = False,
     trust: Trust = False,
 ) -> None:
-    """Evaluate a trained run and its baselines on test logs.
+    """Evaluate a trained run and its baselines on test logs; the assessment comes first.
 
-    The result is also written to evaluation.json in the run folder.
+    The result is also written to evaluation.json in the run folder, and nothing else is.
     """
     # a misspelt limit is refused before minutes of rollouts
     paths = options.logs(data, extra_logs)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +14,7 @@ from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
 from spelgen.cli.options import Accept, Data, Force, MappingFile, MoreData, RobotOption, TextOrJson, Trust
 from spelgen.cli.train_settings import (
+    TIME_LIMIT,
     Request,
     UsageError,
     new_run,
@@ -86,9 +86,9 @@ def train(
         from spelgen.fitting.run_folder import RunFolder
 
         if module is not None:
-            extra_logs = [module, *(extra_logs or [])]  # with --from, all that stands there is logs
+            extra_logs = [module, *(extra_logs or [])]  # with --from, all arguments are logs
         run = RunFolder(source)
-        run.read_config()  # where there is no run, this says so
+        run.read_record()  # raises an error if there is no run
         module = run.module
         robot = robot or (run.urdf if run.urdf.exists() else None)
         request = _warm_start(request)
@@ -121,7 +121,7 @@ def train(
             start.module,
             paths,
             folder,
-            start.config,
+            start.options,
             urdf=urdf,
             source=source,
             preprocessing=Preprocessing(**start.settings.preprocessing),
@@ -134,17 +134,14 @@ def train(
     except OptionError as error:
         option = "--objective" if error.option == "objective" else f"--set {error.option}"
         raise UsageError(f"{option}: {error.got}") from error
-    _tell(fit, folder, paths, format, resume=resume)
+    if TIME_LIMIT in request.values and TIME_LIMIT not in type(fit.config).model_fields:
+        objective = fit.config.objective
+        note(f"info: {TIME_LIMIT} limits fits to windows; these logs are fitted by {objective}")
+    _report(fit, folder, format)
 
 
-def _tell(fit: Fit, folder: Path, paths: Sequence[Path], format: str, *, resume: bool) -> None:
-    """Print how the fit ended, and keep the baselines of a new run; exit with 130 if it was interrupted."""
-    # a resumed run has its baselines already, and an interrupted one is not finished
-    interrupted = fit.status == "interrupted"
-    if not resume and not interrupted:
-        from spelgen.evaluation.keep import keep_baseline
-
-        keep_baseline(folder, paths)
+def _report(fit: Fit, folder: Path, format: str) -> None:
+    """Print the outcome of the fit; exit with 130 if it was interrupted."""
     record = {
         "run": str(folder),
         "status": fit.status,
@@ -152,30 +149,30 @@ def _tell(fit: Fit, folder: Path, paths: Sequence[Path], format: str, *, resume:
         "steps": fit.steps,
         "epochs": fit.epochs,
         "seconds": fit.seconds,
-        # a rollout may have left all bounds, and JSON has no word for that
+        # JSON has no infinity, the loss of a rollout that diverged
         "validation_loss": fit.best_validation if math.isfinite(fit.best_validation) else None,
         "torque_nmse": fit.torque_nmse,
         "findings": [finding.to_dict() for finding in fit.diagnostics],
     }
     answer(format, record, *_outcome(fit), f"run folder: {folder}")
-    if interrupted:
+    if fit.status == "interrupted":
         note("the best model so far is in the run folder; resume it by --resume")
         raise typer.Exit(INTERRUPTED)
 
 
 def _outcome(fit: Fit) -> tuple[str, str]:
-    """Return how a fit ended, with the reason where its status does not say it, and what it came to."""
+    """Return the end of a fit, with a reason in addition to its status, and its result."""
     from spelgen.fitting.servo.report import servo_summary
 
     config, result = fit.config, fit.result
     reason = ""
     if fit.status == "out of time" and isinstance(config, WindowConfig):
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
-    if not isinstance(config, Rollout):  # windows only judge
-        summary = servo_summary(fit.record)
+    if not isinstance(config, Rollout):  # windows only measure the model
+        summary = servo_summary(fit.record.servo)
         if summary is not None:
             result = summary.text
-        elif not fit.record["validation_windows"]:
+        elif not fit.record.validation_windows:
             result = f"{fit.steps} steps were taken"
         return f"{fit.status}: {config.objective} fitted in {fit.seconds:.0f} s{reason}", result
     if fit.status == "stopped early":
@@ -187,7 +184,7 @@ def _outcome(fit: Fit) -> tuple[str, str]:
 
 
 def _warm_start(request: Request) -> Request:
-    """Return the request for a model that was fitted before: by default its load is fitted to torques."""
+    """Return the request to adapt a fitted model: by default its load, to torques."""
     objective, values = request.objective or "torque", dict(request.values)
     if objective == "torque":
         values.setdefault("adapt", "load")

@@ -14,6 +14,7 @@ from scipy.integrate import cumulative_trapezoid
 from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import States
 from spelgen.dynamics.bristles import bristles_along
+from spelgen.dynamics.protocol import has_momentum
 from spelgen.evaluation.horizons import JudgedLogs
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.torque import friction_past, mean_nmse, predicted_torques
@@ -156,7 +157,7 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
     q, qd, qdd = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
     with torch.no_grad():
         inputs = np.eye(q.shape[-1])
-        if hasattr(model, "input_matrix"):  # gears may stand between a motor and a joint
+        if has_momentum(model):  # gears may connect motors and joints
             inputs = model.input_matrix(q).numpy()
         gravity = model.gravity(q)
         parts = {

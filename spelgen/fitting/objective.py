@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -12,14 +12,16 @@ from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import has_rigid_bodies, input_of
 from spelgen.errors import Diagnostic, RunError
 from spelgen.fitting.dataset import TrainingData, WindowChoice, prepare_data
-from spelgen.fitting.run_record import Content
+from spelgen.fitting.rollout import LossScales
+from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.streaming import LargeLogs, prepare_streamed
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import FitConfig
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.spec import logged_joints
+from spelgen.settings.messages import validated
+from spelgen.spec import facts_of, logged_joints
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -70,16 +72,21 @@ class FitRequest:
 
 @dataclass(frozen=True)
 class PreparedLogs:
-    """Hold what `Objective.prepare` tells of the logs.
+    """Logs that were checked and cut into windows, and the settings that depend on them.
 
-    config, preprocessing: with all that depends on the logs decided. record: what config.json says of the logs, see
-    `run_record.Record`. notes: for people.
+    config, preprocessing: resolved. digest: see `dataset.digest`. training, validation: names of the logs. scales: of
+    the validation loss; None without one. notes: diagnostics for the user.
     """
 
     config: FitConfig
     preprocessing: Preprocessing
-    record: Content
+    digest: str
+    training: Sequence[str]
+    validation: Sequence[str]
+    training_windows: int
+    validation_windows: int
     notes: Sequence[Diagnostic]
+    scales: LossScales | None = None
 
 
 class Objective(ABC):
@@ -150,15 +157,13 @@ class TorqueLogObjective(Objective):
         return PreparedLogs(
             config=config,
             preprocessing=data.preprocessing,
-            record={
-                "data_digest": data.digest,
-                "training": list(data.training_names),
-                "validation": list(data.validation_names),
-                "training_windows": len(data.training),
-                "validation_windows": len(data.validation),
-                "scales": {name: x.tolist() for name, x in data.scales._asdict().items()},
-            },
+            digest=data.digest,
+            training=data.training_names,
+            validation=data.validation_names,
+            training_windows=len(data.training),
+            validation_windows=len(data.validation),
             notes=data.diagnostics,
+            scales=data.scales,
         )
 
     def _regularizer(
@@ -177,25 +182,32 @@ class TorqueLogObjective(Objective):
             return None
 
 
-def record_of(request: FitRequest, prepared: PreparedLogs) -> Content:
-    """Return what goes into config.json: options that were used, resolved, and nothing that does not apply."""
-    model, facts = request.model, getattr(request.model, "facts", None)
-    mapping = request.options.mapping or LogMapping(input=input_of(model))
-    fraction = None
-    if prepared.record["validation"] and isinstance(request.validation, float):
+def new_record(request: FitRequest, prepared: PreparedLogs) -> Record:
+    """Return the record of a fit before it runs, with the resolved options that apply to the model and no others."""
+    model, facts = request.model, facts_of(request.model)
+    config, fraction = prepared.config, None
+    if prepared.validation and isinstance(request.validation, float):
         fraction = request.validation
-    return {
-        "schema": 2,
-        "robot": facts.robot if facts else type(model).__name__,
-        "preset": facts.options.preset if facts else None,
-        "joints": list(logged_joints(model)),
-        "objective": prepared.config.objective,
-        "config": prepared.config.record(rigid_bodies=has_rigid_bodies(model)),
-        "preprocessing": asdict(prepared.preprocessing),
-        "validation_fraction": fraction,
-        "seed": request.seed,
-        **prepared.record,
-        "mapping": mapping.model_dump(exclude_defaults=True),
-        "device": request.options.device,
-        "threads": request.options.threads,
-    }
+    scales = {}
+    if prepared.scales is not None:
+        scales["scales"] = {name: x.tolist() for name, x in prepared.scales._asdict().items()}
+    return Record(
+        schema=2,
+        robot=facts.robot if facts else type(model).__name__,
+        preset=facts.options.preset if facts else None,
+        joints=list(logged_joints(model)),
+        objective=config.objective,
+        config=validated(type(config), config.record(rigid_bodies=has_rigid_bodies(model))),
+        preprocessing=prepared.preprocessing,
+        validation_fraction=fraction,
+        seed=request.seed,
+        data_digest=prepared.digest,
+        training=list(prepared.training),
+        validation=list(prepared.validation),
+        training_windows=prepared.training_windows,
+        validation_windows=prepared.validation_windows,
+        mapping=request.options.mapping or LogMapping(input=input_of(model)),
+        device=request.options.device,
+        threads=request.options.threads,
+        **scales,
+    )

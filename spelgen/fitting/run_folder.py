@@ -15,7 +15,7 @@ import torch
 from spelgen.emission.loading import has_run, load_module
 from spelgen.errors import RunError
 from spelgen.files import local, read_bytes, read_json, remove, require_regular_file, write_bytes
-from spelgen.fitting.run_record import Checkpoint, Content, Epoch, require, require_record
+from spelgen.fitting.run_record import Checkpoint, Content, Epoch, Record, require
 from spelgen.spec import read_source
 from spelgen.urdf.document import urdf_bytes
 
@@ -31,7 +31,7 @@ class RunFolder:
 
     module: the trained module's source. urdf, settings: of its robot, where known. config: how it was trained. metrics:
     a line per epoch. checkpoint: everything needed to go on. weights: the best state_dict so far. evaluation: what
-    `evaluate` found. baseline: what least squares found.
+    `evaluate` found. baseline: baselines fitted to the training logs, and the coverage of these.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -116,15 +116,18 @@ class RunFolder:
             )
         return read_json(path, RunError)
 
-    def read_config(self) -> Content:
-        """What config.json says. Raises RunError when it is absent, broken, or lacks what every run has."""
-        return require_record(self.read_json(self.config), self.config)
+    def read_record(self) -> Record:
+        """Return config.json. Raises RunError if it is absent, broken, or has a key absent or of another type."""
+        return require(Record, self.read_json(self.config), self.config)
 
-    def load_checkpoint(self) -> Content:
-        """checkpoint.pt, with the numbers that every one has. Raises RunError."""
-        checkpoint = self.load_state(self.checkpoint)
-        require(Checkpoint, checkpoint, self.checkpoint)
-        _require_finite(checkpoint["best_weights"], self.checkpoint)
+    def read_baselines(self) -> Content:
+        """Return least_squares.json, {} if there is none. Raises RunError if it is broken."""
+        return self.read_json(self.baseline) if self.baseline.exists() else {}
+
+    def load_checkpoint(self) -> Checkpoint:
+        """Return checkpoint.pt. Raises RunError if it is absent, broken, or has a key absent or of another type."""
+        checkpoint = require(Checkpoint, self.load_state(self.checkpoint), self.checkpoint)
+        _require_finite(checkpoint.best_weights, self.checkpoint)
         return checkpoint
 
     def load_state(self, path: Path) -> Content:

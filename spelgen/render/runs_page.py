@@ -29,7 +29,7 @@ def render_runs(folders: Sequence[Path]) -> str:
     runs: dict[str, Run] = {}
     results: dict[str, Results] = {}
     for name, folder in zip(_names(folders), folders, strict=True):
-        RunFolder(folder).read_config()  # where there is no run, this says so
+        RunFolder(folder).read_record()  # raises an error if there is no run
         run = open_run(folder)
         if run.results is None:
             raise RunError("a run that is not evaluated", file=folder, do="spelgen evaluate")

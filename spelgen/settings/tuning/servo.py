@@ -108,16 +108,6 @@ class ServoStartTuning:
 
 
 @dataclass(frozen=True)
-class PositionActuatorTuning:
-    """Decide how MuJoCo's position actuators are fitted, the baseline of servo fits."""
-
-    step: float = 5e-3  # [s] at most; frictionloss is as hard as twice this allows
-    windows: int = 60  # half a minute of fitting
-    iterations: int = 8  # of mujoco.minimize
-    nudge: float = 1e-4  # of unknowns, for slopes
-
-
-@dataclass(frozen=True)
 class ServoSimulationTuning:
     """Decide how `spelgen simulate` moves an arm under position servos."""
 
