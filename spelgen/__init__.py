@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from spelgen.emission.loading import load_module
     from spelgen.errors import SpelgenError
     from spelgen.evaluation.evaluate import evaluate
-    from spelgen.evaluation.keep import keep_baseline
     from spelgen.evaluation.results import Results
     from spelgen.evaluation.rollout import rollout
     from spelgen.excitation.design import excite
@@ -51,7 +50,6 @@ _HOME = {
     "excite": "excitation.design",
     "identify": "identification.identify",
     "LeastSquares": "identification.identification",
-    "keep_baseline": "evaluation.keep",
     "FrictionModel": "dynamics.linear_friction",
     "Identification": "identification.identification",
     "fit": "fitting.fit",
@@ -99,7 +97,6 @@ __all__ = [
     "generate",
     "identify",
     "inspect",
-    "keep_baseline",
     "load_arm",
     "load_module",
     "load_run",

@@ -57,7 +57,10 @@ def test_a_run_and_its_logs_may_be_elsewhere(robots, tmp_path, memory):
         path.rsplit("/", 1)[-1] for path in memory.find("/runs/first")
     }
     assert len(memory.cat("/runs/first/metrics.jsonl").splitlines()) == 2
-    assert json.loads(memory.cat("/runs/first/config.json")) == RunFolder("memory://runs/first").read_config()
+    assert (
+        json.loads(memory.cat("/runs/first/config.json"))
+        == RunFolder("memory://runs/first").read_record().to_dict()
+    )
 
 
 def test_what_is_removed_here_is_removed_there(memory):

@@ -23,8 +23,9 @@ urdf settings arm design spec
 structure dynamics
 certificate emission logs pipeline
 identification excitation simulation
-log_checks fitting
-exporting baselines
+log_checks baselines
+fitting
+exporting
 evaluation
 fleet comparison render
 cli __init__ __main__

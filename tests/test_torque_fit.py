@@ -416,8 +416,8 @@ def test_logs_too_slow_for_accelerations_are_fitted_by_windows(emitted, robots):
     logs = sparse(drawn(emitted["rpr"][0], seed=0))
     found = fit(model, logs, Rollout(epochs=1, momentum_steps=0, urdf_weight=0.0))
     assert [note.code for note in found.diagnostics].count("no-torque-fit") == 1
-    assert default_objective(model, [20.0]) == "rollout"
-    assert default_objective(model, [20.0, 100.0]) == "torque"
+    assert default_objective(model, lambda: [20.0]) == "rollout"
+    assert default_objective(model, lambda: [20.0, 100.0]) == "torque"
     for adapt, what in ((None, "to fit torques to"), ("load", "to adapt to")):
         with pytest.raises(LogError, match=f"no motion {what}, expected samples at 24 Hz or more that move"):
             fit(model, logs, TorqueFit(adapt=adapt))
