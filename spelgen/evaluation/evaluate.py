@@ -16,8 +16,8 @@ from spelgen.dynamics.residuals import used_parameter_count, without_idle_residu
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import Diagnostic, LogError, in_one_line
 from spelgen.evaluation.horizons import (
+    EvaluatedLogs,
     Horizon,
-    JudgedLogs,
     Predictions,
     TipPosition,
     horizon_lengths,
@@ -79,26 +79,26 @@ def evaluate(
 
     Raises LogError.
     """
-    judged = subject(model, arm)
+    tested = subject(model, arm)
     logs = [logs] if isinstance(logs, Trajectory) else list(logs)
     for trajectory in logs:
-        require_joints(trajectory, judged.joints)
-    notes = check(logs, judged.joints, judged.model.joint_types)
-    seen = [trajectory.name for trajectory in logs if trajectory.name in judged.trained_on]
+        require_joints(trajectory, tested.joints)
+    notes = check(logs, tested.joints, tested.model.joint_types)
+    seen = [trajectory.name for trajectory in logs if trajectory.name in tested.trained_on]
     if seen:  # a run keeps only the names of its logs
         message = (
             f"names also used in training: {', '.join(seen)}; errors on training data are not test errors"
         )
         notes.append(Diagnostic("warning", "tested-on-training-data", "logs", None, message))
-    if input_of(judged.model) == "position":
+    if input_of(tested.model) == "position":
         if baselines:
             raise LogError(
                 "baselines that take torques", expected="none: the model is one of position servos"
             )
-        return _evaluate_commands(judged, logs, notes)
+        return _evaluate_commands(tested, logs, notes)
     require_torques(logs)
-    used = _preprocessing(judged.fit.preprocessing if judged.fit else None, preprocessing, logs)
-    return _evaluate_torques(judged, logs, notes, used, baselines or {}, (steps, seconds), progress)
+    used = _preprocessing(tested.fit.preprocessing if tested.fit else None, preprocessing, logs)
+    return _evaluate_torques(tested, logs, notes, used, baselines or {}, (steps, seconds), progress)
 
 
 def _preprocessing(
@@ -114,7 +114,7 @@ def _preprocessing(
 
 
 def _evaluate_torques(
-    judged: Subject,
+    tested: Subject,
     logs: Sequence[Trajectory],
     notes: list[Diagnostic],
     used: Preprocessing,
@@ -123,21 +123,23 @@ def _evaluate_torques(
     progress: Progress | None,
 ) -> Results:
     """Evaluate the torques, and the motion under the logged torques."""
-    all_samples = dynamics_samples(logs, pauses=True, preprocessing=used, reach=judged.reach)
+    all_samples = dynamics_samples(logs, pauses=True, preprocessing=used, reach=tested.reach)
     samples = [sample for sample in all_samples if len(sample.q)]
     # a rollout needs an initial sample and one more
-    tests = JudgedLogs(used.pieces(logs, shortest=2), samples, used, judged.reach, judged.model.joint_types)
+    tests = EvaluatedLogs(
+        used.pieces(logs, shortest=2), samples, used, tested.reach, tested.model.joint_types
+    )
     lengths = horizon_lengths(tests, *ahead, notes)
-    probe = tests.windows(judged.window - 1, TUNING.probed_model_windows)
+    probe = tests.windows(tested.window - 1, TUNING.probed_model_windows)
     # residual terms that were not selected only cost time
-    model = without_idle_residuals(judged.model)
+    model = without_idle_residuals(tested.model)
     solver = accurate_solver(model, probe)
     predictors = [Predictor(MODEL, solver, model)]
-    known = EvaluatedArm(judged.joints, judged.urdf, judged.fitted_baselines, judged.fitted_arm, probe, notes)
+    known = EvaluatedArm(tested.joints, tested.urdf, tested.fitted_baselines, tested.fitted_arm, probe, notes)
     predictors += torque_predictors(known)
     for name, dynamics in baselines.items():
         predictors.append(of_dynamics(name, dynamics, probe))
-    tip = _tip(judged, notes)
+    tip = _tip(tested, notes)
     horizons: list[Horizon] = []
     longest: Predictions | None = None
     for name, k in lengths.items():
@@ -148,11 +150,11 @@ def _evaluate_torques(
         # the curves of the longest horizon contain those of the shorter ones
         if k == max(lengths.values()):
             longest = predictions
-    judged_dynamics: dict[str, RigidDynamics] = {}
+    all_dynamics: dict[str, RigidDynamics] = {}
     torque: dict[str, TorqueErrors] = {}
     for predictor in predictors:
         if predictor.dynamics is not None:
-            judged_dynamics[predictor.name] = predictor.dynamics
+            all_dynamics[predictor.name] = predictor.dynamics
             if samples:
                 torque[predictor.name] = torque_errors(predictor.dynamics, samples)
     if not horizons and not torque:
@@ -161,12 +163,12 @@ def _evaluate_torques(
             expected=f"motion at {SLOWEST:g} Hz or more, {SHORTEST:g} s without a gap",
             do="omit --quick",
         )
-    steps = coarse_torques(logs, judged.joints, notes) if torque else {}
+    steps = coarse_torques(logs, tested.joints, notes) if torque else {}
     return _results(
-        judged,
+        tested,
         logs,
         notes,
-        motion_traces(judged_dynamics, tests, longest, tip),
+        motion_traces(all_dynamics, tests, longest, tip),
         cutoff=used.cutoff or None,
         substeps=solver.substeps,
         horizons=tuple(horizons),
@@ -176,37 +178,37 @@ def _evaluate_torques(
 
 
 def _results(
-    judged: Subject, logs: Sequence[Trajectory], notes: Sequence[Diagnostic], traces: Traces, **figures: Any
+    tested: Subject, logs: Sequence[Trajectory], notes: Sequence[Diagnostic], traces: Traces, **figures: Any
 ) -> Results:
     """Return the results with the names of the arm and the logs."""
     return Results(
-        robot=judged.facts.robot if judged.facts else type(judged.model).__name__,
-        joints=tuple(judged.joints),
-        joint_types=tuple(judged.model.joint_types),
+        robot=tested.facts.robot if tested.facts else type(tested.model).__name__,
+        joints=tuple(tested.joints),
+        joint_types=tuple(tested.model.joint_types),
         trajectories=tuple(trajectory.name for trajectory in logs),
-        parameters=used_parameter_count(judged.model),
+        parameters=used_parameter_count(tested.model),
         diagnostics=tuple(notes),
         traces=traces,
         **figures,
     )
 
 
-def _evaluate_commands(judged: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic]) -> Results:
+def _evaluate_commands(tested: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic]) -> Results:
     """Evaluate the positions under the logged commands."""
     for trajectory in logs:
         require_commands(trajectory)
-    followers = command_followers(judged.linear_servos, notes)
-    errors, missed = replays(judged.model, logs, followers, notes)
-    return _results(judged, logs, notes, replay_traces(missed), replays=errors)
+    followers = command_followers(tested.linear_servos, notes)
+    errors, missed = replays(tested.model, logs, followers, notes)
+    return _results(tested, logs, notes, replay_traces(missed), replays=errors)
 
 
-def _tip(judged: Subject, notes: list[Diagnostic]) -> TipPosition | None:
-    if judged.urdf is None:
+def _tip(tested: Subject, notes: list[Diagnostic]) -> TipPosition | None:
+    if tested.urdf is None:
         return None
     try:
-        tip = judged.facts.options.tip if judged.facts else None
-        return tip_kinematics(judged.urdf, tip, joints=judged.joints).position
+        tip = tested.facts.options.tip if tested.facts else None
+        return tip_kinematics(tested.urdf, tip, joints=tested.joints).position
     except Exception as error:  # pytorch-kinematics raises many kinds; the evaluation continues without it
         message = f"no tip errors: {in_one_line(error)}"
-        notes.append(Diagnostic("info", "no-tip", judged.urdf.name, None, message))
+        notes.append(Diagnostic("info", "no-tip", tested.urdf.name, None, message))
         return None

@@ -87,11 +87,11 @@ class Subject:
         return linear
 
 
-def subject(judged: EmittedModel | Fit | Path | str, arm: LoadedArm | Path | str | None = None) -> Subject:
+def subject(tested: EmittedModel | Fit | Path | str, arm: LoadedArm | Path | str | None = None) -> Subject:
     """Return the subject of an evaluation: a model, a fit or the folder of a run; arm: see `evaluate`."""
-    if isinstance(judged, str | Path):
-        judged = load_run(judged)
-    model, fit = (judged.model, judged) if isinstance(judged, Fit) else (judged, None)
+    if isinstance(tested, str | Path):
+        tested = load_run(tested)
+    model, fit = (tested.model, tested) if isinstance(tested, Fit) else (tested, None)
     urdf = None if fit is None else fit.urdf
     if arm is not None:
         urdf = Path(arm) if isinstance(arm, str | Path) else arm.robot.path
