@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
-
-import numpy as np
+from typing import Any
 
 from spelgen.arm.configured_arm import ConfiguredArm
-from spelgen.baselines.predictor import Predictor
+from spelgen.baselines.predictor import CommandFollower, Predictor
 from spelgen.errors import Diagnostic
-from spelgen.logs.commands import LogRows
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows
@@ -37,25 +34,6 @@ class EvaluatedArm:
     fitted_arm: ConfiguredArm | None
     probe: Windows
     notes: list[Diagnostic]
-
-
-class CommandFollower(Protocol):
-    """Predictor of positions under position commands. about: what it is, and how it was fitted."""
-
-    @property
-    def about(self) -> str: ...
-
-    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return the positions at the end of each sample interval.
-
-        Args:
-            parts: rows of logs, each with K sample intervals.
-            q: (parts, n) initial positions [rad, m].
-            qd: (parts, n) initial velocities [rad/s, m/s].
-
-        Returns:
-            (K, n) [rad, m] for each part.
-        """
 
 
 class Baseline:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from spelgen.baselines.baseline import Baseline, CommandFollower
+from spelgen.baselines.baseline import Baseline
 from spelgen.baselines.linear_servos import DelayedCommand, LinearServos
 from spelgen.baselines.names import DELAYED_COMMAND, LINEAR_SERVOS
+from spelgen.baselines.predictor import CommandFollower
 from spelgen.errors import Diagnostic
 
 

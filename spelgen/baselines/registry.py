@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from spelgen.arm.configured_arm import ConfiguredArm
-from spelgen.baselines.baseline import Baseline, CommandFollower, EvaluatedArm, FittedBaselines
+from spelgen.baselines.baseline import Baseline, EvaluatedArm, FittedBaselines
 from spelgen.baselines.constant_velocity import ConstantVelocity
 from spelgen.baselines.fitted_servos import FittedServos
 from spelgen.baselines.least_squares import IdentifiedArm
-from spelgen.baselines.predictor import Predictor
+from spelgen.baselines.predictor import CommandFollower, Predictor
 from spelgen.baselines.urdf import UrdfValues
 from spelgen.errors import Diagnostic
 from spelgen.logs.preprocessing import Preprocessing

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from spelgen.baselines.baseline import CommandFollower
 from spelgen.baselines.names import MODEL
+from spelgen.baselines.predictor import CommandFollower
 from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import Diagnostic
