@@ -32,14 +32,14 @@ def evaluate(
             help=f"Exit with {MISSED} if a figure is larger: {', '.join(LIMITS)}; once for each.",
         ),
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Torque errors alone, without rollouts.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Torque errors only, without rollouts.")] = False,
     trust: Trust = False,
 ) -> None:
     """Evaluate a trained run and its baselines on test logs; the assessment comes first.
 
     The result is also written to evaluation.json in the run folder, and nothing else is.
     """
-    # a misspelt limit is refused before minutes of rollouts
+    # a misspelt limit is reported before minutes of rollouts
     paths = options.logs(data, extra_logs)
     limits = list(map(_limit, limit or []))
     from spelgen.evaluation.evaluate import SECONDS, STEPS
@@ -65,7 +65,7 @@ def evaluate(
         note(diagnostic)
     forms = {"text": results.text, "csv": lambda: csv_text(results).removesuffix("\n")}
     options.write_result(format, output, forms | {"json": lambda: json.dumps(record)})
-    # after the result, so that a script that failed still has the figures
+    # after the result, so that a script gets the figures in any case
     values = {figure.name: figure.value for figure in figures(results)}
     exceeded = []
     for name, largest in limits:
@@ -113,7 +113,7 @@ def report(
 
     if trust:
         for run in runs:
-            RunFolder(run).load_module(trust=True)  # a module that ran once may run again
+            RunFolder(run).load_module(trust=True)  # a module that was loaded once is trusted from then on
     if robot is not None and len(runs) > 1:
         raise typer.BadParameter("belongs to the page of one run", param_hint="'--robot'")
     if len(runs) == 1:

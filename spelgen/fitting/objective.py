@@ -1,4 +1,4 @@
-"""What a fit is: the base of all objectives, and what every objective is given."""
+"""The base class of all objectives, and their arguments: the request of a fit."""
 
 from __future__ import annotations
 
@@ -33,11 +33,12 @@ Status = Literal["finished", "stopped early", "out of time", "interrupted"]
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a fit runs, whatever it fits.
+    """How a fit runs.
 
-    device, threads: of torch. resume: go on from the folder's checkpoint, exactly as if there had been no interruption.
-    force: replace a run. progress: show it on stderr. mapping: how the logs were read, kept with the run. notes: found
-    before, to be reported with the others. began: from when the allowed time counts (`time.monotonic`); None: from now.
+    device, threads: of torch. resume: continue from the folder's checkpoint, exactly as if there had been no
+    interruption. force: replace a run. progress: show it on stderr. mapping: with which the logs were read, kept with
+    the run. notes: earlier diagnostics, reported with the others. began: start of the allowed time (`time.monotonic`);
+    None: now.
     """
 
     device: str = "cpu"
@@ -52,10 +53,10 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class FitRequest:
-    """What is fitted to what, and how: the same for each objective.
+    """The arguments of a fit.
 
-    validation: the fraction of the logs that is set aside, or trajectories. urdf: the robot's, where it is known.
-    began: from when the allowed time counts (`time.monotonic`). folder: of the run.
+    validation: the fraction of the logs that is held out, or trajectories. urdf: of the robot, None if unknown.
+    began: start of the allowed time (`time.monotonic`). folder: of the run, None without one.
     """
 
     model: EmittedModel
@@ -90,16 +91,16 @@ class PreparedLogs:
 
 
 class Objective(ABC):
-    """One way to fit a model: what it needs of logs, how it starts, goes on and is resumed.
+    """A way to fit a model.
 
-    It is made of a model that it is for, and a config of its own. `fit` calls `prepare` first, then `begin` for a new
-    fit or `resume`, then `run`. It owns the run folder: what an objective wants kept it says by ``save``, and in
-    `checkpoint`, history (the lines of metrics.jsonl) and results (what config.json says of how it went).
+    `fit` calls `prepare`, then `begin` for a new fit or `resume`, then `run`. Only `fit` writes to the run folder: it
+    writes `checkpoint` and history (the lines of metrics.jsonl) whenever ``save`` is called, and results (fields of
+    `run_record.Record`, by name) at the end.
     """
 
     name: ClassVar[str]
     input: ClassVar[Literal["torque", "position"]] = "torque"
-    """What the inputs are of the models that it is for, and what their logs have."""
+    """The input of the models that it fits, which is also in their logs."""
 
     def __init__(self, request: FitRequest) -> None:
         self.request, self.model, self.config = request, request.model, request.config
@@ -109,37 +110,37 @@ class Objective(ABC):
 
     @abstractmethod
     def prepare(self) -> PreparedLogs:
-        """Check the logs and read what is fitted. Raises LogError and RunError."""
+        """Check the logs and prepare their samples. Raises LogError and RunError."""
 
     @abstractmethod
     def begin(self) -> list[Diagnostic]:
-        """Do what comes before the first checkpoint of a new fit; return what there is to tell."""
+        """Do the steps of a new fit before its first checkpoint; return diagnostics."""
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Go on from what the run folder holds, by default a model that is fitted.
+        """Continue from the files of a run folder, by default with a fitted model.
 
-        Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError where that is of another model.
+        Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError for files of another model.
         """
         self.model.load_state_dict(checkpoint["best_weights"])
         self._checkpoint = checkpoint
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Fit until an end is reached, by default nothing more; call ``save`` where `checkpoint` should be kept.
+        """Fit until an end is reached, by default at once; call ``save`` to keep a `checkpoint`.
 
         KeyboardInterrupt may end it anywhere.
         """
         return "finished"
 
     def checkpoint(self) -> Content:
-        """Return what a resumed fit needs, with "best_weights", and the numbers of `run_record.Checkpoint`."""
+        """Return the content of checkpoint.pt: the keys of `run_record.Checkpoint`, and states for `resume`."""
         return self._checkpoint
 
 
 class TorqueLogObjective(Objective):
-    """An `Objective` on logs of torques, which are cut into windows: to fit, or to measure the model on."""
+    """An `Objective` on logs with torques, which are cut into windows: to fit them, or to measure the model."""
 
     def _cut_windows(self, window: int, stride: int) -> TrainingData:
-        """Cut windows of the logs: to be fitted, and to be validated on. Raises LogError and RunError."""
+        """Return the training and validation windows of the logs. Raises LogError and RunError."""
         request = self.request
         reach = bristle_reach(self.model)
         choice = WindowChoice(window, stride, request.validation, request.seed, reach)
@@ -153,7 +154,7 @@ class TorqueLogObjective(Objective):
         return prepare_streamed(request.logs, request.preprocessing, choice)
 
     def _prepared(self, data: TrainingData, config: FitConfig) -> PreparedLogs:
-        """Return what windows tell of the logs."""
+        """Return the prepared logs of these windows."""
         return PreparedLogs(
             config=config,
             preprocessing=data.preprocessing,
@@ -169,7 +170,7 @@ class TorqueLogObjective(Objective):
     def _regularizer(
         self, data: TrainingData, weight: float, notes: list[Diagnostic]
     ) -> UrdfRegularizer | None:
-        """Return the regularizer towards the request's URDF, where that has a weight and can be had."""
+        """Return the regularizer towards the URDF; None without a weight or a readable URDF."""
         urdf = self.request.urdf
         if not weight or urdf is None or not urdf.exists():
             return None

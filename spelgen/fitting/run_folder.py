@@ -1,4 +1,4 @@
-"""A run folder: what lies in it, written so that at every moment it is complete, and the module it trains."""
+"""A run folder: its files, each of which is written completely or not at all, and its module."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class RunFolder:
     """The files of one training run.
 
     module: the trained module's source. urdf, settings: of its robot, where known. config: how it was trained. metrics:
-    a line per epoch. checkpoint: everything needed to go on. weights: the best state_dict so far. evaluation: what
+    a line per epoch. checkpoint: everything needed to resume. weights: the best state_dict so far. evaluation: what
     `evaluate` found. baseline: baselines fitted to the training logs, and the coverage of these.
     """
 
@@ -47,7 +47,7 @@ class RunFolder:
         self.baseline = self.path / "least_squares.json"
 
     def require_free(self, *, force: bool) -> None:
-        """Raise RunError where a run lies, unless it may be replaced."""
+        """Raise RunError if there is a run in the folder, unless it may be replaced."""
         if self.path.exists() and not self.path.is_dir():
             raise RunError("a file", file=self.path, expected="a folder or a new name")
         if self.config.exists() and not force:
@@ -60,7 +60,7 @@ class RunFolder:
     def start(self, source: str, urdf: Path | None, *, force: bool) -> None:
         """Make the folder, write the module's source and copy the robot into it.
 
-        It is a run when config.json is there: that is written last. Raises RunError where a run lies, unless forced.
+        A folder is a run if it has config.json, which is written last. Raises RunError if there is one, unless forced.
         """
         self.require_free(force=force)
         robot = self._robot_files(urdf)  # before anything is removed: they may be this very run's copies
@@ -87,14 +87,14 @@ class RunFolder:
         write_state(self.checkpoint, checkpoint)
 
     def write_metrics(self, records: Sequence[Content]) -> None:
-        """Make these all lines of metrics.jsonl; no file for none."""
+        """Write these records as metrics.jsonl; no file without any."""
         if records:
             write_bytes(self.metrics, "".join(json.dumps(record) + "\n" for record in records).encode())
         else:
             remove(self.metrics)
 
     def read_metrics(self) -> list[Content]:
-        """The lines of metrics.jsonl, without a last one that is torn."""
+        """Return the lines of metrics.jsonl, without an incomplete last one."""
         lines, records = [], []
         if self.metrics.exists():
             lines = read_bytes(self.metrics, RunError).decode("utf-8", "replace").splitlines()
