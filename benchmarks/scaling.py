@@ -27,11 +27,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from spelgen.emission.build import build
 from spelgen.fitting.fit import fit
 from spelgen.fitting.rollout import loss_scales, rollout_loss
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows
-from spelgen.emission.build import build
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel

@@ -127,7 +127,7 @@ def main() -> None:
     errors, held, left = {x: [] for x in truths}, {x: [] for x in truths}, {x: 0 for x in truths}
     for seed, logs in enumerate(recordings(arm, asked)):
         since = time.monotonic()
-        found = spelgen.fit(spelgen.build(arm, asked.preset), logs).record["servo"]
+        found = spelgen.fit(spelgen.build(arm, asked.preset), logs).record.servo
         for what, truth in truths.items():
             told = [x[what] for x in found["joints"] if what in x and x[what]["determined"]]
             left[what] += len(found["joints"]) - len(told)

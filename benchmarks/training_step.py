@@ -30,8 +30,8 @@ from published_phnode import ByJvp, Published
 
 from spelgen.design import Design
 from spelgen.dynamics.equations import unbounded
-from spelgen.fitting.rollout import position_difference
 from spelgen.emission.build import build
+from spelgen.fitting.rollout import position_difference
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel

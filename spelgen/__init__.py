@@ -6,14 +6,16 @@ from typing import TYPE_CHECKING, Any
 from spelgen.version import __version__
 
 if TYPE_CHECKING:
-    from spelgen.certificate.inspection import Inspection
+    from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+    from spelgen.certificate.inspection import Inspection, inspect
+    from spelgen.certificate.module_check import check
     from spelgen.design import Design
     from spelgen.dynamics.linear_friction import FrictionModel
     from spelgen.dynamics.tip import tip_kinematics
+    from spelgen.emission.build import build, generate
     from spelgen.emission.loading import load_module
     from spelgen.errors import SpelgenError
     from spelgen.evaluation.evaluate import evaluate
-    from spelgen.evaluation.keep import keep_baseline
     from spelgen.evaluation.results import Results
     from spelgen.evaluation.rollout import rollout
     from spelgen.excitation.design import excite
@@ -25,11 +27,6 @@ if TYPE_CHECKING:
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs, write_logs
     from spelgen.logs.trajectory import Trajectory
-    from spelgen.emission.build import build
-    from spelgen.certificate.inspection import inspect
-    from spelgen.certificate.module_check import check
-    from spelgen.emission.build import generate
-    from spelgen.arm.configured_arm import ConfiguredArm, load_arm
     from spelgen.settings.fits import GaussianPrior, MomentumFit, Rollout, TorqueFit
     from spelgen.simulation.simulate import simulate
 
@@ -53,7 +50,6 @@ _HOME = {
     "excite": "excitation.design",
     "identify": "identification.identify",
     "LeastSquares": "identification.identification",
-    "keep_baseline": "evaluation.keep",
     "FrictionModel": "dynamics.linear_friction",
     "Identification": "identification.identification",
     "fit": "fitting.fit",
@@ -74,6 +70,7 @@ _HOME = {
 """The file that each name of the API lives in; loaded on first use (PEP 562), so `import spelgen` stays fast."""
 
 __all__ = [
+    "ConfiguredArm",
     "Design",
     "Fit",
     "FrictionModel",
@@ -81,7 +78,6 @@ __all__ = [
     "Identification",
     "Inspection",
     "LeastSquares",
-    "ConfiguredArm",
     "MomentumFit",
     "Preprocessing",
     "Results",
@@ -101,7 +97,6 @@ __all__ = [
     "generate",
     "identify",
     "inspect",
-    "keep_baseline",
     "load_arm",
     "load_module",
     "load_run",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
@@ -14,8 +14,6 @@ Preset = Literal["hybrid", "closed-form", "minimal", "spel", "spel-kan", "phnode
 """Those that come with spelgen."""
 
 PRESET_NAMES: tuple[str, ...] = get_args(Preset)
-
-Net = Literal["mlp", "kan"]
 
 BRISTLE_REACH = {
     "revolute": (1e-4, 4e-4, 1.6e-3, 6.4e-3, 2.5e-2, 1e-1),
@@ -61,10 +59,10 @@ CHOICES: dict[str, tuple[str, ...]] = {name: get_args(kind) for name, kind in ge
 """The values of each key of a design."""
 
 
-def load_design(preset: str | Path | Design, net: Net | None = None) -> Design:
+def load_design(preset: str | Path | Design) -> Design:
     """The design of a preset: one that comes with spelgen by its name, one of yours by its YAML file.
 
-    ``net`` takes the place of its own networks. Raises SettingsError.
+    Raises SettingsError.
     """
     if isinstance(preset, Design):
         design = preset
@@ -75,7 +73,7 @@ def load_design(preset: str | Path | Design, net: Net | None = None) -> Design:
     else:
         expected = f"one of {', '.join(PRESET_NAMES)}, or a YAML file"
         raise SettingsError(f"the preset {str(preset)!r}", expected=expected)
-    return design if net is None else replace(design, net=net)
+    return design
 
 
 def _read(path: Path) -> Design:

@@ -177,7 +177,8 @@ class ModelSpec:
     def __post_init__(self) -> None:
         n, links = len(self.joints), self.links
         joints = [*self.potential, *(x.joint for x in links), *(j for x in self.outputs for j in x.joints)]
-        joints += [index for x in (*self.outputs, *self.constants) for row in x.basis for index in row[:2]]
+        bases = [x.basis for x in self.outputs] + [x.basis for x in self.constants]
+        joints += [index for basis in bases for row in basis for index in row[:2]]
         joints += [index for x in self.inputs for index in (x.joint, x.motor)]
         joints += [index for row, column, _, depends in self.entries for index in (row, column, *depends)]
         names = [joint.name for joint in self.joints], [link.name for link in links]

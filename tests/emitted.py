@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from flint import fmpq_mpoly
 from polynomials import polynomials
+from spelgen.emission.emit import emit
 from torch import nn
 
-from spelgen.design import Design
-from spelgen.emission.emit import emit
-from spelgen.emission.build import make_spec
 from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.design import Design
+from spelgen.emission.build import make_spec
 from spelgen.spec import Options
 from spelgen.structure.structure import Structure
 

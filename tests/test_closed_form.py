@@ -7,10 +7,10 @@ import torch
 from emitted import import_source
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.emission.build import generate
-from spelgen.arm.configured_arm import load_arm
 from spelgen.structure.pseudo_inertia import pseudo_inertia
 from spelgen.structure.sampling import float_energies
 

@@ -7,13 +7,12 @@ from typing import get_args
 import pytest
 import torch
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.certificate.module_check import check
 from spelgen.design import CHOICES, PRESETS, Design, Preset, load_design
+from spelgen.emission.build import build, generate
 from spelgen.emission.loading import load_module
 from spelgen.errors import SettingsError, SpelgenError
-from spelgen.emission.build import build
-from spelgen.certificate.module_check import check
-from spelgen.emission.build import generate
-from spelgen.arm.configured_arm import load_arm
 
 COMBINATIONS = [dict(zip(CHOICES, values, strict=True)) for values in itertools.product(*CHOICES.values())]
 

@@ -12,8 +12,8 @@ from typing import get_args
 import pytest
 from emitted import GANTRY, built, import_source
 
-from spelgen.design import Preset
 from spelgen.certificate.module_check import check
+from spelgen.design import Preset
 from spelgen.emission.build import generate
 from spelgen.spec import read_facts
 

@@ -11,12 +11,14 @@ import torch
 import typer
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.constant_velocity import hold_velocity
 from spelgen.baselines.names import observed
 from spelgen.cli import evaluate_command
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.dynamics.tip import tip_kinematics
+from spelgen.emission.build import build
 from spelgen.emission.loading import load_module
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.evaluation.evaluate import evaluate
@@ -29,8 +31,6 @@ from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows
-from spelgen.emission.build import build
-from spelgen.arm.configured_arm import load_arm
 from spelgen.settings.fits import Rollout
 
 STAND_IN = Path(__file__).with_name("stand_in.py")

@@ -8,13 +8,13 @@ from emitted import ROBOTS
 from exported_runs import saved_run
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
+from spelgen.emission.build import build
 from spelgen.errors import RunError
 from spelgen.exporting.export import export
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
-from spelgen.emission.build import build
-from spelgen.arm.configured_arm import load_arm
 
 pytest.importorskip("pinocchio")
 

@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.errors import RunError, SettingsError, SpelgenError
 from spelgen.fleet.fleet import run_fleet
 from spelgen.fleet.prepare import Preparation, prepare
 from spelgen.fleet.ranking import fleet_listings, winners
 from spelgen.fleet.schema import FleetRobot, load_fleet
 from spelgen.logs.read import read_logs, write_logs
-from spelgen.arm.configured_arm import load_arm
 from spelgen.render.fleet_page import write_fleet
 from spelgen.simulation.simulate import simulate
 from spelgen.tasks import run_here, workers

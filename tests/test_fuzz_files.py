@@ -15,6 +15,8 @@ from fuzzing import fuzz
 from hypothesis import strategies as st
 from test_fuzz import mutated
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.emission.build import build
 from spelgen.errors import SpelgenError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.fitting.fit import fit
@@ -22,8 +24,6 @@ from spelgen.fitting.fitted import load_run
 from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.emission.build import build
-from spelgen.arm.configured_arm import load_arm
 from spelgen.render.report_page import render_report
 from spelgen.render.scene import scene
 from spelgen.settings.fits import TorqueFit

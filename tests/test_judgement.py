@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.emission.build import build
 from spelgen.evaluation import invariants
 from spelgen.evaluation.horizons import end_errors
 from spelgen.exporting.mjcf_file import mjcf_text
@@ -27,8 +29,6 @@ from spelgen.fitting.window.momentum import MomentumObjective
 from spelgen.fleet import jobs
 from spelgen.identification.least_squares import deviations
 from spelgen.logs.windows import Windows
-from spelgen.emission.build import build
-from spelgen.arm.configured_arm import load_arm
 from spelgen.settings.fits import Rollout, TorqueFit
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from spelgen.emission.build import build
 from spelgen.emission.loading import load_module
 from spelgen.errors import ModuleError
-from spelgen.emission.build import build
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 STAND_IN = Path(__file__).parent / "stand_in.py"

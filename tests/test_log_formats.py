@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.errors import LogError, SettingsError, SpelgenErrors
 from spelgen.logs import checks, formats, npz
 from spelgen.logs.formats import FORMATS
@@ -21,7 +22,6 @@ from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.suggest import suggest_mapping
 from spelgen.logs.tables import LogFormat, table_layout
 from spelgen.logs.trajectory import Trajectory
-from spelgen.arm.configured_arm import load_arm
 from spelgen.settings.log_mapping import LogMapping
 
 JOINTS = ("shoulder", "elbow")

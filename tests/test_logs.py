@@ -11,6 +11,8 @@ import pyarrow.parquet
 import pytest
 import torch
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.emission.build import build
 from spelgen.errors import LogError, SpelgenErrors
 from spelgen.logs.checks import check
 from spelgen.logs.filtering import low_pass, regular_times, resampled
@@ -19,8 +21,6 @@ from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.trajectory import split_at_gaps
 from spelgen.logs.windows import cut_windows, split_validation
-from spelgen.emission.build import build
-from spelgen.arm.configured_arm import load_arm
 
 JOINTS = ("a", "b")
 

@@ -22,11 +22,11 @@ from lie_group import geodesic_distance, group_rates
 from published_phnode import ByJvp, Published
 from test_model import bias
 
-from spelgen.design import Preset, load_design
-from spelgen.dynamics.protocol import has_friction_state
-from spelgen.fitting.rollout import position_difference
-from spelgen.emission.build import generate, make_spec
 from spelgen.arm.configured_arm import load_arm
+from spelgen.design import Preset, load_design
+from spelgen.dynamics.protocol import is_stateful
+from spelgen.emission.build import generate, make_spec
+from spelgen.fitting.rollout import position_difference
 from spelgen.spec import Options
 from tests.lie_group import to_group
 
@@ -118,7 +118,7 @@ def test_any_batch_shape(preset, net, batch, tmp_path):
 def test_backpropagation_reaches_every_weight(preset, net, tmp_path):
     model = random_model("rpr", tmp_path, seed=0, deviation=0.3, preset=preset, net=net)
     q, qd, _, tau = states(3)
-    past = [0.3 * model.memory(qd)] if has_friction_state(model) else []
+    past = [0.3 * model.memory(qd)] if is_stateful(model) else []
     model.forward_dynamics(q, qd, tau, *past).square().sum().backward()
     for name, parameter in model.named_parameters():
         # V's own level moves nothing

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 from html_page import Page
+from spelgen.pipeline import generate as pipeline
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.design import PRESETS
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.pipeline import generate as pipeline
-from spelgen.arm.configured_arm import load_arm
 from spelgen.render.report_page import render_report, write_report
 from spelgen.render.run_facts import commands
 from spelgen.settings.fits import Rollout

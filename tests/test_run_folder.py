@@ -14,10 +14,12 @@ import pytest
 import torch
 from killing import killed
 from machine import in_time
+from REMOVED import require_own_module
 from typer.testing import CliRunner
 
 import spelgen
 from spelgen.cli.main import app
+from spelgen.emission.build import generate
 from spelgen.errors import ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.exporting.export import export
@@ -31,8 +33,6 @@ from spelgen.fitting.tuning import WindowTuning
 from spelgen.fitting.window import momentum
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
-from REMOVED import require_own_module
-from spelgen.emission.build import generate
 from spelgen.render.report_page import render_report
 from spelgen.settings.fits import Rollout
 

@@ -11,24 +11,23 @@ import pytest
 import torch
 from emitted import ROBOTS, SIX, built, import_source, random_model
 from exported_runs import arm_of
-from torch import Tensor
-from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
-
-from spelgen.design import PRESET_NAMES, load_design
-from spelgen.dynamics.body_regressor import pseudo_inertia
-from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
-from spelgen.dynamics.protocol import has_friction_state, sliding_memory
 from spelgen.emission.bundle import bundle, load_runtime, names_in
 from spelgen.emission.tailored import kinds
 from spelgen.emission.unit_joints import hidden_units
-from spelgen.fitting.torque.weights import body_weights, upper_cholesky
-from spelgen.emission.build import build
-from spelgen.emission.build import make_spec
+from spelgen.runtime.joints import Joints, vector
+from torch import Tensor
+from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
+
 from spelgen.arm.configured_arm import load_arm
+from spelgen.design import PRESET_NAMES, load_design
+from spelgen.dynamics.body_regressor import pseudo_inertia
+from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
+from spelgen.dynamics.protocol import is_stateful, sliding_memory
+from spelgen.emission.build import build, make_spec
+from spelgen.fitting.torque.weights import body_weights, upper_cholesky
 from spelgen.runtime.derived_mass import DerivedMass
 from spelgen.runtime.encoding import JointEncoding
 from spelgen.runtime.friction_laws import turning
-from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.masked_kan import MaskedKAN
 from spelgen.runtime.masked_mlp import MaskedMLP
 from spelgen.runtime.residual_terms import HARMONICS, SPLINES, ResidualTerms
@@ -309,7 +308,7 @@ def test_transforms_work_for_every_preset(robot, preset, net, tmp_path):
     near(forward, reverse, 1e-8)
     curvature = hessian(model.hamiltonian, argnums=1)(q[0], model.momentum(q[0], qd[0]))
     near(curvature, torch.linalg.inv(model.mass_matrix(q[0])), 1e-8)
-    if not has_friction_state(model):
+    if not is_stateful(model):
         return
     z = model.memory(qd)
     near(vmap(model.forward_dynamics)(q, qd, tau, z), model.forward_dynamics(q, qd, tau, z), 1e-9)

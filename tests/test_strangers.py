@@ -18,7 +18,9 @@ import pytest
 import torch
 from machine import in_time
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.comparison.metrics import RunResult
+from spelgen.emission.build import build, generate
 from spelgen.emission.loading import load_module
 from spelgen.errors import LogError, RunError, SettingsError, SpelgenError
 from spelgen.exporting.exported import readme
@@ -28,9 +30,6 @@ from spelgen.log_checks.gravity import find_opposed_inertia, state_samples
 from spelgen.logs import bags
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.emission.build import build
-from spelgen.emission.build import generate
-from spelgen.arm.configured_arm import load_arm
 from spelgen.settings.fits import MomentumFit, Rollout
 from spelgen.settings.messages import validated
 

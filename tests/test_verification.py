@@ -5,8 +5,8 @@ from fractions import Fraction
 
 import pytest
 
-from spelgen.certificate.verify import verify
 from spelgen.arm.configured_arm import load_arm
+from spelgen.certificate.verify import verify
 from spelgen.structure.structure import Entry, derive
 
 ROBOTS = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")

@@ -17,8 +17,8 @@ from spelgen.settings.log_mapping import Accepted
 from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:
-    from spelgen.logs.arm_mapping import LoggedArm
     from spelgen.arm.configured_arm import ConfiguredArm
+    from spelgen.logs.arm_mapping import LoggedArm
     from spelgen.settings.log_mapping import LogMapping
 
 SUFFIXES = {".json": "json", ".csv": "csv", ".html": "html", ".tex": "latex", ".py": "sympy"}
@@ -99,10 +99,6 @@ Filter = Annotated[
         min=0.0,
         help="Cutoff frequency of the zero-phase low-pass filter; 0: no filter.",
     ),
-]
-Trust = Annotated[
-    bool,
-    typer.Option("--trust", help="Execute the module of the run folder even if spelgen did not write it."),
 ]
 Address = Annotated[
     str | None,

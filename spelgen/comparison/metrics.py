@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 from pydantic import TypeAdapter, ValidationError
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.comparison.tuning import TUNING
 from spelgen.dynamics.parameters import parameter_count
-from spelgen.dynamics.protocol import has_residuals
+from spelgen.dynamics.protocol import is_residual
 from spelgen.errors import RunError
 from spelgen.evaluation.drawn_motions import PredictedMotion
 from spelgen.evaluation.invariants import Invariants
@@ -21,7 +22,6 @@ from spelgen.files import read_json, write_json
 from spelgen.fitting.rollout import position_difference, roll_out
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
-from spelgen.arm.configured_arm import load_arm
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
@@ -102,7 +102,7 @@ def predict(model: ArmModel, windows: Windows, substeps: int) -> Prediction:
 
 def sizes(model: ArmModel) -> Sizes:
     """Return how many numbers the model's networks give and read, and how many are trained."""
-    energies: Any = model.residuals if has_residuals(model) else model  # beside rigid bodies
+    energies: Any = model.residuals if is_residual(model) else model  # beside rigid bodies
     mass, friction = _network(energies, "mass"), _network(model, "friction")
     outputs = []
     for network in (mass, friction, _network(model, "input_network"), _network(energies, "potential")):

@@ -10,6 +10,7 @@ from itertools import product
 
 import torch
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.comparison.metrics import (
     RunResult,
@@ -31,7 +32,6 @@ from spelgen.fitting.run_folder import RunFolder, trained_model
 from spelgen.fitting.train import train
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows
-from spelgen.arm.configured_arm import load_arm
 from spelgen.settings.fits import DEFAULTS, Rollout
 from spelgen.structure.nominal import working_range
 from spelgen.tasks import RunTasks

@@ -15,19 +15,19 @@ from typing import Any, cast
 
 import yaml
 from pydantic import TypeAdapter
+from REMOVED import require_own_module
 
+from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.comparison.known_urdf import known_urdf
 from spelgen.comparison.metrics import RunResult
 from spelgen.design import Design, Net, Preset, load_design
+from spelgen.emission.build import generate
 from spelgen.errors import RunError, SettingsError
 from spelgen.files import read_json, write_json, write_text
 from spelgen.fitting.window.momentum import TUNING
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
-from REMOVED import require_own_module
-from spelgen.emission.build import generate
-from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.fits import Rollout, fit_config
 from spelgen.settings.settings import Settings

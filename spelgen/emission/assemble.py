@@ -31,6 +31,10 @@ class ArmModel(PortHamiltonian):
 
     spec: ModelSpec
 
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
+
     def prepared(
         self, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
     ) -> PreparedModel:
@@ -56,13 +60,18 @@ def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
     try:
         for name, rows in parts.rows.items():
             names[name] = tuple(_value(row, names) for row in rows)
-        arguments = {name: _value(item, names) for name, item in parts.model.arguments}
+        arguments = {str(name): _value(item, names) for name, item in parts.model.arguments}
         model = _model_class(base_class(spec))(**arguments)
     except (RuntimeError, ValueError, ArithmeticError, LookupError, TypeError) as problem:
         reason = " ".join(str(problem).split())[:200]
         raise ModuleError(f"a specification of no model ({reason})", do="build it again") from problem
     model.spec = spec
     return model
+
+
+def spec_of(model: object) -> ModelSpec | None:
+    """Return the specification that a model was assembled from; None of another model."""
+    return model.spec if isinstance(model, ArmModel) else None
 
 
 class MassEntries:

@@ -21,21 +21,15 @@ def entry_sums(spec: ModelSpec) -> list[list[Sums]]:
         for row, column, factor in term.basis:
             cells[row, column].append((factor, index))
     ordered = {place: sorted(sums, key=lambda term: term[0] < 0) for place, sums in cells.items()}
-    return [
-        [ordered.get((row, column), []) for column in range(row + 1)] for row in range(len(spec.joints))
-    ]
+    return [[ordered.get((row, column), []) for column in range(row + 1)] for row in range(len(spec.joints))]
 
 
 def term_names(spec: ModelSpec) -> list[str]:
     """Return the names of the terms: f1, f2, ... of functions and c1, c2, ... of constants."""
-    return [f"f{k + 1}" for k in range(len(spec.outputs))] + [
-        f"c{k + 1}" for k in range(len(spec.constants))
-    ]
+    return [f"f{k + 1}" for k in range(len(spec.outputs))] + [f"c{k + 1}" for k in range(len(spec.constants))]
 
 
-def mean_mass(
-    n: int, outputs: Sequence[OutputSpec], constants: Sequence[ConstantSpec]
-) -> np.ndarray:
+def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[ConstantSpec]) -> np.ndarray:
     """Return the lower triangle of the nominal mean of M without armature, (n, n), to six digits."""
     mean = np.zeros((n, n))
     for constant in constants:

@@ -85,7 +85,7 @@ def _about_center(
     ten: Sequence[Fraction | float],
 ) -> tuple[float, Triple, tuple[float, float, float, float, float, float]]:
     """Return mass, center of mass, and inertia about the center of mass, rounded; exact before."""
-    m, hx, hy, hz, *tensor = map(Fraction, ten)
+    m, hx, hy, hz, *tensor = [Fraction(value) for value in ten]
     x, y, z = hx / m, hy / m, hz / m
     steiner = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
     inertia = [value - m * part for value, part in zip(tensor, steiner, strict=True)]

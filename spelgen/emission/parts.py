@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from spelgen.design import BRISTLE_REACH, SERVO_STRIBECK_ROUNDING
 from spelgen.emission.entry_sums import mean_mass
 from spelgen.emission.source import Call, Code, call
-from spelgen.runtime.rows import Joint
 from spelgen.emission.tuning import TUNING
+from spelgen.runtime.rows import Joint
 from spelgen.spec import JointSpec, LinkSpec, ModelSpec
 
 GENERATOR, JOINTS, LINKS = Code("generator"), Code("JOINTS"), Code("LINKS")

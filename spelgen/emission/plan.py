@@ -13,9 +13,9 @@ from spelgen.arm.arm import Arm, Coordinate
 from spelgen.design import Design, load_design
 from spelgen.emission.entry_sums import mean_mass
 from spelgen.emission.links import link_specs
+from spelgen.emission.tuning import TUNING
 from spelgen.errors import SettingsError
 from spelgen.settings.joint import JointSettings
-from spelgen.emission.tuning import TUNING
 from spelgen.spec import (
     ConstantSpec,
     Entries,
@@ -126,9 +126,7 @@ def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
     return tuple(map(tuple, speeds.tolist()))
 
 
-def _joint(
-    coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings
-) -> JointSpec:
+def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings) -> JointSpec:
     low, high = working_range(coordinate)
     lower, upper, speed = coordinate.lower, coordinate.upper, coordinate.velocity
     if coordinate.continuous:

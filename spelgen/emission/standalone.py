@@ -88,7 +88,8 @@ def load_runtime() -> Runtime:
             continue
         texts[name] = path.read_text(encoding="utf-8")
         if name == "__init__":
-            public = {alias.name for node in ast.walk(ast.parse(texts[name])) if isinstance(node, ast.ImportFrom) for alias in node.names}
+            imported = [node for node in ast.parse(texts[name]).body if isinstance(node, ast.ImportFrom)]
+            public = {alias.name for node in imported for alias in node.names}
             continue
         trees[name] = ast.parse(texts[name])
         order.add(name, *_needs(trees[name]))
@@ -100,7 +101,9 @@ def load_runtime() -> Runtime:
                 imports.update(_bound(node))
             elif (defined := _defined(node)) is not None:
                 uses = frozenset(names_in(node))
-                definitions[defined] = Definition(_text(node, texts[name]), uses, not isinstance(node, ast.Assign))
+                definitions[defined] = Definition(
+                    _text(node, texts[name]), uses, not isinstance(node, ast.Assign)
+                )
     rows = frozenset(name for node in trees["rows"].body if (name := _defined(node)) is not None)
     return Runtime(definitions, imports, rows, frozenset(public))
 

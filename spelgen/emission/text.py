@@ -67,7 +67,9 @@ def class_summary(spec: ModelSpec) -> str:
     """Return the model in a line."""
     if spec.links:
         residual = ", and residual terms" if spec.design.net != "none" else ""
-        return f"{counted(len(spec.links), 'rigid body')} with trained inertial parameters, friction{residual}."
+        return (
+            f"{counted(len(spec.links), 'rigid body')} with trained inertial parameters, friction{residual}."
+        )
     if spec.design.mass == "dense-3n":
         return "Networks of the whole M^-1 over three axes per joint, V, D and G."
     return f"{_functions(spec)} make M; networks of V and D."
@@ -153,9 +155,10 @@ def _rows(spec: ModelSpec, parts: ModelParts) -> list[str]:
 def _terms_told(spec: ModelSpec) -> dict[str, str]:
     """Return the entries of M that each function and constant is part of, with the unit of the first."""
     told = {}
-    for name, term in zip(term_names(spec), (*spec.outputs, *spec.constants), strict=True):
-        entries = [entry_name(row, column) for row, column, _ in term.basis]
-        row, column, _ = term.basis[0]
+    bases = [x.basis for x in spec.outputs] + [x.basis for x in spec.constants]
+    for name, basis in zip(term_names(spec), bases, strict=True):
+        entries = [entry_name(row, column) for row, column, _ in basis]
+        row, column, _ = basis[0]
         slides = [spec.joints[joint].joint_type for joint in (row, column)].count("prismatic")
         more = f" and {len(entries) - 2} more" if len(entries) > 2 else ""
         told[name] = f"{', '.join(entries[:2])}{more} [{('kg m^2', 'kg m', 'kg')[slides]}]"
@@ -205,5 +208,3 @@ def _number(value: float) -> str:
     """Return the shortest text of a number."""
     short = f"{value:g}"
     return short if float(short) == value else repr(value)
-
-

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.emission.build import arm_of_spec
 from spelgen.errors import RunError, suggestion
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
-from spelgen.fitting.fitted import Fit, load_run
+from spelgen.fitting.fitted import Fit, load_run, required_spec
 from spelgen.labels import listed
-from spelgen.arm.configured_arm import ConfiguredArm
-from spelgen.emission.build import arm_of_spec
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
@@ -55,7 +55,7 @@ def export(
         expected = "a run of `spelgen train --robot FILE.urdf`, or an arm"
         raise RunError("no robot.urdf", element="export", expected=expected)
     if not isinstance(arm, ConfiguredArm):
-        arm = arm_of_spec(trained.facts, arm)
+        arm = arm_of_spec(required_spec(trained), arm)
     # its module is imported now: what it needs may be an extra
     exported: Exported = pkgutil.resolve_name(exporter.function_name)(Trained(trained, arm, tuple(entries)))
     if path is not None:

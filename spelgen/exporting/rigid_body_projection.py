@@ -12,15 +12,16 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.protocol import has_rigid_bodies, motors_of
+from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.residuals import without_residuals
+from spelgen.emission.build import build
 from spelgen.exporting.describe import array, servos_of
 from spelgen.exporting.description import Servos
 from spelgen.exporting.parity import random_inputs, usual_speeds
 from spelgen.exporting.tuning import TUNING
 from spelgen.fitting.optimizers import minimise
-from spelgen.emission.build import build
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
@@ -81,7 +82,7 @@ def rigid_body_projection(model: ArmModel, arm: ConfiguredArm) -> RigidBodyProje
     """Return the bodies, armature and friction of a trained model of ``arm``."""
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     q = sampled_positions(arm.arm)
-    own = has_rigid_bodies(model)
+    own = isinstance(model, RigidBodyDynamics)
     bodies: ArmModel = without_residuals(model) if own else _nearest_bodies(model, arm, q)
     return RigidBodyProjection(
         arm=arm,

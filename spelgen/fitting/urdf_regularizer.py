@@ -44,9 +44,7 @@ class UrdfRegularizer(NamedTuple):
         return UrdfRegularizer(*(x.to(device) for x in self))
 
 
-def urdf_regularizer(
-    urdf: Path, joints: Sequence[str], model: ArmModel, windows: Windows
-) -> UrdfRegularizer:
+def urdf_regularizer(urdf: Path, joints: Sequence[str], model: ArmModel, windows: Windows) -> UrdfRegularizer:
     """Return the regularizer of a URDF around the positions of ``windows``.
 
     Raises what Pinocchio raises, and ImportError without it.

@@ -4,37 +4,31 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Sequence
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
-from spelgen.dynamics.protocol import has_rigid_bodies
+from spelgen.arm.configured_arm import load_arm
+from spelgen.emission.build import generate
+from spelgen.emission.loading import read_spec
 from spelgen.errors import RunError
 from spelgen.evaluation.evaluate import evaluate
-from spelgen.evaluation.keep import keep_baseline
 from spelgen.evaluation.subject import read_test_logs
 from spelgen.files import read_bytes, read_json, write_json, write_text
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.fitted import load_run
-from spelgen.fitting.objectives import chosen_config
+from spelgen.fitting.objectives import FitOptions
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.train import train
 from spelgen.fleet.prepare import SplitLogs
 from spelgen.fleet.schema import Fleet, FleetRobot
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.emission.build import generate
-from spelgen.arm.configured_arm import load_arm
-from spelgen.settings.fits import FitConfig
 from spelgen.settings.settings import load_settings
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Group
 from spelgen.version import __version__
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 RunResult = dict[str, Any]
 """The content of result.json."""
@@ -116,7 +110,7 @@ def run_job(job: Job) -> RunResult:
         source = generate(arm, job.design, width=job.fleet.width, depth=job.fleet.depth)
         module = write_text(job.folder / "built.py", source)
     fit = train(
-        module, job.logs.train, job.folder, partial(_config, training), urdf=job.arm.urdf,
+        module, job.logs.train, job.folder, _options(training, module), urdf=job.arm.urdf,
         preprocessing=Preprocessing(**training.preprocessing), validation=training.validation_fraction,
         seed=job.seed, options=RunOptions(mapping=job.logs.mapping, resume=resume, force=not resume),
     )  # fmt: skip
@@ -148,26 +142,22 @@ def _remove_foreign_run(job: Job, run: RunFolder) -> None:
     write_json(owner, {"key": job.key})
 
 
-def _config(
-    training: TrainingSettings, model: ArmModel, rates: Sequence[float] | None
-) -> FitConfig | None:
+def _options(training: TrainingSettings, module: Path) -> FitOptions:
     """Return the objective that is asked for, or that suits the model and its logs, with its own options."""
     objective = training.objective
     # rigid bodies are not fitted to momenta: a fleet of several presets asks for these where they are
-    if objective == "momentum" and has_rigid_bodies(model):
+    if objective == "momentum" and read_spec(module).links:
         objective = None
-    return chosen_config(model, rates, objective, {}, training.options)
+    return FitOptions(objective, {}, training.options)
 
 
 def _judged(job: Job, run: RunFolder) -> RunResult:
     """Return errors on the test logs, of the model and the URDF; evaluation.json has all of them.
 
-    Least squares is left out, for it is kept only afterwards: its stiff rollouts take ten times as long as all else,
-    for every run anew.
+    Least squares is left out: its stiff rollouts take ten times as long as all else, for every run anew.
     """
     logs = read_test_logs(job.folder, job.logs.test, job.logs.mapping)
-    results = evaluate(load_run(job.folder), logs)
-    keep_baseline(run.path, job.logs.train)
+    results = evaluate(replace(load_run(job.folder), baselines={}), logs)
     write_json(run.evaluation, results.to_dict())
     errors: dict[str, dict[str, float | None]] = {}
     for horizon in results.horizons:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.errors import LogError, RunError, collect
 from spelgen.files import read_json, write_json
 from spelgen.fleet.schema import FleetRobot
@@ -17,7 +18,6 @@ from spelgen.logs.formats import log_files
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory, set_aside
 from spelgen.logs.windows import split_validation
-from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.settings import load_mapping
 from spelgen.settings.values import Group
@@ -80,7 +80,9 @@ def prepare(preparation: Preparation) -> list[SplitLogs]:
     return splits
 
 
-def _splits(robot: FleetRobot, arm: ConfiguredArm, mapping: LogMapping, count: int, element: str) -> list[Split]:
+def _splits(
+    robot: FleetRobot, arm: ConfiguredArm, mapping: LogMapping, count: int, element: str
+) -> list[Split]:
     """Return the trajectories of each split; whole ones are drawn by a fixed seed where the logs do not say."""
     train, test = _roles(robot, arm, mapping)
     if count == 1 and test:

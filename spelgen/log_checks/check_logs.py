@@ -38,7 +38,9 @@ WRONG_TORQUES = {"torque-sense": SENSE, "torque-order": ORDER}
 ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED}
 
 
-def check_logs(logs: Iterable[Trajectory], arm: ConfiguredArm, mapping: LogMapping | None = None) -> LogReport:
+def check_logs(
+    logs: Iterable[Trajectory], arm: ConfiguredArm, mapping: LogMapping | None = None
+) -> LogReport:
     """Report all about the logs of an arm, read once, one trajectory after another; nothing is repaired or raised.
 
     The report's `errors` prevent training. mapping: that of the logs, by default from the arm's settings; units that

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from spelgen.identification.identification import Identification
 from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.identification.identification import Identification
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import render_page
 from spelgen.render.parameters import DETERMINED, base_table
 from spelgen.render.plots import Record
+from spelgen.structure.structure import derive
 
 
 def page(identification: Identification, arm: ConfiguredArm) -> str:
@@ -24,7 +25,7 @@ def page(identification: Identification, arm: ConfiguredArm) -> str:
         never=never,
         residuals=identification.listings()[0],
         parameters=base_table(None, arm, record),
-        cells=matrix(arm.arm, arm.structure),
+        cells=matrix(arm.arm, derive(arm.arm)),
         arm=arm_section(arm.arm, arm.robot.path),
         heading=identification.heading(),
         notes=identification.diagnostics,

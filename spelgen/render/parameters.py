@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.parameters import parameters_of_kind
-from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.dynamics.rigid_bodies import about_center
 from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.labels import UNITS, entry_name
 from spelgen.listing import Listing
-from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.render.plots import Record
 from spelgen.render.tuning import TUNING
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
@@ -56,7 +56,7 @@ def parameter_tables(
 
 def body_parameters(model: ArmModel | None) -> np.ndarray | None:
     """Return (bodies, 10) of a model of rigid bodies, as ``Body.inertia`` has them; None of another or of none."""
-    if model is None or not has_rigid_bodies(model):
+    if model is None or not isinstance(model, RigidBodyDynamics):
         return None
     values: np.ndarray = model.inertial_parameters.detach().numpy()
     return values
@@ -173,7 +173,7 @@ def _joint_table(model: ArmModel, arm: ConfiguredArm | None) -> Listing:
     if arm is not None:
         joints = arm.arm.coordinates
         columns["joint"] = list(arm.arm.joint_names)
-        if has_rigid_bodies(model):
+        if isinstance(model, RigidBodyDynamics):
             viscous, forward, backward, _ = nearest_friction(arm.arm, model, sampled_positions(arm.arm))
             note = "Viscous and Coulomb friction are fitted to the model's friction law, as in exports."
             # the damping of a drive's control contains its joint's viscous friction
@@ -183,7 +183,7 @@ def _joint_table(model: ArmModel, arm: ConfiguredArm | None) -> Listing:
             columns["Coulomb, qd < 0"] = _with_units(backward, torques)
         columns["URDF: viscous"] = _with_units([joint.damping for joint in joints], slopes)
         columns["URDF: Coulomb"] = _with_units([joint.friction for joint in joints], torques)
-    if has_rigid_bodies(model):
+    if isinstance(model, RigidBodyDynamics):
         columns["torque offset"] = _with_units(model.torque_offset.tolist(), torques)
     return Listing("Drives and friction", tuple(columns), tuple(zip(*columns.values(), strict=True)), note)
 

@@ -95,7 +95,7 @@ class BodyChain(nn.Module):
         return ChainConfiguration(place, mass, axes, jacobian, (self.base * mass).flatten(-3))
 
     def motion(self, at: ChainConfiguration, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return velocities of the points, (..., 3, bodies, 4), twists and rates of the axes (Featherstone, eq. 2.31)."""
+        """Return velocities of the points, (..., 3, bodies, 4), twists, and rates of axes (Featherstone, 2.31)."""
         rates = qd @ self.ratios.mT
         velocity = torch.unflatten(applied(at.jacobian.mT, rates), -1, (3, -1, 4))
         twists = (at.axes * rates.unsqueeze(-2)) @ self.carriers

@@ -28,7 +28,7 @@ class ConstantMass(nn.Module):
         self.constant_scale = nn.Buffer(vector(x.scale for x in constants))
         self.raw_constants = nn.Parameter(vector(x.initial / x.scale for x in constants))
         self.nominal_armature = nn.Buffer(vector(joint.armature for joint in joints))
-        self.raw_armature = nn.Parameter(torch.zeros_like(self.nominal_armature))  # logarithm, relative to the nominal value
+        self.raw_armature = nn.Parameter(torch.zeros_like(self.nominal_armature))  # logarithm
 
     def armature(self) -> Tensor:
         """Return the rotor inertia on the joint side, part of the diagonal of M, (n,) [kg m^2, kg]."""

@@ -43,7 +43,7 @@ class DerivedMass(nn.Module):
         self.function_scale = nn.Buffer(vector(f.scale for f in functions))
         self.raw_constants = nn.Parameter(vector(x.initial / x.scale for x in constants))
         self.nominal_armature = nn.Buffer(vector(joint.armature for joint in joints))
-        self.raw_armature = nn.Parameter(torch.zeros_like(self.nominal_armature))  # logarithm, relative to the nominal value
+        self.raw_armature = nn.Parameter(torch.zeros_like(self.nominal_armature))  # logarithm
         center = self._by_outputs()[-1].detach()
         self.center, self.smallest = nn.Buffer(center), nn.Buffer(margin * center)  # C and margin C
         size = center.diagonal().rsqrt()
@@ -61,7 +61,7 @@ class DerivedMass(nn.Module):
         return self.constant_scale * self.raw_constants
 
     def _by_outputs(self) -> Tensor:
-        """Return the derivative of M with respect to each output of the network, then M at zero outputs, (outputs + 1, n, n)."""
+        """Return dM / d output for each output of the network, then M at zero outputs, (outputs + 1, n, n)."""
         functions = torch.cat([torch.diag(self.function_scale), self.function_mean.unsqueeze(-1)], dim=1)
         constants = F.pad(self.constants().unsqueeze(-1), (len(functions), 0))
         return self.entries(*functions.unbind(), *constants.unbind())

@@ -32,7 +32,9 @@ class FrictionConstants(NamedTuple):
     stribeck_rounding: Tensor  # relative to the Stribeck velocity [1]
     coulomb_smoothing_velocity: Tensor  # of dry friction without bristles [rad/s, m/s]
     min_load: Tensor  # [Nm, N]
-    bristle_fractions: Tensor  # of dry friction, (n, K); the sum over K is one, or zero at joints without bristles
+    bristle_fractions: (
+        Tensor  # of dry friction, (n, K); the sum over K is one, or zero at joints without bristles
+    )
     bristle_reach: Tensor  # break-away displacements, (n, K) [rad, m]
     memoryless: Tensor  # 1 if dry friction depends on velocity only, 0 if on bristles
 

@@ -24,10 +24,17 @@ class MotorInputs(nn.Module):
         super().__init__()
         matrix = torch.tensor(gains, dtype=torch.float64)
         is_trained = torch.zeros_like(matrix) if trained is None else torch.tensor(trained).double()
-        self.constant_gains, self.trained_gains = nn.Buffer((1 - is_trained) * matrix), nn.Buffer(is_trained * matrix)
+        self.constant_gains, self.trained_gains = (
+            nn.Buffer((1 - is_trained) * matrix),
+            nn.Buffer(is_trained * matrix),
+        )
         self.passive = nn.Buffer(1.0 - matrix.any(dim=1).double())  # 1 for a joint without a motor, (n,)
         self.gain_rows = nn.Buffer(is_trained.nonzero()[:, 0])  # joints of the trained gains
-        raw = nn.Parameter(torch.zeros(len(self.gain_rows), dtype=torch.float64)) if len(self.gain_rows) else None
+        raw = (
+            nn.Parameter(torch.zeros(len(self.gain_rows), dtype=torch.float64))
+            if len(self.gain_rows)
+            else None
+        )
         self.register_parameter("raw_gains", raw)
 
     def gains(self) -> Tensor:

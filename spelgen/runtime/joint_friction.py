@@ -28,7 +28,10 @@ class JointFrictionParameters(NamedTuple):
 class JointFriction(nn.Module):
     """A diagonal D(q, qd), positive for all parameters."""
 
-    parameter_groups = ("raw_viscous", "sizes", "Nm s/rad, N s/m"), ("raw_smoothing", "velocities", "rad/s, m/s")
+    parameter_groups = (
+        ("raw_viscous", "sizes", "Nm s/rad, N s/m"),
+        ("raw_smoothing", "velocities", "rad/s, m/s"),
+    )
 
     def __init__(self, joints: Sequence[Joint], network: Network) -> None:
         super().__init__()

@@ -51,6 +51,11 @@ class PortHamiltonian(nn.Module):
         """``revolute`` or ``prismatic``, for each joint."""
         return tuple(joint.joint_type for joint in self.joints)
 
+    @property
+    def input_quantity(self) -> str:
+        """``torque``, or ``position`` for inputs that are commands of position servos."""
+        return "torque"
+
     def at(self, q: Any, *others: Tensor, prepared: Any = None) -> Any:
         """Return the configuration at q. Raises TypeError or ValueError for a wrong dtype or shape.
 

@@ -37,7 +37,12 @@ class PositionServo(nn.Module):
     )
 
     def __init__(
-        self, *, kp: Sequence[float], kd: Sequence[float], limit: Sequence[float | None], known: Sequence[bool]
+        self,
+        *,
+        kp: Sequence[float],
+        kd: Sequence[float],
+        limit: Sequence[float | None],
+        known: Sequence[bool],
     ) -> None:
         super().__init__()
         self.nominal_kp = nn.Buffer(vector(kp))

@@ -164,9 +164,7 @@ class ResidualTerms(nn.Module):
             slope = 1 - output * output
         mass = mass.reshape(*q.shape, self.n)
         friction = friction.exp()
-        return ResidualConfiguration(
-            q, encoded, torque, friction, mass, slope, intermediates, parameters
-        )
+        return ResidualConfiguration(q, encoded, torque, friction, mass, slope, intermediates, parameters)
 
     def energy(self, at: ResidualConfiguration) -> Tensor:
         """Return the residual of V, (...) [J]; that of a spline is zero in its middle."""

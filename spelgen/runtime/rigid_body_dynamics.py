@@ -83,6 +83,11 @@ class RigidBodyDynamics(PortHamiltonian):
         self.register_buffer("loads", None if motors is None else torch.linalg.inv(motors))
 
     @property
+    def input_quantity(self) -> str:
+        """``torque``, or ``position`` for inputs that are commands of position servos."""
+        return "torque" if self.servo is None else "position"
+
+    @property
     def inertial_parameters(self) -> Tensor:
         """(m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of each body about the origin of its joint's frame, (bodies, 10)."""
         root = self.bodies.forward()
@@ -130,7 +135,7 @@ class RigidBodyDynamics(PortHamiltonian):
         return RigidConfiguration(chain, mass, applied(chain.jacobian, chain.weight) @ ratios, prepared)
 
     def potential_energy(self, q: Tensor | RigidConfiguration, z: Tensor | None = None) -> Tensor:
-        """Return V(q) and the elastic energy of the bristles, (...) [J]; V is 0 for masses at the origin of the base."""
+        """Return V(q) and the elastic energy of the bristles, (...) [J]; V is 0 at the origin of the base."""
         at: RigidConfiguration = self.at(q)
         energy = (at.chain.place.flatten(-3) * at.chain.weight).sum(dim=-1)
         return energy if z is None else energy + at.prepared.friction.stored_energy(z)
@@ -156,9 +161,7 @@ class RigidBodyDynamics(PortHamiltonian):
             return qd, at.gravity
         return qd @ self.motors.mT, at.gravity @ self.loads
 
-    def friction_torque(
-        self, q: Tensor | RigidConfiguration, qd: Tensor, *state: Tensor | None
-    ) -> Tensor:
+    def friction_torque(self, q: Tensor | RigidConfiguration, qd: Tensor, *state: Tensor | None) -> Tensor:
         """Return the friction torque, C^T f(C qd), (..., n) [Nm, N]; state: see ``FrictionConstants.torque``."""
         at: RigidConfiguration = self.at(q, qd)
         torque = at.varied * at.prepared.friction.torque(*self._at_motors(at, qd), *state)

@@ -43,7 +43,9 @@ class Joint(NamedTuple):
         """Half the range of motion: networks depend on (q - center) / half_range of a prismatic joint."""
         if self.typical_range is not None:
             return self.typical_range[1]
-        return math.pi if self.lower is None or self.upper is None else _rounded((self.upper - self.lower) / 2)
+        return (
+            math.pi if self.lower is None or self.upper is None else _rounded((self.upper - self.lower) / 2)
+        )
 
 
 class Link(NamedTuple):

@@ -68,13 +68,11 @@ class ServoObjective(Objective):
         return PreparedLogs(
             config=request.config,
             preprocessing=request.preprocessing,
-            record={
-                "data_digest": digest(self._logs),
-                "training": [log.name for log in self._logs],
-                "validation": [],
-                "training_windows": len(self._windows.q),
-                "validation_windows": 0,
-            },
+            digest=digest(self._logs),
+            training=[log.name for log in self._logs],
+            validation=[],
+            training_windows=len(self._windows.q),
+            validation_windows=0,
             notes=notes,
         )
 

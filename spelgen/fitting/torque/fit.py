@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from spelgen.dynamics.protocol import has_residuals
+from spelgen.dynamics.protocol import residual_terms
 from spelgen.fitting.torque.jacobian import TUNING, TorqueJacobian
 from spelgen.fitting.torque.joint_functions import clear_functions, refit_residuals
 from spelgen.fitting.torque.problem import State, TorqueProblem
@@ -83,7 +83,7 @@ def fit_torque(
     if adapt is None:
         state = problem.select_effects(state)
     residuals: list[SelectedResidual] = []
-    if adapt is None and has_residuals(model):
+    if adapt is None and residual_terms(model) is not None:
         state, residuals = _with_residuals(problem, state, samples.thinned(TUNING.residual_samples))
     if problem.jacobian.samples is not samples:  # few samples came near, all of them finish
         state = problem.refine(state, samples)

@@ -13,7 +13,7 @@ import torch
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.bristles import bristle_reach
-from spelgen.dynamics.protocol import has_rigid_bodies, known_past, motors_of
+from spelgen.dynamics.protocol import known_past, motors_of
 from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import TrainingData, Validation
@@ -30,6 +30,7 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import thinned
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import TorqueFit
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ class TorqueObjective(TorqueLogObjective):
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
         preprocessing, self._late = self.request.preprocessing, NO_DELAY
-        if preprocessing.torque_delay is None and has_rigid_bodies(self.model):
+        if preprocessing.torque_delay is None and isinstance(self.model, RigidBodyDynamics):
             self._late = torque_delay(self.model, self.request.logs, preprocessing)
             preprocessing = replace(preprocessing, torque_delay=self._late.delay)
             self.request = replace(self.request, preprocessing=preprocessing)
@@ -74,7 +75,7 @@ class TorqueObjective(TorqueLogObjective):
                 do="fit windows: the objective rollout",
             )
         regularizer = None
-        if not has_rigid_bodies(model):  # the torques of rigid bodies have a prior of their own
+        if not isinstance(model, RigidBodyDynamics):  # the torques of rigid bodies have a prior of their own
             regularizer = self._regularizer(self.data, self.config.urdf_weight, notes)
         notes += fit_torques(model, samples, self.config, regularizer)
         # residuals that were not selected add nothing but time
@@ -107,9 +108,7 @@ def torque_nmse(model: ArmModel, samples: TorqueSamples) -> list[float]:
     return nmse
 
 
-def torque_delay(
-    model: ArmModel, logs: Sequence[Trajectory], preprocessing: Preprocessing
-) -> TorqueDelay:
+def torque_delay(model: ArmModel, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> TorqueDelay:
     """Return how much later than positions these logs show torques, by the bodies of a model."""
     with torch.no_grad():
         inputs = model.input_matrix(torch.zeros(1, model.n).double())[0].numpy()
@@ -120,7 +119,7 @@ def torque_delay(
 def torque_samples(model: ArmModel, data: TrainingData) -> TorqueSamples | None:
     """Return the samples of all logs, those of validation included; None: no log has samples that move, and densely."""
     decimation, reach = 1, bristle_reach(model)
-    if has_rigid_bodies(model):
+    if isinstance(model, RigidBodyDynamics):
         decimation = TUNING.decimation
 
     def moving() -> Iterator[DynamicsSamples]:
@@ -138,7 +137,7 @@ def fit_torques(
 ) -> list[Diagnostic]:
     """Fit the model to samples; return what there is to tell."""
     notes: list[Diagnostic] = []
-    if has_rigid_bodies(model):
+    if isinstance(model, RigidBodyDynamics):
         solution = fit_torque(model, samples, config.prior, config.adapt)
         steps = solution.steps
         if not config.adapt:
