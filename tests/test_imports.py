@@ -26,7 +26,8 @@ identification excitation simulation
 log_checks fitting
 exporting baselines
 evaluation
-fleet comparison render
+comparison
+render
 cli __init__ __main__
 """
 ROOMS = ROWS.split()

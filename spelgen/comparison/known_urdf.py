@@ -1,4 +1,4 @@
-"""What models of a comparison know of the simulated robot: its kinematics alone, or inertials that are wrong."""
+"""URDF that the models of a simulated comparison are built from: kinematics without inertials, or wrong inertials."""
 
 from __future__ import annotations
 
@@ -7,21 +7,19 @@ from pathlib import Path
 import numpy as np
 from lxml import etree
 
-from spelgen.settings.tuning.comparison import ComparisonTuning
+from spelgen.comparison.tuning import ComparisonTuning
 
 TUNING = ComparisonTuning()
 
 
 def known_urdf(robot: Path, error: float | None) -> bytes:
-    """Return the URDF without friction, and with inertials of other possible bodies; None: without inertials.
+    """Return a URDF without friction, and without inertials (error: None) or with disturbed ones.
 
-    Mass, size of the inertia about the centre of mass, and the place of that (relative to the body's own size) err by
-    this standard deviation.
-
-    Masses and inertias by factors exp(error N(0, 1)): 0.3 is 30 %, 1 a factor of e; drawn anew for each link, the same
-    ones in every call.
+    Mass and inertia of each link are multiplied by exp(error N(0, 1)), so 0.3 is about 30 % and 1 a factor of e; the
+    centre of mass is shifted by error N(0, 1) times the body's radius of gyration along each axis. Disturbed inertials
+    are physically consistent and the same in every call.
     """
-    # it was read before, so it is known to be harmless
+    # `load_arm` has read this file, so its size and entities have been checked
     parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
     tree = etree.ElementTree(etree.fromstring(robot.read_bytes(), parser))
     removed = ["dynamics", "visual", "collision"]
@@ -37,20 +35,23 @@ def known_urdf(robot: Path, error: float | None) -> bytes:
     return text
 
 
-def _disturb(inertial: etree._Element, logarithms: np.ndarray, displacement: np.ndarray) -> None:
-    """Change an inertial by factors of its mass and inertia, and by a displacement relative to the body's size."""
+def _disturb(inertial: etree._Element, logarithms: np.ndarray, shift: np.ndarray) -> None:
+    """Multiply mass and inertia by exp(logarithms) (2,), and shift the centre of mass.
+
+    shift: (3,), in units of the radius of gyration.
+    """
     mass, tensor = inertial.find("mass"), inertial.find("inertia")
     if mass is None or tensor is None or float(mass.get("value", "0")) <= TUNING.massless:
         return
-    by_mass, by_inertia = np.exp(logarithms).tolist()
+    mass_factor, inertia_factor = np.exp(logarithms).tolist()
     kilograms = float(mass.get("value"))
     trace = sum(float(tensor.get(name, "0")) for name in ("ixx", "iyy", "izz"))
-    size = np.sqrt(max(trace, 0.0) / 2 / kilograms)  # about that of the body
-    mass.set("value", repr(by_mass * kilograms))
+    radius = np.sqrt(max(trace, 0.0) / 2 / kilograms)
+    mass.set("value", repr(mass_factor * kilograms))
     for name, value in tensor.attrib.items():
-        tensor.set(name, repr(by_mass * by_inertia * float(value)))
+        tensor.set(name, repr(mass_factor * inertia_factor * float(value)))
     origin = inertial.find("origin")
     if origin is None:
         origin = etree.SubElement(inertial, "origin")
     center = np.array(origin.get("xyz", "0 0 0").split(), dtype=float)
-    origin.set("xyz", " ".join(map(repr, (center + size * displacement).tolist())))
+    origin.set("xyz", " ".join(map(repr, (center + radius * shift).tolist())))
