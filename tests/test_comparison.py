@@ -11,14 +11,14 @@ import pinocchio as pin
 import pytest
 import torch
 import yaml
+from spelgen.comparison.formatting import comparison_tables
+from spelgen.comparison.metrics import mass_error, true_mass
+from spelgen.comparison.runs import predict_example, run_study, time_steps
 
 from spelgen.baselines.constant_velocity import hold_velocity
 from spelgen.baselines.predictor import Predictor
 from spelgen.comparison import metrics, runs
-from spelgen.comparison.formatting import comparison_tables
 from spelgen.comparison.known_urdf import known_urdf
-from spelgen.comparison.metrics import mass_error, true_mass
-from spelgen.comparison.runs import predict_example, run_study, time_steps
 from spelgen.comparison.study import VARIANTS, ablation_variants, prepare_study
 from spelgen.design import load_design
 from spelgen.emission.loading import load_module

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from spelgen.fleet import jobs
 
 from spelgen.evaluation import invariants
 from spelgen.evaluation.horizons import end_errors
@@ -24,7 +25,6 @@ from spelgen.fitting.torque.objective import fit_torques
 from spelgen.fitting.torque.selection import select_functions
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.fitting.window.momentum import MomentumObjective
-from spelgen.fleet import jobs
 from spelgen.identification.least_squares import deviations
 from spelgen.logs.windows import Windows
 from spelgen.pipeline.build import build

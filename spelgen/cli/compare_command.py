@@ -71,8 +71,8 @@ def compare(
     """
     from spelgen.comparison.arms import ablation_designs
     from spelgen.comparison.study import prepare_study, run_study
-    from spelgen.fitting.process import locked, termination_as_interrupt
     from spelgen.comparison.tables import arm_sections
+    from spelgen.fitting.process import locked, termination_as_interrupt
     from spelgen.render.comparison_page import write_comparison
     from spelgen.tasks import default_jobs, workers
 

@@ -35,8 +35,8 @@ Progress = Callable[[int, int], None]
 class ArmInputs(Group):
     """Files that the runs of an arm read.
 
-    urdf: URDF that models are built from. truth: URDF of the simulated arm; None if the logs are the user's. data: logs,
-    with their columns and units in `mapping`. digest: of the URDF, settings and logs.
+    urdf: URDF that models are built from. truth: URDF of the simulated arm; None if the logs are the user's.
+    data: logs; their columns and units are in `mapping`. digest: of the URDF, settings and logs.
     """
 
     urdf: Path

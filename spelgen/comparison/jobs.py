@@ -31,7 +31,6 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.pipeline.build import build
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.fits import Rollout, fit_config
-from spelgen.settings.settings import load_settings
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Group
 from spelgen.version import __version__
@@ -39,7 +38,6 @@ from spelgen.version import __version__
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
     from spelgen.evaluation.results import Results
-    from spelgen.fitting.fitted import Fit
     from spelgen.logs.trajectory import Trajectory
     from spelgen.settings.fits import FitConfig
 
@@ -51,8 +49,8 @@ Errors = dict[str, dict[str, float | None]]
 class RunResult:
     """Figures of a finished run.
 
-    key: digest of all that the run depends on. seconds: time of training [s]. parameters: trained numbers that the model
-    uses. simulated: further figures of an arm whose truth is known.
+    key: digest of all that the run depends on. seconds: time of training [s]. parameters: number of trained values
+    that the model uses. simulated: further figures of an arm whose truth is known.
     """
 
     key: str
@@ -77,8 +75,9 @@ class RunResult:
 class Job(Group):
     """A run of a comparison.
 
-    design: a preset, an ablation design, or a YAML file. training: settings of the arm, of logs. protocol: settings of
-    a simulated comparison. default_training: the defaults of `spelgen train` instead of the protocol's steps.
+    design: a preset, an ablation design, or a YAML file. training: settings of fits to the user's logs. protocol:
+    settings of fits to simulated logs. default_training: whether fits to simulated logs, too, have the defaults of
+    `spelgen train`.
     """
 
     arm: str

@@ -76,8 +76,8 @@ class Study:
 def prepare_study(comparison: Comparison, folder: Path, progress: Progress | None = None) -> Study:
     """Prepare the inputs of all arms, find finished runs, and estimate the time of the others.
 
-    An arm whose inputs cannot be prepared is a failure. Raises SettingsError for a preset that does not exist, RunError if
-    no arm can be used, and the error of a single arm.
+    An arm whose inputs cannot be prepared is a failure. Raises SettingsError for a preset that does not exist,
+    RunError if no arm can be used, and the error of a single arm.
     """
     for preset in comparison.presets or ():
         load_design(preset)

@@ -165,7 +165,7 @@ def _medians(runs: Runs, measure: str) -> Numbers:
         for run in of_preset:
             for predictor, error in run.errors[measure].items():
                 name = preset if predictor == MODEL else predictor
-                # infinite and not left out: a model that diverges with one seed of two is not as good as the other seed
+                # infinite and not left out: a model that diverges with one seed of two must not rank by the other
                 values.setdefault(name, []).append(math.inf if error is None else error)
     medians = {name: statistics.median(errors) for name, errors in values.items()}
     ordered = sorted(medians.items(), key=lambda item: item[1])

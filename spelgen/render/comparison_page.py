@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from spelgen.comparison.figures import true_mass
+from spelgen.comparison.figures import SimulatedFigures, true_mass
 from spelgen.comparison.inputs import ArmInputs
-from spelgen.comparison.jobs import RunResult
 from spelgen.comparison.study import Study
 from spelgen.comparison.tables import ArmSection, comparison_sentence
 from spelgen.evaluation.plain import array
@@ -58,20 +57,18 @@ def write_comparison(study: Study, sections: Sequence[ArmSection]) -> Path:
 
 
 def _curves(study: Study, section: ArmSection, inputs: ArmInputs, truth: Path) -> SimulatedCurves:
-    first: dict[str, RunResult] = {}
+    first: dict[str, SimulatedFigures] = {}
     for result in section.results:
-        first.setdefault(result.preset, result)
+        if result.simulated is not None:
+            first.setdefault(result.preset, result.simulated)
     styles = dict(zip(first, STYLES, strict=False))
     folders = {job.preset: job.folder for job in reversed(study.jobs) if job.arm == section.name}
     arm = inputs.load().arm
-    examples = {}
-    for name, result in first.items():
-        if result.simulated is not None and result.simulated.example is not None:
-            examples[name] = result.simulated.example
+    examples = {name: figures.example for name, figures in first.items() if figures.example is not None}
     prediction, mass = [], []
     if examples:
         prediction = trajectory_panels(examples, styles, named_joints(arm.joint_names, arm.joint_types))
-        learned = {name: array(first[name].simulated.mass) for name in examples if first[name].simulated}
+        learned = {name: array(first[name].mass) for name in examples}
         # all presets have the same test logs, and therefore the same example
         along = next(iter(examples.values()))
         true = true_mass(truth, torch.from_numpy(along.q)).numpy()
