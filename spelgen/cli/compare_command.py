@@ -46,15 +46,6 @@ def compare(
             "--ablation", help="Compare designs from phnode to hybrid that differ by one change each."
         ),
     ] = False,
-    urdf_error: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            metavar="PART",
-            help="Relative error of the inertials that models of a simulated arm are built with (0.3: 30 %), "
-            "trained with the defaults of train. Default: no inertials, equal steps for all models.",
-        ),
-    ] = None,
     jobs: Annotated[
         int | None,
         typer.Option(
@@ -76,20 +67,16 @@ def compare(
     from spelgen.render.comparison_page import write_comparison
     from spelgen.tasks import default_jobs, workers
 
-    if urdf_error is not None and steps is not None:
-        raise UsageError("--steps: does not apply with --urdf-error, which uses the training defaults")
     if ablation and presets is not None:
         raise UsageError("--ablation: names the presets itself, omit --presets")
     names = options.names(presets)
     changes = {
         "presets": tuple(ablation_designs()) if ablation else names and tuple(names),
-        "seeds": seeds, "splits": splits, "steps": steps, "urdf_error": urdf_error,
+        "seeds": seeds, "splits": splits, "steps": steps,
     }  # fmt: skip
     given = {name: value for name, value in changes.items() if value is not None}
     comparison = _comparison(target, data, mapping).model_copy(update=given)
     name = target.stem + ("-logs" if data else "") + ("-ablation" if ablation else "")
-    if urdf_error is not None:
-        name += f"-urdf-{urdf_error:g}"
     # workers have working folders of their own, so paths must be absolute
     folder = (output or Path("comparisons") / name).absolute()
     parallel = jobs or default_jobs()

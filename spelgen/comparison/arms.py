@@ -13,7 +13,7 @@ from spelgen.design import PRESET_NAMES, Design, load_design
 from spelgen.errors import SettingsError, collect, suggestion
 from spelgen.settings.messages import dotted, validated
 from spelgen.settings.training import TrainingSettings
-from spelgen.settings.values import Count, Group, NonNegative
+from spelgen.settings.values import Count, Group
 from spelgen.settings.yaml_document import Document, Location, read_document
 
 YAML = (".yaml", ".yml")
@@ -55,8 +55,7 @@ class Comparison(Group):
     seeds: runs with the seeds 0, 1, ...; default: 1 on logs, `comparison.seeds` of the arm's settings if simulated.
     splits: 1 uses train.* and test.* of the logs, or holds out a quarter of the trajectories; k: k-fold
     cross-validation over whole trajectories. width, depth: of hidden layers. training: options as in a robot's
-    settings, for all arms with logs. steps: training steps on simulated arms. urdf_error: relative error of the
-    inertials that models of simulated arms start from; None: models without inertials.
+    settings, for all arms. steps: training steps on simulated arms.
     """
 
     arms: Annotated[dict[Name, ComparedArm], Field(min_length=1)]
@@ -67,7 +66,6 @@ class Comparison(Group):
     depth: Count | None = None
     training: TrainingSettings = Field(default_factory=TrainingSettings)
     steps: Count | None = None
-    urdf_error: NonNegative | None = None
 
 
 def ablation_designs() -> dict[str, str | Design]:

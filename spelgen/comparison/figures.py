@@ -5,6 +5,8 @@ Source: Wang, Chen and Ding, Sci Rep 15:33179 (2025).
 
 from __future__ import annotations
 
+import statistics
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,11 +21,11 @@ from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.evaluation.drawn_motions import PredictedMotion, predicted_motion
 from spelgen.evaluation.invariants import Invariants, invariants
 from spelgen.evaluation.plain import array, finite, listed
-from spelgen.fitting.rollout import position_difference, roll_out
+from spelgen.fitting.rollout import loss_scales, position_difference, roll_out, rollout_loss
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.pipeline.loaded_arm import load_arm
-from spelgen.settings.fits import Rollout
+from spelgen.settings.fits import DEFAULTS, Rollout
 from spelgen.structure.nominal import working_range
 
 if TYPE_CHECKING:
@@ -60,8 +62,8 @@ class SimulatedFigures:
     """Figures of a model of a simulated arm.
 
     train, test: losses of windows as long as in training. prediction: loss over 1 s of the test motions. mass_error:
-    see `mass_error`. example: a test motion and its prediction; None if no test motion lasts 1 s. mass: (T, n, n),
-    learned M at the measured positions of the example.
+    see `mass_error`. step_seconds: time of a training step, see `step_seconds` [s]. example: a test motion and its
+    prediction; None if no test motion lasts 1 s. mass: (T, n, n), learned M at the measured positions of the example.
     """
 
     sizes: Sizes
@@ -70,6 +72,7 @@ class SimulatedFigures:
     prediction: PredictionLoss
     invariants: Invariants
     mass_error: float
+    step_seconds: float
     mass: list[list[list[float]]]
     example: PredictedMotion | None
 
@@ -87,7 +90,7 @@ def simulated_figures(
     low, high = torch.tensor(list(map(working_range, load_arm(truth).arm.coordinates)), dtype=torch.float64).T
     visited = far.q[:, 0]
     example = predict_example(of_dynamics("", model, far), testing, steps, decimation)
-    mass = []
+    mass: list[list[list[float]]] = []
     if example is not None:
         # at the rounded positions of result.json, so that the page shows M at the positions that are stored
         mass = model.mass_matrix(torch.from_numpy(array(listed(example.q)))).tolist()
@@ -98,9 +101,24 @@ def simulated_figures(
         prediction=prediction_loss(model, far, substeps),
         invariants=invariants(model, far, low, high),
         mass_error=mass_error(model.mass_matrix(visited), true_mass(truth, visited)),
+        step_seconds=step_seconds(model, training, config, decimation),
         mass=mass,
         example=example,
     )
+
+
+def step_seconds(model: EmittedModel, logs: Sequence[Trajectory], config: Rollout, decimation: int) -> float:
+    """Return the median time of the loss of a batch and its gradient, without the optimizer [s]."""
+    windows = spread_windows(logs, config.window, decimation)[: config.batch or DEFAULTS.batch]
+    scales = loss_scales(windows, model.joint_types)
+    model.requires_grad_(True)
+    durations = []
+    for _ in range(TUNING.timed_steps):
+        start = time.perf_counter()
+        torch.autograd.backward(rollout_loss(model, windows, scales, 1))
+        durations.append(time.perf_counter() - start)
+    model.zero_grad()
+    return statistics.median(durations)
 
 
 def spread_windows(logs: Sequence[Trajectory], samples: int, decimation: int) -> Windows:

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import yaml
+from lxml import etree
 
-from spelgen.comparison.arms import ComparedArm, Comparison
-from spelgen.comparison.known_urdf import known_urdf
+from spelgen.comparison.arms import ComparedArm
 from spelgen.comparison.tuning import ComparisonTuning
 from spelgen.errors import LogError, RunError, SettingsError, collect
-from spelgen.files import read_json, write_bytes, write_json, write_text
+from spelgen.files import read_json, remove, write_bytes, write_json, write_text
 from spelgen.logs.formats import log_files
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory, set_aside
@@ -76,80 +76,79 @@ class ArmInputs(Group):
 
 
 def arm_inputs(
-    arm: ComparedArm, comparison: Comparison, folder: Path, progress: Progress | None = None
+    arm: ComparedArm, folder: Path, splits: int = 1, progress: Progress | None = None
 ) -> ArmInputs:
     """Return the inputs of an arm's runs; the logs of an arm without logs are simulated into the folder.
 
-    Raises what `load_arm`, `load_mapping`, `read_logs` and `simulate` raise.
+    Raises what `load_arm`, `load_mapping`, `read_logs` and `simulate` raise, before anything is trained.
     """
     loaded = load_arm(arm.urdf, arm.joints, arm.tip)
-    if not arm.data:
-        return _simulated(arm, loaded, comparison, folder, progress)
     mapping = loaded.settings.logs
     if arm.mapping is not None:
         mapping = load_mapping(arm.mapping, loaded.robot.joint)
     files, errors = log_files(arm.data)
     collect(errors)
-    sources: list[object] = [_description(arm, loaded), mapping.model_dump_json(exclude_unset=True)]
-    for file in files:
-        sources.append((file, file.stat().st_size, file.stat().st_mtime_ns))
+    # these keys of the settings change no run
+    apart: dict[str, bool | set[str]] = {"about": True, "comparison": {"seeds", "published"}}
+    settings = loaded.settings.model_dump_json(exclude_unset=True, exclude=apart)
+    versions = [(file, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
+    mapped = mapping.model_dump_json(exclude_unset=True)
+    sources = json.dumps((loaded.robot.digest, arm.joints, arm.tip, settings, mapped, versions), default=str)
     inputs = ArmInputs(
-        urdf=arm.urdf, truth=None, joints=arm.joints, tip=arm.tip, data=arm.data, mapping=mapping,
-        digest=_digest(sources),
+        urdf=arm.urdf, truth=None, joints=loaded.joints, tip=loaded.tip, data=arm.data, mapping=mapping,
+        digest=hashlib.sha256(sources.encode()).hexdigest()[:16],
     )  # fmt: skip
-    inputs.split(
-        0, comparison.splits
-    )  # logs that cannot be used are reported once, before anything is trained
+    if not arm.data:
+        inputs = inputs.model_copy(
+            update={
+                "urdf": folder / "known.urdf",
+                "truth": arm.urdf,
+                "data": (folder,),
+                "mapping": LogMapping(),
+            }
+        )
+        _simulate(inputs, loaded, folder, progress)
+    inputs.split(0, splits)
     return inputs
 
 
-def _simulated(
-    arm: ComparedArm, loaded: LoadedArm, comparison: Comparison, folder: Path, progress: Progress | None
-) -> ArmInputs:
-    """Simulate logs by the protocol of the arm's settings, unless they are there.
+def _simulate(inputs: ArmInputs, loaded: LoadedArm, folder: Path, progress: Progress | None) -> None:
+    """Simulate logs by the protocol of the arm's settings, unless they are in the folder.
 
-    Models know only a copy of the URDF without drives and with wrong inertials or none, so that no model starts from
-    the truth that it is compared with.
+    Models know only a copy of the URDF without inertials, drives and friction, so that no model starts from the truth.
     """
     from spelgen.simulation.simulate import (
-        simulate,
-    )  # Pinocchio is an extra, not needed for the user's own logs
+        simulate,  # Pinocchio is an extra, not needed for the user's own logs
+    )
 
     if loaded.settings.input == "position":
         raise SettingsError(
-            "position servos", file=arm.urdf.with_suffix(".yaml"), element="input",
+            "position servos", file=loaded.robot.path.with_suffix(".yaml"), element="input",
             expected="torques: the simulated protocol has no commands",
             do="give logs of the arm with --data",
         )  # fmt: skip
-    urdf, digest = folder / "known.urdf", _digest([_description(arm, loaded), comparison.urdf_error])
-    inputs = ArmInputs(
-        urdf=urdf, truth=arm.urdf, joints=loaded.joints, tip=loaded.tip, data=(folder / "logs",),
-        mapping=LogMapping(), digest=digest,
-    )  # fmt: skip
     # written last: without it the other files may be incomplete
-    record = folder / "inputs.json"
-    if record.exists() and read_json(record, RunError) == {"digest": digest}:
-        return inputs
-    record.unlink(missing_ok=True)
+    complete = folder / "inputs.json"
+    if complete.exists() and read_json(complete, RunError) == {"digest": inputs.digest}:
+        return
+    remove(complete)
     logs = simulate(loaded, progress=progress)
     training, first = list(logs.train), loaded.settings.comparison.first
     if first is not None:
         training = [log[: int((log.t - log.t[0] < first - 1e-9).sum())] for log in training]
-    write_logs(folder / "logs" / "train.parquet", training, loaded.arm.joint_names)
-    write_logs(folder / "logs" / "test.parquet", logs.test, loaded.arm.joint_names)
-    write_bytes(urdf, known_urdf(arm.urdf, comparison.urdf_error))
-    write_text(urdf.with_suffix(".yaml"), yaml.safe_dump({"gravity": list(loaded.settings.gravity)}))
-    write_json(record, {"digest": digest})
-    return inputs
+    write_logs(folder / "train.parquet", training, loaded.arm.joint_names)
+    write_logs(folder / "test.parquet", logs.test, loaded.arm.joint_names)
+    write_bytes(inputs.urdf, _kinematics(loaded.robot.path))
+    write_text(inputs.urdf.with_suffix(".yaml"), yaml.safe_dump({"gravity": list(loaded.settings.gravity)}))
+    write_json(complete, {"digest": inputs.digest})
 
 
-def _description(arm: ComparedArm, loaded: LoadedArm) -> tuple[object, ...]:
-    # `seeds` only sets the number of runs, and `about` and `published` change no run
-    settings = loaded.settings.model_dump_json(
-        exclude_unset=True, exclude={"about": True, "comparison": {"seeds", "published"}}
-    )
-    return loaded.robot.digest, arm.joints, arm.tip, settings
-
-
-def _digest(sources: Sequence[object]) -> str:
-    return hashlib.sha256(json.dumps(sources, default=str).encode()).hexdigest()[:16]
+def _kinematics(urdf: Path) -> bytes:
+    """Return a URDF without inertials, friction, visuals and collision bodies."""
+    # `load_arm` has read this file, so its size and entities have been checked
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
+    tree = etree.ElementTree(etree.fromstring(urdf.read_bytes(), parser))
+    for element in list(tree.iter("dynamics", "visual", "collision", "inertial")):
+        element.getparent().remove(element)
+    text: bytes = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
+    return text

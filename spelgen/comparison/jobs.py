@@ -75,9 +75,7 @@ class RunResult:
 class Job(Group):
     """A run of a comparison.
 
-    design: a preset, an ablation design, or a YAML file. training: settings of fits to the user's logs. protocol:
-    settings of fits to simulated logs. default_training: whether fits to simulated logs, too, have the defaults of
-    `spelgen train`.
+    design: a preset, an ablation design, or a YAML file. protocol: settings of fits to simulated logs.
     """
 
     arm: str
@@ -90,7 +88,6 @@ class Job(Group):
     depth: int
     training: TrainingSettings
     protocol: ComparisonSettings
-    default_training: bool
     folder: Path
 
     @property
@@ -134,25 +131,22 @@ class Job(Group):
 
     def config(self, model: EmittedModel, logs: Sequence[Trajectory]) -> FitConfig | None:
         """Return the configuration of the fit; None: the default of `fit`."""
-        if self.inputs.truth is None:
-            objective = self.training.objective
-            # a momentum fit is for networks: the other presets of the comparison have their default
-            if objective == "momentum" and has_rigid_bodies(model):
-                objective = None
-            return chosen_config(model, sample_rates(logs), objective, {}, self.training.options)
-        return None if self.default_training else self.equal_steps()
+        if self.inputs.truth is not None:
+            return self.equal_steps()
+        objective = self.training.objective
+        # a momentum fit is for networks: the other presets of the comparison have their default
+        if objective == "momentum" and has_rigid_bodies(model):
+            objective = None
+        return chosen_config(model, sample_rates(logs), objective, {}, self.training.options)
 
     def equal_steps(self) -> Rollout:
         """Return the same number of steps for all models, without the regularizer towards the URDF."""
-        epochs = -(-self.protocol.steps // WINDOWS.epoch_steps)
-        options: dict[str, object] = {
-            "urdf_weight": 0.0, "epochs": epochs, "patience": epochs,
-            "momentum_steps": self.protocol.momentum_steps,
-        }  # fmt: skip
-        if self.protocol.weight_decay is not None:
-            options["weight_decay"] = self.protocol.weight_decay
-        defaults = self.training.options
-        return cast("Rollout", fit_config("rollout", rigid_bodies=False, options=options, defaults=defaults))
+        epochs, decay = -(-self.protocol.steps // WINDOWS.epoch_steps), self.protocol.weight_decay
+        options = self.training.options | {"urdf_weight": 0.0, "epochs": epochs, "patience": epochs}
+        options |= {"momentum_steps": self.protocol.momentum_steps}
+        if decay is not None:
+            options["weight_decay"] = decay
+        return cast("Rollout", fit_config("rollout", rigid_bodies=False, defaults=options))
 
     def preprocessing(self) -> Preprocessing:
         """Return the preprocessing of the logs; simulated states have no noise and are not filtered."""

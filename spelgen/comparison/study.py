@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
 import torch
 
-from spelgen.comparison.arms import Comparison
-from spelgen.comparison.figures import spread_windows
+from spelgen.baselines.names import MODEL
+from spelgen.comparison.arms import Comparison, ablation_designs
+from spelgen.comparison.figures import step_seconds
 from spelgen.comparison.inputs import ArmInputs, Progress, arm_inputs
 from spelgen.comparison.jobs import Job, RunResult, run_job
 from spelgen.comparison.tuning import ComparisonTuning
@@ -20,9 +21,8 @@ from spelgen.design import PRESET_NAMES, load_design
 from spelgen.errors import RunError, SpelgenError, in_one_line
 from spelgen.evaluation.plain import record
 from spelgen.files import write_json
-from spelgen.fitting.rollout import loss_scales, rollout_loss
 from spelgen.labels import counted
-from spelgen.settings.fits import DEFAULTS
+from spelgen.listing import number
 from spelgen.settings.settings import load_settings
 from spelgen.tasks import RunTasks
 
@@ -36,14 +36,13 @@ class Study:
     """A comparison that is ready to run.
 
     jobs: all runs. results: those that are finished, by the name of the run. failures: reason, by the name of an arm or
-    run. step_seconds: time of a training step [s], by simulated arm and preset. estimates: time of a run [s], by name.
+    run. estimates: expected time of the other runs [s], by name.
     """
 
     folder: Path
     jobs: tuple[Job, ...]
     results: dict[str, RunResult]
     failures: dict[str, str]
-    step_seconds: dict[str, dict[str, float]]
     estimates: dict[str, float]
 
     @property
@@ -66,11 +65,11 @@ class Study:
         text = f"{counted(len(self.jobs), 'run')} ({', '.join(counts)})"
         if self.results:
             text += f", {len(self.results)} finished before"
-        left = [self.estimates[job.name] for job in self.jobs if job.name not in self.results]
-        if not left:
+        if not self.estimates:
             return text
-        # runs in parallel end together at best, and no earlier than the longest run
-        return f"{text}; estimated time {duration(max(sum(left) / parallel, *left, 0.0))}"
+        # parallel runs end together at best, and not before the longest one
+        seconds = max(sum(self.estimates.values()) / parallel, *self.estimates.values(), 0.0)
+        return f"{text}; estimated time {duration(seconds)}"
 
 
 def prepare_study(comparison: Comparison, folder: Path, progress: Progress | None = None) -> Study:
@@ -79,13 +78,13 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
     An arm whose inputs cannot be prepared is a failure. Raises SettingsError for a preset that does not exist,
     RunError if no arm can be used, and the error of a single arm.
     """
-    for preset in comparison.presets or ():
+    for preset in set(comparison.presets or ()) - ablation_designs().keys():
         load_design(preset)
     jobs: list[Job] = []
     failures: dict[str, str] = {}
     for name, arm in comparison.arms.items():
         try:
-            inputs = arm_inputs(arm, comparison, folder / "arms" / name, progress)
+            inputs = arm_inputs(arm, folder / "arms" / name, comparison.splits, progress)
             jobs += _jobs(name, inputs, comparison, folder / "runs" / name)
         except SpelgenError as error:
             if len(comparison.arms) == 1:
@@ -94,14 +93,18 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
     if not jobs:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in failures.items())
         raise RunError(f"no arm that can be compared ({reasons})")
-    results = {}
+    finished = {job.name: job.result() for job in jobs}
+    results = {name: result for name, result in finished.items() if result is not None}
+    estimates: dict[str, float] = {}
+    known: dict[tuple[str, str], float] = {}
     for job in jobs:
-        result = job.result()
-        if result is not None:
-            results[job.name] = result
-    steps = _step_seconds(jobs)
-    estimates = {job.name: _estimate(job, results, steps) for job in jobs}
-    return Study(folder, tuple(jobs), results, failures, steps, estimates)
+        if job.name not in results:
+            # runs that differ only by seed or split take about the same time
+            alike = (job.arm, job.preset)
+            if alike not in known:
+                known[alike] = _estimate(job, results)
+            estimates[job.name] = known[alike]
+    return Study(folder, tuple(jobs), results, failures, estimates)
 
 
 def run_study(study: Study, run_tasks: RunTasks, note: Callable[[str], None]) -> Study:
@@ -109,28 +112,25 @@ def run_study(study: Study, run_tasks: RunTasks, note: Callable[[str], None]) ->
 
     note: called with a line for each run that ends. A run with an error is a failure; the same command runs it again.
     """
-    waiting = [job for job in study.jobs if job.name not in study.results]
+    waiting = [job for job in study.jobs if job.name in study.estimates]
     results, failures = dict(study.results), dict(study.failures)
-    start, done, total = time.monotonic(), 0.0, sum(study.estimates[job.name] for job in waiting)
-    for number, (job, outcome) in enumerate(run_tasks(run_job, waiting), start=1):
+    start, done, total = time.monotonic(), 0.0, sum(study.estimates.values())
+    for count, (job, outcome) in enumerate(run_tasks(run_job, waiting), start=1):
         done += study.estimates[job.name]
-        line = f"{number}/{len(waiting)} {job.name}: "
         if isinstance(outcome, Exception):
             failures[job.name] = _reason(outcome)
-            line += f"failed: {failures[job.name]}"
+            line = f"failed: {failures[job.name]}"
         else:
             results[job.name] = outcome
-            line += _outcome(outcome)
-        if number < len(waiting):
+            measure, errors = next(iter(outcome.errors.items()))
+            line = f"{measure} {number(errors[MODEL])}, {outcome.seconds:.0f} s"
+        if count < len(waiting):
             line += f"; about {duration((time.monotonic() - start) * (total / done - 1))} left"
-        note(line)
-    finished = replace(study, results=results, failures=failures)
-    content = {
-        "schema": SCHEMA,
-        "failures": failures,
-        "results": list(map(_figures, finished.results.values())),
-    }
-    write_json(study.folder / "comparison.json", content)
+        note(f"{count}/{len(waiting)} {job.name}: {line}")
+    finished = replace(study, results=results, failures=failures, estimates={})
+    # curves are only in result.json of each run
+    figures = [record(replace(result, simulated=None)) for result in results.values()]
+    write_json(study.folder / "comparison.json", {"schema": SCHEMA, "failures": failures, "results": figures})
     return finished
 
 
@@ -143,74 +143,40 @@ def duration(seconds: float) -> str:
 
 def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) -> list[Job]:
     """Return the runs of an arm, seed by seed, so that an interrupted comparison has all presets of the first seeds."""
-    source = inputs.truth or inputs.urdf
-    settings = load_settings(source)
-    protocol = settings.comparison
-    simulated = inputs.truth is not None
-    training = comparison.training
-    changes = {option: getattr(training, option) for option in training.model_fields_set}
-    presets = comparison.presets or (PRESET_NAMES if simulated else PRESETS_ON_LOGS)
-    seeds = comparison.seeds or (protocol.seeds if simulated else 1)
+    settings = load_settings(inputs.truth or inputs.urdf)
+    protocol, presets, seeds = settings.comparison, PRESET_NAMES, settings.comparison.seeds
+    if inputs.truth is None:
+        presets, seeds = PRESETS_ON_LOGS, 1
+    options = {
+        name: value for name, value in comparison.training if name in comparison.training.model_fields_set
+    }
+    shared = {
+        "arm": name, "inputs": inputs, "splits": comparison.splits,
+        "width": comparison.width or protocol.width, "depth": comparison.depth or protocol.depth,
+        "training": settings.training.model_copy(update=options),
+        "protocol": protocol.model_copy(update={"steps": comparison.steps or protocol.steps}),
+    }  # fmt: skip
+    axes = range(comparison.seeds or seeds), range(comparison.splits), comparison.presets or presets
     jobs = []
-    for seed, split, design in product(range(seeds), range(comparison.splits), presets):
-        job = Job(
-            arm=name, inputs=inputs, design=design, seed=seed, split=split, splits=comparison.splits,
-            width=comparison.width or protocol.width, depth=comparison.depth or protocol.depth,
-            training=settings.training.model_copy(update=changes),
-            protocol=protocol.model_copy(update={"steps": comparison.steps or protocol.steps}),
-            default_training=comparison.urdf_error is not None,
-            folder=folder / f"{Path(design).stem}-seed{seed}-split{split}",
-        )  # fmt: skip
-        jobs.append(job)
+    for seed, split, design in product(*axes):
+        run = folder / f"{Path(design).stem}-seed{seed}-split{split}"
+        jobs.append(
+            Job.model_validate({**shared, "design": design, "seed": seed, "split": split, "folder": run})
+        )
     return jobs
 
 
-def _step_seconds(jobs: Sequence[Job]) -> dict[str, dict[str, float]]:
-    """Return the median time of a loss and its gradient [s], without the optimizer, by simulated arm and preset."""
-    times: dict[str, dict[str, float]] = {}
-    torch.set_num_threads(1)
-    for job in jobs:
-        if job.inputs.truth is None or job.preset in times.setdefault(job.arm, {}):
-            continue
-        model, config = job.build(), job.equal_steps()
-        training, _ = job.inputs.split(job.split, job.splits)
-        decimation = job.training.decimation or 1
-        windows = spread_windows(training, config.window, decimation)[: config.batch or DEFAULTS.batch]
-        scales = loss_scales(windows, model.joint_types)
-        durations = []
-        for _ in range(TUNING.timed_steps):
-            start = time.perf_counter()
-            model.zero_grad()
-            torch.autograd.backward(rollout_loss(model, windows, scales, 1))
-            durations.append(time.perf_counter() - start)
-        times[job.arm][job.preset] = statistics.median(durations)
-    return times
-
-
-def _estimate(job: Job, results: Mapping[str, RunResult], steps: Mapping[str, Mapping[str, float]]) -> float:
+def _estimate(job: Job, results: Mapping[str, RunResult]) -> float:
     """Return the expected time of a run [s]: of finished runs of this arm and preset, else of its training steps."""
-    alike = [x.seconds for x in results.values() if (x.arm, x.preset) == (job.arm, job.preset)]
-    if alike:
-        return statistics.median(alike) + TUNING.measuring
+    known = [x.seconds for x in results.values() if (x.arm, x.preset) == (job.arm, job.preset)]
+    if known:
+        return statistics.median(known) + TUNING.measuring
     if job.inputs.truth is None:
         return TUNING.run_on_logs
-    count = job.protocol.steps + TUNING.momentum_cost * job.protocol.momentum_steps
-    return count * steps[job.arm][job.preset] + TUNING.measuring
-
-
-def _outcome(result: RunResult) -> str:
-    """Return the first figure of a run and its time."""
-    measure, errors = next(iter(result.errors.items()))
-    error = errors["model"]
-    return f"{measure} {'not finite' if error is None else f'{error:.3g}'}, {result.seconds:.0f} s"
-
-
-def _figures(result: RunResult) -> dict[str, object]:
-    """Return the JSON form of a result without its curves, which result.json has."""
-    figures = record(result)
-    for curves in ("mass", "example"):
-        (figures["simulated"] or {}).pop(curves, None)
-    return figures
+    torch.set_num_threads(1)
+    training, _ = job.inputs.split(job.split, job.splits)
+    step = step_seconds(job.build(), training, job.equal_steps(), job.training.decimation or 1)
+    return (job.protocol.steps + TUNING.momentum_cost * job.protocol.momentum_steps) * step + TUNING.measuring
 
 
 def _reason(error: Exception) -> str:

@@ -20,8 +20,9 @@ BASELINE = "phnode"
 Runs = Mapping[str, Sequence[RunResult]]
 """Runs of all seeds and splits of an arm, by preset."""
 Numbers = dict[str, float | None]
+Figure = Callable[[SimulatedFigures], float | None]
 
-LOSSES: dict[str, Callable[[SimulatedFigures], float | None]] = {
+LOSSES: dict[str, Figure] = {
     "prediction loss, 1 s": lambda run: run.prediction.loss,
     "velocity, 1 s": lambda run: run.prediction.velocity,
     "position, 1 s": lambda run: run.prediction.position,
@@ -29,17 +30,18 @@ LOSSES: dict[str, Callable[[SimulatedFigures], float | None]] = {
     "training loss": lambda run: run.train.loss,
     "test loss": lambda run: run.test.loss,
 }
-RATIOS = {"prediction loss, 1 s": "prediction loss", "velocity, 1 s": "velocity"}
-"""Rows that are followed by the baseline's figure divided by the figure of each model."""
-PUBLISHED: dict[str, Callable[[PublishedFigures], float | None]] = {
-    "prediction loss": lambda figures: figures.prediction_loss,
-    "velocity": lambda figures: figures.velocity,
-    "position": lambda figures: figures.position,
-    "training loss": lambda figures: figures.train_loss,
-    "test loss": lambda figures: figures.test_loss,
-    "parameters": lambda figures: figures.parameters,
-    "training step [s]": lambda figures: figures.step_seconds,
+SIZES: dict[str, Figure] = {
+    "outputs of M": lambda run: run.sizes.outputs[0],
+    "outputs of D": lambda run: run.sizes.outputs[1],
+    "outputs of G": lambda run: run.sizes.outputs[2],
+    "outputs of V": lambda run: run.sizes.outputs[3],
+    "inputs of M": lambda run: run.sizes.inputs,
+    "parameters": lambda run: run.sizes.parameters,
+    "training step [ms]": lambda run: 1e3 * run.step_seconds,
+    "smallest eigenvalue of M / mean": lambda run: run.invariants.least_eigenvalue,
 }
+RATIO = {"prediction loss, 1 s": "prediction loss", "velocity, 1 s": "velocity"}
+"""Rows that are followed by the baseline's figure divided by the figure of each model."""
 
 
 @dataclass(frozen=True)
@@ -57,39 +59,37 @@ def arm_sections(study: Study) -> list[ArmSection]:
     sections = []
     for name, results in study.arms.items():
         published = next(job.protocol.published for job in study.jobs if job.arm == name)
-        tables = arm_tables(results, study.step_seconds.get(name, {}), published)
-        sections.append(ArmSection(name, arm_sentence(results), tuple(tables), tuple(results)))
+        tables = tuple(arm_tables(results, published))
+        sections.append(ArmSection(name, arm_sentence(results), tables, tuple(results)))
     return sections
 
 
-def arm_tables(
-    results: Sequence[RunResult],
-    step_seconds: Mapping[str, float],
-    published: Mapping[str, PublishedFigures],
-) -> list[Table]:
-    """Return the tables of an arm, the one with the result first.
-
-    step_seconds: time of a training step [s], by preset. published: figures of a publication, by preset.
-    """
+def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFigures]) -> list[Table]:
+    """Return the tables of an arm, the one with the result first. published: figures of a publication, by preset."""
     runs = _by_preset(results)
-    if results[0].simulated is None:
+    figures = {
+        name: [run.simulated for run in of_preset if run.simulated] for name, of_preset in runs.items()
+    }
+    if not all(figures.values()):
         return [_ranking(runs)]
     losses: dict[str, Numbers] = {}
     for result in sorted(results, key=lambda result: (result.seed, result.split)):
         split = f", split {result.split}" if any(x.split for x in results) else ""
         loss = next(iter(result.errors.values()))[MODEL]
         losses.setdefault(f"seed {result.seed}{split}", {})[result.preset] = loss
-    eigenvalue = _summary(runs, lambda run: run.invariants.least_eigenvalue, min)
-    rise = _summary(runs, lambda run: run.invariants.energy_rise, max)
-    invariants = (
-        Row("smallest eigenvalue of M / mean", eigenvalue, ranked=False),
-        Row("rise of energy, no input", rise, ranked=False),
+    sizes = {label: _summary(figures, figure, min) for label, figure in SIZES.items()}
+    rise = _summary(figures, lambda run: run.invariants.energy_rise, max)
+    rows = [
+        Row(label, values, label in ("parameters", "training step [ms]")) for label, values in sizes.items()
+    ]
+    rows.append(Row("rise of energy, no input", rise, ranked=False))
+    title = (
+        "Sizes, time of a training step, and invariants, the worst over seeds; a negative rise is a decrease"
     )
     return [
-        _losses(runs, published),
-        _sizes(runs, step_seconds),
+        _losses(figures, published),
+        Table(title, tuple(rows)),
         table("Prediction loss over 1 s of every run", losses),
-        Table("Invariants, worst over seeds; a negative rise is a decrease", invariants),
     ]
 
 
@@ -142,64 +142,46 @@ def _by_preset(results: Sequence[RunResult]) -> dict[str, list[RunResult]]:
 
 def _ranking(runs: Runs) -> Table:
     """Return the errors of models and baselines on the user's logs, the best one first."""
-    every = [run for of_preset in runs.values() for run in of_preset]
-    measures = [name for name in every[0].errors if all(name in run.errors for run in every)]
-    rows = [Row(measure, _medians(runs, measure)) for measure in measures]
-    count = {name: len(of_preset) for name, of_preset in runs.items()}
-    parameters = {name: of_preset[0].parameters for name, of_preset in runs.items()}
-    seconds = {name: statistics.median(run.seconds for run in of_preset) for name, of_preset in runs.items()}
-    rows += [
-        Row("parameters", parameters, ranked=False),
-        Row("runs", count, ranked=False),
-        Row("training time [s]", seconds, ranked=False),
-    ]
+    rows = [Row(measure, _medians(runs, measure)) for measure in next(iter(runs.values()))[0].errors]
+    figures: dict[str, Callable[[Sequence[RunResult]], float]] = {
+        "parameters": lambda of_preset: of_preset[0].parameters,
+        "runs": len,
+        "training time [s]": lambda of_preset: statistics.median(run.seconds for run in of_preset),
+    }
+    for label, figure in figures.items():
+        rows.append(Row(label, {name: figure(of_preset) for name, of_preset in runs.items()}, ranked=False))
     title = "Errors on the test logs, best first; medians over seeds and splits"
-    note = "relative RMS: 0 is no error, 1 the error if the arm had stood still; columns without parameters are baselines"
+    note = "relative RMS: 0: no error, 1: as if the arm had stood still; columns without parameters are baselines"
     return Table(title, tuple(rows), note)
 
 
 def _medians(runs: Runs, measure: str) -> Numbers:
     """Return the median error of each model and baseline, the smallest first; an error that is not finite is last."""
-    values: dict[str, list[float]] = {}
+    values: dict[str, list[float | None]] = {}
     for preset, of_preset in runs.items():
         for run in of_preset:
-            for predictor, error in run.errors[measure].items():
-                name = preset if predictor == MODEL else predictor
-                # infinite and not left out: a model that diverges with one seed of two must not rank by the other
-                values.setdefault(name, []).append(math.inf if error is None else error)
-    medians = {name: statistics.median(errors) for name, errors in values.items()}
-    ordered = sorted(medians.items(), key=lambda item: item[1])
-    return {name: median if math.isfinite(median) else None for name, median in ordered}
+            for predictor, error in run.errors.get(measure, {}).items():
+                values.setdefault(preset if predictor == MODEL else predictor, []).append(error)
+    medians = {name: _combined(errors, statistics.median) for name, errors in values.items()}
+    return dict(sorted(medians.items(), key=lambda item: math.inf if item[1] is None else item[1]))
 
 
-def _sizes(runs: Runs, step_seconds: Mapping[str, float]) -> Table:
-    sizes = {name: run.simulated.sizes for name, (run, *_) in runs.items() if run.simulated}
-    rows = []
-    for k, matrix in enumerate("MDGV"):
-        outputs = {name: size.outputs[k] for name, size in sizes.items()}
-        rows.append(Row(f"outputs of {matrix}", outputs, ranked=False))
-    rows += [
-        Row("inputs of M", {name: size.inputs for name, size in sizes.items()}, ranked=False),
-        Row("parameters", {name: size.parameters for name, size in sizes.items()}),
-        Row("training step [ms]", {name: 1e3 * step_seconds[name] for name in runs}),
-    ]
-    return Table("Sizes, and the time of a training step", tuple(rows))
-
-
-def _losses(runs: Runs, published: Mapping[str, PublishedFigures]) -> Table:
+def _losses(
+    figures: Mapping[str, Sequence[SimulatedFigures]], published: Mapping[str, PublishedFigures]
+) -> Table:
     rows = []
     for label, figure in LOSSES.items():
-        medians = _summary(runs, figure, statistics.median)
+        medians = _summary(figures, figure, statistics.median)
         rows.append(Row(label, medians))
         baseline = medians.get(BASELINE)
-        if baseline is not None and label in RATIOS:
+        if baseline is not None and label in RATIO:
             ratios = {name: baseline / median if median else None for name, median in medians.items()}
-            rows.append(Row(f"{BASELINE}'s {RATIOS[label]} / this", ratios, ranked=False))
-    for label, publication in PUBLISHED.items():
-        of_models = {name: publication(published[name]) for name in runs if name in published}
-        figures = {name: value for name, value in of_models.items() if value is not None}
-        if figures:
-            rows.append(Row(f"published: {label}", figures, ranked=False))
+            rows.append(Row(f"{BASELINE}'s {RATIO[label]} / this", ratios, ranked=False))
+    records = {name: published[name].model_dump(exclude_none=True) for name in figures if name in published}
+    for field in PublishedFigures.model_fields:
+        values = {name: record[field] for name, record in records.items() if field in record}
+        if values:
+            rows.append(Row(f"published: {field.replace('_', ' ')}", values, ranked=False))
     title = (
         "Squared errors summed over joints [rad, m, s], mean over samples and windows, and the relative error of M; "
         "median over seeds; below, published figures"
@@ -208,14 +190,14 @@ def _losses(runs: Runs, published: Mapping[str, PublishedFigures]) -> Table:
 
 
 def _summary(
-    runs: Runs,
-    figure: Callable[[SimulatedFigures], float | None],
-    combined: Callable[[list[float]], float],
+    figures: Mapping[str, Sequence[SimulatedFigures]], figure: Figure, combine: Callable[[list[float]], float]
 ) -> Numbers:
-    """Return one number per preset for all runs; a run whose figure is not finite counts as infinitely bad."""
-    summaries: Numbers = {}
-    for name, of_preset in runs.items():
-        values = [figure(run.simulated) for run in of_preset if run.simulated]
-        summary = combined([math.inf if value is None else value for value in values])
-        summaries[name] = summary if math.isfinite(summary) else None
-    return summaries
+    """Return a figure of each preset, combined over its runs."""
+    return {name: _combined(list(map(figure, of_preset)), combine) for name, of_preset in figures.items()}
+
+
+def _combined(values: Sequence[float | None], combine: Callable[[list[float]], float]) -> float | None:
+    """Return the combined value; None if it is not finite."""
+    # infinite and not left out: a model that diverges with one seed of two must not rank by the other
+    combined = combine([math.inf if value is None else value for value in values])
+    return combined if math.isfinite(combined) else None

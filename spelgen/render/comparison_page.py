@@ -49,7 +49,6 @@ def write_comparison(study: Study, sections: Sequence[ArmSection]) -> Path:
         sections=sections,
         protocols={name: job.protocol for name, job in jobs.items() if name in curves},
         widths={name: job.width for name, job in jobs.items()},
-        default_training=any(job.default_training for job in study.jobs),
         curves=curves,
         failures=study.failures,
     )
