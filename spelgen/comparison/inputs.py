@@ -16,14 +16,13 @@ from spelgen.comparison.arms import ComparedArm
 from spelgen.comparison.tuning import ComparisonTuning
 from spelgen.errors import LogError, RunError, SettingsError, collect
 from spelgen.files import read_json, remove, write_bytes, write_json, write_text
+from spelgen.logs.arm_mapping import log_source
 from spelgen.logs.formats import log_files
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory, set_aside
 from spelgen.logs.windows import split_validation
 from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.settings import load_mapping
-from spelgen.settings.values import Group
 
 if TYPE_CHECKING:
     from spelgen.pipeline.loaded_arm import LoadedArm
@@ -32,24 +31,23 @@ TUNING = ComparisonTuning()
 Progress = Callable[[int, int], None]
 
 
-class ArmInputs(Group):
+class ArmInputs(ComparedArm):
     """Files that the runs of an arm read.
 
-    urdf: URDF that models are built from. truth: URDF of the simulated arm; None if the logs are the user's.
-    data: logs; their columns and units are in `mapping`. digest: of the URDF, settings and logs.
+    urdf: URDF that models are built from. truth: URDF of the simulated arm; None if the logs are the user's. digest: of
+    the URDF, settings and logs.
     """
 
-    urdf: Path
-    truth: Path | None
-    joints: tuple[str, ...] | None
-    tip: str | None
-    data: tuple[Path, ...]
-    mapping: LogMapping
+    truth: Path | None = None
     digest: str
 
     def load(self) -> LoadedArm:
         """Return the arm that models are built from."""
         return load_arm(self.urdf, self.joints, self.tip)
+
+    def log_mapping(self) -> LogMapping:
+        """Return the columns and units of the logs."""
+        return log_source(self.load(), self.mapping).mapping
 
     def split(self, number: int, splits: int) -> tuple[list[Trajectory], list[Trajectory]]:
         """Return training and test trajectories of one of `splits` splits. Raises LogError.
@@ -83,30 +81,19 @@ def arm_inputs(
     Raises what `load_arm`, `load_mapping`, `read_logs` and `simulate` raise, before anything is trained.
     """
     loaded = load_arm(arm.urdf, arm.joints, arm.tip)
-    mapping = loaded.settings.logs
-    if arm.mapping is not None:
-        mapping = load_mapping(arm.mapping, loaded.robot.joint)
+    mapping = log_source(loaded, arm.mapping).mapping
     files, errors = log_files(arm.data)
     collect(errors)
     # these keys of the settings change no run
     apart: dict[str, bool | set[str]] = {"about": True, "comparison": {"seeds", "published"}}
-    settings = loaded.settings.model_dump_json(exclude_unset=True, exclude=apart)
+    settings = [loaded.settings.model_dump_json(exclude_unset=True, exclude=apart)]
+    settings.append(mapping.model_dump_json(exclude_unset=True))
     versions = [(file, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-    mapped = mapping.model_dump_json(exclude_unset=True)
-    sources = json.dumps((loaded.robot.digest, arm.joints, arm.tip, settings, mapped, versions), default=str)
-    inputs = ArmInputs(
-        urdf=arm.urdf, truth=None, joints=loaded.joints, tip=loaded.tip, data=arm.data, mapping=mapping,
-        digest=hashlib.sha256(sources.encode()).hexdigest()[:16],
-    )  # fmt: skip
+    sources = json.dumps((loaded.robot.digest, arm.joints, arm.tip, settings, versions), default=str)
+    inputs = ArmInputs(**dict(arm), digest=hashlib.sha256(sources.encode()).hexdigest()[:16])
     if not arm.data:
-        inputs = inputs.model_copy(
-            update={
-                "urdf": folder / "known.urdf",
-                "truth": arm.urdf,
-                "data": (folder,),
-                "mapping": LogMapping(),
-            }
-        )
+        changes = {"urdf": folder / "known.urdf", "truth": arm.urdf, "data": (folder,)}
+        inputs = inputs.model_copy(update=changes | {"joints": loaded.joints, "tip": loaded.tip})
         _simulate(inputs, loaded, folder, progress)
     inputs.split(0, splits)
     return inputs

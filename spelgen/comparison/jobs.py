@@ -104,12 +104,10 @@ class Job(Group):
     @property
     def key(self) -> str:
         """Return a digest of all that the result depends on; the places of files are not part of it."""
-        apart: dict[str, bool | set[str]] = {
-            "folder": True, "design": True, "inputs": {"urdf", "truth", "data"}, "protocol": {"seeds", "published"},
-        }  # fmt: skip
-        content = self.model_dump_json(exclude=apart)
-        design = load_design(self.named_design)
-        return hashlib.sha256(f"{__version__} {self.preset} {design} {content}".encode()).hexdigest()[:16]
+        protocol = self.protocol.model_dump_json(exclude={"seeds", "published"})
+        options = self.model_dump_json(exclude={"design", "inputs", "protocol", "folder"})
+        sources = (__version__, load_design(self.named_design), self.inputs.digest, protocol, options)
+        return hashlib.sha256(repr(sources).encode()).hexdigest()[:16]
 
     @property
     def named_design(self) -> str | Design:
@@ -171,7 +169,7 @@ def run_job(job: Job) -> RunResult:
     trained = fit(
         model, training, job.config(model, training), preprocessing=job.preprocessing(),
         validation=job.training.validation_fraction, seed=job.seed, arm=job.inputs.urdf, folder=job.folder,
-        options=RunOptions(mapping=job.inputs.mapping, resume=resume, force=not resume),
+        options=RunOptions(mapping=job.inputs.log_mapping(), resume=resume, force=not resume),
     )  # fmt: skip
     if trained.status == "interrupted":
         raise KeyboardInterrupt
