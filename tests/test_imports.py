@@ -27,7 +27,8 @@ log_checks baselines
 fitting
 exporting
 evaluation
-fleet comparison render
+comparison
+render
 cli __init__ __main__
 """
 ROOMS = ROWS.split()
