@@ -22,7 +22,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from mujoco import minimize, rollout
-from spelgen.settings.tuning.exporting import TUNING as EXPORT_TUNING
 
 import spelgen
 from spelgen.arm.arm import Arm
@@ -32,6 +31,7 @@ from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.rigid_bodies import about_center, quaternion
 from spelgen.emission.assemble import ArmModel
 from spelgen.evaluation.replay import replays
+from spelgen.exporting.tuning import TUNING as EXPORT_TUNING
 from spelgen.fitting.servo.windows import ServoWindows, servo_windows
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 

@@ -16,7 +16,6 @@ import pytest
 import torch
 import yaml
 from html_page import Page
-from spelgen.settings.tuning.evaluation import EvaluationTuning
 from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
@@ -33,6 +32,7 @@ from spelgen.design import load_design
 from spelgen.emission.build import build
 from spelgen.errors import RunError, SettingsError, SpelgenError
 from spelgen.evaluation import invariants
+from spelgen.evaluation.tuning import EvaluationTuning
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.rollout import roll_out
 from spelgen.logs.read import Trajectory, read_logs, write_logs

@@ -91,15 +91,10 @@ def build(
     if is_new:
         options.require_free(path, force=force)
         line = f"wrote {write_text(path, source)}"
-    facts = {
-        "robot": spec.robot,
-        "urdf": spec.urdf,
-        "urdf_sha256": spec.urdf_sha256,
-        "spec_sha256": spec.sha256,
-    }
-    joints = {"joints": spec.joint_names, "joint_types": spec.joint_types}
-    options_of_spec = {"options": asdict(spec.options)}
-    answer(format, {"module": str(path), "new": is_new, **facts, **options_of_spec, **joints}, line)
+    record: dict[str, object] = {"module": str(path), "new": is_new, "robot": spec.robot, "urdf": spec.urdf}
+    record |= {"urdf_sha256": spec.urdf_sha256, "spec_sha256": spec.sha256, "options": asdict(spec.options)}
+    record |= {"joints": spec.joint_names, "joint_types": spec.joint_types}
+    answer(format, record, line)
 
 
 def check(module: Module, robot: RobotOption = None) -> None:

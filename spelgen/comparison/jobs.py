@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -22,8 +21,8 @@ from spelgen.errors import RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.plain import record
 from spelgen.files import read_json, write_json
-from spelgen.fitting.fit import RunOptions, fit, sample_rates
-from spelgen.fitting.objectives import chosen_config
+from spelgen.fitting.fit import RunOptions, fit
+from spelgen.fitting.objectives import FitOptions
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.window.momentum import TUNING as WINDOWS
 from spelgen.labels import thousandths
@@ -38,7 +37,6 @@ from spelgen.version import __version__
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
     from spelgen.evaluation.results import Results
-    from spelgen.logs.trajectory import Trajectory
     from spelgen.settings.fits import FitConfig
 
 Errors = dict[str, dict[str, float | None]]
@@ -127,15 +125,15 @@ class Job(Group):
         result = RunResult.read(path)
         return result if result.key == self.key else None
 
-    def config(self, model: ArmModel, logs: Sequence[Trajectory]) -> FitConfig | None:
-        """Return the configuration of the fit; None: the default of `fit`."""
+    def config(self, model: ArmModel) -> FitConfig | FitOptions:
+        """Return the configuration of the fit, or its options."""
         if self.inputs.truth is not None:
             return self.equal_steps()
         objective = self.training.objective
         # a momentum fit is for networks: the other presets of the comparison have their default
         if objective == "momentum" and isinstance(model, RigidBodyDynamics):
             objective = None
-        return chosen_config(model, sample_rates(logs), objective, {}, self.training.options)
+        return FitOptions(objective, {}, self.training.options)
 
     def equal_steps(self) -> Rollout:
         """Return the same number of steps for all models, without the regularizer towards the URDF."""
@@ -167,7 +165,7 @@ def run_job(job: Job) -> RunResult:
     training, testing = job.inputs.split(job.split, job.splits)
     model, start = job.build(), time.monotonic()
     trained = fit(
-        model, training, job.config(model, training), preprocessing=job.preprocessing(),
+        model, training, job.config(model), preprocessing=job.preprocessing(),
         validation=job.training.validation_fraction, seed=job.seed, arm=job.inputs.urdf, folder=job.folder,
         options=RunOptions(mapping=job.inputs.log_mapping(), resume=resume, force=not resume),
     )  # fmt: skip

@@ -104,7 +104,7 @@ def load_runtime() -> Runtime:
                 definitions[defined] = Definition(
                     _text(node, texts[name]), uses, not isinstance(node, ast.Assign)
                 )
-    rows = frozenset(name for node in trees["rows"].body if (name := _defined(node)) is not None)
+    rows = frozenset(filter(None, map(_defined, trees["rows"].body)))
     return Runtime(definitions, imports, rows, frozenset(public))
 
 

@@ -24,6 +24,7 @@ from spelgen.dynamics.tip import last_link
 from spelgen.errors import RunError
 from spelgen.exporting.description import Harmonics, Network, Residuals, Servos, Tip, TrainedModel
 from spelgen.exporting.entry_points import EntryPoint, entry_points
+from spelgen.runtime.friction_laws import FrictionConstants
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ def describe(model: ArmModel, loaded: ConfiguredArm) -> TrainedModel:
         constant_mass=constant_mass,
         motors=array(motors_of(exact)),
         residuals=residuals,
-        friction=weights.friction._make(map(array, weights.friction)),
+        friction=FrictionConstants._make(map(array, weights.friction)),
         reach=array(exact.friction.reach),
         inputs=array(exact.input_matrix(torch.zeros(exact.n).double())),
         actuated=array(exact.actuated),
