@@ -1,7 +1,9 @@
-"""What every test shares: one thread for tiny matrices, and where the robots and the reference data lie."""
+"""Shared by all tests: one thread for tiny matrices, the order of files, tests with bounds of time, common fixtures."""
 
+import fcntl
 import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,11 +12,38 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by torch and numpy when th
 
 ROOT = Path(__file__).parents[1]
 
+# The files that take longest. Workers of pytest-xdist take whole files in this order, so the longest start first.
+LONGEST_FILES = ("test_types",)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run the longest files first, so that no worker is left with one of them when the others are done."""
+    order = {name: index for index, name in enumerate(LONGEST_FILES)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))  # stable: others keep their order
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[object]:
+    """Run a test marked ``timed`` while no other worker runs a test, as other tests would make it slower.
+
+    A readers-writer lock: every test locks the file ``running``, a timed one exclusively. To do so it locks the file
+    ``entry`` first, so that no other test starts while a timed one waits for those that are running.
+    """
+    mode = fcntl.LOCK_EX if item.get_closest_marker("timed") else fcntl.LOCK_SH
+    with open(
+        ROOT / "tests" / "conftest.py"
+    ) as running:  # any two files of the checkout, which all workers share
+        with open(ROOT / "pyproject.toml") as entry:
+            fcntl.flock(entry, fcntl.LOCK_EX)
+            fcntl.flock(running, mode)
+        try:
+            return (yield)
+        finally:
+            fcntl.flock(running, fcntl.LOCK_UN)  # also of a process that the test forked and left running
+
 
 def pytest_collection_finish() -> None:
-    """What was imported lives as long as the tests do: the garbage collector need not go through it every time, which
-    takes a twentieth of the time.
-    """
+    """Exempt imported modules from garbage collection: they live as long as the tests (saves 5 % of the time)."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000)

@@ -120,18 +120,24 @@ def test_it_builds_against_the_header_of_older_interfaces(package, tmp_path):
 
 
 @pytest.mark.skipif(
-    not all(shutil.which(program) for program in ("colcon", "cmake", "g++")),
-    reason="no colcon, no cmake or no g++ on this machine",
+    not all(shutil.which(program) for program in ("cmake", "g++")),
+    reason="no cmake or no g++ on this machine",
 )
 def test_colcon_builds_it(package, tmp_path):
-    """With stubs of ament and of what the package depends on: the library that colcon installs is the plugin."""
+    """The installed library is the plugin. Without colcon its commands of CMake are run; stubs replace dependencies."""
     _, folder = package
     shutil.copytree(folder, tmp_path / "src" / folder.name)
     stubs = [
         f"-D{path.stem.removesuffix('Config')}_DIR={path.parent}" for path in (STUBS / "cmake").iterdir()
     ]
-    run("colcon", "build", "--packages-select", folder.name, "--cmake-args", *stubs, cwd=tmp_path)
     installed = tmp_path / "install" / folder.name
+    if shutil.which("colcon"):
+        run("colcon", "build", "--packages-select", folder.name, "--cmake-args", *stubs, cwd=tmp_path)
+    else:
+        build = tmp_path / "build" / folder.name
+        prefix = f"-DCMAKE_INSTALL_PREFIX={installed}"
+        run("cmake", "-S", tmp_path / "src" / folder.name, "-B", build, prefix, *stubs)
+        run("cmake", "--build", build, "--target", "install")
     assert (installed / "share/inverse_dynamics_solver/plugins/plugin.xml").exists()
     library = installed / "lib" / f"lib{folder.name}.so"
     by_colcon = compiled_driver(folder, tmp_path, str(library), f"-Wl,-rpath,{library.parent}")

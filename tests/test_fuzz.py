@@ -6,7 +6,7 @@ import random
 from pathlib import Path
 
 import pytest
-from fuzzing import fuzz
+from fuzzing import FEW, MINUTES, fuzz
 from hypothesis import strategies as st
 
 from spelgen.errors import SpelgenError
@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 OURS = sorted((ROOT / "robots").glob("*.urdf"))
 THEIRS = sorted((ROOT.parent / "shared" / "arms").rglob("*.urdf"))[::9]
 LARGEST = 60_000  # bytes of a file that is mutated: longer ones only take longer
-MUTANTS = 300
+MUTANTS = 300 if MINUTES else 2 * FEW
 NAMES = st.sampled_from(["a", "b", "c", "d", "base", "", "a b", "é", "{{ a }}", "a'b", "l" * 200])
 TYPES = st.sampled_from(
     ["revolute", "continuous", "prismatic", "fixed", "floating", "planar", "", "hinge"]

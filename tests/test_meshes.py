@@ -172,6 +172,7 @@ LEFT_OUT = (
 )  # fmt: skip
 
 
+@pytest.mark.timed
 @pytest.mark.parametrize("make", DRAWN + LEFT_OUT)
 def test_meshes_are_drawn_or_left_out_in_bounds(tmp_path, make):
     pytest.importorskip("trimesh")

@@ -341,6 +341,7 @@ def test_facts_of_another_type_or_size_are_told(plain, tmp_path, case):
             use(run)
 
 
+@pytest.mark.timed
 def test_a_huge_file_is_not_read(plain, start, tmp_path):
     run = copied(plain, tmp_path)
     with (run / "notes.bin").open("wb") as file:
