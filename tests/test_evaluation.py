@@ -33,7 +33,7 @@ from spelgen.pipeline.build import build
 from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.fits import Rollout
 
-STAND_IN = Path(__file__).with_name("stand_in.py")
+STAND_IN = Path(__file__).with_name("planar_model.py")
 JOINTS = ("shoulder", "elbow")
 UR10E = [
     f"{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")

@@ -11,7 +11,7 @@ import sys
 
 import pytest
 from arms import random_arm
-from formulas_read import assert_equal_to_pinocchio, read_back
+from formula_parsing import assert_equal_to_pinocchio, read_back
 from typer.testing import CliRunner
 
 from spelgen.arm.arm import make_arm

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import sympy
-from formulas_read import assert_close, assert_equal_to_pinocchio, read_back, without_latex
+from formula_parsing import assert_close, assert_equal_to_pinocchio, read_back, without_latex
 from hypothesis import HealthCheck, given, settings
 from random_arms import arms
 

@@ -13,7 +13,7 @@ import pyarrow.parquet
 import pytest
 from fuzzing import fuzz
 from hypothesis import strategies as st
-from test_fuzz import mutated
+from test_fuzz_urdf import mutated
 
 from spelgen.errors import SpelgenError
 from spelgen.evaluation.evaluate import evaluate

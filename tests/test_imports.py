@@ -1,4 +1,4 @@
-"""Files import only from their own layer and the layers above; derivation without torch, fits without symbolic algebra."""
+"""Imports run only within a layer and from the layers above; derivation needs no torch, fits no symbolic algebra."""
 
 import ast
 from functools import cache

@@ -10,7 +10,7 @@ from spelgen.errors import ModuleError
 from spelgen.pipeline.build import build
 
 ROBOTS = Path(__file__).parents[1] / "robots"
-STAND_IN = Path(__file__).parent / "stand_in.py"
+STAND_IN = Path(__file__).parent / "planar_model.py"
 
 
 def test_a_file_and_its_text_give_the_same_model():

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from machine import in_time
+from time_bounds import in_time
 
 from spelgen.render import shapes
 from spelgen.render.mesh_child import mesh_file

@@ -19,7 +19,7 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows
 from spelgen.settings.tuning.evaluation import EvaluationTuning
 
-STAND_IN = Path(__file__).with_name("stand_in.py")
+STAND_IN = Path(__file__).with_name("planar_model.py")
 RATE = 100.0
 OFFSET = torch.tensor([0.6, -0.4], dtype=torch.float64)  # Nm that logs do not tell of
 UNFILTERED = Preprocessing(cutoff=0, decimation=1)

@@ -20,7 +20,7 @@ from emitted import (
 )
 from lie_group import geodesic_distance, group_rates
 from published_phnode import ByJvp, Published
-from test_model import bias
+from test_emitted_module import bias
 
 from spelgen.design import Preset, load_design
 from spelgen.dynamics.protocol import has_friction_state

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from killing import killed
-from machine import in_time
+from process_kill import killed
+from time_bounds import in_time
 from typer.testing import CliRunner
 
 import spelgen

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from killing import killed
+from process_kill import killed
 from servo_arm import servo_logs, write_servo_arm
 from typer.testing import CliRunner
 

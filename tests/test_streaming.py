@@ -21,7 +21,7 @@ from spelgen.logs.trajectory import QUANTITIES, Trajectory
 from spelgen.settings.fits import Rollout
 from spelgen.settings.log_mapping import LogMapping
 
-STAND_IN = Path(__file__).with_name("stand_in.py")
+STAND_IN = Path(__file__).with_name("planar_model.py")
 JOINTS = ("shoulder", "elbow")
 KINDS = ("revolute", "revolute")
 EVERY_OTHER, AUTOMATIC = Preprocessing(decimation=2), Preprocessing()

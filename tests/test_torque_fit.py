@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from characters import TESTS, read_characters, write_arm
+from delan_characters import TESTS, read_characters, write_arm
 from emitted import import_source
 from lxml import etree
 from motions import smooth_motion

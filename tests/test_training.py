@@ -46,7 +46,7 @@ from spelgen.settings.fits import MomentumFit, Rollout
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.tuning.fitting import WindowTuning
 
-STAND_IN = Path(__file__).with_name("stand_in.py")
+STAND_IN = Path(__file__).with_name("planar_model.py")
 JOINTS = ("shoulder", "elbow")
 ADAMW = {"optimizer": "adamw", "batch": 32, "learning_rate": 1e-2}
 QUICK = Rollout(epochs=6, momentum_steps=20, **ADAMW)

@@ -6,7 +6,7 @@ import time
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from machine import in_time
+from time_bounds import in_time
 
 from spelgen.arm.arm import make_arm
 from spelgen.errors import ArmError, SpelgenError

@@ -9,7 +9,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from arms import STRAIGHT, chain, reference_arms
-from seen_arm import NOTHING, Seen
+from pinocchio_geometry import NOTHING, Seen
 
 from spelgen.arm.arm import Arm, make_arm
 from spelgen.certificate.axes import is_plain

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 import torch
-from machine import in_time
+from time_bounds import in_time
 
 from spelgen.comparison.metrics import RunResult
 from spelgen.emission.loading import load_module
