@@ -1,6 +1,6 @@
 """Random files for tests: the same FEW in each run of `make test`, new ones until the time is up in `make fuzz`.
 
-The use of each example must end within SECONDS (of the reference in time_bounds.py) with a result or with a SpelgenError.
+Each example must end within SECONDS (of the reference in time_bounds.py) with a result or with a SpelgenError.
 `make fuzz` also bounds the memory that all examples took.
 """
 
