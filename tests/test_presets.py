@@ -1,4 +1,4 @@
-"""Every preset keeps what an emitted module promises, and is the model that the papers write down."""
+"""Each preset is the model that its paper writes down; see test_contracts.py for properties that all presets share."""
 
 import math
 from dataclasses import replace
@@ -8,24 +8,20 @@ from typing import get_args
 import pytest
 import torch
 from emitted import (
-    GANTRY,
     NETWORKS,
     bounded,
     built,
     frictionless,
-    import_source,
     network_inputs,
     outputs_alone,
     random_model,
 )
 from lie_group import geodesic_distance, group_rates
 from published_phnode import ByJvp, Published
-from test_emitted_module import bias
 
 from spelgen.design import Preset, load_design
-from spelgen.dynamics.protocol import has_friction_state
 from spelgen.fitting.rollout import position_difference
-from spelgen.pipeline.generate import generate, make_spec
+from spelgen.pipeline.generate import make_spec
 from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.spec import Options
 from tests.lie_group import to_group
@@ -33,7 +29,6 @@ from tests.lie_group import to_group
 ROOT = Path(__file__).parents[1]
 PRESETS = [("phnode", "mlp"), ("phnode", "kan"), ("spel", "mlp"), ("spel-kan", "kan"), ("hybrid", "kan")]
 ROBOTS = ("two_link", "rpr", "six_dof")
-each = pytest.mark.parametrize(("preset", "net"), PRESETS)
 each_robot = pytest.mark.parametrize("robot", ROBOTS)
 
 
@@ -56,86 +51,6 @@ def test_presets_are_the_files():
         assert make_spec(load_arm(ROOT / "robots" / "rpr.urdf"), Options(preset=name)).options.net == (
             design.net if design.net in ("mlp", "kan") else None
         )
-
-
-@each_robot
-@each
-def test_written_out_derivatives_equal_autograd(robot, preset, net, tmp_path):
-    model = frictionless(random_model(robot, tmp_path, seed=4, preset=preset, net=net))
-    n = model.n
-    q, qd, _, _ = states(n)
-    q.requires_grad_()
-    (gravity,) = torch.autograd.grad(model.potential_energy(q).sum(), q)
-    near(model.gravity(q), gravity)
-    p = model.momentum(q, qd).detach()
-    (slope,) = torch.autograd.grad(model.hamiltonian(q, p).sum(), q)
-    rate = model(torch.zeros(()), torch.cat([q, p], dim=-1))
-    near(rate[..., n:], -slope)
-    near(rate[..., :n], qd)
-    near(model.nonlinear_effects(q, qd), bias(model, q, qd))
-
-
-@each_robot
-@each
-def test_forward_and_inverse_dynamics_undo_each_other(robot, preset, net, tmp_path):
-    model = random_model(robot, tmp_path, seed=3, preset=preset, net=net)
-    if preset == "phnode":  # random gains may be next to zero
-        torch.nn.init.zeros_(model.input_network.weights[-1])
-    q, qd, _, tau = states(model.n)
-    near(model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau)), tau, 1e-8)
-
-
-@each_robot
-@each
-def test_mass_matrix_and_dissipation_are_positive(robot, preset, net, tmp_path):
-    # larger weights make U of phnode, 3 n rows of an inverse, too ill-conditioned for 16 digits
-    deviation = None if preset == "phnode" else 3.0
-    for seed in range(5):
-        model = random_model(robot, tmp_path, seed=seed, deviation=deviation, preset=preset, net=net)
-        q, qd, _, _ = states(model.n, 500)
-        with torch.no_grad():
-            assert torch.linalg.eigvalsh(model.mass_matrix(q))[:, 0].min() > 0
-            damping = model.dissipation(q, qd)
-            assert torch.linalg.eigvalsh(damping)[:, 0].min() > -1e-12 * damping.abs().max()
-            torque = model.friction_torque(q, qd)
-            near(torque, (damping @ qd.unsqueeze(-1)).squeeze(-1))
-
-
-@pytest.mark.parametrize("batch", [(), (1,), (0,), (2, 3), (2, 0)])
-@each
-def test_any_batch_shape(preset, net, batch, tmp_path):
-    model = random_model("rpr", tmp_path, seed=0, preset=preset, net=net)
-    q, qd, tau = (torch.rand(*batch, 3, dtype=torch.float64) for _ in range(3))
-    for value in (model.gravity(q), model.forward_dynamics(q, qd, tau), model.inverse_dynamics(q, qd, tau)):
-        assert value.shape == (*batch, 3)
-    for value in (model.mass_matrix(q), model.dissipation(q, qd), model.input_matrix(q)):
-        assert value.shape == (*batch, 3, 3)
-    assert model.potential_energy(q).shape == batch
-    assert model(torch.zeros(()), torch.cat([q, qd, tau], dim=-1)).shape == (*batch, 9)
-
-
-@each
-def test_backpropagation_reaches_every_weight(preset, net, tmp_path):
-    model = random_model("rpr", tmp_path, seed=0, deviation=0.3, preset=preset, net=net)
-    q, qd, _, tau = states(3)
-    past = [0.3 * model.memory(qd)] if has_friction_state(model) else []
-    model.forward_dynamics(q, qd, tau, *past).square().sum().backward()
-    for name, parameter in model.named_parameters():
-        # V's own level moves nothing
-        assert "potential.biases" in name or parameter.grad.abs().max() > 0, name
-
-
-@pytest.mark.parametrize("preset", get_args(Preset))
-def test_arm_whose_mass_matrix_is_constant(preset, tmp_path):
-    """A gantry: M is a diagonal of trained numbers, and gravity does no work."""
-    urdf = tmp_path / "gantry.urdf"
-    urdf.write_text(GANTRY, encoding="utf-8")
-    model = import_source(generate(urdf, preset=preset), tmp_path / "gantry.py").Model()
-    q, qd, _, tau = states(2)
-    near(model.mass_matrix(q), model.mass_matrix(q[:1]).expand(len(q), 2, 2))
-    near(model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau)), tau)
-    assert (model.gravity(q) == 0).all()
-    assert model(torch.zeros(()), torch.cat([q, qd, tau], dim=-1)).shape == (len(q), 6)
 
 
 @pytest.mark.parametrize("robot", ["rpr", "six_dof", "panda"])

@@ -9,15 +9,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from emitted import ROBOTS, SIX, built, import_source, random_model
+from emitted import ROBOTS, SIX, built, import_source
 from exported_runs import arm_of
 from torch import Tensor
-from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
+from torch.func import jacrev, jvp, vjp
 
 from spelgen.design import PRESET_NAMES, load_design
 from spelgen.dynamics.body_regressor import pseudo_inertia
 from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
-from spelgen.dynamics.protocol import has_friction_state, sliding_memory
 from spelgen.emission.bundle import bundle, load_runtime, names_in
 from spelgen.emission.tailored import kinds
 from spelgen.emission.unit_joints import hidden_units
@@ -291,57 +290,6 @@ def test_tailored_part_is_short_and_shows_the_entries():
             assert end < 250, f"{robot}, {preset}, {net}: {end} lines"
     assert "return symmetric([f3], [f1, c2], [f2, 0, c1])" in built("rpr")[0]
     assert "m22 = f9 + 2 * f12 - f5" in built("six_dof")[0]
-
-
-@pytest.mark.parametrize(
-    ("robot", "preset", "net"),
-    [*(("rpr", *each) for each in PRESETS), ("six_dof", "hybrid", "mlp"), ("six_dof", "closed-form", None)],
-)
-def test_transforms_work_for_every_preset(robot, preset, net, tmp_path):
-    """Without a branch on data: torch.func."""
-    model = random_model(robot, tmp_path, seed=1, preset=preset, net=net)
-    n = model.n
-    q, qd, tau = draw(5, n), draw(5, n, seed=1), draw(5, n, seed=2)
-    qdd = model.forward_dynamics(q, qd, tau)
-    near(vmap(model.forward_dynamics)(q, qd, tau), qdd, 1e-9)
-    one = q[0], qd[0], tau[0]
-    forward, reverse = jacfwd(model.forward_dynamics)(*one), jacrev(model.forward_dynamics)(*one)
-    near(forward, reverse, 1e-8)
-    curvature = hessian(model.hamiltonian, argnums=1)(q[0], model.momentum(q[0], qd[0]))
-    near(curvature, torch.linalg.inv(model.mass_matrix(q[0])), 1e-8)
-    if not has_friction_state(model):
-        return
-    z = model.memory(qd)
-    near(vmap(model.forward_dynamics)(q, qd, tau, z), model.forward_dynamics(q, qd, tau, z), 1e-9)
-
-
-@pytest.mark.parametrize(("preset", "net"), PRESETS)
-def test_every_preset_is_one_graph(preset, net, tmp_path):
-    """Strict export with a batch of any size, and all that torch.compile traces."""
-    model = random_model("rpr", tmp_path, seed=1, preset=preset, net=net).requires_grad_(False)
-    q, qd, tau = draw(5, 3), draw(5, 3, seed=1), draw(5, 3, seed=2)
-    state = torch.cat([q, qd, sliding_memory(model, qd).flatten(-2), tau], dim=-1)
-    batch = {"t": None, "state": {0: torch.export.Dim("batch")}}
-    program = torch.export.export(model, (torch.zeros(()), state), dynamic_shapes=batch, strict=True)
-    more = torch.cat([state, state])
-    near(program.module()(torch.zeros(()), more), model(torch.zeros(()), more), 1e-9)
-    compiled = torch.compile(model.forward_dynamics, fullgraph=True, backend="eager")
-    near(compiled(q, qd, tau), model.forward_dynamics(q, qd, tau), 1e-9)
-
-
-@pytest.mark.parametrize(("preset", "net"), PRESETS)
-def test_single_precision_and_batches_of_any_shape(preset, net, tmp_path):
-    module = import_source(built("rpr", preset=preset, net=net)[0], tmp_path / "rpr_single.py")
-    double, single = module.Model(seed=1), module.Model(seed=1, dtype=torch.float32)
-    assert {x.dtype for x in single.state_dict().values() if x.is_floating_point()} == {torch.float32}
-    for shape in ((), (3,), (2, 3)):
-        q, qd, tau = (draw(*shape, 3, seed=seed) for seed in range(3))
-        exact = double.inverse_dynamics(q, qd, tau)
-        for model in (single, module.Model(seed=1).float()):
-            found = model.inverse_dynamics(q.float(), qd.float(), tau.float())
-            assert found.dtype == torch.float32
-            near(found.double(), exact, 1e-4)
-        assert single.hamiltonian(q.float(), qd.float()).shape == shape
 
 
 def test_values_are_in_units(tmp_path):
