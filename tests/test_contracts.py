@@ -22,7 +22,7 @@ VARIANTS = {  # preset and networks
 }
 ALL_ROBOTS = ("hybrid", "minimal", "closed-form")  # variants whose derivation is that of each robot
 THREE = ("two_link", "rpr", "six_dof")
-URDFS = {"mimic": FOLLOWED, "gantry": GANTRY}  # arms beside those of the repository
+URDFS = {"mimic": FOLLOWED, "gantry": GANTRY}  # arms in addition to the robots of the repository
 # Standard deviations of random parameters; None: as `randomise` scales them. With 1.0 the bound of M is active.
 DEVIATIONS = {"minimal": (None, 1.0), "closed-form": (0.5,)}
 LARGE = {
