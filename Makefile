@@ -33,7 +33,8 @@ test: lint ## format and lint, then all tests on all cores, among them types and
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 
 fuzz: $(TOOLS) ## random URDFs, logs, settings, meshes and run folders, new ones for MINUTES=20
-	FUZZ_MINUTES=$(MINUTES) $(BIN)/python -m pytest -q -s tests/test_fuzz_urdf.py tests/test_fuzz_files.py
+	FUZZ_MINUTES=$(MINUTES) $(BIN)/python -m pytest -q -s tests/test_fuzz_urdf.py tests/test_fuzz_files.py \
+	    tests/test_emitted_module.py::test_mass_matrix_is_positive_definite_for_any_weights
 
 check: lint ## format, lint, types, import direction
 	$(BIN)/python -m pytest -q tests/test_types.py tests/test_imports.py

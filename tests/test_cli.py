@@ -4,10 +4,8 @@ import contextlib
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -15,6 +13,7 @@ from typer.testing import CliRunner
 
 from spelgen import __version__
 from spelgen.cli.main import app
+from spelgen.fitting.progress import TrainingProgress
 
 ROOT = Path(__file__).parents[1]
 COMMANDS = ["inspect", "build", "simulate", "excite", "logs", "train", "evaluate", "report", "check"]
@@ -386,23 +385,21 @@ def test_a_second_run_needs_force_or_resume(trained, monkeypatch):
     assert "after 3 epochs" in more.stdout
 
 
-def test_interrupted_training_leaves_a_run(spelgen, trained, tmp_path):
+def test_interrupted_training_leaves_a_run(spelgen, trained, tmp_path, monkeypatch):
+    """Ctrl-C after the first epoch; test_training.py sends the signals to a process."""
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
     folder, _ = trained
-    run = tmp_path / "run"
-    command = [sys.executable, "-m", "spelgen", "train", "arm_spel.py", "--data", "logs", "-o", str(run)]
-    command += ["--set", "optimizer=adamw", "--set", "momentum_steps=0"]  # L-BFGS would have ended by itself
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(
-        command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # whoever runs the tests may ignore it
-    ) as started:  # fmt: skip
-        while not (run / "metrics.jsonl").exists() and started.poll() is None:
-            time.sleep(0.05)
-        started.send_signal(signal.SIGINT)
-        out, err = started.communicate(timeout=60)
-    assert started.returncode == 130, err
-    assert b"interrupted after" in out
-    assert spelgen("report", run).exit_code == 0
+    monkeypatch.chdir(folder)
+    command = ["train", "arm_spel.py", "--data", "logs", "-o", tmp_path / "run"]
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingProgress, "epoch", interrupt)
+        done = spelgen(*command, "--set", "optimizer=adamw", "--set", "momentum_steps=0")
+    assert done.exit_code == 130, done.stderr
+    assert "interrupted after" in done.stdout
+    assert spelgen("report", tmp_path / "run").exit_code == 0
 
 
 # ---- words that nearly fit

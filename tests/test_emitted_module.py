@@ -21,12 +21,14 @@ from emitted import (
     random_model,
     randomise,
 )
+from fuzzing import MINUTES
 
 from spelgen.dynamics.equations import runge_kutta
 from spelgen.settings.settings import load_settings
 from tests.lie_group import from_group, to_group
 
 STATES = 25
+COUNT = 10_000 if MINUTES else 500
 
 
 def states(n: int, count: int, seed: int = 0) -> list[torch.Tensor]:
@@ -67,14 +69,14 @@ def test_true_values_give_pinocchio(robot, tmp_path):
 
 @pytest.mark.parametrize("robot", SIX)
 def test_mass_matrix_is_positive_definite_for_any_weights(robot, tmp_path):
-    """10,000 random q for each of 100 draws of all weights, constants included, with standard deviation 30."""
+    """For 100 draws of all weights, constants included, with standard deviation 30; COUNT random q each."""
     model = random_model(robot, tmp_path, seed=0, design=NETWORKS)
     generator = torch.Generator().manual_seed(0)
     needed = 0
     with torch.no_grad():
         for draw in range(100):
             randomise(model, seed=draw, deviation=30.0)
-            q = 8 * torch.rand(10_000, model.n, dtype=torch.float64, generator=generator) - 4
+            q = 8 * torch.rand(COUNT, model.n, dtype=torch.float64, generator=generator) - 4
             pose = model.at(q)
             assert not torch.linalg.cholesky_ex(pose.mass).info.any()
             needed += (pose.intermediates[1] < 1).any().item()
