@@ -1,4 +1,4 @@
-"""Small arms made by hand, as exact as those read from files."""
+"""Small serial arms with exact rational geometry, and the reference arms with their known structure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A headless Chromium, spoken to over pipes in its DevTools protocol: no driver, no port."""
+"""A headless Chromium, controlled over pipes by its DevTools protocol: no driver, no port."""
 
 from __future__ import annotations
 

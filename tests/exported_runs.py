@@ -1,4 +1,4 @@
-"""Run folders to export: models whose weights were moved at random, so that no part of them is idle."""
+"""Models and run folders for export tests; their parameters are random, so that no term is zero."""
 
 from pathlib import Path
 

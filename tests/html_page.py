@@ -1,4 +1,4 @@
-"""An HTML page as a parser sees it."""
+"""An HTML page as parsed: elements, text, links."""
 
 from html.parser import HTMLParser
 

@@ -1,4 +1,4 @@
-"""The geometry of an arm as Pinocchio shows it at a few random configurations."""
+"""The geometry of an arm, computed by Pinocchio at random configurations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A hand-written two-joint planar arm with the interface of an emitted module, small enough to check by eye."""
+"""A hand-written model of a planar two-joint arm with the interface of an emitted module."""
 
 from typing import NamedTuple
 

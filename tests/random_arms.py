@@ -1,4 +1,4 @@
-"""Random arms as URDF text: chains of any joint types, with special and with general geometry."""
+"""Random arms as URDF text: chains of all joint types, with special and with general geometry."""
 
 from __future__ import annotations
 

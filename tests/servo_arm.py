@@ -1,4 +1,4 @@
-"""An arm of two links in a vertical plane under position servos, simulated by itself in small steps."""
+"""A two-link arm in a vertical plane under position servos, with a simulator of its own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The arm taken from a robot: which joints, which bodies, how exact, and against Pinocchio's reading."""
+"""The arm made from a robot has the right joints, bodies and exact numbers, compared with Pinocchio's reading."""
 
 import json
 import re

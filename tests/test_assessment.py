@@ -1,4 +1,4 @@
-"""The verdict of a report: computed from the figures, each word of it."""
+"""Each word of the assessment in a report follows from the figures."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: exit codes, one clear line per error, nothing half-written."""
+"""Commands return the documented exit codes, print one clear line per error and write no partial files."""
 
 import contextlib
 import json

@@ -1,4 +1,4 @@
-"""The preset closed-form: rigid bodies against Pinocchio, derivatives against autograd, fits against known arms."""
+"""The preset closed-form: rigid bodies against Pinocchio, friction and torque offsets against their formulas."""
 
 import numpy as np
 import pinocchio as pin

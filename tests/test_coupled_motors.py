@@ -1,4 +1,4 @@
-"""Drives that move several joints: friction, its memory and rotors belong to the motors' speeds; logs show it."""
+"""Drives that move several joints: friction and rotor inertia act at motor speeds, and logs reveal couplings."""
 
 import json
 import shutil

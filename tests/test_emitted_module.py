@@ -1,4 +1,4 @@
-"""The emitted module: exact against Pinocchio with true values, and sound for any weights."""
+"""An emitted module equals Pinocchio for exact parameters and has the derived structure for all parameters."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""How errors and diagnostics read."""
+"""The text of errors and diagnostics: file, line, element, got, expected, remedy."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Evaluation: baselines against exact solutions, errors that mean what they say, results that are valid JSON."""
+"""Errors of an evaluation equal those of exact solutions; baselines are exact; results are valid JSON."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""`spelgen excite`: motions within limits, at rest at both ends, that show what a motion at random does not."""
+"""`spelgen excite`: motions stay within limits, start and end at rest, and are more informative than random ones."""
 
 import csv
 

@@ -1,4 +1,4 @@
-"""What was learned, as a URDF and settings again: exactly for closed-form models, nearest for others."""
+"""Export to URDF: exact for closed-form models, the nearest rigid bodies for others."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""MuJoCo loads what was learned and has the same M, bias and forward dynamics."""
+"""MuJoCo loads the exported MJCF and computes the same M, bias forces and forward dynamics."""
 
 import re
 import shutil

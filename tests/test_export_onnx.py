@@ -1,4 +1,4 @@
-"""ONNX Runtime gives what the model gives, at any batch size."""
+"""ONNX Runtime computes the same numbers as the model, for any batch size."""
 
 import logging
 

@@ -1,4 +1,4 @@
-"""What hybrid has beside rigid bodies: exported where it is not zero, left out where it is."""
+"""Residual terms of hybrid models are exported where they are not zero and omitted where they are."""
 
 import shutil
 

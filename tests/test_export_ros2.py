@@ -1,4 +1,4 @@
-"""The ROS 2 package: it compiles against stubs of the interface that it implements, and gives the model's torques."""
+"""The exported ROS 2 package compiles against stubs of its interface and computes the torques of the model."""
 
 import shutil
 import subprocess

@@ -1,4 +1,4 @@
-"""Programs of torch.export give what the model gives, for any batch, and bring its weights."""
+"""Programs of torch.export compute the same numbers as the model, for any batch, and contain its parameters."""
 
 import io
 

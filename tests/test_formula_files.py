@@ -1,4 +1,4 @@
-"""What `inspect --formulas` writes: what a person reads, the files, and names that would be code."""
+"""Files of `inspect --formulas`: readable text, complete, and free of code from names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Closed forms: each equals Pinocchio, as text, as LaTeX and in the SymPy file."""
+"""Closed forms equal Pinocchio as text, as LaTeX and as a SymPy file."""
 
 from __future__ import annotations
 

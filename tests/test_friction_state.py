@@ -1,4 +1,4 @@
-"""Friction that remembers: bristles are exact in displacement, passive, and blind to an encoder's jitter."""
+"""Friction states are exact in displacement, passive, and unaffected by encoder jitter."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Whatever logs, settings and run folders hold: an answer, or errors in one line each; never anything else."""
+"""Any log, settings file, mesh or run folder gives a result or errors of one line each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever a file holds: a derived structure, or errors that name the file in one line each; never anything else."""
+"""Any URDF file gives a derived structure or errors of one line each that name the file."""
 
 from __future__ import annotations
 

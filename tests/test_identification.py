@@ -1,4 +1,4 @@
-"""Identification: the regressor against Pinocchio, least squares against known arms and published figures."""
+"""The regressor equals Pinocchio's; least squares recovers known arms and published figures."""
 
 import json
 

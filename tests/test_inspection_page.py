@@ -1,4 +1,4 @@
-"""The structure as an HTML page: whole, self-contained, and safe whatever the URDF's names are."""
+"""The structure page is complete, self-contained HTML for all names that a URDF can have."""
 
 import re
 

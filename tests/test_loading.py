@@ -1,4 +1,4 @@
-"""A module from its file or its text: what it carries, and what is refused."""
+"""A module is loaded from its file or its text; text that is no emitted module is refused."""
 
 from pathlib import Path
 

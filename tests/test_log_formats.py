@@ -1,4 +1,4 @@
-"""Every kind of log file and every way to name and measure: the same trajectory, or one clear sentence."""
+"""Each log format and each naming of columns gives the same trajectories, or one clear error."""
 
 import csv
 import os

@@ -1,4 +1,4 @@
-"""Logs: read back exactly, refused clearly, filtered without delay, split and cut without leaking."""
+"""Logs are read exactly, filtered without delay, split without leakage, and refused with one clear error."""
 
 from dataclasses import replace
 from itertools import pairwise

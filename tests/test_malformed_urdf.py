@@ -1,4 +1,4 @@
-"""28 real malformed or awkward files: each is read right, or refused by a message that names its defect."""
+"""28 malformed or unusual URDF files are read correctly or refused by a message that names the defect."""
 
 import csv
 import re

@@ -1,4 +1,4 @@
-"""Meshes from anywhere: drawn, or the arm is drawn without them; no pipe is opened, no file unpacks to gigabytes."""
+"""Meshes are drawn or replaced by tubes within bounds of time and memory; pipes are never opened."""
 
 import base64
 import json

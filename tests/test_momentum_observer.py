@@ -1,4 +1,4 @@
-"""The momentum observer: what it finds of forces that a model lacks, and what holding them is worth."""
+"""The momentum observer estimates external torques; compensating them improves control."""
 
 from pathlib import Path
 

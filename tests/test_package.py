@@ -1,4 +1,4 @@
-"""The package as users install it: a wheel and an sdist, away from the repository, and what it depends on."""
+"""Wheel and sdist contain the whole package and work outside the repository; dependencies are complete."""
 
 import os
 import pkgutil

@@ -1,4 +1,4 @@
-"""Pages as people see them, in a headless browser: quiet, alone, within their width, and led by the keyboard."""
+"""Pages in a headless browser: no console messages, no requests, no overflow, usable by keyboard."""
 
 from __future__ import annotations
 

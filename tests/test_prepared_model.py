@@ -1,4 +1,4 @@
-"""The deployment form of a model gives what the model gives, and its derivatives and steps are right."""
+"""A prepared model equals its model; its derivatives and steps are correct."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Random arms: what spelgen derives from a URDF against Pinocchio's own reading of the same text."""
+"""Structures derived from random URDFs agree with Pinocchio's reading of the same text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plain words: every statement and every reason against numbers by Pinocchio, and the words themselves."""
+"""Statements and reasons of the inspection agree with numbers by Pinocchio."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs and runs at addresses that fsspec knows are as those on the disk."""
+"""Logs and run folders at fsspec addresses behave like those on the local disk."""
 
 import json
 import zipfile

@@ -1,4 +1,4 @@
-"""The report: one complete HTML page from a run folder, whatever the folder holds."""
+"""The report is one complete HTML page for any content of a run folder."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""What a step does not need does not refuse it; what it needs does."""
+"""A command refuses missing or wrong data only if it needs them."""
 
 import pytest
 

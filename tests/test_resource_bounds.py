@@ -1,4 +1,4 @@
-"""Files made to hurt: each is refused, or built, by the whole of `inspect` and `build` in 10 s and 1 GB.
+"""Hostile URDF files are refused or built by `inspect` and `build` within 10 s and 1 GB each.
 
 Seconds are those of the reference in time_bounds.py.
 """

@@ -1,4 +1,4 @@
-"""All that has rigid-body dynamics: against Pinocchio's own reading of the URDF, mechanics by hand, one another."""
+"""Rigid-body dynamics against Pinocchio's own reading of the URDF and against mechanics derived by hand."""
 
 from fractions import Fraction
 

@@ -1,4 +1,4 @@
-"""The robots that come with spelgen: read without a remark, physically possible, true to their sources."""
+"""The robots of the repository are read without warnings, physically consistent and true to their sources."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A run folder from elsewhere runs nothing, belongs to one training at a time, and is whole whenever that is killed."""
+"""Run folders: foreign modules are not executed, one training at a time, and no kill corrupts them."""
 
 import functools
 import json

@@ -1,4 +1,4 @@
-"""Several runs on one page, an identification as a page, and an evaluation as a table for programs."""
+"""The page of several runs, the page of an identification, and evaluations as machine-readable tables."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""The runtime where it stands: derivatives against autograd, shapes and types, and what a module takes of it."""
+"""Parts of the runtime: derivatives against autograd, units, and the selection of classes that a module contains."""
 
 import ast
 import json

@@ -1,4 +1,4 @@
-"""The arm of a page: it stands where other programs say, and what is drawn of it is whole."""
+"""The 3D scene of a page: link poses equal those of the kinematics, and shapes are closed."""
 
 import json
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""What decides whether a part, a law or a figure is accepted: each test fails where that judgement is left out."""
+"""Acceptance of residual terms, friction effects and figures: each test fails without its criterion."""
 
 import re
 from dataclasses import replace

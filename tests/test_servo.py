@@ -1,4 +1,4 @@
-"""Arms under position servos: from settings to a module, from logs to ratios to kp, and to replayed commands."""
+"""Arms under position servos: parameters relative to kp are recovered, and replayed commands track the logs."""
 
 import json
 import re

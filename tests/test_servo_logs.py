@@ -1,4 +1,4 @@
-"""What `spelgen logs` tells of logs of commanded positions."""
+"""`spelgen logs` on logs of commanded positions."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""The sidecar file: what is read, and what a wrong one is told."""
+"""The settings file: valid values are read, wrong ones are refused with line, expectation and remedy."""
 
 import re
 import subprocess

@@ -1,4 +1,4 @@
-"""The docs as a site: every page has its place, every name that is written out exists, and the site builds."""
+"""The documentation site lists each page, resolves each API name and builds."""
 
 import importlib
 import importlib.util

@@ -1,4 +1,4 @@
-"""A mapping read off the column names of a log as loggers write it: the log is read by it as it was."""
+"""A mapping suggested from column names reads the log with its original values."""
 
 import csv
 

@@ -1,4 +1,4 @@
-"""Closed-form models fitted to torques: known arms found again, in blocks as at once, adapted to a load, real ones."""
+"""Torque fits of closed-form models recover known arms, in blocks or at once, and adapt to loads."""
 
 import json
 from dataclasses import replace

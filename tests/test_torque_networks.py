@@ -1,4 +1,4 @@
-"""Networks fitted to torques: the torques of an arm that they can be, met to many digits."""
+"""Networks fitted to torques reproduce an arm that they can represent to many digits."""
 
 import torch
 from emitted import NETWORKS, ROBOTS, built, import_source

@@ -1,4 +1,4 @@
-"""Logs of a controlled arm: it follows its sines, encoders count in steps, what is logged is near what happened."""
+"""Logs of a controlled arm: tracking error, encoder steps and logged torques are as specified."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Training: exact solutions, exact resumption, recovery from blow-ups, interruptions, refusals."""
+"""Training reaches exact solutions, resumes exactly, recovers from divergence and handles interruptions."""
 
 import io
 import json

@@ -1,4 +1,4 @@
-"""Logs and options as strangers send them: an answer, or one error that is ours; no warning of NumPy, no waiting."""
+"""Untrusted logs and options give a result or one spelgen error, without NumPy warnings and in bounded time."""
 
 import io
 import os

@@ -1,4 +1,4 @@
-"""The numerical proof: agrees with what is derived, and reports every fact that is not so."""
+"""The numerical verification confirms the derived structure and reports each false statement."""
 
 from dataclasses import replace
 from fractions import Fraction

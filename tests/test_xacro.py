@@ -1,4 +1,4 @@
-"""Files called *.xacro are run by the package xacro and read like what they expand to; no others are."""
+"""*.xacro files are expanded by the package xacro and read like the expanded text; other files are never run."""
 
 import importlib.util
 import subprocess
