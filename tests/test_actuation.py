@@ -1,6 +1,4 @@
-"""G, the input matrix: what the URDF's transmissions and the sidecar's gears and couplings make of it, in the
-report, in the simulation, in the emitted module and in training.
-"""
+"""The input matrix G from transmissions, gears and couplings, in report, simulation, module and training."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What the docs show is what happens: on every page, console and Python blocks run in their order.
+"""Console and Python blocks of each documentation page run in order and print what the page shows.
 
 In a ```console block a line `$ COMMAND` is followed by what it prints, and an ```output block follows the Python block
 that prints it; `pytest --update` writes both anew. ```text blocks and indented ones are not run: they show long runs,

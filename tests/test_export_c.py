@@ -1,4 +1,4 @@
-"""Exported C and CasADi functions equal the torch model; the C passes sanitizers and allocates nothing."""
+"""Exported C and CasADi functions equal the torch model; the C passes address and undefined-behaviour sanitizers."""
 
 import re
 import shutil

@@ -1,4 +1,4 @@
-"""The momentum observer estimates external torques; compensating them improves control."""
+"""The momentum observer estimates constant and changing external torques from past samples only."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Wheel and sdist contain the whole package and work outside the repository; dependencies are complete."""
+"""Wheel and sdist contain all files of the package, install elsewhere and build the same modules."""
 
 import os
 import pkgutil

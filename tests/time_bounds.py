@@ -1,7 +1,7 @@
-"""Bounds of processor time, on machines of any speed.
+"""Bounds of processor time that are valid on machines of any speed.
 
-A bound is given in seconds of a machine on which ``_loop`` takes REFERENCE of them, as on a laptop of 2024. A machine
-that is slower, or busy, has as much more as a loop of today takes there.
+A bound is stated in seconds of a reference machine (a laptop of 2024), on which ``_loop`` takes REFERENCE seconds. On a
+slower or busy machine the bound grows in proportion to the current duration of ``_loop``.
 """
 
 from __future__ import annotations
