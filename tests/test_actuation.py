@@ -104,13 +104,13 @@ def test_the_kinds_of_entries(tmp_path, transmissions, sidecar, expected):
     assert inputs(urdf(tmp_path, *transmissions, sidecar=sidecar)) == expected
 
 
-def test_what_is_told(tmp_path):
+def test_actuation_is_reported(tmp_path):
     told = CliRunner().invoke(app, ["inspect", str(urdf(tmp_path, *WRIST[1:], sidecar=MOTOR))]).output
     (line,) = [x for x in told.splitlines() if x.split()[:1] == ["G"]]
     assert line.split("G", 1)[1].strip() == "motor torques, gain trained at joint 1, coupled at joints 2,3"
 
 
-def test_a_joint_without_a_transmission_is_told(tmp_path):
+def test_a_joint_without_a_transmission_is_reported(tmp_path):
     (found,) = [x for x in inspect(urdf(tmp_path, *WRIST[1:])).diagnostics if x.code == "no-transmission"]
     assert found.where == "joint 'j1'"
 

@@ -358,7 +358,7 @@ def trained(robots, tmp_path_factory):
         return folder, {name: CliRunner().invoke(app, words) for name, words in steps.items()}
 
 
-def test_the_whole_way_succeeds(trained):
+def test_all_commands_succeed(trained):
     folder, results = trained
     for name, result in results.items():
         assert result.exit_code == 0, (name, result.stderr)
@@ -368,7 +368,7 @@ def test_the_whole_way_succeeds(trained):
     )
 
 
-def test_evaluate_tells_rivals(trained):
+def test_evaluate_shows_baselines(trained):
     _, results = trained
     assert "velocity stays constant" in results["evaluate"].stdout
 
@@ -385,7 +385,7 @@ def test_a_second_run_needs_force_or_resume(trained, monkeypatch):
     assert "after 3 epochs" in more.stdout
 
 
-def test_interrupted_training_leaves_a_run(spelgen, trained, tmp_path, monkeypatch):
+def test_interrupted_training_writes_a_usable_run(spelgen, trained, tmp_path, monkeypatch):
     """Ctrl-C after the first epoch; test_training.py sends the signals to a process."""
 
     def interrupt(*_):
@@ -432,7 +432,7 @@ def test_help_shows_whole_sentences(spelgen):
         (["logs", "x", "--robot", "y", "--format", "xml"], "'xml' is none of text, json."),
     ],
 )
-def test_what_may_have_been_meant_is_told(spelgen, words, told):
+def test_the_likely_name_is_suggested(spelgen, words, told):
     result = spelgen(*words)
     assert result.exit_code == 2
     assert result.stderr.rstrip().endswith(told)

@@ -75,7 +75,7 @@ def near(a, b, tolerance=1e-9):
 
 
 @pytest.mark.parametrize("robot", [x for x in ROBOTS if x != "rpr"])  # whose bodies are no possible ones
-def test_untrained_it_is_the_urdfs_rigid_arm(emitted, robots, robot):
+def test_untrained_the_model_is_the_rigid_arm_of_the_urdf(emitted, robots, robot):
     module, arm = emitted[robot]
     model = rigid(module)
     names = [coordinate.name for coordinate in arm.coordinates]
@@ -93,7 +93,7 @@ def test_untrained_it_is_the_urdfs_rigid_arm(emitted, robots, robot):
     near(model.potential_energy(q) - model.potential_energy(q[:1]), height - height[0], 1e-8)
 
 
-def test_joints_that_follow_and_joints_that_slide(emitted):
+def test_mimic_and_prismatic_joints(emitted):
     module, arm = emitted["followed"]
     model = rigid(module)
     q, *_ = states(model.n)
@@ -104,7 +104,7 @@ def test_joints_that_follow_and_joints_that_slide(emitted):
     near(model.potential_energy(q), torch.from_numpy(potential), 1e-10)
 
 
-def test_impossible_bodies_start_from_possible_ones(emitted):
+def test_inconsistent_inertials_are_replaced_by_consistent_ones(emitted):
     module, _ = emitted["rpr"]
     ten = module.Model().inertial_parameters.detach().numpy()
     assert (np.linalg.eigvalsh(pseudo_inertia(ten))[:, 0] > 0).all()
@@ -133,7 +133,7 @@ def test_the_regressor_has_the_batch_shape_of_its_states(emitted, batch):
     assert regressor_of(model.chain, q, qd, qdd).shape == (*batch, 3, 30)
 
 
-def test_friction_at_a_standstill_has_its_slope(emitted):
+def test_friction_at_zero_velocity_has_its_derivative(emitted):
     model = drawn(emitted["ur10e"][0], seed=0)
     q = states(6)[0]
     constants = model.friction.prepare()
@@ -151,7 +151,7 @@ def test_friction_at_a_standstill_has_its_slope(emitted):
     near(torque, constants.viscous * away + saturating + dry)
 
 
-def test_it_has_no_network_to_choose(robots, tmp_path):
+def test_a_choice_of_networks_is_refused(robots, tmp_path):
     command = ["build", str(robots / "rpr.urdf"), "--preset", "closed-form", "--net", "kan"]
     done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "arm.py")])
     assert done.exit_code == 2

@@ -206,7 +206,7 @@ def told(report, code):
 
 
 @pytest.mark.parametrize(("logged_at", "ratio"), [("joints", 1.0), ("motors", -0.5)])
-def test_logs_show_a_coupling_and_what_is_said_then_mends_it(uncoupled, tmp_path, logged_at, ratio):
+def test_the_suggested_coupling_removes_the_finding(uncoupled, tmp_path, logged_at, ratio):
     log = recorded(uncoupled, logged_at, ratio)
     (message,) = told(check_logs([log], uncoupled), "coupled-motors")
     assert f"{ratio:g} times as fast" in message and f"those of the {logged_at}" in message
@@ -254,7 +254,7 @@ def test_a_fit_moves_late_torques_and_its_evaluation_too(uncoupled):
     assert misses < 1 - replace(fitted, preprocessing=Preprocessing()).score(log)
 
 
-def test_no_delay_is_searched_beside_a_coupling_that_no_file_names(uncoupled):
+def test_no_delay_is_estimated_with_an_unspecified_coupling(uncoupled):
     """Least squares without the coupling finds 5.7 ms of 10, and calls them sure: `logs` suggests neither."""
     log = recorded(uncoupled, "joints", 1.0, late=0.01)
     assert not told(check_logs([log], uncoupled), "torque-delay")

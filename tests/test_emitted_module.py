@@ -38,7 +38,7 @@ def states(n: int, count: int, seed: int = 0) -> list[torch.Tensor]:
 
 
 @pytest.mark.parametrize("robot", SIX)
-def test_true_values_give_pinocchio(robot, tmp_path):
+def test_exact_parameters_reproduce_pinocchio(robot, tmp_path):
     """With exact functions for networks: M, gravity, forward and inverse dynamics to 1e-10, on Pinocchio's
     own reading of the URDF.
     """
@@ -84,7 +84,7 @@ def test_mass_matrix_is_positive_definite_for_any_weights(robot, tmp_path):
 
 
 @pytest.mark.parametrize("robot", SIX)
-def test_bound_keeps_zeros_and_relations_and_is_nothing_at_nominal_values(robot, tmp_path):
+def test_the_bound_keeps_zeros_and_relations_and_is_inactive_at_nominal_values(robot, tmp_path):
     model = random_model(robot, tmp_path, seed=1, deviation=3.0, design=NETWORKS)
     structure = built(robot)[1]
     q = states(model.n, 200)[0]
@@ -109,7 +109,7 @@ def test_bound_keeps_zeros_and_relations_and_is_nothing_at_nominal_values(robot,
 
 
 @pytest.mark.parametrize("robot", SIX)
-def test_outputs_read_their_own_joints_only(robot, tmp_path):
+def test_network_outputs_depend_only_on_their_own_joints(robot, tmp_path):
     """Moving any other joint leaves an output's bits unchanged, and its own joints move it."""
     model = random_model(robot, tmp_path, seed=2)
     q = states(model.n, 50)[0]
@@ -124,7 +124,7 @@ def test_outputs_read_their_own_joints_only(robot, tmp_path):
 
 
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "ur10e"])
-def test_energy_stays_without_input_and_dissipation(robot, tmp_path):
+def test_energy_is_conserved_without_input_and_dissipation(robot, tmp_path):
     """Random weights, Runge-Kutta with 1.6 ms over 2 s: relative drift of H below 1e-8."""
     model = frictionless(random_model(robot, tmp_path, seed=0))
     for weight in model.residuals.parameters(recurse=False):
@@ -158,7 +158,7 @@ def test_group_view_round_trips_and_stays_orthogonal(tmp_path):
     assert torch.allclose(from_group(model.joint_types, parts), q, atol=1e-14)
 
 
-def test_held_input_moves_the_momentum(tmp_path):
+def test_the_input_is_added_to_the_rate_of_momentum(tmp_path):
     model = random_model("rpr", tmp_path, seed=0)
     q, p, tau, _ = states(3, 5)
     time = torch.zeros(())
@@ -198,7 +198,7 @@ def test_arm_with_a_constant_mass_matrix(tmp_path):
     assert torch.allclose(model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau)), tau)
 
 
-def test_module_needs_torch_alone(tmp_path):
+def test_a_module_imports_only_torch(tmp_path):
     """Each preset runs in a process that can import neither spelgen nor what spelgen needs."""
     presets = {"hybrid": None, "hybrid_kan": "kan", "spel": None, "phnode": None}
     for name, net in presets.items():

@@ -64,7 +64,7 @@ def test_velocities_and_accelerations_are_derivatives(found):
     )
 
 
-def test_the_motion_is_worth_the_search(loaded, found):
+def test_the_optimised_motion_is_more_informative(loaded, found):
     assert found.condition < found.first / 3
     assert (
         found.parameters == 36 + 6 * 4 - 2
@@ -170,7 +170,7 @@ def test_values_that_cannot_be_are_refused(loaded, changes, message):
     assert str(caught.value) == f"excite: {message}"
 
 
-def test_it_is_told_in_a_notebook(found):
+def test_a_notebook_shows_the_result(found):
     assert repr(found).startswith("<Excitation of 'ur10e': 10 s, condition number ")
     assert found._repr_html_().count("<tr>") == 7
 

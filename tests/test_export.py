@@ -76,7 +76,7 @@ def test_friction_goes_back_as_the_urdf_can_say_it(tmp_path):
         assert urdf.damping == pytest.approx(joint.viscous)
 
 
-def test_what_stands_beside_bodies_is_told(tmp_path):
+def test_residual_terms_are_reported(tmp_path):
     """The bodies of hybrid go back exactly; what else M, gravity and friction have is told as figures."""
     run, model = run_of("two_link", tmp_path, "hybrid", heavier)
     loaded, told = exported(run, tmp_path / "bodies.urdf")
@@ -109,7 +109,7 @@ def test_networks_go_back_as_the_nearest_bodies(tmp_path):
     assert "bodies are the rigid bodies nearest to the model; M differs by" in told
 
 
-def test_the_models_own_friction_law_lies_beside(tmp_path):
+def test_the_friction_model_is_exported(tmp_path):
     run, model = run_of("rpr", tmp_path, "closed-form", heavier)
     exported(run, tmp_path / "learned.urdf")
     told = yaml.safe_load((tmp_path / "learned.urdf.friction.yaml").read_text())
@@ -118,7 +118,7 @@ def test_the_models_own_friction_law_lies_beside(tmp_path):
     assert len((tmp_path / "learned.urdf.README.md").read_text().splitlines()) == 5
 
 
-def test_what_lies_there_stays_unless_forced(tmp_path):
+def test_existing_files_are_kept_unless_forced(tmp_path):
     run, _ = run_of("two_link", tmp_path, "closed-form")
     path = tmp_path / "learned.urdf"
     exported(run, path)

@@ -70,7 +70,7 @@ def test_a_joint_that_friction_holds_does_not_creep():
         ("spel", "the rigid bodies nearest to the model"),
     ],
 )
-def test_what_mujoco_has_no_words_for_is_told(preset, which, tmp_path):
+def test_terms_that_mujoco_lacks_are_reported(preset, which, tmp_path):
     run = run_folder("two_link", preset, tmp_path)
     told = CliRunner().invoke(app, ["export", str(run.path), "--to", "mjcf", "-o", str(tmp_path / "arm.xml")])
     assert told.exit_code == 0, told.output

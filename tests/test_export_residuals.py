@@ -55,7 +55,7 @@ def c_library(model, folder):
     return called_by_c(compile_library(write_c(model, functions, folder), "gcc"), functions)
 
 
-def test_what_is_zero_is_left_out():
+def test_zero_terms_are_omitted():
     """C of a fit without residuals is that of closed-form, byte for byte."""
     model = with_parts("rpr")
     ours = describe(model, arm_of("rpr"))
@@ -77,7 +77,7 @@ def test_what_is_zero_is_left_out():
     ],
     ids="-".join,
 )
-def test_each_part_goes_alone(parts, tmp_path):
+def test_each_term_is_exported_by_itself(parts, tmp_path):
     """Unused functions and tables would be refused by the compiler."""
     trained = Trained(with_parts("scara", *parts), arm_of("scara"))
     model, names = trained.described, list(ENTRIES)
@@ -89,7 +89,7 @@ def test_each_part_goes_alone(parts, tmp_path):
 
 @needs_gcc
 @pytest.mark.parametrize("name", ENTRIES)
-def test_an_entry_goes_alone(name, tmp_path):
+def test_a_single_entry_is_exported_by_itself(name, tmp_path):
     """What only other entries call raises no warning, which the export's own compilation refuses."""
     model = with_parts("rpr", *PARTS)
     described = describe(model, arm_of("rpr"))

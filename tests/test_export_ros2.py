@@ -86,7 +86,7 @@ def driver_lines(driver: Path) -> list[str]:
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ on this machine")
-def test_the_plugin_gives_what_the_model_gives(package, tmp_path):
+def test_the_plugin_equals_the_model(package, tmp_path):
     model, folder = package
     (tmp_path / "driver.cpp").write_text(DRIVER)
     binary = compiled_driver(folder, tmp_path, str(folder / "src" / "solver.cpp"), c_object(folder, tmp_path))

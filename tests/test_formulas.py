@@ -54,7 +54,7 @@ def written(robot, assume="kinematics"):
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_sympy_file_alone_equals_pinocchio(robots, robot, tmp_path):
+def test_the_sympy_file_by_itself_equals_pinocchio(robots, robot, tmp_path):
     """The file is executed where this package cannot be imported; Pinocchio reads the URDF by itself."""
     arm, _, found = written(robot)
     write_text(tmp_path / "closed_forms.py", sympy_source(found))

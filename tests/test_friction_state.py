@@ -53,7 +53,7 @@ def test_one_pass_over_positions_solves_the_differential_equation():
     assert np.abs(found / REACH).max() <= 1.0
 
 
-def test_a_step_of_any_length_is_exact_along_one_way():
+def test_a_step_of_any_length_is_exact_in_one_direction():
     reach = torch.tensor(REACH).double()
     z = torch.randn(2, 3).double().clamp(-1, 1) * reach
     way = torch.tensor([0.02, -0.003]).double()
@@ -80,7 +80,7 @@ def test_load_dependent_friction_is_smooth_at_right_angles():
     torch.testing.assert_close(far, -constants.load_dependence, rtol=1e-3, atol=0)
 
 
-def test_bristles_store_and_dissipate_but_never_give_more_than_they_hold():
+def test_bristles_are_passive():
     """d/dt stored energy = power taken - what is lost, and what is lost is never negative."""
     laws = FrictionLaws(FRICTION, SPEED, REACH)
     with torch.no_grad():
@@ -101,7 +101,7 @@ def test_bristles_store_and_dissipate_but_never_give_more_than_they_hold():
         assert energy.min() > 0
 
 
-def test_energy_of_an_arm_left_to_itself_never_rises(tmp_path):
+def test_energy_of_an_unforced_arm_never_rises(tmp_path):
     """H and what the bristles store, of a closed-form rpr, along its own motion."""
     model = import_source(built("rpr", preset="closed-form")[0], tmp_path / "rpr.py").Model(seed=1)
     with torch.no_grad():
@@ -171,7 +171,7 @@ def test_least_squares_finds_the_strengths_of_bristles():
     np.testing.assert_allclose(torque, tau, atol=1e-6)
 
 
-def test_the_weak_form_counts_all_that_the_drives_do():
+def test_the_weak_form_includes_all_work_of_the_drives():
     """An offset of the measured torque and friction that drives make up for are no fault of the rigid bodies."""
     model = load_module(built("rpr", preset="closed-form")[0])
     dynamics = model

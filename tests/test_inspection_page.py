@@ -15,7 +15,7 @@ HOSTILE = "<script>alert(1)</script>{{ 7 * 7 }}&quot;'&amp;"
 
 
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "panda"])
-def test_page_tells_what_the_text_tells(robots, robot):
+def test_the_page_states_the_same_as_the_text(robots, robot):
     found = inspect(robots / f"{robot}.urdf")
     shown = Page(page(found))
     told = " ".join(" ".join(shown.text).split())

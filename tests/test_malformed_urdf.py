@@ -145,7 +145,7 @@ def test_read(nasty, name):
 
 
 @pytest.mark.parametrize("name", READ)
-def test_what_is_read_is_right(nasty, name):
+def test_accepted_files_are_read_correctly(nasty, name):
     """Derived, and found again by Pinocchio and by another reader of the file."""
     robot = read_urdf(nasty / f"{name}.urdf")
     arm = make_arm(robot)

@@ -125,12 +125,12 @@ def archive_of_gigabytes(folder: Path) -> str:
     return "m.zip"
 
 
-def stl_that_says_more_than_it_has(folder: Path) -> str:
+def stl_that_states_more_than_it_has(folder: Path) -> str:
     (folder / "m.stl").write_bytes(bytes(80) + struct.pack("<I", MANY) + bytes(5000))
     return "m.stl"
 
 
-def ply_that_says_more_than_it_has(folder: Path) -> str:
+def ply_that_states_more_than_it_has(folder: Path) -> str:
     fields = "property float x\nproperty float y\nproperty float z\n"
     (folder / "m.ply").write_text(
         f"ply\nformat ascii 1.0\nelement vertex {MANY}\n{fields}end_header\n0 0 0\n"
@@ -167,14 +167,14 @@ def box_without_size(folder: Path) -> str:
 DRAWN = (box_without_size, plain_obj, plain_gltf, gltf_with_a_file, obj_whose_material_is_a_pipe)
 LEFT_OUT = (
     pipe, gltf_whose_buffer_is_a_pipe, gltf_whose_buffer_lies_elsewhere, gltf_of_gigabytes, archive_of_gigabytes,
-    stl_that_says_more_than_it_has, ply_that_says_more_than_it_has, corners_that_are_no_numbers,
+    stl_that_states_more_than_it_has, ply_that_states_more_than_it_has, corners_that_are_no_numbers,
     gltf_of_triangles_without_corners, triangle_beyond_all_areas,
 )  # fmt: skip
 
 
 @pytest.mark.timed
 @pytest.mark.parametrize("make", DRAWN + LEFT_OUT)
-def test_meshes_are_drawn_or_left_out_in_bounds(tmp_path, make):
+def test_meshes_are_drawn_or_omitted_within_bounds(tmp_path, make):
     pytest.importorskip("trimesh")
     path = tmp_path / "r.urdf"
     path.write_text(ARM.replace("FILE", make(tmp_path)))
@@ -191,7 +191,7 @@ def test_meshes_are_drawn_or_left_out_in_bounds(tmp_path, make):
 @pytest.mark.parametrize(
     "name", ["package://arm/meshes/m.obj", "../meshes/m.obj", "file://FOLDER/meshes/m.obj"]
 )
-def test_meshes_are_found_by_each_way_to_name_them(tmp_path, name):
+def test_meshes_are_found_by_each_form_of_path(tmp_path, name):
     (tmp_path / "meshes").mkdir()
     plain_obj(tmp_path / "meshes")
     (tmp_path / "urdf").mkdir()

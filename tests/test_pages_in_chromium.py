@@ -56,7 +56,7 @@ def test_pages_say_nothing_ask_for_nothing_and_stay_within_their_width(browser, 
         assert [url for url in browser.requests if not url.startswith("data:")] == [path.as_uri()]
 
 
-def test_the_arm_is_printed_and_without_script_said_to_be_missing(browser, pages):
+def test_the_arm_is_printed_and_reported_missing_without_scripts(browser, pages):
     shown = (
         "['.without-script', 'canvas.arm', '.controls']"
         ".map(x => getComputedStyle(document.querySelector(x)).display)"

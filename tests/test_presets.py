@@ -54,7 +54,7 @@ def test_presets_are_the_files():
 
 
 @pytest.mark.parametrize("robot", ["rpr", "six_dof", "panda"])
-def test_kan_outputs_read_their_own_joints_only(robot, tmp_path):
+def test_kan_outputs_depend_only_on_their_own_joints(robot, tmp_path):
     model = random_model(robot, tmp_path, seed=2, net="kan")
     outputs = built(robot, net="kan")[1].outputs
     q = states(model.n)[0]
@@ -194,7 +194,7 @@ def test_published_formulation_keeps_its_energy():
     assert rate.abs().min() > 0
 
 
-def test_one_jvp_gives_what_a_derivative_for_each_entry_gives():
+def test_one_jvp_equals_a_derivative_per_entry():
     torch.manual_seed(0)
     published, by_jvp = Published(2, 8, 4), ByJvp(2, 8, 4)
     by_jvp.load_state_dict(published.state_dict())

@@ -167,7 +167,7 @@ def read(drawn: DrawnArm, folder: Path) -> Arm:
 
 @RANDOM
 @given(drawn=arms())
-def test_structure_is_what_pinocchio_shows(tmp_path, drawn):
+def test_structure_agrees_with_pinocchio(tmp_path, drawn):
     arm = read(drawn, tmp_path)
     for inertials in (False, True):
         seen = measured(drawn, inertials=inertials, rng=np.random.default_rng(0))

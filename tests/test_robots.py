@@ -122,7 +122,7 @@ def test_no_file_but_the_urdf_is_needed(robot):
     }
 
 
-def test_it_moves_as_its_dh_table_says(robot):
+def test_it_moves_according_to_its_dh_table(robot):
     """The last DH frame is rigid in the last joint's frame, whatever the joints do."""
     model = pin.buildModelFromUrdf(str(ROBOTS / f"{robot}.urdf"))
     data = model.createData()

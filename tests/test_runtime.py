@@ -84,7 +84,7 @@ def test_encoding_is_cos_sin_and_scaled_distance_with_its_derivatives(joints):
 
 
 @pytest.mark.parametrize("kind", [MaskedMLP, MaskedKAN])
-def test_networks_equal_autograd_and_read_their_own_joints(kind):
+def test_derivatives_of_networks_equal_autograd_and_inputs_are_masked(kind):
     encoding = JointEncoding(JOINTS)
     outputs = [(0,), (1, 2), (2,)]
     generator = torch.Generator().manual_seed(0)
@@ -105,7 +105,7 @@ def test_networks_equal_autograd_and_read_their_own_joints(kind):
     assert (slopes != 0).tolist() == [[joint in read for joint in range(3)] for read in outputs]
 
 
-def test_units_are_shared_out_by_how_many_outputs_read_the_same_joints():
+def test_hidden_units_are_shared_in_proportion_to_outputs():
     hidden = hidden_units([(2,), (1, 2), (1, 2)], width=64, fewest=4)
     assert hidden == (((2,), 21), ((1, 2), 43))
     crowded = hidden_units([(k,) for k in range(9)], width=8, fewest=2)
@@ -168,7 +168,7 @@ def test_friction_stays_between_a_tenth_and_ten_times_for_all_weights():
     assert factor.min() < 0.2 and factor.max() > 5
 
 
-def test_residual_of_m_never_takes_more_than_the_armature():
+def test_the_residual_of_m_is_smaller_than_the_armature():
     motors = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.8], [0.0, -0.7, 1.2]], dtype=torch.float64)
     for armature in (
         torch.diag(vector((0.1, 20.0, 3.0))),
@@ -196,7 +196,7 @@ def test_entries_of_a_symmetric_matrix():
     near(matrix[:, 1, 1], c[:, 0])
 
 
-def test_bound_leaves_what_is_positive_definite_and_mends_what_is_not():
+def test_the_bound_changes_only_matrices_that_are_not_positive_definite():
     center = torch.diag(torch.tensor([5.0, 1.0, 1e-3], dtype=torch.float64))
     constants = [(value, value) for value in center.diagonal().tolist()]
     mass = DerivedMass(
@@ -230,7 +230,7 @@ def test_bound_leaves_what_is_positive_definite_and_mends_what_is_not():
         assert torch.linalg.eigvalsh(relative)[:, 0].min() >= 1e-3
 
 
-def test_bodies_are_possible_for_all_weights():
+def test_bodies_are_physically_consistent_for_all_parameters():
     ten = (2.0, 0.1, 0.2, 0.3, 0.5, 0.01, 0.02, 0.6, 0.03, 0.4)
     nominal = pseudo_inertia(torch.tensor(ten, dtype=torch.float64))
     row, column = torch.triu_indices(4, 4)
@@ -242,7 +242,7 @@ def test_bodies_are_possible_for_all_weights():
         assert torch.linalg.eigvalsh(root @ root.mT)[0, 0] > 0
 
 
-def test_friction_laws_resist_and_read_as_what_they_are():
+def test_friction_is_dissipative_and_equals_its_formula():
     laws = SlidingFriction(JOINTS.friction, JOINTS.speed)
     constants = laws.prepare()
     near(constants.coulomb, torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64))
@@ -261,7 +261,7 @@ def test_friction_laws_resist_and_read_as_what_they_are():
     near(x * turning(x, torch.ones(4)), torch.tensor([0.0, 1e-9, 0.6, -1.0], dtype=torch.float64))
 
 
-def test_a_module_takes_what_it_uses_under_the_names_of_kinds():
+def test_a_module_contains_the_classes_that_it_uses():
     runtime, rpr = load_runtime(), load_arm(ROBOTS / "rpr.urdf")
     for preset, net in PRESETS:
         source = built("rpr", preset=preset, net=net)[0]
@@ -354,7 +354,7 @@ def network_of_first_stage(network, inputs, generator):
 
 
 @pytest.mark.parametrize("case", json.loads(NUMBERS.read_text()))
-def test_numbers_are_those_of_the_first_stage(case, tmp_path):
+def test_numbers_equal_those_of_the_first_release(case, tmp_path):
     """Modules of the first stage, made by templates, gave these with the same seed and the same change of weights."""
     robot, preset, net = case.split()
     design = load_design("closed-form") if preset == "closed-form" else None
@@ -388,7 +388,7 @@ def test_numbers_are_those_of_the_first_stage(case, tmp_path):
         near(found[name], torch.tensor(expected, dtype=torch.float64), 1e-12)
 
 
-def test_every_weight_says_what_it_stands_for():
+def test_every_parameter_has_a_kind():
     """Fits, exports and reports find weights by kind: a part that declares nothing would pass for a network."""
     networks = (
         "network.",
@@ -413,7 +413,7 @@ def test_every_weight_says_what_it_stands_for():
 
 
 @pytest.mark.parametrize("preset", ["closed-form", "minimal"])
-def test_what_is_no_state_is_refused_with_what_to_pass(preset):
+def test_invalid_states_are_refused_with_a_remedy(preset):
     """Arrays, another precision, and shapes that do not go together, by whatever is called."""
     model = build(arm_of("rpr"), preset)
     q = draw(5, 3)

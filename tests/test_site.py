@@ -28,7 +28,7 @@ def test_every_page_has_one_place():
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_what_is_written_out_exists(page):
+def test_every_documented_name_exists(page):
     for name in re.findall(r"^::: (\S+)$", page.read_text(encoding="utf-8"), re.MULTILINE):
         module, member = name.rsplit(".", 1)
         assert getattr(importlib.import_module(module), member).__doc__, name

@@ -41,7 +41,7 @@ def test_counts_of_the_own_robots(robots, robot):
     assert all(0 not in output.joints for output in structure.outputs), "no output reads joint 1"
 
 
-def test_rpr_reads_as_the_paper_says(robots):
+def test_rpr_has_the_structure_of_the_paper(robots):
     structure = derive(load_arm(robots / "rpr.urdf").arm)
     assert sorted(output.joints for output in structure.outputs) == [(1, 2), (1, 2), (2,)]
     assert {(e.row, e.column): e.kind for e in structure.entries if e.kind != "varying"} == {
@@ -52,7 +52,7 @@ def test_rpr_reads_as_the_paper_says(robots):
     assert structure.potential == (2,)
 
 
-def test_planar_chain_separates_what_joints_share():
+def test_a_planar_chain_separates_shared_functions():
     """M_11 of a planar 3R arm mixes q2, q3 and q2 + q3; the smallest form reads them apart."""
     structure = derive(planar(3))
     assert [output.joints for output in structure.outputs] == [(2,), (1,), (1, 2)]

@@ -43,7 +43,7 @@ def test_another_arms_torques_are_met(tmp_path):
     assert missed(model, recorded(true, 7)) < 1e-6
 
 
-def test_what_is_penalised_stays(tmp_path):
+def test_penalised_parameters_stay(tmp_path):
     """A penalty against the torques leaves an error that nothing else would."""
     module = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py")
     true, model = module.Model(seed=0), module.Model(seed=0)
@@ -56,7 +56,7 @@ def test_what_is_penalised_stays(tmp_path):
     assert (constants - 1).abs().max() < 0.01
 
 
-def test_blocks_give_what_all_at_once_gives(tmp_path, monkeypatch):
+def test_blocks_equal_a_single_batch(tmp_path, monkeypatch):
     """The loss and its gradient; what many steps make of the last digits is another thing."""
     module = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py")
     true = module.Model(seed=0)

@@ -24,7 +24,7 @@ def true(rpr):
 
 @pytest.mark.parametrize("assume", ["kinematics", "inertials"])
 @pytest.mark.parametrize("name", ROBOTS)
-def test_what_is_derived_agrees(robots, name, assume):
+def test_the_derived_structure_is_confirmed(robots, name, assume):
     loaded = load_arm(robots / f"{name}.urdf")
     proof = verify(loaded.robot, loaded.arm, derive(loaded.arm, assume))
     assert proof.agrees, proof.text()
@@ -79,7 +79,7 @@ LIES = {
 
 
 @pytest.mark.parametrize("lie", LIES)
-def test_what_is_not_so_is_reported(rpr, true, lie):
+def test_false_statements_are_reported(rpr, true, lie):
     told, words = LIES[lie]
     proof = verify(rpr.robot, rpr.arm, told(true))
     assert not proof.agrees

@@ -119,6 +119,6 @@ def test_constructions_are_found_in_docstrings_and_comments(tmp_path):
     }
 
 
-def test_the_list_finds_what_it_is_for():
+def test_the_list_finds_its_words():
     assert wrong("held-out samples ask for no more") and wrong("What servos lose")
     assert not wrong("the arm starts at rest") and not wrong("pass --trust")

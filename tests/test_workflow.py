@@ -46,7 +46,7 @@ def run_workflow(urdf, folder, settings, monkeypatch, judged=True):
 
 
 @pytest.mark.parametrize("name", OWN)
-def test_every_robot_here(name, robots, tmp_path, monkeypatch):
+def test_every_command_works_for_the_robots_here(name, robots, tmp_path, monkeypatch):
     settings = yaml.safe_load((robots / f"{name}.yaml").read_text())
     # as it is driven, for a shorter time
     settings.pop("tracking", None)
@@ -57,14 +57,14 @@ def test_every_robot_here(name, robots, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_arms_of_others(name, shared, tmp_path, monkeypatch):
+def test_every_command_works_for_reference_arms(name, shared, tmp_path, monkeypatch):
     settings = {"simulation": SHORT, "training": FEW_STEPS}
     run_workflow(
         shared / "arms" / f"{name}.urdf", tmp_path, settings, monkeypatch, judged=name == "drm_2link"
     )
 
 
-def test_a_tip_reaches_every_step(robots, tmp_path, monkeypatch):
+def test_a_tip_in_the_settings_applies_to_every_command(robots, tmp_path, monkeypatch):
     """Not the arm that all commands would choose: its first two joints, as arm.yaml says once."""
     settings = yaml.safe_load((robots / "rpr.yaml").read_text())
     settings |= {"tip": "link2", "training": FEW_STEPS}
@@ -73,7 +73,7 @@ def test_a_tip_reaches_every_step(robots, tmp_path, monkeypatch):
     assert tuple(read_facts("run/module.py").joints) == ("joint1", "joint2")
 
 
-def test_commands_that_the_readme_shows(robots, tmp_path, monkeypatch):
+def test_the_commands_of_the_readme_work(robots, tmp_path, monkeypatch):
     """Its block of use, as it stands there: arm.urdf and two folders of logs are what a reader brings."""
     settings = yaml.safe_load((robots / "two_link.yaml").read_text())
     settings |= {"simulation": SHORT, "training": FEW_STEPS}
