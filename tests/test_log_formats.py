@@ -177,7 +177,7 @@ def test_a_mapping_may_be_a_dict_a_file_or_that_of_the_arm(robots, tmp_path):
 
 
 @pytest.mark.parametrize("arm", ["arm.urdf", ["a", 2], 3])
-def test_a_file_that_is_no_arm_is_refused(tmp_path, arm):
+def test_an_argument_that_is_no_arm_is_refused(tmp_path, arm):
     with pytest.raises(LogError) as caught:
         read_logs(tmp_path, arm)
     assert str(caught.value) == (

@@ -71,7 +71,7 @@ def test_it_depends_only_on_past_samples():
     torch.testing.assert_close(observe(model, windows, past)[1], before)
 
 
-def test_models_in_velocities_need_an_acceleration():
+def test_models_in_velocities_are_observed():
     model, past = load_module(STAND_IN), past_steps(RATE)
     windows = cut_windows(motions(), past + 51, 20, measured=False)
     ahead, disturbance = observe(VelocityState(model), windows, past)
@@ -113,7 +113,7 @@ def test_a_diverged_window_affects_no_other():
     torch.testing.assert_close((q[others], qd[others]), (sound[0][others], sound[1][others]))
 
 
-def test_without_past_samples_windows_are_unchanged():
+def test_the_steps_before_a_window_are_removed():
     windows = cut_windows(motions(), 21, 60, measured=False)
     ahead = without_past(windows, 10)
     torch.testing.assert_close(ahead.tau, windows.tau[:, 10:])
