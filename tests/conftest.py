@@ -13,7 +13,21 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by torch and numpy when th
 ROOT = Path(__file__).parents[1]
 
 # The files that take longest. Workers of pytest-xdist take whole files in this order, so the longest start first.
-LONGEST_FILES = ("test_types",)
+LONGEST_FILES = (
+    "test_types",
+    "test_torque_fit",
+    "test_servo",
+    "test_contracts",
+    "test_workflow",
+    "test_coupled_motors",
+    "test_export_onnx",
+    "test_training",
+    "test_meshes",
+    "test_docs",
+    "test_evaluation",
+    "test_selection",
+    "test_run_folder",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -22,24 +36,47 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))  # stable: others keep their order
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item: pytest.Item) -> Iterator[object]:
-    """Run a test marked ``timed`` while no other worker runs a test, as other tests would make it slower.
+class WorkerLock:
+    """A readers-writer lock between the workers of pytest-xdist, on two files of the checkout.
 
-    A readers-writer lock: every test locks the file ``running``, a timed one exclusively. To do so it locks the file
-    ``entry`` first, so that no other test starts while a timed one waits for those that are running.
+    Every test locks ``running``, a timed one exclusively. To do so it locks ``entry`` first, so that no other test
+    starts while a timed one waits for those that are running.
     """
-    mode = fcntl.LOCK_EX if item.get_closest_marker("timed") else fcntl.LOCK_SH
-    with open(
-        ROOT / "tests" / "conftest.py"
-    ) as running:  # any two files of the checkout, which all workers share
+
+    def __init__(self) -> None:
+        self.running = os.open(ROOT / "tests" / "conftest.py", os.O_RDONLY)
+        self.exclusive = False
+
+    def acquire(self, exclusive: bool) -> None:
         with open(ROOT / "pyproject.toml") as entry:
             fcntl.flock(entry, fcntl.LOCK_EX)
-            fcntl.flock(running, mode)
-        try:
-            return (yield)
-        finally:
-            fcntl.flock(running, fcntl.LOCK_UN)  # also of a process that the test forked and left running
+            fcntl.flock(self.running, fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH)
+        self.exclusive = exclusive
+
+    def release(self) -> None:
+        fcntl.flock(self.running, fcntl.LOCK_UN)
+        self.exclusive = False
+
+
+LOCK = WorkerLock()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[object]:
+    """Run tests marked ``timed`` while no other worker runs a test, which would slow them down.
+
+    Consecutive timed tests keep the lock: other workers wait for them only once.
+    """
+    timed, timed_next = (
+        x is not None and x.get_closest_marker("timed") is not None for x in (item, nextitem)
+    )
+    if not (timed and LOCK.exclusive):
+        LOCK.acquire(exclusive=timed)
+    try:
+        return (yield)
+    finally:
+        if not (timed and timed_next):
+            LOCK.release()
 
 
 def pytest_collection_finish() -> None:
