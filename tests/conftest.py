@@ -94,7 +94,7 @@ def robots() -> Path:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of reference data beside the checkout; tests that read it skip where it is absent."""
+    """The folder of reference data next to the checkout; tests that read it skip if it is absent."""
     folder = ROOT.parent / "shared"
     if not folder.is_dir():
         pytest.skip("the reference data (../shared) is not on this machine")
@@ -103,7 +103,7 @@ def shared() -> Path:
 
 @pytest.fixture
 def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Epochs of few windows take four steps: for tests of what stands around a fit."""
+    """Limit epochs to four steps, for tests that do not depend on the quality of a fit."""
     from spelgen.settings.tuning.fitting import WindowTuning
 
     monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", WindowTuning(epoch_steps=4))
@@ -111,7 +111,7 @@ def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def short_torque_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fits to torques take two steps a round and few rounds: for tests of what stands around a fit."""
+    """Limit torque fits to a few iterations, for tests that do not depend on the quality of a fit."""
     from spelgen.settings.tuning.fitting import TorqueTuning
 
     tuning = TorqueTuning(rounds=1, first_steps=2, last_rounds=1, longer=1, steps=2)
@@ -119,5 +119,5 @@ def short_torque_fits(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """``--update`` writes the golden copies anew."""
+    """Add ``--update``, which rewrites the golden copies."""
     parser.addoption("--update", action="store_true", help="write golden files anew")

@@ -61,7 +61,7 @@ def answered(use: Callable[[], Any]) -> bool:
         signal.signal(each, _late)
     seconds = SECONDS * _slowness()
     signal.setitimer(signal.ITIMER_PROF, seconds)  # of its own time: others may use the machine
-    signal.alarm(int(10 * seconds))  # and what waits uses none
+    signal.alarm(int(10 * seconds))  # a process that waits uses none
     try:
         use()
         return True

@@ -10,7 +10,7 @@ VOID = {"meta", "br", "link", "input"}
 
 
 class Page(HTMLParser):
-    """Checks nesting, and gathers what the tests ask for."""
+    """Checks nesting, and gathers elements, text and links."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

@@ -38,7 +38,7 @@ def from_group(joint_types: Sequence[str], elements: Sequence[torch.Tensor]) -> 
 
 
 class GroupModel(Protocol):
-    """What the view needs of an emitted module; see its docstrings for shapes."""
+    """The methods of an emitted module that the equations need; see its docstrings for shapes."""
 
     joint_types: tuple[str, ...]
 

@@ -74,7 +74,7 @@ class Seen:
         return True
 
     def carried(self, joint: int, turner: int) -> np.ndarray:
-        """Distance of what ``joint`` carries from the plane through the turner's axis along the slide."""
+        """Distance of the mass moved by ``joint`` from the plane through the turner's axis along the slide."""
         found = []
         for q, axes, points in zip(self.configurations, self.axes, self.points, strict=True):
             pin.centerOfMass(self.engine.model, self.engine.data, q, True)

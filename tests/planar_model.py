@@ -17,7 +17,7 @@ FACTS = """{
 
 
 class Pose(NamedTuple):
-    """What depends on q alone: q itself and M."""
+    """The configuration cache: q and M."""
 
     q: torch.Tensor
     mass: torch.Tensor
@@ -109,7 +109,7 @@ class Model(nn.Module):
 
     @property
     def dynamics(self):
-        """An emitted model's parts stand apart; here they are the model's own, and of q all that is kept is q."""
+        """The part that an emitted model keeps separately; here it is the model itself."""
         return self
 
     def configuration(self, q, prepared):

@@ -82,7 +82,7 @@ COUPLED = MOTOR + "couplings:\n- {joints: [pitch, roll], matrix: [[50, 0], [-10,
                 (3, 3): ("coupled", -60.0),
             },
         ),
-        # the sidecar goes before the URDF, and what neither knows is learned
+        # the settings file precedes the URDF, and values that neither states are trained
         (
             WRIST[1:],
             COUPLED,
@@ -200,7 +200,7 @@ class TestModule:
 
 
 def test_the_simulation_moves_joints_by_motors(coupled):
-    """The logged torques, times G, are what the rigid bodies feel."""
+    """The logged torques, times G, are the torques on the rigid bodies."""
     loaded = load_arm(coupled[0])
     short = {"trajectories": 2, "duration": 0.5, "rate": 20.0}
     settings = loaded.settings.model_copy(

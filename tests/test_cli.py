@@ -88,7 +88,7 @@ def test_help_and_inspect_load_nothing_heavy(robots):
         assert done.stdout.splitlines()[-1] == "set()", done.stderr
 
 
-# ---- what goes where
+# ---- standard output, standard error and files
 
 
 def test_inspect_text_fits_80_columns(spelgen, robots):

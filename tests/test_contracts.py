@@ -20,7 +20,7 @@ VARIANTS = {  # preset and networks
     "minimal": ("minimal", "mlp"),
     "closed-form": ("closed-form", None),
 }
-ALL_ROBOTS = ("hybrid", "minimal", "closed-form")  # variants whose derivation is that of each robot
+ALL_ROBOTS = ("hybrid", "minimal", "closed-form")  # variants with the derived structure of each robot
 THREE = ("two_link", "rpr", "six_dof")
 URDFS = {"mimic": FOLLOWED, "gantry": GANTRY}  # arms in addition to the robots of the repository
 # Standard deviations of random parameters; None: as `randomise` scales them. With 1.0 the bound of M is active.
@@ -189,7 +189,7 @@ def test_backpropagation_reaches_every_parameter(variant, dtype, random_model):
     ("variant", "robot"), [*((x, "rpr") for x in VARIANTS), ("hybrid", "six_dof"), ("closed-form", "six_dof")]
 )
 def test_transforms_of_torch_func_apply(variant, robot, random_model):
-    """No branch depends on data. The Jacobians of a batch by vmap are those of its states, except by forward mode
+    """No branch depends on data. The Jacobians of a batch by vmap are those of its states, except in forward mode
     through a solution of linear equations (see below)."""
     model = random_model(variant, robot, 1).requires_grad_(False)
     q, qd, tau = states(model.n, 5, count=3)

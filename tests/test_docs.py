@@ -51,7 +51,7 @@ def test_examples(page, tmp_path, monkeypatch, request):
 
 
 def cell(text: str, block: str, output: str = "") -> str:
-    """The block with its output: as it stands in the text, or else as it should be."""
+    """The block with its output: from the text if it is there, or else the correct one."""
     for match in CELL.finditer(text):
         if match[1] == block:
             return match[0]
@@ -84,7 +84,7 @@ def test_tutorials_are_notebooks(page, request):
 
 
 def run_commands(block: str, folder: Path) -> str:
-    """The block as it should be: each command with what it prints."""
+    """The correct block: each command with its output."""
     told = []
     for command in re.findall(r"^\$ (.*)$", block, re.MULTILINE):
         program, *arguments = shlex.split(command)

@@ -110,7 +110,7 @@ def test_the_bound_keeps_zeros_and_relations_and_is_inactive_at_nominal_values(r
 
 @pytest.mark.parametrize("robot", SIX)
 def test_network_outputs_depend_only_on_their_own_joints(robot, tmp_path):
-    """Moving any other joint leaves an output's bits unchanged, and its own joints move it."""
+    """An output is unchanged to the bit when other joints move, and changes with its own joints."""
     model = random_model(robot, tmp_path, seed=2)
     q = states(model.n, 50)[0]
     network = model.residuals.mass
@@ -199,7 +199,7 @@ def test_arm_with_a_constant_mass_matrix(tmp_path):
 
 
 def test_a_module_imports_only_torch(tmp_path):
-    """Each preset runs in a process that can import neither spelgen nor what spelgen needs."""
+    """Each preset runs in a process that can import neither spelgen nor its dependencies except torch."""
     presets = {"hybrid": None, "hybrid_kan": "kan", "spel": None, "phnode": None}
     for name, net in presets.items():
         source = built("panda", preset=name.removesuffix("_kan"), net=net)[0]

@@ -68,7 +68,7 @@ def test_the_optimised_motion_is_more_informative(loaded, found):
     assert found.condition < found.first / 3
     assert (
         found.parameters == 36 + 6 * 4 - 2
-    )  # rigid bodies, friction and rotors; what these share counts once
+    )  # rigid bodies, friction and rotors; parameters in common count once
     assert (found.efforts < 1).all()
     assert excite(loaded, **CHOICE, trials=1).first == found.first
 

@@ -20,7 +20,7 @@ pytest.importorskip("pinocchio")
 
 
 def run_of(robot, folder, preset, change=lambda model: None):
-    """A run folder as `spelgen train` leaves it, of a model whose weights ``change`` has moved."""
+    """A run folder, with the files that `spelgen train` writes, of a model whose parameters ``change`` has modified."""
     urdf = ROBOTS / f"{robot}.urdf"
     model = build(urdf, preset)
     with torch.no_grad():
@@ -77,7 +77,7 @@ def test_friction_goes_back_as_the_urdf_can_say_it(tmp_path):
 
 
 def test_residual_terms_are_reported(tmp_path):
-    """The bodies of hybrid go back exactly; what else M, gravity and friction have is told as figures."""
+    """The bodies of hybrid are exported exactly; residual terms of M, gravity and friction are reported as figures."""
     run, model = run_of("two_link", tmp_path, "hybrid", heavier)
     loaded, told = exported(run, tmp_path / "bodies.urdf")
     assert max(differences(model, loaded)) < 1e-8
@@ -139,7 +139,7 @@ def test_a_run_without_its_robot_is_refused(tmp_path):
 
 @pytest.mark.parametrize("robot", ["rpr", "panda"])
 def test_exported_bodies_have_the_models_base_parameters(robot, tmp_path):
-    """By the names and combinations of `inspect`, whatever the single parameters are."""
+    """By the names and combinations of `inspect`, for all values of the single parameters."""
     run, model = run_of(robot, tmp_path, "closed-form", heavier)
     export(run.path, "urdf", tmp_path / "learned.urdf")
     arm = load_arm(ROBOTS / f"{robot}.urdf")

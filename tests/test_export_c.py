@@ -38,7 +38,7 @@ BOTH = [("two_link", "closed-form"), ("rpr", "hybrid")]
 
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory):
-    """By robot and preset: what is exported, the C's folder, and its library."""
+    """Per robot and preset: the exported model, the folder of the C files, and the library."""
     found = {}
     for robot, preset in BOTH:
         trained = Trained(moved_model(robot, preset), arm_of(robot), NAMES)

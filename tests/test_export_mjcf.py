@@ -94,7 +94,7 @@ def test_followers_motors_and_passive_joints_go_along(tmp_path):
 
 @pytest.mark.parametrize("torque", ["motor", "joint"])
 def test_coupled_motors_turn_by_several_joints(torque, tmp_path):
-    """Their rotors couple M: tendons' armature in MuJoCo, couplings in the settings beside a URDF."""
+    """Their rotors couple M: armature of tendons in MuJoCo, couplings in the settings of a URDF."""
     urdf = tmp_path / "wrist.urdf"
     shutil.copy(ROBOTS / "six_dof.urdf", urdf)
     names = [each.name for each in load_arm(urdf).arm.coordinates]

@@ -43,7 +43,7 @@ def test_onnx_equals_the_model(tmp_path):
 
 
 def test_the_files_are_plain_onnx_of_equal_bytes():
-    """No operator of one runtime alone, no traces of the machine, the same bytes twice; z is flat."""
+    """Only standard operators, no traces of the machine, the same bytes twice; z is flat."""
     trained = Trained(moved_model("two_link", "closed-form"), arm_of("two_link"))
     prepared = trained.model.prepared()
     content = onnx_model(prepared, "forward_dynamics")

@@ -30,7 +30,7 @@ RESIDUALS = "residuals."
 
 
 def with_parts(robot, *parts, net=None):
-    """A hybrid model whose bodies have moved, and of what stands beside them these parts alone."""
+    """A hybrid model with modified bodies and only these residual terms."""
     model, moved = build(arm_of(robot), "hybrid", net=net), moved_model(robot, "hybrid")
     names = tuple(PARTS[part] for part in parts)
     with torch.no_grad():
@@ -90,7 +90,7 @@ def test_each_term_is_exported_by_itself(parts, tmp_path):
 @needs_gcc
 @pytest.mark.parametrize("name", ENTRIES)
 def test_a_single_entry_is_exported_by_itself(name, tmp_path):
-    """What only other entries call raises no warning, which the export's own compilation refuses."""
+    """Functions that only other entries call cause no compiler warning, which the export would treat as an error."""
     model = with_parts("rpr", *PARTS)
     described = describe(model, arm_of("rpr"))
     functions = c_functions(described, {name: ENTRIES[name]})

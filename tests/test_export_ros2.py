@@ -74,7 +74,7 @@ def c_object(folder: Path, tmp_path: Path) -> str:
 
 
 def compiled_driver(folder: Path, tmp_path: Path, *linked: str) -> Path:
-    """A program that asks the plugin for all that there is."""
+    """A program that calls all functions of the plugin."""
     (tmp_path / "driver.cpp").write_text(DRIVER)
     run("g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", f"-I{STUBS}", f"-I{folder / 'src'}",
         tmp_path / "driver.cpp", *linked, "-o", tmp_path / "driver", "-lm")  # fmt: skip
@@ -98,10 +98,10 @@ def test_the_plugin_equals_the_model(package, tmp_path):
         *model.mass_matrix(q),
         model.nonlinear_effects(q, qd) - model.gravity(q),
         model.gravity(q),
-        # its first call knows no way: its bristles are those of joints that slide
+        # the first call has no history: its friction states are those of sliding joints
         model.friction_torque(torch.zeros_like(q), qd, model.memory(qd)),
         model.inverse_dynamics(q, qd, qdd, model.memory(qd)),
-        # against the way that the first velocity bent the bristles
+        # against the direction in which the first velocity deflected the bristles
         model.inverse_dynamics(q + moved, qd, qdd, model.memory_after(model.memory(qd), moved)),
     ]
     found = np.array([[float(x) for x in line.split()] for line in told])

@@ -49,7 +49,7 @@ m2] about the origin of the joint's frame, turned so that z is the joint's axis,
 of all that moves rigidly with the joint: 1 joint1, 2 joint2. q is the joint's
 position [rad, m]."""
 
-# What a roboticist would write on a board.
+# The notation that a roboticist would write by hand.
 ON_A_BOARD = {
     "rpr": {
         "M11": "Ixx3R*(0.5*cos(2*q3) + 0.5) - Ixy3*sin(2*q3) + Izz1R + 2*hz2R*q2 + m2R*q2**2",

@@ -32,7 +32,7 @@ REACH = [[3e-4, 3e-3, 3e-2], [3e-5, 3e-4, 3e-3]]
 
 
 def swings(samples: int, seed: int = 0) -> np.ndarray:
-    """A smooth path, (samples, 2), that turns around again and again."""
+    """A smooth path, (samples, 2), that reverses many times."""
     t = np.linspace(0.0, 4.0, samples)[:, None]
     phase = np.random.default_rng(seed).uniform(0, 6, (2, 3))
     waves = [np.sin((1.0 + 2.3 * k) * t + phase[:, k]) / (1 + k) for k in range(3)]
@@ -47,7 +47,7 @@ def test_one_pass_over_positions_solves_the_differential_equation():
     for moved in qd:  # Euler, with steps far below the least reach
         z = z + model.memory_rate(z, moved)
     found = bristles_along(q[::1000].numpy(), BristleReach(np.array(REACH)))[-1]
-    # between samples that lie so far apart a joint may turn around: finer ones know of it
+    # between coarse samples a joint may reverse: finer samples show it
     finer = bristles_along(q[::10].numpy(), BristleReach(np.array(REACH)))[-1]
     assert np.abs(finer / REACH - (z / reach).numpy()).max() < 1e-2
     assert np.abs(found / REACH).max() <= 1.0
@@ -81,7 +81,7 @@ def test_load_dependent_friction_is_smooth_at_right_angles():
 
 
 def test_bristles_are_passive():
-    """d/dt stored energy = power taken - what is lost, and what is lost is never negative."""
+    """d/dt stored energy = supplied power - dissipated power, and the dissipated power is never negative."""
     laws = FrictionLaws(FRICTION, SPEED, REACH)
     with torch.no_grad():
         for weight in laws.parameters():
@@ -102,7 +102,7 @@ def test_bristles_are_passive():
 
 
 def test_energy_of_an_unforced_arm_never_rises(tmp_path):
-    """H and what the bristles store, of a closed-form rpr, along its own motion."""
+    """H with the energy of the bristles, of a closed-form rpr, along its own motion."""
     model = import_source(built("rpr", preset="closed-form")[0], tmp_path / "rpr.py").Model(seed=1)
     with torch.no_grad():
         model.friction.raw_stribeck -= 100.0

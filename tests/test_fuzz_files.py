@@ -74,7 +74,7 @@ def used(path: Path, arm, mapping=None) -> None:
 
 @st.composite
 def changes(draw, content):
-    """JSON-like content with one of its places lost, or something odd in it."""
+    """JSON-like content with one value removed or replaced by an anomalous one."""
     if isinstance(content, dict) and content and draw(st.integers(0, 4)):
         key = draw(st.sampled_from(sorted(content)))
         if not draw(st.integers(0, 3)):
@@ -112,7 +112,7 @@ def test_logs_of_arrays(tmp_path, arm):
                 )
                 pa.parquet.write_table(table, path)
             except (pa.ArrowException, TypeError, ValueError):
-                return  # what cannot be written need not be read
+                return  # tables that cannot be written need not be read
         used(path, arm)
 
     arrays = st.dictionaries(NAMES, ARRAYS, min_size=1, max_size=2)

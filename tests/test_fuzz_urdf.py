@@ -30,7 +30,7 @@ NUMBERS = st.sampled_from(
 
 @st.composite
 def elements(draw: st.DrawFn, name: str, attributes: tuple[str, ...], content: str = "") -> str:
-    """An element with some of its attributes, each perhaps odd, none, once or twice."""
+    """Zero, one or two copies of an element with some of its attributes, each of which may be anomalous."""
     present = [x for x in attributes if draw(st.integers(0, 9))]
     told = " ".join(f'{x}="{draw(NUMBERS)}"' for x in present)
     return f"<{name} {told}>{content}</{name}>" * draw(st.sampled_from([0, 1, 1, 1, 1, 1, 2]))
@@ -72,7 +72,7 @@ def robots_of_any_kind(draw: st.DrawFn) -> str:
 
 @st.composite
 def nearly_right(draw: st.DrawFn) -> str:
-    """A serial chain that is right but for what its numbers are."""
+    """A serial chain that is valid except for its numbers."""
     count = draw(st.integers(1, 4))
     told = [f'<link name="l{k}">{draw(elements("inertial", (), ""))}</link>' for k in range(count + 1)]
     for k in range(count):
@@ -124,7 +124,7 @@ def mutated(source: bytes, draw: random.Random) -> bytes:
 
 
 def shuffled(source: bytes, draw: random.Random) -> bytes:
-    """Quoted values swapped: still XML, but saying something else."""
+    """Quoted values swapped: still XML, with another meaning."""
     parts = source.split(b'"')
     values = [k for k in range(1, len(parts), 2)]
     for _ in range(draw.randint(1, 4)):

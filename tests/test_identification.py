@@ -70,7 +70,7 @@ def test_base_parameters_are_those_of_inspect(robots, robot):
     values = base.combination[: base.bodies, :inertial] @ urdf_parameters(arm)
     np.testing.assert_allclose(values, [float(each.value) for each in exact], rtol=1e-12, atol=1e-12)
     assert all(name[:-1] in FrictionModel().effects for name in base.names[base.bodies :])
-    # the first joint's rotor cannot be told from the inertia about its axis
+    # the first joint's rotor and the inertia about its axis are indistinguishable
     assert "armature1" not in base.names
     assert base.identifiability()["armature1"] == "in combination"
     assert base.identifiability()["viscous1"] == "alone"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "spelgen"
 
-# What an emitted module carries with it: these files know torch, a little of the standard library and one another.
+# Files that are copied into emitted modules: they import torch, parts of the standard library and one another.
 RUNTIME = [
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
     for path in sorted((PACKAGE / "runtime").rglob("*.py"))
@@ -14,7 +14,7 @@ RUNTIME = [
 ]
 CARRIED = {"__future__", "collections", "functools", "math", "torch", "typing"}
 
-# A folder (or a file at the top) may import only from itself and from what stands above it.
+# A folder (or a file of the top level) may import only from itself and from those before it in this list.
 ROWS = """
 version errors labels listing tasks templates runtime files
 urdf settings arm design spec
@@ -33,7 +33,7 @@ FILES = [".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in s
 LAYERS = [name for name in FILES if not name.endswith(".__init__")]
 OURS = {f"spelgen.{name}" for name in LAYERS}
 
-# What a file may not import, neither itself nor through others.
+# Modules that a file may not import, neither directly nor through others.
 SYMBOLIC = {"sympy", "flint", "spelgen.arm", "spelgen.structure"}
 PLAIN = {"spelgen.arm.actuation"}  # G by the files, without the exact arithmetic of its folder
 DERIVING = ("urdf.", "arm.", "structure.", "emission.", "certificate.")
@@ -90,7 +90,7 @@ def imported(name: str) -> frozenset[str]:
 
 
 def reached(name: str) -> set[str]:
-    """What `imported` gives for the file and for every file of the package that it reaches."""
+    """Return all modules that a file imports directly or through other files of the package."""
     found: set[str] = set()
     waiting = [name]
     while waiting:

@@ -132,7 +132,7 @@ def test_typed_times_count_from_the_first_however_small_it_is(tmp_path):
     stamps = 50_000_000 + np.array([0, 10_000_000, 20_000_000, 30_000_000])
     path = parquet(tmp_path / "x.parquet", columns(t=pa.array(stamps, pa.duration("ns"))))
     check(read_logs([path], JOINTS)[0], "x", rtol=1e-15)
-    # an unset first stamp leaves a gap behind it
+    # an unset first stamp is followed by a gap
     stamps = 1_700_000_000_000_000_001 + np.array([0, 10_000_000, 20_000_000, 30_000_000])
     stamps[0] = 0
     path = parquet(tmp_path / "x.parquet", columns(t=pa.array(stamps, pa.timestamp("ns"))))
@@ -545,7 +545,7 @@ def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch):
     )
 
 
-# ---- odd files: read, or refused with file, row and column
+# ---- anomalous files: read, or refused with file, row and column
 
 
 def text_log(separator: str = ",", decimal: str = ".", names: str = "{}") -> str:
@@ -682,7 +682,7 @@ def test_output_of_ros2_topic_echo_is_read(tmp_path):
     np.testing.assert_allclose(log.t - log.t[0], 0.01 * np.arange(50), atol=1e-9)
     np.testing.assert_allclose(log.q[:, 1], -0.02 * np.arange(50), atol=1e-9)
     np.testing.assert_allclose(log.tau[:, 0], 5.0 + 0.1 * np.arange(50), atol=1e-9)
-    # the gripper that is logged beside the arm is left out
+    # the gripper that is also logged is omitted
     (arm_alone,) = read_logs([tmp_path / "log.csv"], ("a",))
     assert arm_alone.q.shape == (50, 1)
 

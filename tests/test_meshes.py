@@ -53,7 +53,7 @@ def test_an_arm_of_fine_meshes_is_drawn(tmp_path):
 
 
 def gltf(buffer: dict[str, object], count: int = 3, view: int | None = 0) -> str:
-    """A mesh of positions in a buffer; view None: as many zeros as it says."""
+    """A mesh of positions in a buffer; view None: ``count`` zeros."""
     positions = {"componentType": 5126, "count": count, "type": "VEC3"}
     if view is not None:
         positions["bufferView"] = view
@@ -185,7 +185,7 @@ def test_meshes_are_drawn_or_omitted_within_bounds(tmp_path, make):
     # kB, of the largest process so far: another test's may have been larger, and each begins as a copy of this one
     copied = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert after.ru_maxrss <= max(used.ru_maxrss, copied, 1_100_000)
-    assert time.monotonic() - begin < 60  # what waits for a pipe uses no processor
+    assert time.monotonic() - begin < 60  # a process that waits for a pipe uses no processor time
 
 
 @pytest.mark.parametrize(

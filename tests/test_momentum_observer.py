@@ -21,7 +21,7 @@ from spelgen.settings.tuning.evaluation import EvaluationTuning
 
 STAND_IN = Path(__file__).with_name("planar_model.py")
 RATE = 100.0
-OFFSET = torch.tensor([0.6, -0.4], dtype=torch.float64)  # Nm that logs do not tell of
+OFFSET = torch.tensor([0.6, -0.4], dtype=torch.float64)  # Nm that are not logged
 UNFILTERED = Preprocessing(cutoff=0, decimation=1)
 
 

@@ -38,7 +38,7 @@ def browser(tmp_path_factory):
 
 @pytest.fixture
 def pages(run, robots, tmp_path):  # noqa: F811
-    """The report of a run whose folder has its URDF, and what `inspect` writes of a longer arm."""
+    """The report of a run whose folder has its URDF, and the page of `inspect` of a longer arm."""
     (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
     panda = load_arm(robots / "panda.urdf")
     (tmp_path / "panda.html").write_text(page(panda.inspect(), urdf=panda.robot.path), encoding="utf-8")

@@ -121,7 +121,7 @@ def test_kinematics_of_the_tip(pair):
 
 
 def test_zero_terms_are_removed():
-    """Without residuals hybrid is prepared as the bodies alone; with them it is not, and neither changes the model."""
+    """Without residual terms hybrid is prepared as rigid bodies; preparation never changes the model."""
     model = build(arm_of("rpr"), "hybrid").requires_grad_(False)
     q, qd, x = states(4)
     assert not has_residuals(model.prepared()._model)

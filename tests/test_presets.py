@@ -70,7 +70,7 @@ def test_kan_outputs_depend_only_on_their_own_joints(robot, tmp_path):
 @pytest.mark.parametrize("preset", ["spel", "spel-kan"])
 @each_robot
 def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
-    """Its networks see all joints, as the paper's do; what the structure fixes stays fixed."""
+    """Its networks depend on all joints, as in the paper; zeros, constants and relations of the structure remain."""
     model = random_model(robot, tmp_path, seed=1, preset=preset)
     for weight in model.mass.network.parameters():
         weight.data *= 0.5
@@ -87,7 +87,7 @@ def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
 @pytest.mark.parametrize("part", ["mass.network", "potential", "input_network"])
 @pytest.mark.parametrize("net", ["mlp", "kan"])
 def test_networks_read_rotation_matrices(net, part, tmp_path):
-    """Layer by layer as the papers write them, on what varies of the 9 numbers of R and the 3 of r."""
+    """Layer by layer as in the papers, on the varying entries of the 9 numbers of R and the 3 of r."""
     owner = random_model("rpr", tmp_path, seed=5, preset="phnode", net=net)
     model, encoding = owner.get_submodule(part), owner.encoding
     q = states(3)[0]
@@ -133,7 +133,7 @@ def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset
 
 @pytest.mark.parametrize("net", ["mlp", "kan"])
 def test_phnode_is_its_three_axis_model_held_by_bearings(net, tmp_path):
-    """H = 1/2 p^T M^-1 p over 3 n axes: moving along z alone, p_z follows the n x n module."""
+    """H = 1/2 p^T M^-1 p over 3 n axes: for motion only along z, p_z is that momentum of the n x n module."""
     model = frictionless(random_model("six_dof", tmp_path, seed=7, preset="phnode", net=net))
     n = model.n
     q, qd, _, _ = states(n)
@@ -172,7 +172,7 @@ def test_geodesic_distance_is_the_angle_between():
 
 
 def test_published_formulation_keeps_its_energy():
-    """The benchmark's baseline is the equations it stands for: without friction and input dH/dt = 0."""
+    """The benchmark's baseline conserves energy: without friction and input dH/dt = 0."""
     torch.manual_seed(0)
     model = Published(2, 8, 8)
     for network in (model.dissipation.network, model.gains):

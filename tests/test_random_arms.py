@@ -189,7 +189,7 @@ def test_values_are_those_of_pinocchio(tmp_path, drawn):
 
 
 def test_rational_rotations_keep_the_zeros_of_half_right_angles():
-    """Half a right angle has no rational cosine; what several of them make zero stays zero all the same."""
+    """Half a right angle has no rational cosine; zeros that several of them cause are recognised nevertheless."""
     for tilt in product(range(8), repeat=3):
         rotation = rotation_from_rpy([k * pi / 4 for k in tilt])
         found = exact_rotation(rotation)

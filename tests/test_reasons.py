@@ -124,7 +124,7 @@ def test_reference_arms(shared, assume):
 
 
 def assert_statements_hold(arm: Arm, structure: Structure, told: tuple[Fact, ...], name: str) -> None:
-    """By Pinocchio at random configurations, with random inertials or the URDF's; and all of them are told."""
+    """Every reason is true in Pinocchio at random configurations, with random inertials or the URDF's."""
     keys = triangle(len(structure.joints))
     free = structure.assume == "kinematics"
     samples = draw(arm, 4 if free else 6, np.random.default_rng(0), random_inertials=free)

@@ -31,7 +31,7 @@ def odd(robots, tmp_path, monkeypatch):
 
 
 def body(source):
-    """A module but for the digests of what it was made from."""
+    """A module without the digests of its sources."""
     return [line for line in source.splitlines() if "sha256" not in line]
 
 

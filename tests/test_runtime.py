@@ -389,7 +389,7 @@ def test_numbers_equal_those_of_the_first_release(case, tmp_path):
 
 
 def test_every_parameter_has_a_kind():
-    """Fits, exports and reports find weights by kind: a part that declares nothing would pass for a network."""
+    """Fits, exports and reports find parameters by kind; without a kind they would be treated as networks."""
     networks = (
         "network.",
         "residuals.mass.",
@@ -414,7 +414,7 @@ def test_every_parameter_has_a_kind():
 
 @pytest.mark.parametrize("preset", ["closed-form", "minimal"])
 def test_invalid_states_are_refused_with_a_remedy(preset):
-    """Arrays, another precision, and shapes that do not go together, by whatever is called."""
+    """Arrays, another precision and inconsistent shapes, in every method."""
     model = build(arm_of("rpr"), preset)
     q = draw(5, 3)
     for call in (model.inverse_dynamics, model.forward_dynamics):

@@ -33,7 +33,7 @@ from spelgen.settings.fits import Rollout, TorqueFit
 
 
 class Alone:
-    """Bodies and friction laws that take over nothing."""
+    """Rigid bodies and a friction model that absorb none of the added torque."""
 
     @staticmethod
     def remaining(joint, torque):

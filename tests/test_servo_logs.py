@@ -28,7 +28,7 @@ def logs():
 
 
 def changed(logs, **columns):
-    """The logs, with columns that functions of a trajectory make anew."""
+    """The logs, with columns replaced by functions of a trajectory."""
     return [replace(x, **{name: made(x) for name, made in columns.items()}) for x in logs]
 
 

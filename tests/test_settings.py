@@ -31,7 +31,7 @@ def urdf(tmp_path, monkeypatch):
 
 
 def told(path):
-    """What is said of a file whose every group is read."""
+    """Errors of a file after every group was read."""
     with pytest.raises(SettingsError) as error:
         settings = load_settings(path)
         for group in OF_A_STEP:
@@ -253,7 +253,7 @@ def test_reading_settings_imports_nothing_heavy():
 
 @pytest.mark.parametrize("name", ["rpr", "scara", "panda", "ur10e"])
 def test_a_starter_file_states_the_defaults(robots, tmp_path, name):
-    """As it is written it changes nothing; with every line said it is right, and still changes nothing."""
+    """The file changes nothing as written, nor with every comment activated."""
     urdf = tmp_path / "arm.urdf"
     urdf.write_bytes((robots / f"{name}.urdf").read_bytes())
     assert CliRunner().invoke(app, ["init", str(urdf)]).stdout == f"wrote {tmp_path}/arm.yaml\n"

@@ -61,7 +61,7 @@ def test_a_planar_chain_separates_shared_functions():
 
 @pytest.mark.parametrize("robot", COUNTS)
 def test_smallest_form_is_exact(robots, robot):
-    """sum c A + sum f B gives M back, with c and f read off M as the structure says."""
+    """sum c A + sum f B equals M, with c and f taken from the entries of M that the structure names."""
     loaded = load_arm(robots / f"{robot}.urdf")
     structure = derive(loaded.arm)
     keys = triangle(len(structure.joints))
@@ -75,7 +75,7 @@ def test_smallest_form_is_exact(robots, robot):
 
 
 def test_factors_are_exact_fractions(robots):
-    """two_link is eq. 20 of the paper: M_11 holds twice what M_21 does."""
+    """two_link is eq. 20 of the paper: M_11 contains twice the functions of M_21."""
     structure = derive(load_arm(robots / "two_link.urdf").arm)
     assert structure.outputs[0].basis == ((0, 0, Fraction(2)), (1, 0, Fraction(1)))
 
@@ -96,7 +96,7 @@ def test_reference_arms(shared, assume):
 
 @pytest.mark.parametrize(("joints", "seed"), [(6, 0), (7, 1), (8, 2), (10, 3)])
 def test_generic_arms_follow_the_formula(joints, seed):
-    """With random geometry every entry varies but M_nn, and one relation is left: n(n+1)/2 - 1 outputs, one
+    """With random geometry every entry except M_nn varies, with one relation: n(n+1)/2 - 1 outputs, one
     constant.
     """
     structure = derive(random_arm(joints, seed))

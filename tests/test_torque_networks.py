@@ -44,7 +44,7 @@ def test_another_arms_torques_are_met(tmp_path):
 
 
 def test_penalised_parameters_stay(tmp_path):
-    """A penalty against the torques leaves an error that nothing else would."""
+    """A strong penalty keeps the constants at their initial values against the torques."""
     module = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py")
     true, model = module.Model(seed=0), module.Model(seed=0)
     constants = model.mass.raw_constants
@@ -57,7 +57,7 @@ def test_penalised_parameters_stay(tmp_path):
 
 
 def test_blocks_equal_a_single_batch(tmp_path, monkeypatch):
-    """The loss and its gradient; what many steps make of the last digits is another thing."""
+    """The loss and its gradient are compared, as many steps would amplify rounding."""
     module = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py")
     true = module.Model(seed=0)
     samples = TorqueSamples.of([recorded(true, 5), recorded(true, 6)])

@@ -70,7 +70,7 @@ def test_the_arm_follows_its_sines_to_a_few_degrees(recordings):
 
 @pytest.mark.parametrize("choice", ["same", "own"])
 def test_trajectories_follow_one_path_or_each_its_own(loaded, choice):
-    """On one path, what a trajectory does late another has done before: the whole path is trained on."""
+    """On one path, trajectories overlap, so that the whole path is trained on."""
     settings = changed(loaded.settings, {"paths": choice})
     period = 1 / settings.tracking.frequency
     begun = paths(loaded.arm, settings, np.array([0.0, 2 / 6 * period]))
@@ -191,7 +191,7 @@ def test_motors_behind_gears_get_their_share_and_a_passive_joint_none():
 
 
 def test_the_arm_is_held_against_its_weight_from_the_start(loaded):
-    """Without gains and without a sine to follow, what the controller starts with keeps the arm at rest."""
+    """Without gains and without a sine, the initial torque of the controller keeps the arm at rest."""
     friction = make_friction(loaded.arm, loaded.settings)
     engine = arm_dynamics(loaded.arm, loaded.settings, friction)
     still = sines(np.full(N, 0.4), 0.0, 0.125, np.zeros(N), np.arange(50) / 125)

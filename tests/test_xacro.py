@@ -175,7 +175,7 @@ def test_without_the_package_one_error_states_how_to_install_it(arm, tmp_path, m
 
 @pytest.mark.parametrize("name", ["arm.urdf", "arm.xml", "arm.xacro.urdf", "xacro"])
 def test_content_never_causes_expansion(arm, name, monkeypatch):
-    """Only a name that ends in .xacro does; the author of a downloaded URDF has no say in it."""
+    """Only the suffix .xacro does; the content of a downloaded URDF does not."""
     monkeypatch.setattr("subprocess.run", lambda *_, **__: pytest.fail("it was run"))
     path = arm.rename(arm.with_name(name))
     lines = refusal(path).splitlines()

@@ -13,12 +13,12 @@ REFERENCE = 0.04  # s
 
 
 def in_time(seconds: float, bound: float) -> bool:
-    """Return whether ``seconds`` of processor time, just now and here, are less than ``bound`` of the reference's."""
+    """Return whether ``seconds`` of processor time, just measured, are below ``bound`` of the reference machine."""
     return seconds < bound or seconds < bound * slowness()
 
 
 def slowness() -> float:
-    """Return how many times as long as the reference this machine takes for the same loop; at least 1."""
+    """Return the duration of the loop relative to the reference machine; at least 1."""
     return max(1.0, statistics.median(_loop() for _ in range(5)) / REFERENCE)
 
 
