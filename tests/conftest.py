@@ -103,7 +103,7 @@ def shared() -> Path:
 
 @pytest.fixture
 def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Limit epochs to four steps, for tests that do not depend on the quality of a fit."""
+    """Epochs of few windows take four steps: for tests of what stands around a fit."""
     from spelgen.settings.tuning.fitting import WindowTuning
 
     monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", WindowTuning(epoch_steps=4))
@@ -111,7 +111,7 @@ def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def short_torque_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Limit torque fits to a few iterations, for tests that do not depend on the quality of a fit."""
+    """Fits to torques take two steps a round and few rounds: for tests of what stands around a fit."""
     from spelgen.settings.tuning.fitting import TorqueTuning
 
     tuning = TorqueTuning(rounds=1, first_steps=2, last_rounds=1, longer=1, steps=2)

@@ -6,8 +6,7 @@ from emitted import GANTRY, SIX, built, import_source, randomise
 from torch import Tensor, nn
 from torch.func import hessian, jacfwd, jacrev, jvp, vmap
 
-from spelgen.dynamics.protocol import has_friction_state, sliding_memory
-from spelgen.pipeline.generate import generate
+import spelgen
 from tests.test_closed_form import FOLLOWED
 
 VARIANTS = {  # preset and networks
@@ -21,6 +20,7 @@ VARIANTS = {  # preset and networks
     "closed-form": ("closed-form", None),
 }
 ALL_ROBOTS = ("hybrid", "minimal", "closed-form")  # variants with the derived structure of each robot
+WITH_FRICTION_STATE = ("hybrid", "hybrid-kan", "closed-form")
 THREE = ("two_link", "rpr", "six_dof")
 URDFS = {"mimic": FOLLOWED, "gantry": GANTRY}  # arms in addition to the robots of the repository
 # Standard deviations of random parameters; None: as `randomise` scales them. With 1.0 the bound of M is active.
@@ -49,7 +49,7 @@ def module_of(tmp_path_factory):
             preset, net = VARIANTS[variant]
             if robot in URDFS:
                 (folder / f"{robot}.urdf").write_text(URDFS[robot], encoding="utf-8")
-                source = generate(folder / f"{robot}.urdf", preset=preset)
+                source = spelgen.generate(folder / f"{robot}.urdf", preset)
             else:
                 source = built(robot, preset=preset, net=net)[0]
             name = f"{robot}_{variant}.py".replace("-", "_")
@@ -81,6 +81,11 @@ def assert_near(found: Tensor, expected: Tensor, bound: float = 1e-10) -> None:
     """Check the shape, and the difference relative to the largest entry."""
     assert found.shape == expected.shape
     assert (found - expected).abs().max() <= bound * max(1.0, expected.abs().max().item())
+
+
+def friction_state(variant: str, model: nn.Module, qd: Tensor) -> list[Tensor]:
+    """Return the friction state z of joints that slide at qd, (..., n, elements), if the variant has one."""
+    return [model.memory(qd)] if variant in WITH_FRICTION_STATE else []
 
 
 def times(matrix: Tensor, vector: Tensor) -> Tensor:
@@ -177,7 +182,7 @@ def test_backpropagation_reaches_every_parameter(variant, dtype, random_model):
     model = random_model(variant, "rpr", 0, 0.3).to(dtype)
     q, qd, _, tau = (x.to(dtype) for x in states(3, 20))
     # friction states between the values of both directions of motion
-    state = [0.3 * model.memory(qd) * torch.rand_like(model.memory(qd))] if has_friction_state(model) else []
+    state = [0.3 * z * torch.rand_like(z) for z in friction_state(variant, model, qd)]
     loss = model.forward_dynamics(q, qd, tau, *state).square().sum() + model.hamiltonian(q, qd, *state).sum()
     loss.backward()
     for name, parameter in model.named_parameters():
@@ -200,8 +205,7 @@ def test_transforms_of_torch_func_apply(variant, robot, random_model):
             assert_near(vmap(mode(function))(q, qd, tau), single, 1e-8)
     curvature = hessian(model.hamiltonian, argnums=1)(q[0], model.momentum(q[0], qd[0]))
     assert_near(curvature, torch.linalg.inv(model.mass_matrix(q[0])), 1e-8)
-    if has_friction_state(model):
-        z = model.memory(qd)
+    for z in friction_state(variant, model, qd):
         expected = model.forward_dynamics(q, qd, tau, z)
         assert_near(vmap(model.forward_dynamics)(q, qd, tau, z), expected, 1e-9)
 
@@ -222,7 +226,7 @@ def test_a_model_is_one_graph(variant, random_model):
     """torch.export in strict mode for batches of any size, and torch.compile without graph breaks."""
     model = random_model(variant, "rpr", 1).requires_grad_(False)
     q, qd, tau = states(3, 5, count=3)
-    state = torch.cat([q, qd, sliding_memory(model, qd).flatten(-2), tau], dim=-1)
+    state = torch.cat([q, qd, *(z.flatten(-2) for z in friction_state(variant, model, qd)), tau], dim=-1)
     batch = {"t": None, "state": {0: torch.export.Dim("batch")}}
     program = torch.export.export(model, (torch.zeros(()), state), dynamic_shapes=batch, strict=True)
     more = torch.cat([state, state])
