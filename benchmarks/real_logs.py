@@ -24,8 +24,8 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from characters import TESTS as CHARACTERS
-from characters import read_characters, write_arm
+from delan_characters import TESTS as CHARACTERS
+from delan_characters import read_characters, write_arm
 
 import spelgen
 from spelgen.arm.arm import Arm

@@ -35,7 +35,7 @@ NETWORKS = Design(
     mass="derived", potential="derived", dissipation="per-joint", input="derived", memory="none", net="mlp",
     encoding="joint",
 )  # fmt: skip
-"""M and V by networks of the derived structure alone."""
+"""M and V by networks of the derived structure, without rigid bodies."""
 SIX = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")
 
 
@@ -88,7 +88,7 @@ def random_model(
 
 
 def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> None:
-    """Draw every weight anew: with this standard deviation, or with the inverse root of a layer's inputs."""
+    """Randomise every parameter: with this standard deviation, or with the inverse root of a layer's inputs."""
     generator = torch.Generator().manual_seed(seed)
     for name, parameter in model.named_parameters():
         draw = torch.randn(parameter.shape, dtype=parameter.dtype, generator=generator)
@@ -105,14 +105,14 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
 
 
 def network_inputs(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
-    """What the networks of a model read of q, (..., encoded)."""
+    """The inputs of the networks of a model, (..., encoded)."""
     owner = getattr(model, "residuals", model)
     encoded: torch.Tensor = owner.encoding(q)
     return encoded
 
 
 def outputs_alone(network: nn.Module, encoded: torch.Tensor) -> torch.Tensor:
-    """A network's outputs y, (..., outputs), without what a model makes of them."""
+    """A network's outputs y, (..., outputs), before a model scales and combines them."""
     count = len(network.biases[-1])
     layers = network.prepare(torch.eye(count, dtype=encoded.dtype), encoded.new_zeros(count))
     y: torch.Tensor = network(encoded, layers)[0]
@@ -132,7 +132,7 @@ def frictionless(model: nn.Module) -> nn.Module:
 
 
 class ExactFunctions(nn.Module):
-    """Stands in for a network: y = (polynomial - mean) / scale, with exact derivatives."""
+    """Replaces a network: y = (polynomial - mean) / scale, with exact derivatives."""
 
     def __init__(
         self, functions: list[fmpq_mpoly], mean: torch.Tensor, scale: torch.Tensor, encoding: nn.Module

@@ -1,4 +1,4 @@
-"""`spelgen logs`: what it measures is what was put in, and what is wrong is found."""
+"""`spelgen logs` reports the properties that simulated logs have, and finds each inserted fault."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""The design space: every combination is a model that works, or is refused with the two options that clash."""
+"""Each combination of design options is a model that works, or is refused with the two options in conflict."""
 
 import itertools
 from dataclasses import asdict

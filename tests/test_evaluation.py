@@ -1,4 +1,4 @@
-"""Evaluation: baselines against exact solutions, errors that mean what they say, results that are valid JSON."""
+"""Errors of an evaluation equal those of exact solutions; baselines are exact; results are valid JSON."""
 
 import json
 from dataclasses import replace
@@ -33,7 +33,7 @@ from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.settings.fits import Rollout
 
-STAND_IN = Path(__file__).with_name("stand_in.py")
+STAND_IN = Path(__file__).with_name("planar_model.py")
 JOINTS = ("shoulder", "elbow")
 UR10E = [
     f"{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")

@@ -1,4 +1,4 @@
-"""`spelgen excite`: motions within limits, at rest at both ends, that show what a motion at random does not."""
+"""`spelgen excite`: motions stay within limits, start and end at rest, and are more informative than random ones."""
 
 import csv
 
@@ -64,11 +64,11 @@ def test_velocities_and_accelerations_are_derivatives(found):
     )
 
 
-def test_the_motion_is_worth_the_search(loaded, found):
+def test_the_optimised_motion_is_more_informative(loaded, found):
     assert found.condition < found.first / 3
     assert (
         found.parameters == 36 + 6 * 4 - 2
-    )  # rigid bodies, friction and rotors; what these share counts once
+    )  # rigid bodies, friction and rotors; parameters in common count once
     assert (found.efforts < 1).all()
     assert excite(loaded, **CHOICE, trials=1).first == found.first
 
@@ -170,7 +170,7 @@ def test_values_that_cannot_be_are_refused(loaded, changes, message):
     assert str(caught.value) == f"excite: {message}"
 
 
-def test_it_is_told_in_a_notebook(found):
+def test_a_notebook_shows_the_result(found):
     assert repr(found).startswith("<Excitation of 'ur10e': 10 s, condition number ")
     assert found._repr_html_().count("<tr>") == 7
 

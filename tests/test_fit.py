@@ -1,4 +1,4 @@
-"""Fits in memory: the same as those of files, saved and loaded again; torques predicted and scored; both solvers."""
+"""Fits in memory equal fits of files, survive saving and loading, and give the torques that they report."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Options of a fit: each objective has its own, and one that does not apply is told with what it belongs to."""
+"""Each objective accepts its own options; any other option is refused with the objective that it belongs to."""
 
 from pathlib import Path
 

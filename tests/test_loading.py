@@ -1,4 +1,4 @@
-"""A module from its file or its text: what it carries, and what is refused."""
+"""A module is loaded from its file or its text; text that is no emitted module is refused."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from spelgen.emission.loading import load_module
 from spelgen.errors import ModuleError
 
 ROBOTS = Path(__file__).parents[1] / "robots"
-STAND_IN = Path(__file__).parent / "stand_in.py"
+STAND_IN = Path(__file__).parent / "planar_model.py"
 
 
 def test_a_file_and_its_text_give_the_same_model():

@@ -1,4 +1,4 @@
-"""Arms under position servos: from settings to a module, from logs to ratios to kp, and to replayed commands."""
+"""Arms under position servos: parameters relative to kp are recovered, and replayed commands track the logs."""
 
 import json
 import re
@@ -58,6 +58,12 @@ def fitted(arm, logs, tmp_path_factory):
     return spelgen.fit(spelgen.build(arm, "closed-form"), logs[:4], arm=arm, folder=folder)
 
 
+@pytest.fixture(scope="module")
+def results(fitted, logs):
+    """The evaluation of the fit on the log that was not fitted."""
+    return spelgen.evaluate(fitted, logs[4:])
+
+
 def test_ratios_to_kp_are_found(fitted):
     model, kp = fitted.model, np.array(TRUTH.kp)
     with torch.no_grad():
@@ -71,8 +77,7 @@ def test_ratios_to_kp_are_found(fitted):
     assert float(model.delay) == pytest.approx(TRUTH.delay, abs=0.004)
 
 
-def test_replay_of_another_motion_beats_the_baselines(fitted, logs):
-    results = spelgen.evaluate(fitted, logs[4:])
+def test_replay_of_another_motion_beats_the_baselines(fitted, logs, results):
     for replay in results.replays:
         errors = {name: each.mean for name, each in replay.errors.items()}
         assert errors["model"] < 0.4 * min(errors[LINEAR_SERVOS], errors[DELAYED_COMMAND])
@@ -172,8 +177,8 @@ def test_commands_are_held_and_late():
     assert late == pytest.approx(np.array([[0.0, 0.0], [0.5, 1.0]]), abs=1e-9)
 
 
-def test_its_report_shows_servos_and_replays_and_no_torques(fitted, logs):
-    write_json(RunFolder(fitted.folder).evaluation, spelgen.evaluate(fitted, logs[4:]).to_dict())
+def test_its_report_shows_servos_and_replays_and_no_torques(fitted, results):
+    write_json(RunFolder(fitted.folder).evaluation, results.to_dict())
     page = render_report(fitted.folder)
     told = " ".join(page.split())
     assert "Typical log replayed: motion 4" in page and told.count('class="line hold"') >= 2

@@ -1,4 +1,4 @@
-"""Simulated logs: exact solutions, friction, inputs held, seeds, and another integrator."""
+"""Simulated logs equal exact solutions and another integrator; inputs are held, seeds are deterministic."""
 
 import numpy as np
 import pinocchio as pin

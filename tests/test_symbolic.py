@@ -1,4 +1,4 @@
-"""The polynomials: an independent proof of the structure, and equal to Pinocchio."""
+"""Exact polynomials of M and V prove the derived structure and equal Pinocchio."""
 
 import numpy as np
 import pytest

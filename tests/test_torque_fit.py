@@ -1,4 +1,4 @@
-"""Closed-form models fitted to torques: known arms found again, in blocks as at once, adapted to a load, real ones."""
+"""Torque fits of closed-form models recover known arms, in blocks or at once, and adapt to loads."""
 
 import json
 from dataclasses import replace
@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from characters import TESTS, read_characters, write_arm
+from delan_characters import TESTS, read_characters, write_arm
 from emitted import import_source
 from lxml import etree
 from motions import smooth_motion

@@ -1,4 +1,4 @@
-"""A process that dies without a word between two writes, as under SIGKILL, at a moment that is chosen."""
+"""Run a training in a forked process that exits without cleanup at a chosen write, as under SIGKILL."""
 
 import os
 from collections.abc import Callable

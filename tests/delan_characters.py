@@ -1,4 +1,4 @@
-"""The arm that drew DeLaN's characters, and what it measured."""
+"""The arm and the recordings of the DeLaN characters data set, read from its files."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Plain words: every statement and every reason against numbers by Pinocchio, and the words themselves."""
+"""Statements and reasons of the inspection agree with numbers by Pinocchio."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from arms import STRAIGHT, chain, reference_arms
-from seen_arm import NOTHING, Seen
+from pinocchio_geometry import NOTHING, Seen
 
 from spelgen.arm.arm import Arm, make_arm
 from spelgen.certificate.axes import is_plain
@@ -124,7 +124,7 @@ def test_reference_arms(shared, assume):
 
 
 def assert_statements_hold(arm: Arm, structure: Structure, told: tuple[Fact, ...], name: str) -> None:
-    """By Pinocchio at random configurations, with random inertials or the URDF's; and all of them are told."""
+    """Every reason is true in Pinocchio at random configurations, with random inertials or the URDF's."""
     keys = triangle(len(structure.joints))
     free = structure.assume == "kinematics"
     samples = draw(arm, 4 if free else 6, np.random.default_rng(0), random_inertials=free)

@@ -1,4 +1,4 @@
-"""The deployment form of a model gives what the model gives, and its derivatives and steps are right."""
+"""A prepared model equals its model; its derivatives and steps are correct."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def states(*shape):
     return [0.4 * torch.randn(*shape, 3, generator=random, dtype=torch.float64) for _ in range(3)]
 
 
-def test_gives_what_the_model_gives(pair):
+def test_a_prepared_model_equals_its_model(pair):
     model, prepared = pair
     q, qd, x = states(4, 2)
     same = [
@@ -36,7 +36,7 @@ def test_gives_what_the_model_gives(pair):
         torch.testing.assert_close(found, expected)
 
 
-def test_later_training_does_not_reach_it(pair):
+def test_later_training_does_not_change_it(pair):
     model, prepared = pair
     q, qd, x = states()
     before = prepared.inverse_dynamics(q, qd, x)
@@ -49,7 +49,7 @@ def test_later_training_does_not_reach_it(pair):
         parameter.copy_(old)
 
 
-def test_momentum_rate_is_the_slope_of_momentum(pair):
+def test_momentum_rate_is_the_derivative_of_momentum(pair):
     _, prepared = pair
     q, qd, tau = states(4)
     qdd, h = prepared.forward_dynamics(q, qd, tau), 1e-6
@@ -59,7 +59,7 @@ def test_momentum_rate_is_the_slope_of_momentum(pair):
     )
 
 
-def test_linearize_is_the_slope_of_rate_and_step(pair):
+def test_linearize_is_the_derivative_of_rate_and_step(pair):
     _, prepared = pair
     given = torch.cat(states(3), dim=-1)  # q, qd, tau
     z = prepared.memory(given[..., 3:6])
@@ -79,7 +79,7 @@ def test_linearize_is_the_slope_of_rate_and_step(pair):
             torch.testing.assert_close(found[..., k], slope, rtol=1e-4, atol=1e-5)
 
 
-def test_a_batch_is_linearized_alike_without_autograd_and_when_compiled(pair):
+def test_linearization_of_a_batch_is_the_same_without_autograd_and_when_compiled(pair):
     _, prepared = pair
     inputs = states(4)
     expected = prepared.linearize(*inputs)
@@ -120,8 +120,8 @@ def test_kinematics_of_the_tip(pair):
         moved_model("two_link", "closed-form").prepared().pose(q[:2])
 
 
-def test_what_is_zero_takes_no_time():
-    """Without residuals hybrid is prepared as the bodies alone; with them it is not, and neither changes the model."""
+def test_zero_terms_are_removed():
+    """Without residual terms hybrid is prepared as rigid bodies; preparation never changes the model."""
     model = build(arm_of("rpr"), "hybrid").requires_grad_(False)
     q, qd, x = states(4)
     assert residual_terms(model.prepared()._model) is None

@@ -1,4 +1,4 @@
-"""What decides whether a part, a law or a figure is accepted: each test fails where that judgement is left out."""
+"""Acceptance of residual terms, friction effects and figures: each test fails without its criterion."""
 
 import re
 from dataclasses import replace
@@ -32,7 +32,7 @@ from spelgen.settings.fits import Rollout, TorqueFit
 
 
 class Alone:
-    """Bodies and friction laws that take over nothing."""
+    """Rigid bodies and a friction model that absorb none of the added torque."""
 
     @staticmethod
     def remaining(joint, torque):

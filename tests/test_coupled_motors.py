@@ -1,4 +1,4 @@
-"""Drives that move several joints: friction, its memory and rotors belong to the motors' speeds; logs show it."""
+"""Drives that move several joints: friction and rotor inertia act at motor speeds, and logs reveal couplings."""
 
 import json
 import shutil
@@ -38,7 +38,7 @@ SPEEDS = np.array([[1.0, 0.8], [1.0, -0.8]])  # of its motors, as of the fifth j
 
 @pytest.fixture(scope="module")
 def wrist(tmp_path_factory):
-    """A six-joint arm whose last two joints hang on a differential: its module and what was loaded of it."""
+    """A six-joint arm with a differential at its last two joints: its module and the loaded arm."""
     folder = tmp_path_factory.mktemp("wrist")
     names = [f"j{k}" for k in range(1, 7)]
     shutil.copy(ROBOTS / "six_dof.urdf", folder / "arm.urdf")
@@ -155,7 +155,7 @@ def test_energy_and_memory_are_those_of_the_motors(wrist):
 
 
 def test_motors_may_be_coupled_where_joint_torques_are_logged(wrist, tmp_path):
-    """Friction and rotors are the motors' all the same: in least squares, in what is emitted, in what is shown."""
+    """Friction and rotors belong to the motors in least squares, in the emitted module and in reports."""
     _, driven = wrist
     names = [x.name for x in driven.arm.coordinates]
     shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")
@@ -206,7 +206,7 @@ def told(report, code):
 
 
 @pytest.mark.parametrize(("logged_at", "ratio"), [("joints", 1.0), ("motors", -0.5)])
-def test_logs_show_a_coupling_and_what_is_said_then_mends_it(uncoupled, tmp_path, logged_at, ratio):
+def test_the_suggested_coupling_removes_the_finding(uncoupled, tmp_path, logged_at, ratio):
     log = recorded(uncoupled, logged_at, ratio)
     (message,) = told(check_logs([log], uncoupled), "coupled-motors")
     assert f"{ratio:g} times as fast" in message and f"those of the {logged_at}" in message
@@ -254,7 +254,7 @@ def test_a_fit_moves_late_torques_and_its_evaluation_too(uncoupled):
     assert misses < 1 - replace(fitted, preprocessing=Preprocessing()).score(log)
 
 
-def test_no_delay_is_searched_beside_a_coupling_that_no_file_names(uncoupled):
+def test_no_delay_is_estimated_with_an_unspecified_coupling(uncoupled):
     """Least squares without the coupling finds 5.7 ms of 10, and calls them sure: `logs` suggests neither."""
     log = recorded(uncoupled, "joints", 1.0, late=0.01)
     assert not told(check_logs([log], uncoupled), "torque-delay")
@@ -271,7 +271,7 @@ def test_no_delay_is_searched_beside_a_coupling_that_no_file_names(uncoupled):
 
 
 def test_a_coupling_that_goes_with_the_delay_is_a_delay(uncoupled, monkeypatch):
-    """Number 160 of `benchmarks/truth.py`: 5 ms of an arm without friction passed for a coupling."""
+    """Number 160 of `benchmarks/truth.py`: 5 ms of delay of an arm without friction resemble a coupling."""
     coupling, looked_at = Coupling(5, 4, 1.0, "joints"), []
 
     def only_at_first(problem):
@@ -292,7 +292,7 @@ def test_logs_of_plain_drives_suggest_nothing(uncoupled):
 
 
 def test_gains_of_currents_are_found(uncoupled, tmp_path):
-    """Torques logged in units of their own, joint by joint: the gains are found beside bodies, friction and rotors."""
+    """Torques logged in one unit per joint: the gains are estimated together with bodies, friction and rotors."""
     gains = np.array([1.5, 0.7, 1.3, 0.8, 1.2, 0.9])
     logs = [recorded(uncoupled, "joints", 0.0)]
     shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")

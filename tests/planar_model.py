@@ -1,4 +1,4 @@
-"""A hand-written two-joint planar arm with the interface of an emitted module, small enough to check by eye."""
+"""A hand-written model of a planar two-joint arm with the interface of an emitted module."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ FACTS = """{
 
 
 class Pose(NamedTuple):
-    """What depends on q alone: q itself and M."""
+    """The configuration cache: q and M."""
 
     q: torch.Tensor
     mass: torch.Tensor
@@ -109,7 +109,7 @@ class Model(nn.Module):
 
     @property
     def dynamics(self):
-        """An emitted model's parts stand apart; here they are the model's own, and of q all that is kept is q."""
+        """The part that an emitted model keeps separately; here it is the model itself."""
         return self
 
     def configuration(self, q, prepared):

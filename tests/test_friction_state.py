@@ -1,4 +1,4 @@
-"""Friction that remembers: bristles are exact in displacement, passive, and blind to an encoder's jitter."""
+"""Friction states are exact in displacement, passive, and unaffected by encoder jitter."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ REACH = [[3e-4, 3e-3, 3e-2], [3e-5, 3e-4, 3e-3]]
 
 
 def swings(samples: int, seed: int = 0) -> np.ndarray:
-    """A smooth path, (samples, 2), that turns around again and again."""
+    """A smooth path, (samples, 2), that reverses many times."""
     t = np.linspace(0.0, 4.0, samples)[:, None]
     phase = np.random.default_rng(seed).uniform(0, 6, (2, 3))
     waves = [np.sin((1.0 + 2.3 * k) * t + phase[:, k]) / (1 + k) for k in range(3)]
@@ -47,13 +47,13 @@ def test_one_pass_over_positions_solves_the_differential_equation():
     for moved in qd:  # Euler, with steps far below the least reach
         z = z + model.memory_rate(z, moved)
     found = bristles_along(q[::1000].numpy(), BristleReach(np.array(REACH)))[-1]
-    # between samples that lie so far apart a joint may turn around: finer ones know of it
+    # between coarse samples a joint may reverse: finer samples show it
     finer = bristles_along(q[::10].numpy(), BristleReach(np.array(REACH)))[-1]
     assert np.abs(finer / REACH - (z / reach).numpy()).max() < 1e-2
     assert np.abs(found / REACH).max() <= 1.0
 
 
-def test_a_step_of_any_length_is_exact_along_one_way():
+def test_a_step_of_any_length_is_exact_in_one_direction():
     reach = torch.tensor(REACH).double()
     z = torch.randn(2, 3).double().clamp(-1, 1) * reach
     way = torch.tensor([0.02, -0.003]).double()
@@ -80,8 +80,8 @@ def test_load_dependent_friction_is_smooth_at_right_angles():
     torch.testing.assert_close(far, -constants.load_dependence, rtol=1e-3, atol=0)
 
 
-def test_bristles_store_and_dissipate_but_never_give_more_than_they_hold():
-    """d/dt stored energy = power taken - what is lost, and what is lost is never negative."""
+def test_bristles_are_passive():
+    """d/dt stored energy = supplied power - dissipated power, and the dissipated power is never negative."""
     laws = FrictionLaws(FRICTION, SPEED, REACH)
     with torch.no_grad():
         for weight in laws.parameters():
@@ -101,8 +101,8 @@ def test_bristles_store_and_dissipate_but_never_give_more_than_they_hold():
         assert energy.min() > 0
 
 
-def test_energy_of_an_arm_left_to_itself_never_rises(tmp_path):
-    """H and what the bristles store, of a closed-form rpr, along its own motion."""
+def test_energy_of_an_unforced_arm_never_rises(tmp_path):
+    """H with the energy of the bristles, of a closed-form rpr, along its own motion."""
     model = import_source(built("rpr", preset="closed-form")[0], tmp_path / "rpr.py").Model(seed=1)
     with torch.no_grad():
         model.friction.raw_stribeck -= 100.0
@@ -171,7 +171,7 @@ def test_least_squares_finds_the_strengths_of_bristles():
     np.testing.assert_allclose(torque, tau, atol=1e-6)
 
 
-def test_the_weak_form_counts_all_that_the_drives_do():
+def test_the_weak_form_includes_all_work_of_the_drives():
     """An offset of the measured torque and friction that drives make up for are no fault of the rigid bodies."""
     model = load_module(built("rpr", preset="closed-form")[0])
     dynamics = model

@@ -1,4 +1,4 @@
-"""The verdict of a report: computed from the figures, each word of it."""
+"""Each word of the assessment in a report follows from the figures."""
 
 from dataclasses import replace
 
@@ -63,11 +63,11 @@ def torques(slow, fast):
     (0.7, 0.5, "Not accurate enough yet"),
     (0.7, None, "Not accurate enough yet"),
 ])  # fmt: skip
-def test_what_it_is_good_for_follows_the_figures(relative, nmse, said):
+def test_the_assessment_follows_from_the_figures(relative, nmse, said):
     assert said in verdict(evaluation(relative, nmse)).sentence
 
 
-def test_figures_and_better_baselines_are_told():
+def test_figures_and_better_baselines_are_reported():
     told = verdict(evaluation(0.05, 0.004, squares=0.03)).because
     assert "explains 99.6 % of the variance" in told and "is off by 5 % of the motion after 1 s" in told
     assert "But squares is better after 1 s." in told
@@ -83,14 +83,14 @@ def test_where_it_fails_follows_the_residuals(slow, fast, place):
 
 
 @pytest.mark.parametrize("nmse, worst", [(0.004, "a"), (0.2, "b")])
-def test_where_motion_alone_fails_its_joint_is_named(nmse, worst):
+def test_if_only_motion_fails_its_joint_is_named(nmse, worst):
     judged = evaluation(0.7, nmse)
     missed = judged.horizons[-1].errors
     missed["model"] = replace(missed["model"], q_relative_rms=(1.3, 0.1))
     assert f"; worst at {worst}." in verdict(judged).sentence
 
 
-def test_a_terminal_shows_the_verdict_last():
+def test_a_terminal_shows_the_assessment_last():
     text, judged = evaluation(0.7).text(), verdict(evaluation(0.7))
     assert " ".join(text.split("\n\n")[-1].split()) == f"{judged.sentence} {judged.because}"
     assert max(map(len, text.splitlines())) <= 80
@@ -111,7 +111,7 @@ def test_a_good_mean_does_not_hide_a_bad_joint():
     assert "contact detection" in good.sentence
 
 
-def test_a_joint_that_is_logged_in_coarse_steps_is_not_judged():
+def test_a_joint_that_is_logged_in_coarse_steps_is_not_assessed():
     assert "contact detection; worst at a" in of_torques([0.001, 0.2], {"b": 1.0}).sentence
     assert of_torques([0.3, 0.2], {"b": 1.0, "a": 2.0}).sentence == "Not accurate enough yet."
 
@@ -122,7 +122,7 @@ def test_errors_above_the_whole_are_times_of_it():
     assert (share(0.9964), share(1.0), share(2.0)) == ("99.64 %", "100 %", "2 times")
 
 
-def test_what_to_record_follows_what_the_logs_cover():
+def test_recommended_recordings_follow_from_the_coverage_of_logs():
     def ranges(high):
         return {"q": [{"low": 0.0, "high": x} for x in (1.0, high)], "qd": [{"low": -1.0, "high": 1.0}] * 2}
 
@@ -154,11 +154,11 @@ def test_where_a_constant_velocity_is_better_the_model_is_for_torques():
     assert "prediction 1 s ahead with a momentum observer" in verdict(held).sentence
 
 
-def test_errors_beyond_the_motion_are_told_as_such():
+def test_errors_larger_than_the_motion_are_reported_as_such():
     assert "is off by 8 times the motion after 1 s" in verdict(evaluation(8.0)).because
 
 
-def test_nothing_to_judge_by_is_said():
+def test_an_empty_evaluation_is_reported():
     assert verdict(results([], {})).sentence == "No verdict: no horizon and no torque was evaluated."
 
 

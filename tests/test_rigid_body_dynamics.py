@@ -1,4 +1,4 @@
-"""All that has rigid-body dynamics: against Pinocchio's own reading of the URDF, mechanics by hand, one another."""
+"""Rigid-body dynamics against Pinocchio's own reading of the URDF and against mechanics derived by hand."""
 
 from fractions import Fraction
 
@@ -25,7 +25,7 @@ SIX = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")
 
 
 @pytest.mark.parametrize("robot", SIX)
-def test_an_arm_is_what_pinocchio_reads_from_the_file(robot, robots):
+def test_an_arm_equals_pinocchios_reading_of_the_file(robot, robots):
     path = robots / f"{robot}.urdf"
     gravity = load_settings(path).gravity
     engine = arm_dynamics(make_arm(read_urdf(path), gravity=gravity), Settings())

@@ -1,4 +1,4 @@
-"""What a step does not need does not refuse it; what it needs does."""
+"""A command refuses missing or wrong data only if it needs them."""
 
 import pytest
 
@@ -31,7 +31,7 @@ def odd(robots, tmp_path, monkeypatch):
 
 
 def body(source):
-    """A module but for the digests of what it was made from."""
+    """A module without the digests of its sources."""
     return [line for line in source.splitlines() if "sha256" not in line]
 
 
@@ -45,7 +45,7 @@ def body(source):
         ("", "simulation: {positions: {nobody: [0, 1]}}", ["unusable-settings"]),
     ],
 )
-def test_it_is_a_warning_at_most(odd, more, sidecar, codes):
+def test_unneeded_defects_are_warnings_at_most(odd, more, sidecar, codes):
     plain = generate(odd())
     arm = load_arm(odd(more, sidecar))
     assert [each.code for each in arm.diagnostics if each.severity == "warning"] == codes
@@ -74,7 +74,7 @@ def test_couplings_of_locked_joints_are_not_needed(odd):
         ),
     ],
 )
-def test_what_is_needed_refuses(odd, more, sidecar, message):
+def test_needed_defects_are_refused(odd, more, sidecar, message):
     with pytest.raises(SpelgenError) as error:
         load_arm(odd(more, sidecar))
     assert message in str(error.value).splitlines()

@@ -1,4 +1,4 @@
-"""Logs and options as strangers send them: an answer, or one error that is ours; no warning of NumPy, no waiting."""
+"""Untrusted logs and options give a result or one spelgen error, without NumPy warnings and in bounded time."""
 
 import io
 import os
@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 import torch
-from machine import in_time
+from time_bounds import in_time
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.comparison.jobs import RunResult
@@ -149,6 +149,7 @@ def test_windows_without_motion_are_not_fitted(robots, scale, config):
         fit(model, logs, config)
 
 
+@pytest.mark.timed
 def test_twenty_thousand_recordings_of_two_samples_take_seconds(tmp_path, arm):
     count = 20_000
     t = np.tile([0.0, 0.01], count)

@@ -1,4 +1,4 @@
-"""28 real malformed or awkward files: each is read right, or refused by a message that names its defect."""
+"""28 malformed or unusual URDF files are read correctly or refused by a message that names the defect."""
 
 import csv
 import re
@@ -145,7 +145,7 @@ def test_read(nasty, name):
 
 
 @pytest.mark.parametrize("name", READ)
-def test_what_is_read_is_right(nasty, name):
+def test_accepted_files_are_read_correctly(nasty, name):
     """Derived, and found again by Pinocchio and by another reader of the file."""
     robot = read_urdf(nasty / f"{name}.urdf")
     arm = make_arm(robot)

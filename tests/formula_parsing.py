@@ -1,4 +1,4 @@
-"""Closed forms read back from what was written, and compared with Pinocchio."""
+"""Closed forms parsed from the written text and compared with Pinocchio."""
 
 from __future__ import annotations
 

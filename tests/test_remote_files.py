@@ -1,4 +1,4 @@
-"""Logs and runs at addresses that fsspec knows are as those on the disk."""
+"""Logs and run folders at fsspec addresses behave like those on the local disk."""
 
 import json
 import zipfile
@@ -27,7 +27,7 @@ def memory():
     return system
 
 
-def test_a_run_and_its_logs_may_be_elsewhere(robots, tmp_path, memory):
+def test_a_run_and_its_logs_may_be_remote(robots, tmp_path, memory):
     arm = load_arm(robots / "two_link.urdf")
     logs = simulate(arm, trajectories=4)
     write_logs(local("memory://data/train.parquet"), logs.train, JOINTS)
@@ -63,7 +63,7 @@ def test_a_run_and_its_logs_may_be_elsewhere(robots, tmp_path, memory):
     )
 
 
-def test_what_is_removed_here_is_removed_there(memory):
+def test_local_removal_removes_the_remote_file(memory):
     memory.pipe("/old/run/config.json", b"{}")
     run = RunFolder("memory://old/run")
     assert run.config.read_text() == "{}"
@@ -71,7 +71,7 @@ def test_what_is_removed_here_is_removed_there(memory):
     assert memory.find("/old/run") == ["/old/run/module.py"]
 
 
-def test_addresses_that_lead_nowhere(memory, tmp_path):
+def test_addresses_without_files_are_refused(memory, tmp_path):
     with pytest.raises(LogError, match=r"^memory://none: got no such file or folder, expected a log"):
         read_logs("memory://none", JOINTS)
     with pytest.raises(SpelgenError, match=r"^nowhere://x/y: cannot be reached \(.*nowhere"):

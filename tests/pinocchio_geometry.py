@@ -1,4 +1,4 @@
-"""The geometry of an arm as Pinocchio shows it at a few random configurations."""
+"""The geometry of an arm, computed by Pinocchio at random configurations."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Seen:
         return True
 
     def carried(self, joint: int, turner: int) -> np.ndarray:
-        """Distance of what ``joint`` carries from the plane through the turner's axis along the slide."""
+        """Distance of the mass moved by ``joint`` from the plane through the turner's axis along the slide."""
         found = []
         for q, axes, points in zip(self.configurations, self.axes, self.points, strict=True):
             pin.centerOfMass(self.engine.model, self.engine.data, q, True)

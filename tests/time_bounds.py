@@ -1,7 +1,7 @@
-"""Bounds of processor time, on machines of any speed.
+"""Bounds of processor time that are valid on machines of any speed.
 
-A bound is given in seconds of a machine on which ``_loop`` takes REFERENCE of them, as on a laptop of 2024. A machine
-that is slower, or busy, has as much more as a loop of today takes there.
+A bound is stated in seconds of a reference machine (a laptop of 2024), on which ``_loop`` takes REFERENCE seconds. On a
+slower or busy machine the bound grows in proportion to the current duration of ``_loop``.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ REFERENCE = 0.04  # s
 
 
 def in_time(seconds: float, bound: float) -> bool:
-    """Return whether ``seconds`` of processor time, just now and here, are less than ``bound`` of the reference's."""
+    """Return whether ``seconds`` of processor time, just measured, are below ``bound`` of the reference machine."""
     return seconds < bound or seconds < bound * slowness()
 
 
 def slowness() -> float:
-    """Return how many times as long as the reference this machine takes for the same loop; at least 1."""
+    """Return the duration of the loop relative to the reference machine; at least 1."""
     return max(1.0, statistics.median(_loop() for _ in range(5)) / REFERENCE)
 
 
