@@ -18,6 +18,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -28,12 +29,14 @@ from spelgen.arm.arm import Arm
 from spelgen.baselines.registry import command_followers
 from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.rigid_bodies import about_center, quaternion
-from spelgen.emission.loading import EmittedModel
 from spelgen.evaluation.replay import replays
 from spelgen.fitting.servo.windows import ServoWindows, servo_windows
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 from spelgen.pipeline.loaded_arm import LoadedArm
 from spelgen.settings.tuning.exporting import TUNING as EXPORT_TUNING
+
+if TYPE_CHECKING:
+    from spelgen.emission.loading import EmittedModel
 
 STEP = 5e-4  # [s] of the simulated robot
 HARD = [2e-3, 1.0]  # of constraints: a time constant [s], and no rebound
