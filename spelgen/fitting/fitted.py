@@ -27,6 +27,7 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.settings.fits import FitConfig
+from spelgen.spec import facts_of
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -157,7 +158,7 @@ class Fit:
 
         Raises RunError if there is a run in the folder, unless ``force``.
         """
-        if not hasattr(self.model, "source"):
+        if facts_of(self.model) is None:
             raise RunError("a model without a module", expected="one of spelgen.build or spelgen.load_module")
         run = RunFolder(folder)
         with locked(run.path):
