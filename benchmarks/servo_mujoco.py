@@ -18,6 +18,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -34,6 +35,9 @@ from spelgen.evaluation.replay import replays
 from spelgen.exporting.tuning import TUNING as EXPORT_TUNING
 from spelgen.fitting.servo.windows import ServoWindows, servo_windows
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
+
+if TYPE_CHECKING:
+    from spelgen.emission.assemble import ArmModel
 
 STEP = 5e-4  # [s] of the simulated robot
 HARD = [2e-3, 1.0]  # of constraints: a time constant [s], and no rebound

@@ -34,9 +34,9 @@ def evaluate(
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Torque errors only, without rollouts.")] = False,
 ) -> None:
-    """Evaluate a trained run and its baselines on test logs; the assessment comes first.
+    """Evaluate a trained run and its baselines on test logs.
 
-    The result is also written to evaluation.json in the run folder, and nothing else is.
+    The assessment comes first. The result is also written to evaluation.json in the run folder; nothing else is.
     """
     # a misspelt limit is reported before minutes of rollouts
     paths = options.logs(data, extra_logs)

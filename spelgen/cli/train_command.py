@@ -131,14 +131,14 @@ def train(
     except OptionError as error:
         option = "--objective" if error.option == "objective" else f"--set {error.option}"
         raise UsageError(f"{option}: {error.got}") from error
+    _report(fit, request, folder, format)
+
+
+def _report(fit: Fit, request: Request, folder: Path, format: str) -> None:
+    """Print the outcome of the fit; exit with 130 if it was interrupted."""
     if TIME_LIMIT in request.values and TIME_LIMIT not in type(fit.config).model_fields:
         objective = fit.config.objective
         note(f"info: {TIME_LIMIT} limits fits to windows; these logs are fitted by {objective}")
-    _report(fit, folder, format)
-
-
-def _report(fit: Fit, folder: Path, format: str) -> None:
-    """Print the outcome of the fit; exit with 130 if it was interrupted."""
     record = {
         "run": str(folder),
         "status": fit.status,

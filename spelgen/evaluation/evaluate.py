@@ -133,11 +133,7 @@ def _evaluate_torques(
     # residual terms that were not selected only cost time
     model = without_idle_residuals(tested.model)
     solver = accurate_solver(model, probe)
-    predictors = [Predictor(MODEL, solver, model)]
-    known = EvaluatedArm(tested.joints, tested.urdf, tested.fitted_baselines, tested.fitted_arm, probe, notes)
-    predictors += torque_predictors(known)
-    for name, dynamics in baselines.items():
-        predictors.append(of_dynamics(name, dynamics, probe))
+    predictors = [Predictor(MODEL, solver, model), *_baselines(tested, baselines, probe, notes)]
     tip = _tip(tested, notes)
     horizons: list[Horizon] = []
     longest: Predictions | None = None
@@ -174,6 +170,17 @@ def _evaluate_torques(
         torque=torque,
         torque_steps=steps,
     )
+
+
+def _baselines(
+    tested: Subject, given: Mapping[str, RigidDynamics], probe: Windows, notes: list[Diagnostic]
+) -> list[Predictor]:
+    """Return the baselines of the registry, and the given ones. probe: windows that determine integrator steps."""
+    arm = EvaluatedArm(tested.joints, tested.urdf, tested.fitted_baselines, tested.fitted_arm, probe, notes)
+    return [
+        *torque_predictors(arm),
+        *(of_dynamics(name, dynamics, probe) for name, dynamics in given.items()),
+    ]
 
 
 def _results(

@@ -66,7 +66,7 @@ def fit(
             all logs and needs no validation. Default: torque for rigid bodies if logs are dense enough for
             accelerations, rollout for networks.
         preprocessing: filter, gaps and delay of the logs.
-        validation: the fraction of the logs that is held out, whole trajectories chosen by ``seed``, or trajectories.
+        validation: the fraction of the logs that is set aside, whole trajectories chosen by ``seed``, or trajectories.
         seed: of the split and of the order of batches.
         arm: the arm or the URDF that the model was made from: for the regularizer, the baselines and the run folder.
         folder: where checkpoints are written after every epoch (see `RunFolder`); without one, `Fit.save` writes all.

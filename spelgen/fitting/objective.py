@@ -54,7 +54,7 @@ class RunOptions:
 class FitRequest:
     """The arguments of a fit.
 
-    validation: the fraction of the logs that is held out, or trajectories. urdf: of the robot, None if unknown.
+    validation: the fraction of the logs that is set aside, or trajectories. urdf: of the robot, None if unknown.
     began: start of the allowed time (`time.monotonic`). folder: of the run, None without one.
     """
 
