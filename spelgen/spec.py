@@ -14,7 +14,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
-from spelgen.design import Design, Net
+from spelgen.design import Design
 from spelgen.errors import ModuleError, SettingsError
 from spelgen.files import read_bytes
 from spelgen.urdf.robot import Assume
@@ -42,8 +42,6 @@ class Options:
     preset: str = "hybrid"
     design: Design | None = None
     """None: that of the preset of this name, which comes with spelgen."""
-    net: Net | None = None
-    """None: the design's own."""
     assume: Assume = "kinematics"
     joints: tuple[str, ...] | None = None
     tip: str | None = None

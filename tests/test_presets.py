@@ -31,9 +31,10 @@ from spelgen.spec import Options
 from tests.lie_group import to_group
 
 ROOT = Path(__file__).parents[1]
-PRESETS = [("phnode", "mlp"), ("phnode", "kan"), ("spel", "mlp"), ("spel-kan", "kan"), ("hybrid", "kan")]
+PRESETS = ["phnode", "spel", "spel-kan", "hybrid"]
 ROBOTS = ("two_link", "rpr", "six_dof")
-each = pytest.mark.parametrize(("preset", "net"), PRESETS)
+KAN = replace(NETWORKS, net="kan")
+each = pytest.mark.parametrize("preset", PRESETS)
 each_robot = pytest.mark.parametrize("robot", ROBOTS)
 
 
@@ -51,17 +52,15 @@ def test_presets_are_the_files():
     files = {path.stem for path in (ROOT / "spelgen" / "presets").glob("*.yaml")}
     assert {name for name in get_args(Preset) if name in files} == files
     for name in files:
-        design = load_design(name)
-        assert design.net == "none" or load_design(name, "kan").net == "kan"
-        assert make_spec(load_arm(ROOT / "robots" / "rpr.urdf"), Options(preset=name)).options.net == (
-            design.net if design.net in ("mlp", "kan") else None
+        assert make_spec(load_arm(ROOT / "robots" / "rpr.urdf"), Options(preset=name)).design == load_design(
+            name
         )
 
 
 @each_robot
 @each
-def test_written_out_derivatives_equal_autograd(robot, preset, net, tmp_path):
-    model = frictionless(random_model(robot, tmp_path, seed=4, preset=preset, net=net))
+def test_written_out_derivatives_equal_autograd(robot, preset, tmp_path):
+    model = frictionless(random_model(robot, tmp_path, seed=4, preset=preset))
     n = model.n
     q, qd, _, _ = states(n)
     q.requires_grad_()
@@ -77,8 +76,8 @@ def test_written_out_derivatives_equal_autograd(robot, preset, net, tmp_path):
 
 @each_robot
 @each
-def test_forward_and_inverse_dynamics_undo_each_other(robot, preset, net, tmp_path):
-    model = random_model(robot, tmp_path, seed=3, preset=preset, net=net)
+def test_forward_and_inverse_dynamics_undo_each_other(robot, preset, tmp_path):
+    model = random_model(robot, tmp_path, seed=3, preset=preset)
     if preset == "phnode":  # random gains may be next to zero
         torch.nn.init.zeros_(model.input_network.weights[-1])
     q, qd, _, tau = states(model.n)
@@ -87,11 +86,11 @@ def test_forward_and_inverse_dynamics_undo_each_other(robot, preset, net, tmp_pa
 
 @each_robot
 @each
-def test_mass_matrix_and_dissipation_are_positive(robot, preset, net, tmp_path):
+def test_mass_matrix_and_dissipation_are_positive(robot, preset, tmp_path):
     # larger weights make U of phnode, 3 n rows of an inverse, too ill-conditioned for 16 digits
     deviation = None if preset == "phnode" else 3.0
     for seed in range(5):
-        model = random_model(robot, tmp_path, seed=seed, deviation=deviation, preset=preset, net=net)
+        model = random_model(robot, tmp_path, seed=seed, deviation=deviation, preset=preset)
         q, qd, _, _ = states(model.n, 500)
         with torch.no_grad():
             assert torch.linalg.eigvalsh(model.mass_matrix(q))[:, 0].min() > 0
@@ -103,8 +102,8 @@ def test_mass_matrix_and_dissipation_are_positive(robot, preset, net, tmp_path):
 
 @pytest.mark.parametrize("batch", [(), (1,), (0,), (2, 3), (2, 0)])
 @each
-def test_any_batch_shape(preset, net, batch, tmp_path):
-    model = random_model("rpr", tmp_path, seed=0, preset=preset, net=net)
+def test_any_batch_shape(preset, batch, tmp_path):
+    model = random_model("rpr", tmp_path, seed=0, preset=preset)
     q, qd, tau = (torch.rand(*batch, 3, dtype=torch.float64) for _ in range(3))
     for value in (model.gravity(q), model.forward_dynamics(q, qd, tau), model.inverse_dynamics(q, qd, tau)):
         assert value.shape == (*batch, 3)
@@ -115,8 +114,8 @@ def test_any_batch_shape(preset, net, batch, tmp_path):
 
 
 @each
-def test_backpropagation_reaches_every_weight(preset, net, tmp_path):
-    model = random_model("rpr", tmp_path, seed=0, deviation=0.3, preset=preset, net=net)
+def test_backpropagation_reaches_every_weight(preset, tmp_path):
+    model = random_model("rpr", tmp_path, seed=0, deviation=0.3, preset=preset)
     q, qd, _, tau = states(3)
     past = [0.3 * model.memory(qd)] if has_friction_state(model) else []
     model.forward_dynamics(q, qd, tau, *past).square().sum().backward()
@@ -140,10 +139,10 @@ def test_arm_whose_mass_matrix_is_constant(preset, tmp_path):
 
 @pytest.mark.parametrize("robot", ["rpr", "six_dof", "panda"])
 def test_kan_outputs_read_their_own_joints_only(robot, tmp_path):
-    model = random_model(robot, tmp_path, seed=2, net="kan")
-    outputs = built(robot, net="kan")[1].outputs
+    model = random_model(robot, tmp_path, seed=2, design=KAN)
+    outputs = built(robot, design=KAN)[1].outputs
     q = states(model.n)[0]
-    network = model.residuals.mass
+    network = model.mass.network
     before = outputs_alone(network, network_inputs(model, q))
     for joint in range(model.n):
         moved = q.clone()
@@ -173,7 +172,7 @@ def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
 @pytest.mark.parametrize("net", ["mlp", "kan"])
 def test_networks_read_rotation_matrices(net, part, tmp_path):
     """Layer by layer as the papers write them, on what varies of the 9 numbers of R and the 3 of r."""
-    owner = random_model("rpr", tmp_path, seed=5, preset="phnode", net=net)
+    owner = random_model("rpr", tmp_path, seed=5, design=replace(load_design("phnode"), net=net))
     model, encoding = owner.get_submodule(part), owner.encoding
     q = states(3)[0]
     parts = to_group(owner.joint_types, q)
@@ -194,12 +193,12 @@ def test_networks_read_rotation_matrices(net, part, tmp_path):
     near(outputs_alone(model, network_inputs(owner, q)), layer)
 
 
-@pytest.mark.parametrize(("preset", "net"), [*PRESETS, ("hybrid", "mlp")])
+@each
 @pytest.mark.parametrize("robot", ["rpr", "six_dof"])
-def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset, net, tmp_path):
+def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset, tmp_path):
     """Eq. 15 and 18 over three axes a joint, all derivatives automatic, against the n x n module."""
-    design = replace(NETWORKS, net=net) if preset == "hybrid" else None
-    model = random_model(robot, tmp_path, seed=6, preset=preset, net=net, design=design)
+    design = NETWORKS if preset == "hybrid" else None
+    model = random_model(robot, tmp_path, seed=6, preset=preset, design=design)
     n = model.n
     q, p, _, tau = states(n)
     parts = to_group(model.joint_types, q)
@@ -219,7 +218,9 @@ def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset
 @pytest.mark.parametrize("net", ["mlp", "kan"])
 def test_phnode_is_its_three_axis_model_held_by_bearings(net, tmp_path):
     """H = 1/2 p^T M^-1 p over 3 n axes: moving along z alone, p_z follows the n x n module."""
-    model = frictionless(random_model("six_dof", tmp_path, seed=7, preset="phnode", net=net))
+    model = frictionless(
+        random_model("six_dof", tmp_path, seed=7, design=replace(load_design("phnode"), net=net))
+    )
     n = model.n
     q, qd, _, _ = states(n)
 

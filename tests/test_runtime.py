@@ -43,14 +43,7 @@ FIRST_STAGE = (  # friction's laws then: |gravity torque|, tanh and exp
     ("torch.rsqrt(velocity * velocity + width**2)", "(velocity / width).tanh() / velocity"),
     ("slow.square().square().square()", "(-((qd / self.stribeck_velocity) ** 2)).exp()"),
 )
-PRESETS = (
-    ("hybrid", "mlp"),
-    ("hybrid", "kan"),
-    ("spel", "mlp"),
-    ("spel-kan", "kan"),
-    ("phnode", "mlp"),
-    ("closed-form", None),
-)
+PRESETS = ("hybrid", "spel", "spel-kan", "phnode", "closed-form")
 JOINTS = Joints(
     revolute=(True, False, True),
     center=(0.0, 0.5, 0.0),
@@ -264,12 +257,12 @@ def test_friction_laws_resist_and_read_as_what_they_are():
 
 def test_a_module_takes_what_it_uses_under_the_names_of_kinds():
     runtime, rpr = load_runtime(), load_arm(ROBOTS / "rpr.urdf")
-    for preset, net in PRESETS:
-        source = built("rpr", preset=preset, net=net)[0]
+    for preset in PRESETS:
+        source = built("rpr", preset=preset)[0]
         tree = ast.parse(source)
         defined = {node.name for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
         own = defined - {"Model", "make_parts", "mass_entries"}
-        classes = kinds(make_spec(rpr, Options(preset=preset, net=net)))
+        classes = kinds(make_spec(rpr, Options(preset=preset)))
         assert set(classes) <= own
         for name in own:
             text = runtime.definitions[classes.get(name, name)].text
@@ -285,21 +278,21 @@ def test_a_module_takes_what_it_uses_under_the_names_of_kinds():
 
 def test_tailored_part_is_short_and_shows_the_entries():
     for robot in SIX:
-        for preset, net in PRESETS:
-            lines = built(robot, preset=preset, net=net)[0].splitlines()
+        for preset in PRESETS:
+            lines = built(robot, preset=preset)[0].splitlines()
             end = next(number for number, line in enumerate(lines) if line.startswith("# ---- spelgen's"))
-            assert end < 250, f"{robot}, {preset}, {net}: {end} lines"
+            assert end < 250, f"{robot}, {preset}: {end} lines"
     assert "return symmetric([f3], [f1, c2], [f2, 0, c1])" in built("rpr")[0]
     assert "m22 = f9 + 2 * f12 - f5" in built("six_dof")[0]
 
 
 @pytest.mark.parametrize(
-    ("robot", "preset", "net"),
-    [*(("rpr", *each) for each in PRESETS), ("six_dof", "hybrid", "mlp"), ("six_dof", "closed-form", None)],
+    ("robot", "preset"),
+    [*(("rpr", preset) for preset in PRESETS), ("six_dof", "hybrid"), ("six_dof", "closed-form")],
 )
-def test_transforms_work_for_every_preset(robot, preset, net, tmp_path):
+def test_transforms_work_for_every_preset(robot, preset, tmp_path):
     """Without a branch on data: torch.func."""
-    model = random_model(robot, tmp_path, seed=1, preset=preset, net=net)
+    model = random_model(robot, tmp_path, seed=1, preset=preset)
     n = model.n
     q, qd, tau = draw(5, n), draw(5, n, seed=1), draw(5, n, seed=2)
     qdd = model.forward_dynamics(q, qd, tau)
@@ -315,10 +308,10 @@ def test_transforms_work_for_every_preset(robot, preset, net, tmp_path):
     near(vmap(model.forward_dynamics)(q, qd, tau, z), model.forward_dynamics(q, qd, tau, z), 1e-9)
 
 
-@pytest.mark.parametrize(("preset", "net"), PRESETS)
-def test_every_preset_is_one_graph(preset, net, tmp_path):
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_is_one_graph(preset, tmp_path):
     """Strict export with a batch of any size, and all that torch.compile traces."""
-    model = random_model("rpr", tmp_path, seed=1, preset=preset, net=net).requires_grad_(False)
+    model = random_model("rpr", tmp_path, seed=1, preset=preset).requires_grad_(False)
     q, qd, tau = draw(5, 3), draw(5, 3, seed=1), draw(5, 3, seed=2)
     state = torch.cat([q, qd, sliding_memory(model, qd).flatten(-2), tau], dim=-1)
     batch = {"t": None, "state": {0: torch.export.Dim("batch")}}
@@ -329,9 +322,9 @@ def test_every_preset_is_one_graph(preset, net, tmp_path):
     near(compiled(q, qd, tau), model.forward_dynamics(q, qd, tau), 1e-9)
 
 
-@pytest.mark.parametrize(("preset", "net"), PRESETS)
-def test_single_precision_and_batches_of_any_shape(preset, net, tmp_path):
-    module = import_source(built("rpr", preset=preset, net=net)[0], tmp_path / "rpr_single.py")
+@pytest.mark.parametrize("preset", PRESETS)
+def test_single_precision_and_batches_of_any_shape(preset, tmp_path):
+    module = import_source(built("rpr", preset=preset)[0], tmp_path / "rpr_single.py")
     double, single = module.Model(seed=1), module.Model(seed=1, dtype=torch.float32)
     assert {x.dtype for x in single.state_dict().values() if x.is_floating_point()} == {torch.float32}
     for shape in ((), (3,), (2, 3)):
@@ -408,10 +401,10 @@ def network_of_first_stage(network, inputs, generator):
 @pytest.mark.parametrize("case", json.loads(NUMBERS.read_text()))
 def test_numbers_are_those_of_the_first_stage(case, tmp_path):
     """Modules of the first stage, made by templates, gave these with the same seed and the same change of weights."""
-    robot, preset, net = case.split()
+    robot, preset, _ = case.split()
     design = load_design("closed-form") if preset == "closed-form" else None
     design = design and replace(design, memory="none")
-    source = built(robot, preset=preset, net=None if net == "default" else net, design=design)[0]
+    source = built(robot, preset=preset, design=design)[0]
     for now, first in FIRST_STAGE:
         source = source.replace(now, first)
     model = import_source(source, tmp_path / f"{robot}_numbers.py").Model(seed=3)

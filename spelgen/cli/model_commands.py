@@ -22,7 +22,7 @@ from spelgen.cli.options import (
     Tip,
     Trust,
 )
-from spelgen.design import PRESET_NAMES, Net
+from spelgen.design import PRESET_NAMES
 from spelgen.exporting.exported import Format
 from spelgen.files import write_text
 from spelgen.spec import parse_facts
@@ -63,7 +63,6 @@ def build(
             metavar="NAME|FILE.yaml", help=f"Preset of the model: {', '.join(PRESET_NAMES)}, or a YAML file."
         ),
     ] = "hybrid",
-    net: Annotated[Net | None, typer.Option(help="Kind of networks; default: that of the preset.")] = None,
     width: Annotated[int, typer.Option(min=1, max=4096, help="Hidden units per layer.")] = 64,
     depth: Annotated[int, typer.Option(min=1, max=16, help="Number of hidden layers.")] = 2,
     output: Annotated[
@@ -78,14 +77,11 @@ def build(
     if preset not in PRESET_NAMES and Path(preset).suffix not in (".yaml", ".yml"):
         message = f"{preset!r} is none of {', '.join(PRESET_NAMES)}, nor a YAML file"
         raise typer.BadParameter(message, param_hint="'--preset'")
-    # an option without effect would pass for one that was applied
-    if net is not None and preset == "closed-form":
-        raise typer.BadParameter("closed-form has no networks", param_hint="'--net'")
     from spelgen.pipeline.generate import generate
 
     arm = options.load(robot, joints, tip, angle_tolerance)
     path = output or Path(f"{robot.stem}_spel.py")
-    source = generate(arm, preset, net=net, width=width, depth=depth, assume=assume, module=path)
+    source = generate(arm, preset, width=width, depth=depth, assume=assume, module=path)
     # the same text: nothing is replaced, and its date stays
     is_new = not path.is_file() or path.read_bytes() != source.encode()
     line = f"{path} is up to date"

@@ -18,7 +18,7 @@ from pydantic import TypeAdapter
 
 from spelgen.comparison.known_urdf import known_urdf
 from spelgen.comparison.metrics import RunResult
-from spelgen.design import Design, Net, Preset, load_design
+from spelgen.design import Design, Preset, load_design
 from spelgen.errors import RunError, SettingsError
 from spelgen.files import read_json, write_json, write_text
 from spelgen.fitting.window.momentum import TUNING
@@ -37,11 +37,10 @@ SCHEMA = 6
 
 @dataclass(frozen=True)
 class Variant:
-    """A preset, or a design of one's own, with a kind of network."""
+    """A preset, or a design of your own."""
 
     name: str
     preset: Preset | Design
-    net: Net | None = None
 
 
 VARIANTS = (
@@ -50,7 +49,6 @@ VARIANTS = (
     Variant("spel-kan", "spel-kan"),
     Variant("minimal", "minimal"),
     Variant("hybrid", "hybrid"),
-    Variant("hybrid-kan", "hybrid", "kan"),
     Variant("closed-form", "closed-form"),
 )
 
@@ -196,7 +194,7 @@ def _write_modules(study: Study, loaded: LoadedArm) -> None:
     write_text(study.urdf.with_suffix(".yaml"), gravity)
     width, depth = study.settings.width, study.settings.depth
     for variant in study.variants:
-        source = generate(study.urdf, variant.preset, net=variant.net, width=width, depth=depth)
+        source = generate(study.urdf, variant.preset, width=width, depth=depth)
         write_text(study.module(variant), source)
 
 

@@ -90,10 +90,8 @@ def _private_name(source: str) -> str:
 
 
 def _summary(model: EmittedModel) -> str:
-    options = model.facts.options
-    preset = options.preset + (f", {options.net}" if options.net in ("mlp", "kan") else "")
     sizes = f"{model.n} joints, {parameter_count(model)} parameters"
-    return f"<Model of {printable(model.facts.robot)!r} ({preset}): {sizes}>"
+    return f"<Model of {printable(model.facts.robot)!r} ({model.facts.options.preset}): {sizes}>"
 
 
 def _page(model: EmittedModel) -> str:

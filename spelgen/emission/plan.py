@@ -5,7 +5,6 @@ from __future__ import annotations
 import keyword
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -38,7 +37,7 @@ def plan_model(
     ``drives``: what is known of the joints' motors and gears; where no rotor inertia is, one is guessed.
     ``servos``: whether positions are commanded. Raises SettingsError where the design has no friction that remembers.
     """
-    design = load_design(options.design or options.preset, options.net)
+    design = load_design(options.design or options.preset)
     if servos and design.memory == "none":
         raise SettingsError(
             f"position servos with the preset {options.preset}", element="input",
@@ -69,7 +68,7 @@ def plan_model(
         urdf=urdf,
         urdf_sha256=urdf_sha256,
         gravity=(x, y, z),
-        options=replace(options, net=None if design.net == "none" else design.net),
+        options=options,
         design=design,
         joints=tuple(joints),
         entries=tuple((e.row, e.column, e.kind, e.joints) for e in structure.entries),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spelgen.design import Design, Net
+from spelgen.design import Design
 from spelgen.emission.loading import load_module
 from spelgen.pipeline.generate import generate
 from spelgen.pipeline.loaded_arm import LoadedArm
@@ -19,7 +19,6 @@ def build(
     arm: LoadedArm | str | Path,
     preset: str | Path | Design = "hybrid",
     *,
-    net: Net | None = None,
     width: int = 64,
     depth: int = 2,
     assume: Assume = "kinematics",
@@ -30,4 +29,4 @@ def build(
     ``seed``: of the weights that it starts with. ``model.source`` is the text of its module, ``model.facts`` what
     it was made from.
     """
-    return load_module(generate(arm, preset, net=net, width=width, depth=depth, assume=assume), seed=seed)
+    return load_module(generate(arm, preset, width=width, depth=depth, assume=assume), seed=seed)

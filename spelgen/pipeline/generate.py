@@ -9,7 +9,7 @@ from pathlib import Path
 
 from spelgen.certificate.inspection import Inspection
 from spelgen.certificate.verification import Verification
-from spelgen.design import PRESET_NAMES, Design, Net, load_design
+from spelgen.design import PRESET_NAMES, Design, load_design
 from spelgen.emission.emit import emit
 from spelgen.emission.plan import plan_model
 from spelgen.errors import ModuleError, RunError, SpelgenError
@@ -34,7 +34,6 @@ def generate(
     arm: LoadedArm | str | Path,
     preset: str | Path | Design = "hybrid",
     *,
-    net: Net | None = None,
     width: int = 64,
     depth: int = 2,
     assume: Assume = "kinematics",
@@ -42,8 +41,8 @@ def generate(
 ) -> str:
     """The source of the module tailored to an arm, or to that of a URDF.
 
-    ``preset``: one that comes with spelgen by its name, one of yours by its YAML file, or a ``Design``. ``net``
-    takes the place of its own networks, which have ``depth`` hidden layers of ``width``.
+    ``preset``: one that comes with spelgen by its name, one of yours by its YAML file, or a ``Design``.
+    Its networks have ``depth`` hidden layers of ``width`` units.
     ``assume`` as for ``inspect``. ``module``: the file that the source is for, which then names the way to its URDF.
     Raises what ``load_arm`` raises, SettingsError for a design that stands for
     no model.
@@ -56,7 +55,6 @@ def generate(
     options = Options(
         preset=name,
         design=design,
-        net=net,
         assume=assume,
         joints=loaded.joints,
         tip=loaded.tip,
