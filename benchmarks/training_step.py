@@ -18,7 +18,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -37,14 +37,13 @@ if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
 
 ROBOT = Path(__file__).parents[1] / "robots" / "six_dof.urdf"
-PRESETS: dict[str, tuple[str | Design, Literal["mlp", "kan"] | None]] = {
-    "phnode": ("phnode", "mlp"),
-    "spel": ("spel", "mlp"),
-    "spel-kan": ("spel-kan", "kan"),
-    "derived M, V": (NETWORKS, "mlp"),
-    "hybrid": ("hybrid", "mlp"),
-    "hybrid-kan": ("hybrid", "kan"),
-    "closed-form": ("closed-form", None),
+PRESETS: dict[str, str | Design] = {
+    "phnode": "phnode",
+    "spel": "spel",
+    "spel-kan": "spel-kan",
+    "derived M, V": NETWORKS,
+    "hybrid": "hybrid",
+    "closed-form": "closed-form",
 }
 WIDTH, WINDOWS, SAMPLES, JOINTS, STEP = 64, 256, 5, 6, 0.02
 PARTS, REPEATS, SLOW_REPEATS = 4, 15, 3
@@ -168,7 +167,7 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     data = Data(WINDOWS)
-    models = {name: build(ROBOT, preset, net=net, width=WIDTH) for name, (preset, net) in PRESETS.items()}
+    models = {name: build(ROBOT, preset, width=WIDTH) for name, preset in PRESETS.items()}
     plain = {name: plain_mass(model) for name, model in models.items()}
     steps, floors, bare = ({name: list[float]() for name in models} for _ in range(3))
     for _ in range(REPEATS):

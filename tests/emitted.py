@@ -15,14 +15,14 @@ import numpy as np
 import torch
 from flint import fmpq_mpoly
 from polynomials import polynomials
-from spelgen.emission.emit import emit
 from torch import nn
 
 from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.design import Design
-from spelgen.emission.build import make_spec
+from spelgen.emission.build import derive_spec
+from spelgen.emission.text import module_text
 from spelgen.spec import Options
-from spelgen.structure.structure import Structure
+from spelgen.structure.structure import Structure, derive
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 GANTRY = """<robot name="gantry"><link name="base"/><link name="bridge"/><link name="trolley"/>
@@ -56,12 +56,11 @@ def built(
     robot: str,
     assume: str = "kinematics",
     preset: str = "hybrid",
-    net: str | None = None,
     design: Design | None = None,
 ) -> tuple[str, Structure]:
     """Source and structure of one of the robots that come with spelgen."""
     loaded = _loaded(robot)
-    options = Options(preset=preset, design=design, net=net, assume=assume)
+    options = Options(preset=preset, design=design, assume=assume)
     return emit(make_spec(loaded, options)), loaded.structure_for(assume)
 
 
@@ -77,11 +76,10 @@ def random_model(
     seed: int,
     deviation: float | None = None,
     preset: str = "hybrid",
-    net: str | None = None,
     design: Design | None = None,
 ) -> nn.Module:
     """The robot's model with random weights, as ``randomise`` draws them."""
-    source = built(robot, preset=preset, net=net, design=design)[0]
+    source = built(robot, preset=preset, design=design)[0]
     model = import_source(source, folder / f"{robot}_spel.py").Model(seed=seed)
     randomise(model, seed, deviation)
     return model

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from spelgen.dynamics.protocol import residual_terms
-from spelgen.runtime.masked_kan import MaskedKAN
 from spelgen.runtime.masked_mlp import MaskedMLP
 from spelgen.runtime.residual_dynamics import ResidualDynamics
 
@@ -57,7 +56,7 @@ def without_idle_residuals(model: Model) -> Model:
     return reduced
 
 
-def _is_idle(network: MaskedMLP | MaskedKAN | None) -> bool:
+def _is_idle(network: MaskedMLP | None) -> bool:
     """Return whether a network gives zero for all inputs, as none at all does."""
     return network is None or not (network.weights[-1].any() or network.biases[-1].any())
 

@@ -34,6 +34,7 @@ from spelgen.logs.dynamics_samples import SHORTEST, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import Trajectory, require_commands, require_joints, require_torques
+from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import ConfiguredArm

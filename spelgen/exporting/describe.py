@@ -78,7 +78,11 @@ def describe(model: ArmModel, loaded: ConfiguredArm) -> TrainedModel:
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
     if not isinstance(exact, RigidBodyDynamics):
         preset = model.spec.options.preset
-        raise _unsupported(f"the preset {preset}, which is not of rigid bodies")
+        raise RunError(
+            f"the preset {preset}, which is not of rigid bodies",
+            expected="closed-form or hybrid",
+            do="--to torch, onnx, mjcf and urdf take every preset",
+        )
     weights = exact.prepare()
     # what does not depend on q is one matrix, whatever it comes from
     constant_mass = array(weights.armature)
@@ -153,44 +157,31 @@ def tip_frame(loaded: ConfiguredArm) -> Tip:
     return Tip(link, frame.body, pose, bodies)
 
 
-def _unsupported(subject: str) -> RunError:
-    return RunError(
-        subject,
-        expected="closed-form, or hybrid with tanh networks",
-        do="--to torch, onnx, mjcf and urdf take every preset",
-    )
-
-
 def _residuals(model: ArmModel) -> Residuals:
-    """Return the residuals without those that are zero. Raises RunError for Kolmogorov-Arnold networks."""
+    """Return the residuals without those that are zero."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
     entries: np.ndarray = np.argwhere(np.tril(functions.any(axis=0).reshape(model.n, model.n)))
-    mass = _network(terms.mass, weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
+    mass = _network(weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
     if mass is None:
         entries = entries[:0]
     return Residuals(
         entries=tuple(map(tuple, entries.tolist())),
         mass=mass,
-        potential=_network(terms.potential, weights.potential, terms.encoding),
+        potential=_network(weights.potential, terms.encoding),
         torque=_splines(terms, terms.unit * terms.raw_torque_splines),
         ripple=_ripple(terms, weights.ripple),
         friction=_splines(terms, terms.friction_logarithms()),
     )
 
 
-def _network(
-    network: object, layers: Layers | None, encoding: Any, functions: np.ndarray | None = None
-) -> Network | None:
+def _network(layers: Layers | None, encoding: Any, functions: np.ndarray | None = None) -> Network | None:
     """Return a network y, None where there is none or its last layer is zero; with functions, tanh(y) @ functions.
 
     Its units are sigmoids, which C computes faster than tanh.
     """
     if layers is None or not any(tensor.any() for tensor in layers[-1]):
         return None
-    # an emitted module brings a class of its own; bumps on a grid are what a Kolmogorov-Arnold network is made of
-    if hasattr(network, "grid"):
-        raise _unsupported("Kolmogorov-Arnold networks beside rigid bodies")
     weights, biases = [], []
     for weight, bias in layers:
         weights.append(array(weight))
