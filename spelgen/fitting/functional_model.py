@@ -9,7 +9,7 @@ import torch
 from torch.func import functional_call
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 NamedTensors = Mapping[str, torch.Tensor]
 """Tensors by the names of a model's parameters and buffers."""
@@ -20,7 +20,7 @@ Result = TypeVar("Result")
 class _Caller(torch.nn.Module):
     """`functional_call` calls `forward` only: this one calls any function of a model."""
 
-    def __init__(self, model: EmittedModel) -> None:
+    def __init__(self, model: ArmModel) -> None:
         super().__init__()
         self.model = model
 
@@ -28,7 +28,7 @@ class _Caller(torch.nn.Module):
         return function(self.model)
 
 
-def evaluate_with(model: EmittedModel, parameters: NamedTensors, function: Callable[[Any], Result]) -> Result:
+def evaluate_with(model: ArmModel, parameters: NamedTensors, function: Callable[[Any], Result]) -> Result:
     """Return function(model) with the given parameters; all other parameters of the model keep their values."""
     named = {f"model.{name}": tensor for name, tensor in parameters.items()}
     result: Result = functional_call(_Caller(model), named, (function,))

@@ -17,7 +17,7 @@ from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import Solver
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING, ADAPTIVE = IntegrationTuning(), AdaptiveTuning()
 SOLVER: dict[str, Any] = {"method": "dopri5", "rtol": ADAPTIVE.relative, "atol": ADAPTIVE.absolute}
@@ -143,7 +143,7 @@ def _scale(mean_square: torch.Tensor) -> torch.Tensor:
 
 
 def rollout_errors(
-    model: EmittedModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
+    model: ArmModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
 ) -> torch.Tensor:
     """Return scaled errors (W, K-1, 2n) of the rollout: of the positions, then of the velocities."""
     q, qd = roll_out(model, windows, substeps, solver)
@@ -152,7 +152,7 @@ def rollout_errors(
 
 
 def rollout_loss(
-    model: EmittedModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
+    model: ArmModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
 ) -> torch.Tensor:
     """Return the mean squared scaled error of the rollout, (): SPEL eq. 8 with other units.
 
@@ -162,7 +162,7 @@ def rollout_loss(
     return rollout_errors(model, windows, scales, substeps, solver).square().mean()
 
 
-def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> torch.Tensor:
+def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> torch.Tensor:
     """Return the mean squared residual of the weak form, (): p(t) - p(0) minus the impulse of all forces until t.
 
     The impulse is along the measured samples, by the trapezium rule: no ODE solution and no accelerations are needed.
@@ -199,7 +199,7 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     return result
 
 
-def probed(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
+def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
     """Return `rollout_errors`, (W, K-1, 2n), without gradients; NaN if the rollout diverges."""
     try:
         with torch.no_grad():
@@ -220,7 +220,7 @@ def integration_error(coarse: torch.Tensor, fine: torch.Tensor) -> float:
     return error if math.isfinite(error) else math.inf
 
 
-def choose_substeps(model: EmittedModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
+def choose_substeps(model: ArmModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
     """Return the minimum number of rk4 steps per sample interval, at least `start`, with a small integration error."""
     substeps, coarse = start, probed(model, windows, scales, start)
     while substeps < TUNING.most_substeps:

@@ -16,7 +16,7 @@ from spelgen.fitting.tuning import RegularizerTuning
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = RegularizerTuning()
 
@@ -34,7 +34,7 @@ class UrdfRegularizer(NamedTuple):
     gravity: torch.Tensor
     gravity_scale: torch.Tensor
 
-    def loss(self, model: EmittedModel) -> torch.Tensor:
+    def loss(self, model: ArmModel) -> torch.Tensor:
         """Return the mean squared difference of the model in M and in the gravity torque, both without unit."""
         variation = _variation(model.mass_matrix(self.q), self.whitening) - self.variation
         gravity = (model.gravity(self.q) - self.gravity) / self.gravity_scale
@@ -45,9 +45,7 @@ class UrdfRegularizer(NamedTuple):
         return UrdfRegularizer(*(x.to(device) for x in self))
 
 
-def urdf_regularizer(
-    urdf: Path, joints: Sequence[str], model: EmittedModel, windows: Windows
-) -> UrdfRegularizer:
+def urdf_regularizer(urdf: Path, joints: Sequence[str], model: ArmModel, windows: Windows) -> UrdfRegularizer:
     """Return the regularizer of a URDF at random positions in the range of a log.
 
     Args:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import torch
 
-from spelgen.dynamics.protocol import has_residuals
+from spelgen.dynamics.protocol import residual_terms
 from spelgen.fitting.levenberg_marquardt import Termination
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import limit_friction
@@ -28,7 +28,7 @@ from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 
 class FitStage(NamedTuple):
@@ -63,7 +63,7 @@ class TorqueSolution:
 
 
 def fit_torque(
-    model: EmittedModel,
+    model: ArmModel,
     samples: TorqueSamples | Sequence[DynamicsSamples],
     prior: GaussianPrior | None = None,
     adapt: Adaptation | None = None,
@@ -123,7 +123,7 @@ def _run_stages(
     if problem.adapt is None:
         estimate = choose_friction_effects(estimate)
         done("friction effects", estimate)
-        if has_residuals(model):
+        if residual_terms(model) is not None:
             estimate, selected = fit_residual_terms(estimate, samples.subsampled(TUNING.residual_samples))
             done("residual terms", estimate)
     if estimate.problem.jacobian.samples is not samples:
@@ -132,7 +132,7 @@ def _run_stages(
     return estimate, selected, stages
 
 
-def _max_samples(model: EmittedModel) -> int:
+def _max_samples(model: ArmModel) -> int:
     """Return the maximum number of samples: their two regressors are kept in memory."""
     numbers = 2 * model.n * model.inertial_parameters.numel()
     return max(TUNING.initial_samples, int(TUNING.regressor_bytes / (8 * numbers)))

@@ -26,7 +26,7 @@ from spelgen.fitting.torque.samples import SampleBlock, TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 LOGARITHMIC_GROUPS = ("armature", "sizes", "effects", "load_dependence")
 
@@ -66,7 +66,7 @@ class TorqueJacobian:
     """
 
     def __init__(
-        self, model: EmittedModel, samples: TorqueSamples, terms: Mapping[int, LinearTerms] = NO_TERMS
+        self, model: ArmModel, samples: TorqueSamples, terms: Mapping[int, LinearTerms] = NO_TERMS
     ) -> None:
         self.model, self.samples, self.terms = model, samples, terms
         self.rigid = RigidParameters(model)

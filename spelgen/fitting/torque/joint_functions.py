@@ -21,7 +21,7 @@ from spelgen.fitting.torque.linearization import LinearTerms, RigidProjection
 from spelgen.runtime.residual_terms import LARGEST, SPLINES, ResidualTerms
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TermKey = tuple[str, int | None]
 """Parameter of a residual term, and its joint; None: all joints."""
@@ -101,7 +101,7 @@ class ProjectedTerms(NamedTuple):
     terms: dict[int, LinearTerms]
     candidates: tuple[JointFunction, ...]
 
-    def write(self, model: EmittedModel, torque_residual: torch.Tensor) -> None:
+    def write(self, model: ArmModel, torque_residual: torch.Tensor) -> None:
         """Set the model's residual terms to the weights eliminated at a torque residual (T, n)."""
         weights = {joint: terms.weights(torque_residual[:, joint]) for joint, terms in self.terms.items()}
         for candidate in self.candidates:
@@ -110,7 +110,7 @@ class ProjectedTerms(NamedTuple):
             weights[joint] = weights[joint][count:]
 
 
-def clear_terms(model: EmittedModel, joints: Iterable[int]) -> None:
+def clear_terms(model: ArmModel, joints: Iterable[int]) -> None:
     """Set all residual terms of single joints to zero for these joints."""
     terms = model.residuals
     with torch.no_grad():
@@ -119,7 +119,7 @@ def clear_terms(model: EmittedModel, joints: Iterable[int]) -> None:
 
 
 def refit_terms(
-    model: EmittedModel,
+    model: ArmModel,
     samples: ResidualSamples,
     projection: RigidProjection,
     selected: Collection[TermKey],
@@ -160,7 +160,7 @@ def refit_terms(
 
 
 def joint_functions(
-    model: EmittedModel,
+    model: ArmModel,
     samples: ResidualSamples,
     projection: RigidProjection,
     selected: Collection[TermKey] | None = None,

@@ -21,11 +21,11 @@ from spelgen.fitting.torque.selection import (
 from spelgen.fitting.torque.tuning import SELECTION
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 
 def select_networks(
-    model: EmittedModel, samples: ResidualSamples, correlation_length: float
+    model: ArmModel, samples: ResidualSamples, correlation_length: float
 ) -> Iterator[SelectedTerm]:
     """Fit and select the network of the potential, then the network of the mass matrix.
 
@@ -53,7 +53,7 @@ def select_networks(
 
 
 def _fit_network(
-    model: EmittedModel, network: torch.nn.Module, samples: ResidualSamples, correlation_length: float
+    model: ArmModel, network: torch.nn.Module, samples: ResidualSamples, correlation_length: float
 ) -> float | None:
     """Fit one network if, fitted to the first half, it lowers the error on the last half; return the error reduction.
 
@@ -88,7 +88,7 @@ def _fit_network(
     return reduction
 
 
-def _remaining_residual(model: EmittedModel, samples: ResidualSamples) -> torch.Tensor:
+def _remaining_residual(model: ArmModel, samples: ResidualSamples) -> torch.Tensor:
     """Return the residual (T, n) [Nm, N] after all residual terms of the model."""
     with torch.no_grad():
         return samples.torque_residual - residual_torque(model, *samples[:3])

@@ -16,7 +16,7 @@ from spelgen.runtime.rigid_body import body_factor
 from spelgen.settings.fits import Adaptation
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 MIN_SPEED = SAMPLES.moving
 RIGID_GROUPS = (
@@ -35,7 +35,7 @@ class RigidParameters:
     groups: parameter group per name. initial: values when this object was created.
     """
 
-    def __init__(self, model: EmittedModel) -> None:
+    def __init__(self, model: ArmModel) -> None:
         tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         self.groups: dict[str, str] = {}
         self._tensors: dict[str, torch.Tensor] = {}  # parameters, and buffers that a fit may set
@@ -90,14 +90,14 @@ class RigidParameters:
         return free
 
 
-def joint_torque(model: EmittedModel, samples: SampleBlock) -> torch.Tensor:
+def joint_torque(model: ArmModel, samples: SampleBlock) -> torch.Tensor:
     """Return the measured joint torque, (T, n) [Nm, N]."""
     with torch.no_grad():
         torque: torch.Tensor = samples.tau @ model.input_matrix(samples.q[:1])[0].mT
     return torque
 
 
-def limit_friction(model: EmittedModel, samples: SampleBlock) -> None:
+def limit_friction(model: ArmModel, samples: SampleBlock) -> None:
     """Limit the nominal friction of each drive to the standard deviation of its torque in the samples.
 
     Nominal friction is derived from the effort limits of the URDF, which are placeholders in many files. Torque offsets

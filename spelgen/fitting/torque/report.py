@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch.autograd.functional import jacobian
 
-from spelgen.dynamics.protocol import has_residuals
+from spelgen.dynamics.protocol import residual_terms
 from spelgen.dynamics.residuals import idle_residuals
 from spelgen.errors import Diagnostic
 from spelgen.fitting.functional_model import evaluate_with
@@ -20,7 +20,7 @@ from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TorqueReportTuning
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = TorqueReportTuning()
 
@@ -33,9 +33,7 @@ TERM_NAMES = {
 }
 
 
-def torque_notes(
-    model: EmittedModel, samples: TorqueSamples, solution: TorqueSolution
-) -> Iterator[Diagnostic]:
+def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSolution) -> Iterator[Diagnostic]:
     """Yield the notes of a fit of rigid bodies to samples."""
     names = np.array(model.joint_names)
     # the log-Cholesky parameters of a body are logarithms of its mass and radii
@@ -44,7 +42,7 @@ def torque_notes(
     yield Diagnostic("info", "urdf-prior", "bodies", None, message)
     if solution.compensated.any():
         yield _compensation(model, solution, names)
-    if has_residuals(model):
+    if residual_terms(model) is not None:
         yield Diagnostic("info", "residuals", "model", None, _selected_terms(solution, names))
     subset = samples.subsampled(TUNING.positions).columns
     inertia, deviation = _inertia(model, subset.q, solution.covariance)
@@ -62,7 +60,7 @@ def torque_notes(
         yield Diagnostic("warning", "acceleration-unseen", "logs", None, message)
 
 
-def _compensation(model: EmittedModel, solution: TorqueSolution, names: np.ndarray) -> Diagnostic:
+def _compensation(model: ArmModel, solution: TorqueSolution, names: np.ndarray) -> Diagnostic:
     value = model.friction_compensation.detach().numpy()
     joints = ", ".join(f"{names[k]} {value[k]:.3g}" for k in np.flatnonzero(solution.compensated))
     message = (
@@ -88,14 +86,15 @@ def _selected_terms(solution: TorqueSolution, names: np.ndarray) -> str:
     )
 
 
-def terms_in_use(model: EmittedModel) -> list[str]:
+def terms_in_use(model: ArmModel) -> list[str]:
     """Return the residual terms of a model that are not zero, with their joints."""
     names = model.joint_names
-    if not has_residuals(model):
+    residuals = residual_terms(model)
+    if residuals is None:
         return []
     idle = idle_residuals(model)
     terms: list[str] = []
-    for name, weights in model.residuals.named_parameters():
+    for name, weights in residuals.named_parameters():
         if f"residuals.{name}" in idle:
             continue
         if name in TERM_NAMES:
@@ -110,7 +109,7 @@ def terms_in_use(model: EmittedModel) -> list[str]:
     return terms
 
 
-def _inertia(model: EmittedModel, q: torch.Tensor, covariance: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+def _inertia(model: ArmModel, q: torch.Tensor, covariance: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Return the diagonal of M, averaged over positions, and the standard deviation of its logarithm, both (n,).
 
     Args:

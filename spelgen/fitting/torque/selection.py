@@ -24,7 +24,7 @@ from spelgen.fitting.torque.linearization import RigidProjection
 from spelgen.fitting.torque.tuning import SELECTION
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def within_range(position: torch.Tensor, fitted: torch.Tensor) -> torch.Tensor:
 
 
 def select_functions(
-    model: EmittedModel,
+    model: ArmModel,
     samples: ResidualSamples,
     projection: RigidProjection,
     selected: Collection[TermKey],
