@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from spelgen.pipeline.generate import check, generate, inspect
     from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
     from spelgen.settings.fits import GaussianPrior, MomentumFit, Rollout, TorqueFit
+    from spelgen.simulation.as_built import as_built
     from spelgen.simulation.simulate import simulate
 
 
@@ -48,6 +49,7 @@ _HOME = {
     "check_logs": "log_checks.check_logs",
     "Preprocessing": "logs.preprocessing",
     "simulate": "simulation.simulate",
+    "as_built": "simulation.as_built",
     "excite": "excitation.design",
     "identify": "identification.identify",
     "LeastSquares": "identification.identification",
@@ -89,6 +91,7 @@ __all__ = [
     "TorqueFit",
     "Trajectory",
     "__version__",
+    "as_built",
     "build",
     "check",
     "check_logs",

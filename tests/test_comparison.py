@@ -16,7 +16,6 @@ from spelgen.baselines.constant_velocity import hold_velocity
 from spelgen.baselines.predictor import Predictor
 from spelgen.comparison import metrics, runs
 from spelgen.comparison.formatting import comparison_tables
-from spelgen.comparison.known_urdf import known_urdf
 from spelgen.comparison.metrics import mass_error, true_mass
 from spelgen.comparison.runs import predict_example, run_study, time_steps
 from spelgen.comparison.study import VARIANTS, ablation_variants, prepare_study
@@ -29,6 +28,7 @@ from spelgen.logs.read import Trajectory, read_logs
 from spelgen.logs.windows import cut_windows, joined
 from spelgen.render.comparison_page import write_comparison
 from spelgen.settings.tuning.evaluation import EvaluationTuning
+from spelgen.simulation.perturbed_urdf import perturbed_urdf
 from spelgen.tasks import run_here
 from spelgen.urdf.read import read_urdf
 
@@ -80,7 +80,7 @@ def test_inertials_that_are_wrong_are_possible_ones(robot, tmp_path):
     true = {x.name: x.inertial for x in read_urdf(robot).links if x.inertial}
     for error in (0.0, 0.3, 1.0):
         path = tmp_path / f"wrong_{error}.urdf"
-        path.write_bytes(known_urdf(robot, error))
+        path.write_bytes(perturbed_urdf(robot, error, 0))
         found = {x.name: x.inertial for x in read_urdf(path).links if x.inertial}
         away = [abs(np.log(float(found[x].mass) / float(true[x].mass))) for x in true]
         assert found.keys() == true.keys()
@@ -94,7 +94,7 @@ def test_inertials_that_are_wrong_are_possible_ones(robot, tmp_path):
 
 def test_with_a_wrong_urdf_models_are_trained_by_defaults(robot, quick, tmp_path):
     found = prepare_study(robot, tmp_path, variants=CHOSEN[1:], urdf_error=0.3)
-    assert found.urdf.read_bytes() == known_urdf(robot, 0.3)
+    assert found.urdf.read_bytes() == perturbed_urdf(robot, 0.3, 0)
     with pytest.MonkeyPatch.context() as patch:
         seen = []
 

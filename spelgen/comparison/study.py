@@ -16,7 +16,6 @@ from typing import Any, cast
 import yaml
 from pydantic import TypeAdapter
 
-from spelgen.comparison.known_urdf import known_urdf
 from spelgen.comparison.metrics import RunResult
 from spelgen.design import Design, Net, Preset, load_design
 from spelgen.errors import RunError, SettingsError
@@ -30,6 +29,7 @@ from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.fits import Rollout, fit_config
 from spelgen.settings.settings import Settings
+from spelgen.simulation.perturbed_urdf import perturbed_urdf
 from spelgen.spec import read_facts
 
 SCHEMA = 6
@@ -191,7 +191,7 @@ def prepare_study(
 
 def _write_modules(study: Study, loaded: LoadedArm) -> None:
     """Write the URDF that the models know, and a module of each variant."""
-    study.urdf.write_bytes(known_urdf(study.source, study.urdf_error))
+    study.urdf.write_bytes(perturbed_urdf(study.source, study.urdf_error, TUNING.seed))
     gravity = yaml.safe_dump({"gravity": list(loaded.settings.gravity)})
     write_text(study.urdf.with_suffix(".yaml"), gravity)
     width, depth = study.settings.width, study.settings.depth

@@ -137,11 +137,11 @@ def record(
     state = np.concatenate([path.q[0], np.zeros(n)])
     # begun at the arm's weight, as a brake is released: else it falls until the integral has grown
     integral = dynamics.nonlinear_effects(*np.split(state, 2))
-    previous = seen = _seen(state[:n], tracking)
+    previous = seen = quantized(state[:n], tracking)
     states, torques = [], []
     within = np.arange(samples + 1) / settings.simulation.sample_rate
     for k, (q, qd, qdd) in enumerate(zip(path.q, path.qd, path.qdd, strict=True)):
-        previous, seen = seen, _seen(state[:n], tracking)
+        previous, seen = seen, quantized(state[:n], tracking)
         error, lag = q - seen, qd - (seen - previous) / tick
         integral = integral + tick * gains.integral * error
         effort = gains.proportional * error + gains.derivative * lag + integral
@@ -154,7 +154,7 @@ def record(
         state = passed[-1]
     true = np.concatenate(states)
     t = np.arange(len(true)) / settings.simulation.sample_rate
-    return Recording(t, true, _seen(true[:, :n], tracking), np.repeat(torques, samples, axis=0))
+    return Recording(t, true, quantized(true[:, :n], tracking), np.repeat(torques, samples, axis=0))
 
 
 def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Trajectory:
@@ -164,7 +164,7 @@ def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Tra
     return Trajectory(recording.t, q, np.gradient(q, recording.t, axis=0), recording.tau, name)
 
 
-def _seen(q: np.ndarray, tracking: TrackingSettings) -> np.ndarray:
+def quantized(q: np.ndarray, tracking: TrackingSettings) -> np.ndarray:
     """Return the nearest whole steps of the encoders."""
     return np.round(q / tracking.resolution) * tracking.resolution
 
