@@ -16,13 +16,13 @@ from spelgen.baselines.constant_velocity import hold_velocity
 from spelgen.baselines.predictor import Predictor
 from spelgen.comparison import metrics, runs
 from spelgen.comparison.formatting import comparison_tables
-from spelgen.comparison.metrics import mass_error, true_mass
 from spelgen.comparison.runs import predict_example, run_study, time_steps
 from spelgen.comparison.study import VARIANTS, ablation_variants, prepare_study
 from spelgen.design import load_design
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
 from spelgen.evaluation import invariants
+from spelgen.evaluation.truth import mass_error, true_mass
 from spelgen.fitting.rollout import roll_out
 from spelgen.logs.read import Trajectory, read_logs
 from spelgen.logs.windows import cut_windows, joined

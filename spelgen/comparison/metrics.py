@@ -20,7 +20,6 @@ from spelgen.files import read_json, write_json
 from spelgen.fitting.rollout import position_difference, roll_out
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.tuning.comparison import ComparisonTuning
 
 if TYPE_CHECKING:
@@ -124,23 +123,3 @@ def _network(model: Any, name: str) -> Any:
     """Return the network of a part of the model; None where it has no such part or that has none."""
     owner = getattr(model, name, None)
     return owner if hasattr(owner, "biases") else getattr(owner, "network", None)
-
-
-def true_mass(robot: Path, q: torch.Tensor) -> torch.Tensor:
-    """Return M (T, n, n) [kg m^2, kg m, kg] of a URDF and its sidecar, by Pinocchio, at q (T, n); rotors included."""
-    from spelgen.dynamics.pinocchio_arm import arm_dynamics
-
-    loaded = load_arm(robot)
-    mass: torch.Tensor = arm_dynamics(loaded.arm, loaded.settings).mass_matrix(q)
-    return mass
-
-
-def mass_error(learned: torch.Tensor, true: torch.Tensor) -> float:
-    """Return how far M is off (T, n, n), without unit: root mean square of the entries of L^-1 (learned - true) L^-T.
-
-    L L^T is the mean true M: so every entry counts in the units of its own joints.
-    """
-    factor = torch.linalg.cholesky(true.mean(dim=0))
-    half = torch.linalg.solve_triangular(factor, learned - true, upper=False)
-    relative = torch.linalg.solve_triangular(factor, half.mT, upper=False)
-    return float(relative.square().mean().sqrt())

@@ -13,17 +13,16 @@ import torch
 from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.comparison.metrics import (
     RunResult,
-    mass_error,
     predict,
     sizes,
     thinned,
-    true_mass,
 )
 from spelgen.comparison.study import Study, Variant
 from spelgen.emission.loading import load_module
 from spelgen.evaluation.drawn_motions import PredictedMotion, predicted_motion
 from spelgen.evaluation.invariants import invariants
 from spelgen.evaluation.plain import array, listed
+from spelgen.evaluation.truth import mass_error, true_mass
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.rollout import loss_scales, rollout_loss
 from spelgen.fitting.run_folder import RunFolder, trained_model

@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
+
 from spelgen.baselines.baseline import CommandFollower, JudgedArm
 from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import Predictor, accurate_solver, of_dynamics
@@ -28,11 +30,18 @@ from spelgen.evaluation.results import Results
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import TorqueErrors, coarse_torques, torque_errors
 from spelgen.evaluation.traces import Traces, motion_traces, replay_traces
+from spelgen.evaluation.truth import mass_errors
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import SHORTEST, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
-from spelgen.logs.trajectory import Trajectory, require_commands, require_joints, require_torques
+from spelgen.logs.trajectory import (
+    Trajectory,
+    joined_column,
+    require_commands,
+    require_joints,
+    require_torques,
+)
 from spelgen.settings.tuning.evaluation import EvaluationTuning
 
 if TYPE_CHECKING:
@@ -56,6 +65,7 @@ def evaluate(
     preprocessing: Preprocessing | None = None,
     steps: Sequence[int] = STEPS,
     seconds: Sequence[float] = SECONDS,
+    truth: LoadedArm | Path | str | None = None,
     progress: Progress | None = None,
 ) -> Results:
     """Predict the states and torques of test logs and measure the errors.
@@ -64,8 +74,9 @@ def evaluate(
     the fit's: it gives the URDF as a baseline, and errors of the tip. baselines: other dynamics to be judged beside
     those of `baselines.registry` and what the fit's folder keeps, by name, e.g. ``{"truth": identify(...).dynamics}``.
     preprocessing: of states and torques; by default as the model was fitted. steps, seconds: horizons in samples and in
-    time; those longer than every trajectory are omitted, with a note. progress: called with the rollouts that are done,
-    all of them, and the name of the next one.
+    time; those longer than every trajectory are omitted, with a note. truth: the true arm of simulated logs, or
+    its URDF, for the errors of M. progress: called with the rollouts that are done, all of them, and the name of the
+    next one.
     All that has dynamics is judged open loop, and with the constant disturbance that a momentum observer finds before a
     prediction starts (see `momentum_observer.py`). The result is deterministic. Raises LogError.
     """
@@ -88,7 +99,7 @@ def evaluate(
         return _judge_commands(judged, logs, notes)
     require_torques(logs)
     used = _preprocessing(judged.fit.preprocessing if judged.fit else None, preprocessing, logs)
-    return _judge_torques(judged, logs, notes, used, baselines or {}, (steps, seconds), progress)
+    return _judge_torques(judged, logs, notes, used, baselines or {}, (steps, seconds), truth, progress)
 
 
 def _preprocessing(
@@ -110,6 +121,7 @@ def _judge_torques(
     used: Preprocessing,
     baselines: Mapping[str, RigidDynamics],
     ahead: tuple[Sequence[int], Sequence[float]],
+    truth: LoadedArm | Path | str | None,
     progress: Progress | None,
 ) -> Results:
     """Judge torques, and the motion that they predict."""
@@ -152,6 +164,10 @@ def _judge_torques(
             do="omit --quick",
         )
     steps = coarse_torques(logs, judged.joints, notes) if torque else {}
+    masses = {}
+    if truth is not None:
+        q = torch.from_numpy(joined_column(logs, "q"))
+        masses = mass_errors(judged_dynamics, truth, judged.joints, q)
     return _results(
         judged,
         logs,
@@ -162,6 +178,7 @@ def _judge_torques(
         horizons=tuple(horizons),
         torque=torque,
         torque_steps=steps,
+        mass_errors=masses,
     )
 
 

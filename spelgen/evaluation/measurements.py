@@ -15,7 +15,7 @@ from spelgen.evaluation.replay import Replay
 from spelgen.evaluation.torque import TorqueErrors
 from spelgen.evaluation.traces import Traces
 
-SCHEMA = 9
+SCHEMA = 10
 
 
 @dataclass(frozen=True, repr=False)
@@ -25,7 +25,8 @@ class Measurements:
     cutoff: of the filter on the test logs [Hz], None without. substeps: of the integrator between samples, for the
     model. parameters: its trained numbers. torque: by predictor, empty where the logs are too sparse. traces: the
     curves behind the figures; those of predictions are the longest horizon's. replays: of commands, of an arm under
-    position servos. torque_steps: of joints whose torque is logged in steps of its own size, by name [Nm, N].
+    position servos. mass_errors: relative errors of M by predictor, if the truth is known. torque_steps: of joints
+    whose torque is logged in steps of its own size, by name [Nm, N].
     """
 
     robot: str
@@ -41,6 +42,7 @@ class Measurements:
     torque: dict[str, TorqueErrors] = field(default_factory=dict)
     torque_steps: dict[str, float] = field(default_factory=dict)
     replays: tuple[Replay, ...] = ()
+    mass_errors: dict[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON form, versioned by `schema`."""

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from spelgen.comparison.metrics import RunResult, true_mass
+from spelgen.comparison.metrics import RunResult
 from spelgen.comparison.study import Study
 from spelgen.evaluation.drawn_motions import PredictedMotion
 from spelgen.evaluation.plain import array
 from spelgen.evaluation.tables import Table
+from spelgen.evaluation.truth import true_mass
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.labels import named_joints

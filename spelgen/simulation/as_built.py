@@ -76,7 +76,7 @@ def _settings(arm: ConfiguredArm, seed: int) -> dict[str, Any]:
             "presliding": AS_BUILT.presliding,
             "torque_noise": AS_BUILT.torque_noise,
         }
-        settings["tracking"] = {"paths": "excitation"}
+        settings["tracking"] = {"paths": "excitation", "resolution": AS_BUILT.resolution}
     settings["simulation"] = simulation
     return settings
 

@@ -27,6 +27,7 @@ class EvaluationTuning:
     most_predicted_steps: int = 10_000
     fewest_windows: int = 100  # as far as there are so many
     probed_model_windows: int = 64  # of which the former are taken
+    mass_positions: int = 500  # at which M is compared with the true one; more change nothing
     # of the torque's variance; convention of this package, as the next two
     explained_for_contacts: float = 0.99
     explained_for_feed_forward: float = 0.95  # likewise

@@ -59,6 +59,8 @@ class AsBuiltTuning:
     elements: int = 5
     # White noise of the torque sensors, relative to the standard deviation of the torque.
     torque_noise: float = 0.02
+    # Encoders of 19 bits [rad; m].
+    resolution: float = 1.2e-5
     # Recordings [s], [Hz].
     duration: float = 15.0
     sample_rate: float = 200.0
