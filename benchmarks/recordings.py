@@ -1,10 +1,11 @@
 """Make the folder of recordings that the benchmarks read, from clones of public repositories.
 
-    python benchmarks/recordings.py FOLDER [--clones DIR] [--only NAME ...]
+    python benchmarks/recordings.py [FOLDER] [--clones DIR] [--only NAME ...]
 
-Each source is read at the commit of `SOURCES`, by `git show`. A repository is cloned into DIR (by default
-FOLDER/clones), unless DIR/<its name> exists. Licences are those that the repositories state; where none is stated all
-rights are the authors', and what may be done with their recordings is for the user to find out.
+Each source is read at the commit of `SOURCES`, by `git show`. FOLDER is runs/recordings by default, where the
+benchmarks look for it. A repository is cloned into DIR (by default FOLDER/clones), unless DIR/<its name> exists.
+Licences are those that the repositories state; where none is stated all rights are the authors', and what may be done
+with their recordings is for the user to find out.
 
 Recordings are Parquet files with the columns t [s], and q_<joint> [rad], qd_<joint> [rad/s], tau_<joint> [Nm] per
 joint; sample times are as recorded.
@@ -28,6 +29,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 
+FOLDER = Path(__file__).parents[1] / "runs" / "recordings"
 Read = Callable[[str], bytes]
 """Return the bytes of a file of a repository, by its path."""
 
@@ -397,9 +399,23 @@ def make(name: str, folder: Path, clones: Path) -> None:
         (target / f"{name}.urdf").write_bytes(reader(repository, clones)(path))
 
 
+def folder_of(argument: str | Path | None) -> Path:
+    """Return the folder of recordings that a benchmark reads: FOLDER of its command line, or the default."""
+    folder = Path(argument or FOLDER)
+    if not folder.is_dir():
+        sys.exit(f"{folder}: no folder of recordings; make it by `python benchmarks/recordings.py FOLDER`")
+    return folder
+
+
+def panda_urdf(folder: Path) -> Path:
+    """Return the URDF of the Panda: beside its recording, or in a folder of arms beside the recordings."""
+    urdf = folder / "panda" / "panda.urdf"
+    return urdf if urdf.exists() else folder.parent / "arms" / "panda_erd.urdf"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", nargs="?", type=Path, default=FOLDER)
     parser.add_argument("--clones", type=Path, help="folder of the clones; default: FOLDER/clones")
     parser.add_argument("--only", nargs="+", choices=SOURCES, default=list(SOURCES))
     options = parser.parse_args()
