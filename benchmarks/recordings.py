@@ -219,6 +219,7 @@ def so101(read: Read, folder: Path) -> None:
         for k, joint in enumerate(joints):
             columns |= {f"q_{joint}": q[:, k], f"u_{joint}": u[:, k], f"load_{joint}": load[:, k]}
         pa.parquet.write_table(pa.table(columns), folder / f"{name}.parquet")
+    (folder / "so101.yaml").write_text("input: position\n")
 
 
 RECONSTRUCT = np.zeros(0).__reduce__()[0]
