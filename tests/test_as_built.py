@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import spelgen
 from spelgen.cli.main import app
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
-from spelgen.errors import LogError, SettingsError, SpelgenErrors
+from spelgen.errors import LogError, SettingsError, SpelgenError, SpelgenErrors
 from spelgen.evaluation.truth import mass_error, true_mass
 from spelgen.excitation.trajectory import Motion
 from spelgen.settings.joint import JointSettings
@@ -112,9 +112,33 @@ def test_an_impossible_inertia_becomes_a_possible_one(tmp_path):
 def test_an_arm_without_inertials_is_refused_by_its_joint(tmp_path, robots):
     path = tmp_path / "bare.urdf"
     path.write_bytes(perturbed_urdf(robots / "two_link.urdf", None, 0))
-    with pytest.raises(SpelgenErrors, match="joint 'joint1'.*without <inertial>"):
+    with pytest.raises(SpelgenErrors, match=r"joint 'joint1'.*without <inertial>"):
         spelgen.as_built(spelgen.load_arm(path), 0, tmp_path / "as_built.urdf")
     assert not (tmp_path / "as_built.urdf").exists()
+
+
+def test_the_arm_itself_is_never_replaced(robots, tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_bytes((robots / "rpr.urdf").read_bytes())
+    with pytest.raises(SpelgenError, match="the URDF of the arm itself"):
+        spelgen.as_built(spelgen.load_arm(path), 0, path)
+    assert path.read_bytes() == (robots / "rpr.urdf").read_bytes()
+
+
+def test_arms_that_no_path_moves_are_driven_by_their_own_settings(robots, tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_bytes((robots / "two_link.urdf").read_bytes())
+    settings = (
+        "joints: {joint2: {actuated: false}}\nsimulation: {inputs: [-1, 1], trajectories: 4, duration: 0.2}\n"
+    )
+    path.with_suffix(".yaml").write_text(settings)
+    true = spelgen.as_built(spelgen.load_arm(path), 0, tmp_path / "as_built.urdf")
+    logs = spelgen.simulate(true)
+    assert len(logs) == 4
+    assert not logs.train[0].tau[:, 1].any() and set(np.unique(logs.train[0].tau[:, 0])) <= {-1.0, 1.0}
+    path.with_suffix(".yaml").write_text("input: position\nsimulation: {trajectories: 2, duration: 1}\n")
+    servos = spelgen.simulate(spelgen.as_built(spelgen.load_arm(path), 0, tmp_path / "as_built.urdf"))
+    assert len(servos) == 2 and servos.train[0].u is not None
 
 
 class TestHysteresis:

@@ -7,13 +7,13 @@ presliding hysteresis. The result is a URDF with a settings file beside it: the 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
 
 from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
+from spelgen.errors import SpelgenError
 from spelgen.excitation.trajectory import SPEEDS, motion_bounds
 from spelgen.files import write_bytes, write_text
 from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
@@ -35,10 +35,13 @@ def as_built(arm: ConfiguredArm, seed: int, path: Path | str) -> LoadedArm:
         path: The URDF to write; the settings go to the same name with .yaml.
     """
     path = Path(path)
+    if path.resolve() == arm.robot.path.resolve():
+        raise SpelgenError(
+            "the URDF of the arm itself", file=path, expected="another file for the arm as built"
+        )
     arm_dynamics(arm.arm, arm.settings)  # complains of missing inertials under the name of the user's file
+    settings, sidecar = _settings(arm, seed), path.with_suffix(".yaml")
     write_bytes(path, perturbed_urdf(arm.robot.path, AS_BUILT.inertial_error, seed))
-    settings = _settings(arm, seed)
-    sidecar = path.with_suffix(".yaml")
     # magnitudes of friction and armature follow from the perturbed rigid bodies, without drives
     write_text(sidecar, _yaml(settings))
     bodies = load_arm(path, angle_tolerance=arm.angle_tolerance)
@@ -47,41 +50,40 @@ def as_built(arm: ConfiguredArm, seed: int, path: Path | str) -> LoadedArm:
     return load_arm(path, angle_tolerance=arm.angle_tolerance)
 
 
-def _settings(arm: ConfiguredArm, seed: int) -> dict[str, Any]:
+def _settings(arm: ConfiguredArm, seed: int) -> dict[str, object]:
     """Return the settings of the arm as built, without drives: how it is mounted, wired and moved."""
     given = arm.settings
-    settings: dict[str, Any] = {
-        "about": ABOUT.format(seed),
-        "moving_joints": list(arm.arm.joint_names),
-        "gravity": list(given.gravity),
-        "input": given.input,
-        "torque": given.torque,
-    }
-    if given.couplings:
-        settings["couplings"] = [coupling.model_dump(mode="json") for coupling in given.couplings]
+    own = given.model_dump(
+        mode="json",
+        include={"gravity", "input", "torque", "couplings", "simulation", "tracking"},
+        exclude_unset=True,
+    )
+    names = list(arm.arm.joint_names)
+    settings: dict[str, object] = {"about": ABOUT.format(seed), "moving_joints": names} | own
+    # a joint without a motor cannot be moved along a path: such an arm is driven as its own settings state
+    if given.input == "position" or any(joint.passive for joint in arm.arm.coordinates):
+        settings["simulation"] = own.get("simulation", {}) | {"seed": seed}
+        return settings
     bounds = motion_bounds(arm.arm, 1.0, 1.0, arm.robot.joint)
     ranges = np.stack([bounds.low, bounds.high], axis=1).tolist()
-    simulation: dict[str, Any] = {
+    settings["simulation"] = {
+        "protocol": "prescribed",
+        "trajectories": 2,
+        "duration": AS_BUILT.duration,
+        "sample_rate": AS_BUILT.sample_rate,
+        "test_fraction": 0.5,
+        "presliding": AS_BUILT.presliding,
+        "torque_noise": AS_BUILT.torque_noise,
+        "positions": dict(zip(names, ranges, strict=True)) | own.get("simulation", {}).get("positions", {}),
         "seed": seed,
-        "positions": dict(zip(arm.arm.joint_names, ranges, strict=True)),
     }
-    # a joint without a motor cannot be moved along a path: the arm is driven as its own settings state
-    if given.input == "torque" and not any(joint.passive for joint in arm.arm.coordinates):
-        simulation |= {
-            "protocol": "prescribed",
-            "trajectories": 2,
-            "duration": AS_BUILT.duration,
-            "sample_rate": AS_BUILT.sample_rate,
-            "test_fraction": 0.5,
-            "presliding": AS_BUILT.presliding,
-            "torque_noise": AS_BUILT.torque_noise,
-        }
-        settings["tracking"] = {"paths": "excitation", "resolution": AS_BUILT.resolution}
-    settings["simulation"] = simulation
+    settings["tracking"] = {"paths": "excitation", "resolution": AS_BUILT.resolution}
     return settings
 
 
-def _drives(arm: ConfiguredArm, bodies: ConfiguredArm, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
+def _drives(
+    arm: ConfiguredArm, bodies: ConfiguredArm, rng: np.random.Generator
+) -> dict[str, dict[str, object]]:
     """Return random friction and armature of each joint, as settings.
 
     Coulomb friction is a fraction of the rigid-body torque of moderate motion (at most half the effort limit), armature
@@ -106,13 +108,12 @@ def _drives(arm: ConfiguredArm, bodies: ConfiguredArm, rng: np.random.Generator)
     asymmetry = rng.uniform(-AS_BUILT.asymmetry, AS_BUILT.asymmetry, len(joints))
     viscous = rng.uniform(*AS_BUILT.viscous, len(joints)) * coulomb / speed
     armature = rng.uniform(*AS_BUILT.armature, len(joints)) * inertia
-    drives: dict[str, dict[str, Any]] = {}
+    drives: dict[str, dict[str, object]] = {}
     for k, joint in enumerate(joints):
-        kept = arm.settings.joint(joint.name).model_dump(
-            mode="json", include={"gear", "actuated", "kp", "inputs"}
-        )
-        drives[joint.name] = {key: value for key, value in kept.items() if value is not None} | {
-            "rotor_inertia": _rounded(armature[k] / kept["gear"] ** 2),
+        given = arm.settings.joint(joint.name)
+        kept = given.model_dump(mode="json", include={"gear", "actuated", "kp", "inputs"}, exclude_none=True)
+        drives[joint.name] = kept | {
+            "rotor_inertia": _rounded(armature[k] / given.gear**2),
             "viscous": _rounded(viscous[k]),
             "coulomb": [
                 _rounded(coulomb[k] * (1 + asymmetry[k])),
@@ -127,6 +128,6 @@ def _rounded(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def _yaml(settings: dict[str, Any]) -> str:
+def _yaml(settings: dict[str, object]) -> str:
     text: str = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True)
     return text

@@ -51,16 +51,17 @@ def _perturb(inertial: etree._Element, log_factors: np.ndarray, displacement: np
         displacement: (3,) shift of the centre of mass, relative to the radius of gyration.
     """
     mass, tensor = inertial.find("mass"), inertial.find("inertia")
-    if mass is None or tensor is None or float(mass.get("value", "0")) <= MASSLESS:
+    if mass is None or float(mass.get("value", "0")) <= MASSLESS:
         return
     mass_factor, inertia_factor = np.exp(log_factors).tolist()
-    kilograms = float(mass.get("value"))
-    _make_consistent(tensor)
-    trace = sum(float(tensor.get(name, "0")) for name in ("ixx", "iyy", "izz"))
-    gyration_radius = np.sqrt(max(trace, 0.0) / 2 / kilograms)
+    kilograms, trace = float(mass.get("value")), 0.0
     mass.set("value", repr(mass_factor * kilograms))
-    for name, value in tensor.attrib.items():
-        tensor.set(name, repr(mass_factor * inertia_factor * float(value)))
+    if tensor is not None:
+        _make_consistent(tensor)
+        trace = sum(float(tensor.get(name, "0")) for name in ("ixx", "iyy", "izz"))
+        for name, value in tensor.attrib.items():
+            tensor.set(name, repr(mass_factor * inertia_factor * float(value)))
+    gyration_radius = np.sqrt(max(trace, 0.0) / 2 / kilograms)
     origin = inertial.find("origin")
     if origin is None:
         origin = etree.SubElement(inertial, "origin")
