@@ -24,12 +24,17 @@ demo: $(STAMP) ## robots/rpr.urdf from URDF to C: train on a simulated arm that 
 	@mkdir -p $(DEMO)
 	$(BIN)/spelgen inspect robots/rpr.urdf
 	$(BIN)/spelgen build robots/rpr.urdf -o $(DEMO)/rpr_spel.py
-	$(BIN)/spelgen excite robots/rpr.urdf --duration 15 --sample-rate 200 -o $(DEMO)/train.csv
-	$(BIN)/spelgen excite robots/rpr.urdf --duration 15 --sample-rate 200 --seed 1 -o $(DEMO)/test.csv
-	$(BIN)/spelgen simulate robots/rpr.urdf --as-built 8 --motion $(DEMO)/train.csv --motion $(DEMO)/test.csv -o $(DEMO)/logs
+	$(BIN)/spelgen excite robots/rpr.urdf -o $(DEMO)/train.csv \
+	    --duration 15 --sample-rate 200
+	$(BIN)/spelgen excite robots/rpr.urdf -o $(DEMO)/test.csv \
+	    --duration 15 --sample-rate 200 --seed 1
+	$(BIN)/spelgen simulate robots/rpr.urdf -o $(DEMO)/logs --as-built 8 \
+	    --motion $(DEMO)/train.csv --motion $(DEMO)/test.csv
 	$(BIN)/spelgen logs $(DEMO)/logs --robot robots/rpr.urdf
-	$(BIN)/spelgen train $(DEMO)/rpr_spel.py --robot robots/rpr.urdf --data $(DEMO)/logs -o $(DEMO)/run
-	$(BIN)/spelgen evaluate $(DEMO)/run --data $(DEMO)/logs --truth $(DEMO)/logs/as_built.urdf
+	$(BIN)/spelgen train $(DEMO)/rpr_spel.py --robot robots/rpr.urdf \
+	    --data $(DEMO)/logs -o $(DEMO)/run
+	$(BIN)/spelgen evaluate $(DEMO)/run --data $(DEMO)/logs \
+	    --truth $(DEMO)/logs/as_built.urdf
 	$(BIN)/spelgen report $(DEMO)/run > $(DEMO)/summary.txt
 	$(BIN)/spelgen export $(DEMO)/run --to c -o $(DEMO)/rpr_c
 	@echo && cat $(DEMO)/summary.txt

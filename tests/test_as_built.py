@@ -255,7 +255,7 @@ class TestMotionFile:
 def demo(tmp_path_factory):
     """The folder and the output of the commands of `make demo`, as the Makefile states them."""
     folder, output = tmp_path_factory.mktemp("demo"), {}
-    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8").replace("\\\n\t", "")
     for line in re.findall(r"^\t\$\(BIN\)/spelgen (.*\$\(DEMO\).*|inspect .*)$", makefile, re.MULTILINE):
         command = line.split(" > ")[0].replace("$(DEMO)", str(folder)).replace("robots/", f"{ROOT}/robots/")
         name, *arguments = shlex.split(command)

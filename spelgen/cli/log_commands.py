@@ -118,7 +118,7 @@ def simulate(
         options.require_free(path, force=force)
     if as_built is not None:
         arm = make_as_built(arm, as_built, truth)
-        say(f"wrote {truth} and as_built.yaml: the arm as built, the truth of these logs")
+        say(f"wrote {truth} and as_built.yaml, the true arm")
     with progress_bar("simulating") as progress:
         logs = simulate_arm(arm, seed=seed, motions=motions, progress=progress)
     # logs are written in SI units with the URDF's joint names: no mapping is needed to read them
