@@ -28,7 +28,7 @@ demo: $(STAMP) ## robots/rpr.urdf from URDF to C: train on a simulated arm that 
 	    --duration 15 --sample-rate 200
 	$(BIN)/spelgen excite robots/rpr.urdf -o $(DEMO)/test.csv \
 	    --duration 15 --sample-rate 200 --seed 1
-	$(BIN)/spelgen simulate robots/rpr.urdf -o $(DEMO)/logs --as-built 8 \
+	$(BIN)/spelgen simulate robots/rpr.urdf -o $(DEMO)/logs --as-built 3 \
 	    --motion $(DEMO)/train.csv --motion $(DEMO)/test.csv
 	$(BIN)/spelgen logs $(DEMO)/logs --robot robots/rpr.urdf
 	$(BIN)/spelgen train $(DEMO)/rpr_spel.py --robot robots/rpr.urdf \
