@@ -9,16 +9,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
-from spelgen.settings.tuning.evaluation import EvaluationTuning
+from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.evaluation.tuning import TUNING
 
 if TYPE_CHECKING:
     from spelgen.dynamics.protocol import RigidDynamics
 
-TUNING = EvaluationTuning()
 
-
-def true_mass(robot: LoadedArm | Path | str, q: Tensor, joints: Sequence[str] | None = None) -> Tensor:
+def true_mass(robot: ConfiguredArm | Path | str, q: Tensor, joints: Sequence[str] | None = None) -> Tensor:
     """Return M (T, n, n) [kg m^2, kg m, kg] of a URDF and its settings by Pinocchio, armature included.
 
     Args:
@@ -28,7 +26,7 @@ def true_mass(robot: LoadedArm | Path | str, q: Tensor, joints: Sequence[str] | 
     """
     from spelgen.dynamics.pinocchio_arm import arm_dynamics
 
-    path = robot.robot.path if isinstance(robot, LoadedArm) else robot
+    path = robot.robot.path if isinstance(robot, ConfiguredArm) else robot
     loaded = load_arm(path, joints)
     mass: Tensor = arm_dynamics(loaded.arm, loaded.settings).mass_matrix(q)
     return mass
@@ -50,7 +48,7 @@ def mass_error(learned: Tensor, true: Tensor) -> float:
 
 
 def mass_errors(
-    dynamics: Mapping[str, RigidDynamics], truth: LoadedArm | Path | str, joints: Sequence[str], q: Tensor
+    dynamics: Mapping[str, RigidDynamics], truth: ConfiguredArm | Path | str, joints: Sequence[str], q: Tensor
 ) -> dict[str, float]:
     """Return the relative error of M by predictor, at evenly spread positions.
 

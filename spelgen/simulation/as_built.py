@@ -11,19 +11,18 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SpelgenError
 from spelgen.excitation.trajectory import SPEEDS, motion_bounds
 from spelgen.files import write_bytes, write_text
-from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
-from spelgen.settings.tuning.simulation import AS_BUILT
 from spelgen.simulation.perturbed_urdf import perturbed_urdf
+from spelgen.simulation.tuning import AS_BUILT
 
 ABOUT = "The arm as built, from seed {}: the ground truth of simulated logs. `spelgen simulate` on it makes more logs."
 
 
-def as_built(arm: ConfiguredArm, seed: int, path: Path | str) -> LoadedArm:
+def as_built(arm: ConfiguredArm, seed: int, path: Path | str) -> ConfiguredArm:
     """Write the URDF and the settings of an arm as it may have been built, and return that arm.
 
     The arm can be simulated, and `evaluate` compares mass matrices with it. Raises ArmError if a moving link has no

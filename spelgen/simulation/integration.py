@@ -15,7 +15,7 @@ from scipy.integrate import ODEintWarning, odeint
 
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import RunError
-from spelgen.settings.tuning.simulation import SIMULATION
+from spelgen.simulation.tuning import TUNING
 
 
 def rollout(
@@ -39,7 +39,7 @@ def rollout(
         tolerance_factor: Factor of the relative and the absolute tolerance.
     """
     n = tau.shape[1]
-    tolerances = {"rtol": SIMULATION.rtol * tolerance_factor, "atol": SIMULATION.atol * tolerance_factor}
+    tolerances = {"rtol": TUNING.rtol * tolerance_factor, "atol": TUNING.atol * tolerance_factor}
     states = np.empty((t.size, 2 * n))
     states[0] = initial
     changes = np.flatnonzero((tau[1:-1] != tau[:-2]).any(axis=1)) + 1
@@ -61,7 +61,7 @@ def rollout(
                     states[first],
                     t[span],
                     tfirst=True,
-                    mxstep=SIMULATION.most_steps,
+                    mxstep=TUNING.most_steps,
                     **tolerances,
                 )
             except ODEintWarning as warning:

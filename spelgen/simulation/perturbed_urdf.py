@@ -1,4 +1,4 @@
-"""URDFs with wrong or absent inertials: the parameters of another, physically consistent arm."""
+"""URDFs with perturbed inertials: those of another, physically consistent arm."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MIN_SPREAD = 0.01
 """Smallest principal second moment of mass, relative to the largest, that replaces a negative one."""
 
 
-def perturbed_urdf(robot: Path, error: float | None, seed: int) -> bytes:
+def perturbed_urdf(robot: Path, error: float, seed: int) -> bytes:
     """Return the URDF without friction, visuals and collisions, and with perturbed inertials.
 
     Per link, mass and inertia about the centre of mass are scaled by independent factors exp(error N(0, 1)); the centre
@@ -24,20 +24,16 @@ def perturbed_urdf(robot: Path, error: float | None, seed: int) -> bytes:
 
     Args:
         robot: URDF or xacro file, which was read before.
-        error: Relative standard deviation: 0.3 is 30 %. None: the inertials are removed.
+        error: Relative standard deviation: 0.3 is 30 %.
         seed: Seed of the random factors; the same seed gives the same bytes.
     """
     parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
     tree = etree.ElementTree(etree.fromstring(urdf_bytes(robot), parser))
-    removed = ["dynamics", "visual", "collision"]
-    if error is None:
-        removed.append("inertial")
-    for element in list(tree.iter(*removed)):
+    for element in list(tree.iter("dynamics", "visual", "collision")):
         element.getparent().remove(element)
-    if error is not None:
-        rng = np.random.default_rng(seed)
-        for inertial in tree.iterfind(".//link/inertial"):
-            _perturb(inertial, error * rng.normal(size=2), error * rng.normal(size=3))
+    rng = np.random.default_rng(seed)
+    for inertial in tree.iterfind(".//link/inertial"):
+        _perturb(inertial, error * rng.normal(size=2), error * rng.normal(size=3))
     text: bytes = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
     return text
 

@@ -18,10 +18,10 @@ from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SettingsError
 from spelgen.excitation.trajectory import Motion
 from spelgen.settings.settings import Settings
-from spelgen.settings.tuning.simulation import AS_BUILT
 from spelgen.simulation.paths import paths
 from spelgen.simulation.protocol import SimulatedLogs, make_friction
 from spelgen.simulation.tracking import Recording, measured, quantized
+from spelgen.simulation.tuning import AS_BUILT
 
 
 def prescribed(

@@ -11,10 +11,9 @@ from spelgen.arm.arm import Arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
-from spelgen.settings.tuning.servo import ServoSimulationTuning
 from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction
+from spelgen.simulation.tuning import SERVOS as TUNING
 
-TUNING = ServoSimulationTuning()
 SWEEPS = 4  # Gauss-Seidel iterations over the joints, for dry friction
 ENCODER = 2 * np.pi / 4096  # [rad], 12 bits per revolution; a tenth of it [m] for prismatic joints
 EFFORT, LAG = 5.0, 0.05  # [Nm], [s]: torque limit and time constant kd / kp of an unspecified servo
