@@ -13,7 +13,7 @@ import numpy as np
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.bristles import BristleReach, bristles_along
-from spelgen.dynamics.joint_friction import Friction
+from spelgen.dynamics.joint_friction import DriveFriction
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SettingsError
 from spelgen.excitation.trajectory import Motion
@@ -72,7 +72,7 @@ def prescribed(
     return SimulatedLogs(logs[:trained], logs[trained:])
 
 
-def friction_along(friction: Friction, arm: Arm, motion: Motion, presliding: float) -> np.ndarray:
+def friction_along(friction: DriveFriction, arm: Arm, motion: Motion, presliding: float) -> np.ndarray:
     """Return the friction torque (T, n) [Nm; N] along a motion.
 
     Maxwell-slip model (Al-Bender, Lampaert, Swevers, IEEE TAC 50:1883, 2005): elements in parallel, each of which
