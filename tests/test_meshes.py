@@ -43,6 +43,7 @@ def test_triangles_without_common_corners_stay_one_surface(tmp_path):
     assert drawn.area == pytest.approx(ball.area, rel=0.02)
 
 
+@pytest.mark.timed  # the process that reads meshes is stopped after a minute
 def test_an_arm_of_fine_meshes_is_drawn(tmp_path):
     trimesh.creation.icosphere(subdivisions=7, radius=0.1).export(tmp_path / "m.stl")  # 327,680 faces
     visual = '<visual><geometry><mesh filename="m.stl"/></geometry></visual>'
