@@ -17,12 +17,12 @@ from flint import fmpq_mpoly
 from polynomials import polynomials
 from torch import nn
 
+from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.design import Design
-from spelgen.emission.emit import emit
-from spelgen.pipeline.generate import make_spec
-from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
+from spelgen.emission.build import derive_spec
+from spelgen.emission.text import module_text
 from spelgen.spec import Options
-from spelgen.structure.structure import Structure
+from spelgen.structure.structure import Structure, derive
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 GANTRY = """<robot name="gantry"><link name="base"/><link name="bridge"/><link name="trolley"/>
@@ -56,17 +56,18 @@ def built(
     robot: str,
     assume: str = "kinematics",
     preset: str = "hybrid",
-    net: str | None = None,
     design: Design | None = None,
+    *,
+    standalone: bool = False,
 ) -> tuple[str, Structure]:
-    """Source and structure of one of the robots that come with spelgen."""
-    loaded = _loaded(robot)
-    options = Options(preset=preset, design=design, net=net, assume=assume)
-    return emit(make_spec(loaded, options)), loaded.structure_for(assume)
+    """Return the source of a module, and the structure, of one of the robots that come with spelgen."""
+    arm = _loaded(robot)
+    spec = derive_spec(arm, Options(preset=preset, design=design, assume=assume))
+    return module_text(spec, standalone=standalone), derive(arm.arm, assume)
 
 
 @cache
-def _loaded(robot: str) -> LoadedArm:
+def _loaded(robot: str) -> ConfiguredArm:
     return load_arm(ROBOTS / f"{robot}.urdf")
 
 
@@ -77,11 +78,10 @@ def random_model(
     seed: int,
     deviation: float | None = None,
     preset: str = "hybrid",
-    net: str | None = None,
     design: Design | None = None,
 ) -> nn.Module:
     """The robot's model with random weights, as ``randomise`` draws them."""
-    source = built(robot, preset=preset, net=net, design=design)[0]
+    source = built(robot, preset=preset, design=design)[0]
     model = import_source(source, folder / f"{robot}_spel.py").Model(seed=seed)
     randomise(model, seed, deviation)
     return model

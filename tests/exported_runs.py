@@ -5,11 +5,11 @@ from pathlib import Path
 import torch
 from emitted import ROBOTS
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.emission.build import build
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.fits import TorqueFit
 
 COUPLED = """<robot name="2 fast; } int main( /* */"><link name="base"/>

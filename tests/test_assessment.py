@@ -90,9 +90,9 @@ def test_if_only_motion_fails_its_joint_is_named(nmse, worst):
     assert f"; worst at {worst}." in verdict(judged).sentence
 
 
-def test_a_terminal_shows_the_assessment_last():
+def test_a_terminal_shows_the_assessment_first():
     text, judged = evaluation(0.7).text(), verdict(evaluation(0.7))
-    assert " ".join(text.split("\n\n")[-1].split()) == f"{judged.sentence} {judged.because}"
+    assert " ".join(text.split("\n\n")[0].split()) == f"{judged.sentence} {judged.because}"
     assert max(map(len, text.splitlines())) <= 80
 
 

@@ -428,7 +428,10 @@ def test_help_shows_whole_sentences(spelgen):
             ["train", "m.py", "--set", "prior.body=1"],
             "--set prior: unknown key 'body'; did you mean 'bodies'?",
         ),
-        (["build", "x.urdf", "--net", "mpl"], "'mpl' is none of mlp, kan. Did you mean 'mlp'?"),
+        (
+            ["build", "x.urdf", "--assume", "inertal"],
+            "'inertal' is none of kinematics, inertials. Did you mean 'inertials'?",
+        ),
         (["logs", "x", "--robot", "y", "--format", "xml"], "'xml' is none of text, json."),
     ],
 )

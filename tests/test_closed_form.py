@@ -1,16 +1,14 @@
-"""The preset closed-form: rigid bodies against Pinocchio, friction and torque offsets against their formulas."""
+"""The preset closed-form: rigid bodies against Pinocchio, derivatives against autograd, fits against known arms."""
 
 import numpy as np
 import pinocchio as pin
 import pytest
 import torch
 from emitted import import_source
-from typer.testing import CliRunner
 
-from spelgen.cli.main import app
+from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.body_regressor import regressor_of
-from spelgen.pipeline.generate import generate
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import generate
 from spelgen.structure.pseudo_inertia import pseudo_inertia
 from spelgen.structure.sampling import float_energies
 
@@ -74,8 +72,13 @@ def near(a, b, tolerance=1e-9):
     assert (a - b).abs().max() <= tolerance * max(1.0, b.abs().max())
 
 
+def moved(q, qd, matrix_of):
+    """d/dt of matrix_of(q) along qd."""
+    return torch.func.jvp(matrix_of, (q,), (qd,))[1]
+
+
 @pytest.mark.parametrize("robot", [x for x in ROBOTS if x != "rpr"])  # whose bodies are no possible ones
-def test_untrained_the_model_is_the_rigid_arm_of_the_urdf(emitted, robots, robot):
+def test_untrained_it_is_the_urdfs_rigid_arm(emitted, robots, robot):
     module, arm = emitted[robot]
     model = rigid(module)
     names = [coordinate.name for coordinate in arm.coordinates]
@@ -93,7 +96,7 @@ def test_untrained_the_model_is_the_rigid_arm_of_the_urdf(emitted, robots, robot
     near(model.potential_energy(q) - model.potential_energy(q[:1]), height - height[0], 1e-8)
 
 
-def test_mimic_and_prismatic_joints(emitted):
+def test_joints_that_follow_and_joints_that_slide(emitted):
     module, arm = emitted["followed"]
     model = rigid(module)
     q, *_ = states(model.n)
@@ -104,36 +107,66 @@ def test_mimic_and_prismatic_joints(emitted):
     near(model.potential_energy(q), torch.from_numpy(potential), 1e-10)
 
 
-def test_inconsistent_inertials_are_replaced_by_consistent_ones(emitted):
+def test_impossible_bodies_start_from_possible_ones(emitted):
     module, _ = emitted["rpr"]
     ten = module.Model().inertial_parameters.detach().numpy()
     assert (np.linalg.eigvalsh(pseudo_inertia(ten))[:, 0] > 0).all()
 
 
-def test_torque_offsets_are_subtracted_from_the_input(emitted):
-    model = drawn(emitted["rpr"][0], seed=1).requires_grad_(False)
-    q, p, _, tau = states(model.n)
-    (_, driven), (_, free) = (model.port_hamiltonian_rhs(q, p, x, model.prepare()) for x in (tau, None))
-    added = (model.input_matrix(q) @ (tau - model.torque_offset).unsqueeze(-1)).squeeze(-1)
-    near(driven - free, added)
+@pytest.mark.parametrize("robot", [*ROBOTS, "followed"])
+def test_the_equations_are_those_of_its_hamiltonian(emitted, robot):
+    model = drawn(emitted[robot][0], seed=1)
+    q, qd, _, tau = states(model.n)
+    q.requires_grad_()
+    p = model.momentum(q, qd).detach()
+    (slope,) = torch.autograd.grad(model.hamiltonian(q, p).sum(), q)
+    (gravity,) = torch.autograd.grad(model.potential_energy(q).sum(), q)
+    q = q.detach()
+    near(model.gravity(q), gravity)
+    rate, force = model.port_hamiltonian_rhs(q, p, tau, model.prepare())
+    near(rate, qd)
+    given = (model.input_matrix(q) @ (tau - model.torque_offset).unsqueeze(-1)).squeeze(-1)
+    near(force, given - slope - (model.dissipation(q, qd) @ qd.unsqueeze(-1)).squeeze(-1))
+    qdd = model.forward_dynamics(q, qd, tau)
+    near(model.inverse_dynamics(q, qd, qdd), tau, 1e-8)
+    momentum_rate = moved(q, qd, lambda x: model.momentum(x, qd)) + model.momentum(q, qdd)
+    near(momentum_rate, force, 1e-8)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_bodies_are_physically_consistent_for_all_parameters(emitted, robot):
+def test_possible_bodies_and_resisting_friction_for_all_weights(emitted, robot):
     for seed in range(3):
         model = drawn(emitted[robot][0], seed=seed, deviation=1.5).requires_grad_(False)
+        q, qd, _, _ = states(model.n, 300, seed)
         pseudo = pseudo_inertia(model.inertial_parameters.numpy())
         assert (np.linalg.eigvalsh(pseudo)[:, 0] > 0).all()
+        assert torch.linalg.eigvalsh(model.mass_matrix(q))[:, 0].min() > 0
+        assert model.dissipation(q, 1e-3 * qd).diagonal(dim1=-2, dim2=-1).min() > 0
 
 
 @pytest.mark.parametrize("batch", [(), (1,), (0,), (2, 3), (2, 0)])
-def test_the_regressor_has_the_batch_shape_of_its_states(emitted, batch):
+def test_any_batch_shape(emitted, batch):
     model = drawn(emitted["rpr"][0], seed=0)
-    q, qd, qdd = (torch.rand(*batch, 3, dtype=torch.float64) for _ in range(3))
-    assert regressor_of(model.chain, q, qd, qdd).shape == (*batch, 3, 30)
+    q, qd, tau = (torch.rand(*batch, 3, dtype=torch.float64) for _ in range(3))
+    for value in (model.gravity(q), model.forward_dynamics(q, qd, tau), model.inverse_dynamics(q, qd, tau)):
+        assert value.shape == (*batch, 3)
+    for value in (model.mass_matrix(q), model.dissipation(q, qd), model.input_matrix(q)):
+        assert value.shape == (*batch, 3, 3)
+    assert regressor_of(model.chain, q, qd, tau).shape == (*batch, 3, 30)
+    assert model.potential_energy(q).shape == batch
+    assert model(torch.zeros(()), torch.cat([q, qd, tau], dim=-1)).shape == (*batch, 9)
 
 
-def test_friction_at_zero_velocity_has_its_derivative(emitted):
+def test_backpropagation_reaches_every_weight(emitted):
+    model = drawn(emitted["rpr"][0], seed=0, deviation=0.3)
+    q, qd, _, tau = states(3)
+    z = 0.3 * model.memory(qd)  # on their way from one side to the other
+    model.forward_dynamics(q, qd, tau, z * torch.rand_like(z)).square().sum().backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad.abs().max() > 0, name
+
+
+def test_friction_at_a_standstill_has_its_slope(emitted):
     model = drawn(emitted["ur10e"][0], seed=0)
     q = states(6)[0]
     constants = model.friction.prepare()
@@ -149,10 +182,3 @@ def test_friction_at_zero_velocity_has_its_derivative(emitted):
     saturating = constants.saturation * away / (away**2 + constants.saturation_velocity**2).sqrt()
     dry = dry * away / (away**2 + constants.coulomb_smoothing_velocity**2).sqrt()
     near(torque, constants.viscous * away + saturating + dry)
-
-
-def test_a_choice_of_networks_is_refused(robots, tmp_path):
-    command = ["build", str(robots / "rpr.urdf"), "--preset", "closed-form", "--net", "kan"]
-    done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "arm.py")])
-    assert done.exit_code == 2
-    assert "closed-form has no networks" in done.output

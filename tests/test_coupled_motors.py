@@ -12,8 +12,11 @@ import torch
 from emitted import ROBOTS, import_source
 
 from spelgen.arm.actuation import motor_speeds
+from spelgen.arm.configured_arm import load_arm
+from spelgen.certificate.inspection import inspect
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.emission.build import build, generate
 from spelgen.fitting.fit import fit
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import TorqueJacobian
@@ -27,9 +30,6 @@ from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.build import build
-from spelgen.pipeline.generate import generate, inspect
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.log_mapping import LogMapping
 
 WRIST = np.array([[50.0, 50.0], [40.0, -40.0]])  # joint torques by motor torques of the last two joints

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.errors import SettingsError, SpelgenErrors
 from spelgen.excitation.criterion import Criterion
 from spelgen.excitation.design import excite
 from spelgen.excitation.trajectory import ExcitationTrajectory, motion_bounds
-from spelgen.pipeline.loaded_arm import load_arm
 from tests.hand_built import coupled_urdf
 
 CHOICE = {"duration": 10.0, "sample_rate": 100.0, "harmonics": 5, "reach": 0.8, "speed": 0.6}

@@ -8,13 +8,13 @@ from emitted import ROBOTS
 from exported_runs import saved_run
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
+from spelgen.emission.build import build
 from spelgen.errors import RunError
 from spelgen.exporting.export import export
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 
 pytest.importorskip("pinocchio")
 
@@ -113,7 +113,7 @@ def test_the_friction_model_is_exported(tmp_path):
     run, model = run_of("rpr", tmp_path, "closed-form", heavier)
     exported(run, tmp_path / "learned.urdf")
     told = yaml.safe_load((tmp_path / "learned.urdf.friction.yaml").read_text())
-    law = [told["joints"][name]["law"]["coulomb"] for name in model.facts.joints]
+    law = [told["joints"][name]["law"]["coulomb"] for name in model.joint_names]
     np.testing.assert_allclose(law, model.coulomb.detach().numpy(), rtol=1e-10)
     assert len((tmp_path / "learned.urdf.README.md").read_text().splitlines()) == 5
 

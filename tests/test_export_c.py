@@ -12,7 +12,9 @@ import torch
 from exported_runs import COUPLED, MOTORS, arm_of, moved_model, run_folder
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
+from spelgen.emission.build import build
 from spelgen.errors import RunError
 from spelgen.exporting import friction_expressions, parity
 from spelgen.exporting.c_export import c_files, called_by_c, compile_library
@@ -23,8 +25,6 @@ from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.export import export
 from spelgen.exporting.model_expressions import expression_functions
 from spelgen.exporting.parity import check_parity, random_inputs, require_parity
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 
 ONE_JOINT = """<robot name="one"><link name="base"/>
 <link name="arm"><inertial><origin xyz="0.1 0 0"/><mass value="1"/>

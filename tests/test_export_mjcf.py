@@ -11,14 +11,14 @@ from emitted import ROBOTS
 from exported_runs import COUPLED, MOTORS, arm_of, moved_model, run_folder
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.dynamics.tip import tip_kinematics
+from spelgen.emission.build import build
 from spelgen.errors import RunError
 from spelgen.exporting.export import export
 from spelgen.exporting.mjcf_export import check_mjcf
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 
 
 @pytest.mark.parametrize("robot", ["rpr", "scara", "panda"])

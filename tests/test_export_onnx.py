@@ -8,12 +8,12 @@ import pytest
 import torch
 from exported_runs import COUPLED, MOTORS, arm_of, moved_model
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.emission.build import build
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.export import export
 from spelgen.exporting.onnx_export import called_by_onnx, onnx_model, onnx_session
 from spelgen.exporting.parity import check_parity
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 
 
 def coupled_model(folder):

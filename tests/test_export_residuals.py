@@ -7,14 +7,13 @@ import pytest
 import torch
 from exported_runs import arm_of, moved_model
 
-from spelgen.errors import RunError
+from spelgen.emission.build import build
 from spelgen.exporting.c_export import called_by_c, compile_library
 from spelgen.exporting.c_source import c_functions, c_source, write_c
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
 from spelgen.exporting.describe import Trained, describe
 from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.parity import check_parity
-from spelgen.pipeline.build import build
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
 ENTRIES = {name: entry for name, entry in ENTRY_POINTS.items() if name != "servo_torque"}
@@ -137,13 +136,3 @@ def test_splines_at_their_ends_and_beyond(tmp_path):
             for step in (1e-6, -1e-6)
         )
         np.testing.assert_allclose(slope[:, :, 0], (ahead - behind) / 2e-6, rtol=1e-4, atol=1e-4)
-
-
-def test_kolmogorov_arnold_networks_are_refused_unless_zero():
-    model = with_parts("two_link", net="kan")
-    assert not describe(model, arm_of("two_link")).residuals
-    model.residuals.mass.weights[-1].add_(0.1)
-    with pytest.raises(
-        RunError, match="Kolmogorov-Arnold networks beside rigid bodies, expected closed-form"
-    ):
-        describe(model, arm_of("two_link"))

@@ -15,13 +15,13 @@ from formula_parsing import assert_equal_to_pinocchio, read_back
 from typer.testing import CliRunner
 
 from spelgen.arm.arm import make_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.formula_files import sympy_source
 from spelgen.certificate.formula_text import text, to_dict
 from spelgen.certificate.formulas import formulas
+from spelgen.certificate.inspection import inspect
 from spelgen.cli.main import app
 from spelgen.errors import SpelgenError
-from spelgen.pipeline.generate import inspect
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf
 

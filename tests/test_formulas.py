@@ -17,12 +17,12 @@ from hypothesis import HealthCheck, given, settings
 from random_arms import arms
 
 from spelgen.arm.arm import make_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.formula_files import latex, sympy_source
 from spelgen.certificate.formula_text import text
 from spelgen.certificate.formulas import WRITABLE, formulas
 from spelgen.certificate.numeric_samples import with_random_inertias
 from spelgen.files import write_text
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.structure.expansion import Budget, Expansion
 from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf

@@ -6,6 +6,7 @@ import torch
 from emitted import ROBOTS, built, import_source
 from exported_runs import arm_of
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.bristles import (
     BristleReach,
     bristle_reach,
@@ -15,6 +16,7 @@ from spelgen.dynamics.bristles import (
     reach_of,
 )
 from spelgen.dynamics.linear_friction import FrictionModel
+from spelgen.emission.build import build
 from spelgen.emission.loading import load_module
 from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
 from spelgen.identification.identification import LeastSquares
@@ -22,8 +24,6 @@ from spelgen.identification.identify import least_squares
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.runtime.friction_laws import FrictionLaws
 from spelgen.runtime.sliding_friction import SlidingFriction
 

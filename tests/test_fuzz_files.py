@@ -15,16 +15,15 @@ from fuzzing import fuzz
 from hypothesis import strategies as st
 from test_fuzz_urdf import mutated
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.emission.build import build
 from spelgen.errors import SpelgenError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.fitting.fit import fit
 from spelgen.fitting.fitted import load_run
 from spelgen.log_checks.check_logs import check_logs
-from spelgen.logs.chunks import scan
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.render.report_page import render_report
 from spelgen.render.scene import scene
 from spelgen.settings.fits import TorqueFit
@@ -68,8 +67,6 @@ def arm(robots):
 def used(path: Path, arm, mapping=None) -> None:
     """A log as the commands use it."""
     check_logs(read_logs(path, arm, mapping), arm)
-    if path.suffix == ".parquet":
-        list(scan([path], JOINTS))
 
 
 @st.composite

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from fuzzing import FEW, MINUTES, fuzz
 from hypothesis import strategies as st
+from spelgen.pipeline import generate as pipeline
 
 from spelgen.errors import SpelgenError
-from spelgen.pipeline import generate as pipeline
 
 ROOT = Path(__file__).parents[1]
 OURS = sorted((ROOT / "robots").glob("*.urdf"))

@@ -7,6 +7,8 @@ import pinocchio as pin
 import pytest
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.certificate.inspection import inspect
 from spelgen.cli.main import app
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.regressor import regressor, urdf_parameters
@@ -18,8 +20,6 @@ from spelgen.identification.least_squares import correlation_time
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
-from spelgen.pipeline.generate import inspect
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.structure.pseudo_inertia import parameters_of, pseudo_inertia, reference_factor
 
 ROBOTS = ("two_link", "rpr", "scara", "six_dof", "ur10e", "panda")

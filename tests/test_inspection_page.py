@@ -6,9 +6,9 @@ import pytest
 from html_page import Page
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.certificate.inspection import inspect
 from spelgen.cli.main import app
-from spelgen.pipeline.generate import inspect
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.render.inspection_page import page
 
 HOSTILE = "<script>alert(1)</script>{{ 7 * 7 }}&quot;'&amp;"

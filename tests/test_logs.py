@@ -11,17 +11,16 @@ import pyarrow.parquet
 import pytest
 import torch
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.emission.build import build
 from spelgen.errors import LogError, SpelgenErrors
 from spelgen.logs.checks import check
-from spelgen.logs.chunks import scan
 from spelgen.logs.filtering import low_pass, regular_times, resampled
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.trajectory import split_at_gaps
 from spelgen.logs.windows import cut_windows, split_validation
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 
 JOINTS = ("a", "b")
 
@@ -96,7 +95,7 @@ def test_recordings_are_told_apart_wherever_their_rows_lie(tmp_path):
     np.testing.assert_array_equal(found[17].q[:, 0], [17, 3017, 6017, 9017])
 
 
-@pytest.mark.parametrize("step", ["read", "scan", "check"])
+@pytest.mark.parametrize("step", ["read", "check"])
 def test_many_short_recordings_take_time_by_their_number(tmp_path, step):
     """Two samples each: sixteen times as many took 256 times as long."""
     random, seconds = np.random.default_rng(0), []
@@ -105,7 +104,6 @@ def test_many_short_recordings_take_time_by_their_number(tmp_path, step):
         write_logs(tmp_path / "x.parquet", logs, JOINTS)
         run = {
             "read": lambda: read_logs(tmp_path / "x.parquet", JOINTS),
-            "scan": lambda: list(scan([tmp_path / "x.parquet"], JOINTS)),
             "check": lambda logs=logs: check(logs, JOINTS, ("prismatic",) * 2),
         }[step]
         start = process_time()

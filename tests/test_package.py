@@ -10,9 +10,9 @@ from importlib.metadata import PackageNotFoundError, metadata, requires
 from pathlib import Path
 
 import pytest
+from spelgen.pipeline import generate as pipeline
 
 import spelgen
-from spelgen.pipeline import generate as pipeline
 
 ROOT = Path(__file__).parents[1]
 
@@ -79,7 +79,7 @@ def test_importing_it_imports_nothing_heavy():
 
 def test_objects_are_short_to_read(robots):
     arm = spelgen.load_arm(robots / "rpr.urdf")
-    assert repr(arm) == "<LoadedArm 'rpr': 3 joints of rpr.urdf>"
+    assert repr(arm) == "<ConfiguredArm 'rpr': 3 joints of rpr.urdf>"
     told = "3 outputs, 2 constants, 11 base parameters"
     assert repr(arm.structure) == f"<Structure of 3 joints (kinematics used): {told}>"
     told = "3 outputs and 2 constants, 11 base inertial parameters"

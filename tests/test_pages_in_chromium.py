@@ -6,7 +6,7 @@ import pytest
 from chromium import Chromium, executable
 from test_report import run  # noqa: F401  (a fixture)
 
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.render.inspection_page import page
 from spelgen.render.report_page import write_report
 

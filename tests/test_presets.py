@@ -1,7 +1,6 @@
 """Each preset is the model that its paper writes down; see test_contracts.py for properties that all presets share."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -19,15 +18,15 @@ from emitted import (
 from lie_group import geodesic_distance, group_rates
 from published_phnode import ByJvp, Published
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.design import Preset, load_design
+from spelgen.emission.build import make_spec
 from spelgen.fitting.rollout import position_difference
-from spelgen.pipeline.generate import make_spec
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.spec import Options
 from tests.lie_group import to_group
 
 ROOT = Path(__file__).parents[1]
-PRESETS = [("phnode", "mlp"), ("phnode", "kan"), ("spel", "mlp"), ("spel-kan", "kan"), ("hybrid", "kan")]
+PRESETS = ["phnode", "spel", "spel-kan", "hybrid"]
 ROBOTS = ("two_link", "rpr", "six_dof")
 each_robot = pytest.mark.parametrize("robot", ROBOTS)
 
@@ -46,10 +45,8 @@ def test_presets_are_the_files():
     files = {path.stem for path in (ROOT / "spelgen" / "presets").glob("*.yaml")}
     assert {name for name in get_args(Preset) if name in files} == files
     for name in files:
-        design = load_design(name)
-        assert design.net == "none" or load_design(name, "kan").net == "kan"
-        assert make_spec(load_arm(ROOT / "robots" / "rpr.urdf"), Options(preset=name)).options.net == (
-            design.net if design.net in ("mlp", "kan") else None
+        assert make_spec(load_arm(ROOT / "robots" / "rpr.urdf"), Options(preset=name)).design == load_design(
+            name
         )
 
 
@@ -58,7 +55,7 @@ def test_kan_outputs_depend_only_on_their_own_joints(robot, tmp_path):
     model = random_model(robot, tmp_path, seed=2, net="kan")
     outputs = built(robot, net="kan")[1].outputs
     q = states(model.n)[0]
-    network = model.residuals.mass
+    network = model.mass.network
     before = outputs_alone(network, network_inputs(model, q))
     for joint in range(model.n):
         moved = q.clone()
@@ -109,12 +106,12 @@ def test_networks_read_rotation_matrices(net, part, tmp_path):
     near(outputs_alone(model, network_inputs(owner, q)), layer)
 
 
-@pytest.mark.parametrize(("preset", "net"), [*PRESETS, ("hybrid", "mlp")])
+@each
 @pytest.mark.parametrize("robot", ["rpr", "six_dof"])
-def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset, net, tmp_path):
+def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset, tmp_path):
     """Eq. 15 and 18 over three axes a joint, all derivatives automatic, against the n x n module."""
-    design = replace(NETWORKS, net=net) if preset == "hybrid" else None
-    model = random_model(robot, tmp_path, seed=6, preset=preset, net=net, design=design)
+    design = NETWORKS if preset == "hybrid" else None
+    model = random_model(robot, tmp_path, seed=6, preset=preset, design=design)
     n = model.n
     q, p, _, tau = states(n)
     parts = to_group(model.joint_types, q)

@@ -14,8 +14,8 @@ from pinocchio_geometry import NOTHING, Seen
 from spelgen.arm.arm import Arm, make_arm
 from spelgen.certificate.axes import is_plain
 from spelgen.certificate.facts import Fact, facts
+from spelgen.certificate.inspection import inspect
 from spelgen.certificate.numeric_samples import draw
-from spelgen.pipeline.generate import inspect
 from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure, derive
 from spelgen.urdf.read import read_urdf

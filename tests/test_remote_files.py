@@ -8,12 +8,12 @@ import fsspec
 import pytest
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.errors import LogError, SpelgenError
 from spelgen.files import local
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.read import read_logs, write_logs
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.simulation.simulate import simulate
 
 JOINTS = ("joint1", "joint2")
@@ -57,7 +57,10 @@ def test_a_run_and_its_logs_may_be_remote(robots, tmp_path, memory):
         path.rsplit("/", 1)[-1] for path in memory.find("/runs/first")
     }
     assert len(memory.cat("/runs/first/metrics.jsonl").splitlines()) == 2
-    assert json.loads(memory.cat("/runs/first/config.json")) == RunFolder("memory://runs/first").read_config()
+    assert (
+        json.loads(memory.cat("/runs/first/config.json"))
+        == RunFolder("memory://runs/first").read_record().to_dict()
+    )
 
 
 def test_local_removal_removes_the_remote_file(memory):

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 from html_page import Page
+from spelgen.pipeline import generate as pipeline
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.design import PRESETS
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.pipeline import generate as pipeline
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.render.report_page import render_report, write_report
 from spelgen.render.run_facts import commands
 from spelgen.settings.fits import Rollout
@@ -131,16 +131,16 @@ def test_numbers_are_those_of_the_run(run):
     assert "34 for training, 17 for validation" in text
     assert "--objective rollout --set seed=7 --set epochs=30 --set cutoff=8.0 --set decimation=1" in text
     assert "2,000 steps on the momentum" in text and "rk4, 4 steps between samples" in text
-    assert "spelgen build rpr.urdf --net mlp -o module.py spelgen train module.py --data LOGS" in text
+    assert "spelgen build rpr.urdf -o module.py spelgen train module.py --data LOGS" in text
 
 
 def test_a_run_of_a_custom_preset_names_the_file_that_it_needs(run, robots, tmp_path):
     preset = tmp_path / "mine.yaml"
     preset.write_text((PRESETS / "minimal.yaml").read_text())
-    module = pipeline.generate(load_arm(robots / "rpr.urdf", joints=["joint1", "joint2"]), preset, net="kan")
+    module = pipeline.generate(load_arm(robots / "rpr.urdf", joints=["joint1", "joint2"]), preset)
     (run / "module.py").write_text(module, encoding="utf-8")
     first = commands(RunFolder(run), read_facts(run / "module.py"), None)[0]
-    assert first == "spelgen build rpr.urdf --preset mine.yaml --net kan --joints joint1,joint2 -o module.py"
+    assert first == "spelgen build rpr.urdf --preset mine.yaml --joints joint1,joint2 -o module.py"
 
 
 def test_long_trainings_are_reported_in_minutes_and_hours(run):

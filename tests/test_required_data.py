@@ -2,9 +2,9 @@
 
 import pytest
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.emission.build import generate
 from spelgen.errors import SpelgenError
-from spelgen.pipeline.generate import generate
-from spelgen.pipeline.loaded_arm import load_arm
 
 TRANSMISSION = """<transmission name="drive"><type>transmission_interface/SimpleTransmission</type>
 <joint name="joint1"><mechanicalReduction>{} </mechanicalReduction></joint>

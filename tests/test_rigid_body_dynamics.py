@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from spelgen.arm.arm import make_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics, pinocchio_model
 from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.dynamics.protocol import integrable
@@ -15,7 +16,6 @@ from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import ArmError, SpelgenErrors
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.joint import JointSettings
 from spelgen.settings.settings import Settings, load_settings
 from spelgen.urdf.read import read_urdf

@@ -11,13 +11,13 @@ from html_page import Page
 from test_report import EVALUATION, run  # noqa: F401  (a fixture)
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.errors import RunError
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import CSV_HEAD, csv_text
 from spelgen.identification.identify import identify
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.render.identification_page import page
 from spelgen.render.runs_page import render_runs
 

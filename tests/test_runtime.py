@@ -11,23 +11,22 @@ import pytest
 import torch
 from emitted import ROBOTS, SIX, built, import_source
 from exported_runs import arm_of
-from torch import Tensor
-from torch.func import jacrev, jvp, vjp
-
-from spelgen.design import PRESET_NAMES, load_design
-from spelgen.dynamics.body_regressor import pseudo_inertia
-from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
 from spelgen.emission.bundle import bundle, load_runtime, names_in
 from spelgen.emission.tailored import kinds
 from spelgen.emission.unit_joints import hidden_units
+from spelgen.runtime.joints import Joints, vector
+from torch import Tensor
+from torch.func import jacrev, jvp, vjp
+
+from spelgen.arm.configured_arm import load_arm
+from spelgen.design import PRESET_NAMES, load_design
+from spelgen.dynamics.body_regressor import pseudo_inertia
+from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
+from spelgen.emission.build import build, make_spec
 from spelgen.fitting.torque.weights import body_weights, upper_cholesky
-from spelgen.pipeline.build import build
-from spelgen.pipeline.generate import make_spec
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.runtime.derived_mass import DerivedMass
 from spelgen.runtime.encoding import JointEncoding
 from spelgen.runtime.friction_laws import turning
-from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.masked_kan import MaskedKAN
 from spelgen.runtime.masked_mlp import MaskedMLP
 from spelgen.runtime.residual_terms import HARMONICS, SPLINES, ResidualTerms
@@ -42,14 +41,7 @@ FIRST_STAGE = (  # friction's laws then: |gravity torque|, tanh and exp
     ("torch.rsqrt(velocity * velocity + width**2)", "(velocity / width).tanh() / velocity"),
     ("slow.square().square().square()", "(-((qd / self.stribeck_velocity) ** 2)).exp()"),
 )
-PRESETS = (
-    ("hybrid", "mlp"),
-    ("hybrid", "kan"),
-    ("spel", "mlp"),
-    ("spel-kan", "kan"),
-    ("phnode", "mlp"),
-    ("closed-form", None),
-)
+PRESETS = ("hybrid", "spel", "spel-kan", "phnode", "closed-form")
 JOINTS = Joints(
     revolute=(True, False, True),
     center=(0.0, 0.5, 0.0),
@@ -263,12 +255,12 @@ def test_friction_is_dissipative_and_equals_its_formula():
 
 def test_a_module_contains_the_classes_that_it_uses():
     runtime, rpr = load_runtime(), load_arm(ROBOTS / "rpr.urdf")
-    for preset, net in PRESETS:
-        source = built("rpr", preset=preset, net=net)[0]
+    for preset in PRESETS:
+        source = built("rpr", preset=preset)[0]
         tree = ast.parse(source)
         defined = {node.name for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
         own = defined - {"Model", "make_parts", "mass_entries"}
-        classes = kinds(make_spec(rpr, Options(preset=preset, net=net)))
+        classes = kinds(make_spec(rpr, Options(preset=preset)))
         assert set(classes) <= own
         for name in own:
             text = runtime.definitions[classes.get(name, name)].text
@@ -284,10 +276,10 @@ def test_a_module_contains_the_classes_that_it_uses():
 
 def test_tailored_part_is_short_and_shows_the_entries():
     for robot in SIX:
-        for preset, net in PRESETS:
-            lines = built(robot, preset=preset, net=net)[0].splitlines()
+        for preset in PRESETS:
+            lines = built(robot, preset=preset)[0].splitlines()
             end = next(number for number, line in enumerate(lines) if line.startswith("# ---- spelgen's"))
-            assert end < 250, f"{robot}, {preset}, {net}: {end} lines"
+            assert end < 250, f"{robot}, {preset}: {end} lines"
     assert "return symmetric([f3], [f1, c2], [f2, 0, c1])" in built("rpr")[0]
     assert "m22 = f9 + 2 * f12 - f5" in built("six_dof")[0]
 
@@ -356,10 +348,10 @@ def network_of_first_stage(network, inputs, generator):
 @pytest.mark.parametrize("case", json.loads(NUMBERS.read_text()))
 def test_numbers_equal_those_of_the_first_release(case, tmp_path):
     """Modules of the first stage, made by templates, gave these with the same seed and the same change of weights."""
-    robot, preset, net = case.split()
+    robot, preset, _ = case.split()
     design = load_design("closed-form") if preset == "closed-form" else None
     design = design and replace(design, memory="none")
-    source = built(robot, preset=preset, net=None if net == "default" else net, design=design)[0]
+    source = built(robot, preset=preset, design=design)[0]
     for now, first in FIRST_STAGE:
         source = source.replace(now, first)
     model = import_source(source, tmp_path / f"{robot}_numbers.py").Model(seed=3)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.tip import tip_kinematics
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import json_data
 from spelgen.render.scene import scene

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.emission.build import build
 from spelgen.evaluation import invariants
 from spelgen.evaluation.horizons import end_errors
 from spelgen.exporting.mjcf_file import mjcf_text
@@ -24,11 +26,8 @@ from spelgen.fitting.torque.objective import fit_torques
 from spelgen.fitting.torque.selection import select_functions
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.fitting.window.momentum import MomentumObjective
-from spelgen.fleet import jobs
 from spelgen.identification.least_squares import deviations
 from spelgen.logs.windows import Windows
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.fits import Rollout, TorqueFit
 
 
@@ -255,24 +254,6 @@ def test_straying_from_the_urdf_costs_what_the_docs_say(robots, monkeypatch):
     monkeypatch.setattr(torque_objective, "has_rigid_bodies", lambda model: False)
     fit_torques(networks, SimpleNamespace(seen=1, count=1), TorqueFit(urdf_weight=0.7), regularizer)
     assert penalties == [pytest.approx(0.7 * expected)]
-
-
-def test_each_job_of_a_fleet_trains_with_its_own_seed(robots, tmp_path, monkeypatch):
-    seeds = []
-
-    def train(module, data, folder, config=None, **options):
-        seeds.append(options["seed"])
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(jobs, "train", train)
-    for seed in (0, 1, 5):
-        job = jobs.Job(
-            fleet={"robots": {"a": {"urdf": robots / "two_link.urdf"}}, "width": 4, "depth": 1}, robot="a",
-            design="spel", seed=seed, split=0, logs={"digest": "x"}, folder=tmp_path / str(seed),
-        )  # fmt: skip
-        with pytest.raises(KeyboardInterrupt):
-            jobs.run_job(job)
-    assert seeds == [0, 1, 5]
 
 
 def test_the_cost_of_a_torque_fit_has_the_prior_in_it():

@@ -62,7 +62,8 @@ def test_an_interrupted_fit_is_usable_and_resumes_to_the_same_bytes(start, whole
     assert spelgen.evaluate(run, servo_logs(1, 1.0)).replays[0].errors["model"].mean < 0.1
     told = CliRunner().invoke(app, [*map(str, command), "--resume"])
     assert told.exit_code == 0, told.stderr
-    assert (run / "model.pt").read_bytes() == (whole / "model.pt").read_bytes()
+    for name in ("model.pt", "least_squares.json"):
+        assert (run / name).read_bytes() == (whole / name).read_bytes()
 
 
 def test_only_the_same_logs_and_model_are_resumed(start, whole, tmp_path):
@@ -76,6 +77,6 @@ def test_only_the_same_logs_and_model_are_resumed(start, whole, tmp_path):
     checkpoint, run = RunFolder(whole).load_checkpoint(), RunFolder(tmp_path / "run")
     run.start((whole / "module.py").read_text(), start / "servo_arm.urdf", force=False)
     run.config.write_bytes((whole / "config.json").read_bytes())
-    torch.save(checkpoint | {"servo": {}}, run.checkpoint)
+    torch.save(checkpoint.content | {"servo": {}}, run.checkpoint)
     with pytest.raises(RunError, match="a checkpoint of another model"):
         trained(start, run.path, options=RunOptions(resume=True))

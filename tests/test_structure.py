@@ -7,7 +7,7 @@ import pytest
 from arms import planar, random_arm, reference_arms
 
 from spelgen.arm.arm import make_arm
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.structure.recursion import triangle
 from spelgen.structure.sampling import float_samples
 from spelgen.structure.structure import Structure, derive

@@ -8,10 +8,10 @@ import pyarrow.parquet
 import pytest
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.logs.read import read_logs
 from spelgen.logs.suggest import suggest_mapping
-from spelgen.pipeline.loaded_arm import load_arm
 
 T = np.arange(200) * 0.008
 Q = np.stack([0.8 * np.sin(3 * T), 0.7 * np.cos(2 * T), 0.1 + 0.02 * np.sin(T), np.sin(T)], axis=1)

@@ -6,7 +6,7 @@ from arms import planar, random_arm
 from flint import fmpq_mat
 from polynomials import Polynomials, polynomials
 
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import derive
 

@@ -3,12 +3,12 @@
 import torch
 from emitted import NETWORKS, ROBOTS, built, import_source
 
+from spelgen.emission.build import generate
 from spelgen.fitting.objectives import default_objective
 from spelgen.fitting.torque import networks as torque_networks
 from spelgen.fitting.torque.networks import fit_networks
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.logs.dynamics_samples import DynamicsSamples
-from spelgen.pipeline.generate import generate
 
 
 def recorded(model, seed, count=150):
@@ -73,4 +73,4 @@ def test_blocks_equal_a_single_batch(tmp_path, monkeypatch):
 def test_networks_are_fitted_to_torques_only_where_that_is_asked_for(tmp_path):
     """Without a word on it windows are predicted."""
     model = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py").Model()
-    assert default_objective(model, [1000.0]) == "rollout"
+    assert default_objective(model, lambda: [1000.0]) == "rollout"

@@ -7,9 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from spelgen.arm.actuation import Drives
+from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SettingsError, SpelgenErrors
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
 from spelgen.simulation import tracking

@@ -18,7 +18,9 @@ import pytest
 import torch
 from time_bounds import in_time
 
-from spelgen.comparison.metrics import RunResult
+from spelgen.arm.configured_arm import load_arm
+from spelgen.comparison.jobs import RunResult
+from spelgen.emission.build import build, generate
 from spelgen.emission.loading import load_module
 from spelgen.errors import LogError, RunError, SettingsError, SpelgenError
 from spelgen.exporting.exported import readme
@@ -28,9 +30,6 @@ from spelgen.log_checks.gravity import find_opposed_inertia, state_samples
 from spelgen.logs import bags
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.build import build
-from spelgen.pipeline.generate import generate
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.fits import MomentumFit, Rollout
 from spelgen.settings.messages import validated
 
@@ -125,7 +124,7 @@ def test_two_samples_are_too_few_to_judge(arm):
     ("content", "message"),
     [
         (b"{", "broken JSON"), (b"\xff", "broken JSON"), (b"[" * 100_000, "broken JSON"), (b"[]", "list in JSON"),
-        (b"{}", "other values than a result has"), (None, "no regular file"),
+        (b"{}", "not the values of a result"), (None, "no regular file"),
     ],
 )  # fmt: skip
 def test_results_of_a_comparison_that_are_none_are_refused(tmp_path, content, message):

@@ -5,8 +5,8 @@ from fractions import Fraction
 
 import pytest
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.verify import verify
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.structure.structure import Entry, derive
 
 ROBOTS = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")

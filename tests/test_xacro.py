@@ -7,13 +7,15 @@ import time
 
 import numpy as np
 import pytest
+from REMOVED import require_own_module
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.certificate.module_check import check
+from spelgen.emission.build import generate
 from spelgen.errors import SpelgenError
 from spelgen.fitting.train import train
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.generate import check, generate, require_own_module
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.fits import Rollout
 from spelgen.urdf import xacro_input
 from spelgen.urdf.document import urdf_bytes

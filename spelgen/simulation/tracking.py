@@ -13,7 +13,7 @@ import numpy as np
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.joint_friction import Friction
+from spelgen.dynamics.joint_friction import DriveFriction
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import SettingsError
@@ -22,10 +22,10 @@ from spelgen.logs.filtering import low_pass_regular
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
-from spelgen.settings.tuning.simulation import SIMULATION
 from spelgen.simulation.integration import rollout
 from spelgen.simulation.paths import paths
 from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction
+from spelgen.simulation.tuning import TUNING
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +91,12 @@ def track(
 def tuned_gains(inertia: np.ndarray, bandwidth: float) -> Gains:
     """Return gains for joints of inertia (n,) [kg m^2; kg]; both poles of the position loop are at the bandwidth."""
     omega = 2 * np.pi * bandwidth
-    return Gains(inertia * omega**2, SIMULATION.integral_gain * inertia * omega**3, 2 * inertia * omega)
+    return Gains(inertia * omega**2, TUNING.integral_gain * inertia * omega**3, 2 * inertia * omega)
 
 
 def computed_torque(
     dynamics: PinocchioDynamics,
-    friction: Friction,
+    friction: DriveFriction,
     motion: tuple[np.ndarray, np.ndarray, np.ndarray],
     error: np.ndarray,
     lag: np.ndarray,
@@ -118,7 +118,7 @@ def computed_torque(
 
 def record(
     dynamics: PinocchioDynamics,
-    friction: Friction,
+    friction: DriveFriction,
     inputs: np.ndarray,
     path: Motion,
     gains: Gains,
@@ -149,7 +149,7 @@ def record(
             effort = computed_torque(dynamics, friction, (seen, qd, qdd), error, lag, omega)
         torques.append(to_motors @ effort)
         torque = np.tile(inputs @ torques[-1], (samples + 1, 1))
-        passed = rollout(dynamics, state, k * tick + within, torque, SIMULATION.seen_loosening)
+        passed = rollout(dynamics, state, k * tick + within, torque, TUNING.seen_loosening)
         states.append(passed[:-1])
         state = passed[-1]
     true = np.concatenate(states)
