@@ -257,7 +257,7 @@ def test_what_is_no_run_is_refused(run, tmp_path):
 @pytest.mark.usefixtures("short_epochs")
 def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
     """End to end on a URDF: its own dynamics made the logs, so the URDF baseline is perfect."""
-    from spelgen.pipeline import generate as pipeline
+    from spelgen.emission import build as pipeline
 
     module = cart.with_name("cart_model.py")
     module.write_text(pipeline.generate(cart))
