@@ -20,7 +20,7 @@ from spelgen.dynamics.parameters import parameter_count
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.evaluation.drawn_motions import PredictedMotion, predicted_motion
 from spelgen.evaluation.invariants import Invariants, invariants
-from spelgen.evaluation.plain import array, finite, listed
+from spelgen.evaluation.plain import Curve, finite
 from spelgen.fitting.rollout import loss_scales, position_difference, roll_out, rollout_loss
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
@@ -73,7 +73,7 @@ class SimulatedFigures:
     invariants: Invariants
     mass_error: float
     step_seconds: float
-    mass: list[list[list[float]]]
+    mass: Curve | None
     example: PredictedMotion | None
 
 
@@ -90,10 +90,7 @@ def simulated_figures(
     low, high = torch.tensor(list(map(working_range, load_arm(truth).arm.coordinates)), dtype=torch.float64).T
     visited = far.q[:, 0]
     example = predict_example(of_dynamics("", model, far), testing, steps, decimation)
-    mass: list[list[list[float]]] = []
-    if example is not None:
-        # at the rounded positions of result.json, so that the page shows M at the positions that are stored
-        mass = model.mass_matrix(torch.from_numpy(array(listed(example.q)))).tolist()
+    mass = None if example is None else model.mass_matrix(torch.from_numpy(example.q)).numpy()
     return SimulatedFigures(
         sizes=sizes(model),
         train=prediction_loss(model, spread_windows(training, config.window, decimation), substeps),
