@@ -18,6 +18,7 @@ import yaml
 from html_page import Page
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.constant_velocity import hold_velocity
 from spelgen.baselines.predictor import Predictor
 from spelgen.cli.main import app
@@ -28,16 +29,15 @@ from spelgen.comparison.inputs import arm_inputs
 from spelgen.comparison.study import duration, prepare_study, run_study
 from spelgen.comparison.tables import arm_sections, arm_sentence, arm_tables, comparison_sentence
 from spelgen.design import load_design
+from spelgen.emission.build import build
 from spelgen.errors import RunError, SettingsError, SpelgenError
 from spelgen.evaluation import invariants
+from spelgen.evaluation.tuning import EvaluationTuning
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.rollout import roll_out
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import cut_windows, joined
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.render.comparison_page import write_comparison
-from spelgen.settings.tuning.evaluation import EvaluationTuning
 from spelgen.simulation.simulate import simulate
 from spelgen.tasks import run_here, workers
 from spelgen.urdf.read import read_urdf

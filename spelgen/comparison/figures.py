@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.comparison.tuning import ComparisonTuning
 from spelgen.dynamics.parameters import parameter_count
@@ -24,12 +25,11 @@ from spelgen.evaluation.plain import Curve, finite
 from spelgen.fitting.rollout import loss_scales, position_difference, roll_out, rollout_loss
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.fits import DEFAULTS, Rollout
 from spelgen.structure.nominal import working_range
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
     from spelgen.fitting.fitted import Fit
 
 TUNING = ComparisonTuning()
@@ -104,7 +104,7 @@ def simulated_figures(
     )
 
 
-def step_seconds(model: EmittedModel, logs: Sequence[Trajectory], config: Rollout, decimation: int) -> float:
+def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, decimation: int) -> float:
     """Return the median time of the loss of a batch and its gradient, without the optimizer [s]."""
     windows = spread_windows(logs, config.window, decimation)[: config.batch or DEFAULTS.batch]
     scales = loss_scales(windows, model.joint_types)
@@ -125,7 +125,7 @@ def spread_windows(logs: Sequence[Trajectory], samples: int, decimation: int) ->
     return cut_windows(logs, samples, stride, decimation, measured=False)
 
 
-def prediction_loss(model: EmittedModel, windows: Windows, substeps: int) -> PredictionLoss:
+def prediction_loss(model: ArmModel, windows: Windows, substeps: int) -> PredictionLoss:
     """Return the loss of windows that are predicted from their first sample, with `substeps` steps per sample."""
     with torch.no_grad():
         q, qd = roll_out(model, windows, substeps)
@@ -135,7 +135,7 @@ def prediction_loss(model: EmittedModel, windows: Windows, substeps: int) -> Pre
     return PredictionLoss(*finite(torch.stack([position + velocity, position, velocity])))
 
 
-def sizes(model: EmittedModel) -> Sizes:
+def sizes(model: ArmModel) -> Sizes:
     """Return the number of outputs and inputs of the networks of M, D, G and V; residual networks included."""
     outputs, inputs = [], 0
     for quantity in ("mass", "friction", "input_network", "potential"):

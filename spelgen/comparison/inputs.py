@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 from lxml import etree
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.comparison.arms import ComparedArm
 from spelgen.comparison.tuning import ComparisonTuning
 from spelgen.errors import LogError, RunError, SettingsError, collect
@@ -21,11 +22,10 @@ from spelgen.logs.formats import log_files
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory, set_aside
 from spelgen.logs.windows import split_validation
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.log_mapping import LogMapping
 
 if TYPE_CHECKING:
-    from spelgen.pipeline.loaded_arm import LoadedArm
+    from spelgen.arm.configured_arm import ConfiguredArm
 
 TUNING = ComparisonTuning()
 Progress = Callable[[int, int], None]
@@ -41,7 +41,7 @@ class ArmInputs(ComparedArm):
     truth: Path | None = None
     digest: str
 
-    def load(self) -> LoadedArm:
+    def load(self) -> ConfiguredArm:
         """Return the arm that models are built from."""
         return load_arm(self.urdf, self.joints, self.tip)
 
@@ -99,7 +99,7 @@ def arm_inputs(
     return inputs
 
 
-def _simulate(inputs: ArmInputs, loaded: LoadedArm, folder: Path, progress: Progress | None) -> None:
+def _simulate(inputs: ArmInputs, loaded: ConfiguredArm, folder: Path, progress: Progress | None) -> None:
     """Simulate logs by the protocol of the arm's settings, unless they are in the folder.
 
     Models know only a copy of the URDF without inertials, drives and friction, so that no model starts from the truth.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -17,18 +16,18 @@ from spelgen.comparison.arms import ablation_designs
 from spelgen.comparison.figures import SimulatedFigures, simulated_figures
 from spelgen.comparison.inputs import ArmInputs
 from spelgen.design import Design, load_design
-from spelgen.dynamics.protocol import has_rigid_bodies
+from spelgen.emission.build import build
 from spelgen.errors import RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.plain import record
 from spelgen.files import read_json, write_json
-from spelgen.fitting.fit import RunOptions, fit, sample_rates
-from spelgen.fitting.objectives import chosen_config
+from spelgen.fitting.fit import RunOptions, fit
+from spelgen.fitting.objectives import FitOptions
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.window.momentum import TUNING as WINDOWS
 from spelgen.labels import thousandths
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.pipeline.build import build
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.fits import Rollout, fit_config
 from spelgen.settings.training import TrainingSettings
@@ -36,9 +35,8 @@ from spelgen.settings.values import Group
 from spelgen.version import __version__
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
     from spelgen.evaluation.results import Results
-    from spelgen.logs.trajectory import Trajectory
     from spelgen.settings.fits import FitConfig
 
 Errors = dict[str, dict[str, float | None]]
@@ -114,7 +112,7 @@ class Job(Group):
         """Return the design as `build` takes it."""
         return ablation_designs().get(self.design, self.design)
 
-    def build(self) -> EmittedModel:
+    def build(self) -> ArmModel:
         """Return the untrained model."""
         arm = self.inputs.load()
         return build(arm, self.named_design, width=self.width, depth=self.depth, seed=self.seed)
@@ -127,15 +125,15 @@ class Job(Group):
         result = RunResult.read(path)
         return result if result.key == self.key else None
 
-    def config(self, model: EmittedModel, logs: Sequence[Trajectory]) -> FitConfig | None:
-        """Return the configuration of the fit; None: the default of `fit`."""
+    def config(self, model: ArmModel) -> FitConfig | FitOptions:
+        """Return the configuration of the fit, or its options."""
         if self.inputs.truth is not None:
             return self.equal_steps()
         objective = self.training.objective
         # a momentum fit is for networks: the other presets of the comparison have their default
-        if objective == "momentum" and has_rigid_bodies(model):
+        if objective == "momentum" and isinstance(model, RigidBodyDynamics):
             objective = None
-        return chosen_config(model, sample_rates(logs), objective, {}, self.training.options)
+        return FitOptions(objective, {}, self.training.options)
 
     def equal_steps(self) -> Rollout:
         """Return the same number of steps for all models, without the regularizer towards the URDF."""
@@ -167,7 +165,7 @@ def run_job(job: Job) -> RunResult:
     training, testing = job.inputs.split(job.split, job.splits)
     model, start = job.build(), time.monotonic()
     trained = fit(
-        model, training, job.config(model, training), preprocessing=job.preprocessing(),
+        model, training, job.config(model), preprocessing=job.preprocessing(),
         validation=job.training.validation_fraction, seed=job.seed, arm=job.inputs.urdf, folder=job.folder,
         options=RunOptions(mapping=job.inputs.log_mapping(), resume=resume, force=not resume),
     )  # fmt: skip

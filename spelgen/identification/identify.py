@@ -10,7 +10,7 @@ import numpy as np
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.regressor import body_chain, regressor
@@ -19,12 +19,12 @@ from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.identification import Identification, LeastSquares
 from spelgen.identification.least_squares import Columns, Solution, deviations, reduce, solve
 from spelgen.identification.torque_delay import TorqueDelay, find_torque_delay
+from spelgen.identification.tuning import TUNING
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import SHORTEST, DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
-from spelgen.settings.tuning.identification import TUNING
 
 
 def identify(
@@ -40,7 +40,7 @@ def identify(
     preprocessing: its filter and gap. Raises LogError for logs that cannot be used.
     """
     if not isinstance(arm, ConfiguredArm):
-        arm = ConfiguredArm.load(arm)
+        arm = load_arm(arm)
     logs = [logs] if isinstance(logs, Trajectory) else logs
     return identify_by(arm, logs, [method or LeastSquares()], preprocessing or Preprocessing())[0]
 

@@ -29,7 +29,7 @@ def render_runs(folders: Sequence[Path]) -> str:
     runs: dict[str, Run] = {}
     results: dict[str, Results] = {}
     for name, folder in zip(_names(folders), folders, strict=True):
-        RunFolder(folder).read_config()  # raises RunError for a folder that is not a run
+        RunFolder(folder).read_record()  # raises an error if there is no run
         run = open_run(folder)
         if run.results is None:
             raise RunError("a run that is not evaluated", file=folder, do="spelgen evaluate")
@@ -39,7 +39,7 @@ def render_runs(folders: Sequence[Path]) -> str:
         "runs.html.jinja",
         runs=runs,
         verdict=_verdict(results),
-        robots=sorted({run.facts.robot for run in runs.values()}),
+        robots=sorted({run.spec.robot for run in runs.values()}),
         tables=joined(results),
         # more runs than styles repeat the styles
         growth=growth_panels(growths, dict(zip(runs, STYLES * len(runs), strict=False)), runs),

@@ -10,13 +10,13 @@ from spelgen.dynamics.parameters import parameter_table
 from spelgen.dynamics.protocol import motors_of
 from spelgen.fitting.functional_model import Weights
 from spelgen.fitting.torque.samples import Block
+from spelgen.fitting.torque.tuning import TorqueTuning
+from spelgen.logs.tuning import SAMPLES
 from spelgen.runtime.rigid_body import body_factor
 from spelgen.settings.fits import Adaptation
-from spelgen.settings.tuning.fitting import TorqueTuning
-from spelgen.settings.tuning.identification import IdentificationTuning
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 RIGID = (
     "bodies", "friction_compensation", "gains", "armature", "offset", "sizes", "effects", "velocities",
@@ -24,7 +24,7 @@ RIGID = (
 )  # fmt: skip
 """Kinds of parameters of bodies, drives and friction laws: all but what stands beside them."""
 TUNING = TorqueTuning()
-MOVING = IdentificationTuning().moving
+MOVING = SAMPLES.moving
 DAILY = ("sizes", "effects", "velocities", "load_dependence", "fractions", "offset")
 """Kinds that change from day to day."""
 NONE = -30.0  # of a size that is none, the logarithm
@@ -33,7 +33,7 @@ NONE = -30.0  # of a size that is none, the logarithm
 class RigidWeights:
     """The weights of bodies, drives and friction laws of a model, by name, and what they stand for."""
 
-    def __init__(self, model: EmittedModel) -> None:
+    def __init__(self, model: ArmModel) -> None:
         tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         self.kinds: dict[str, str] = {}
         self.tensors: dict[str, torch.Tensor] = {}  # parameters, and buffers that a fit may set
@@ -83,14 +83,14 @@ class RigidWeights:
         return free
 
 
-def joint_torque(model: EmittedModel, samples: Block) -> torch.Tensor:
+def joint_torque(model: ArmModel, samples: Block) -> torch.Tensor:
     """Return the measured torque (T, n), as the joints feel it."""
     with torch.no_grad():
         torque: torch.Tensor = samples.tau @ model.input_matrix(samples.q[:1])[0].mT
     return torque
 
 
-def bound_friction(model: EmittedModel, samples: Block) -> None:
+def bound_friction(model: ArmModel, samples: Block) -> None:
     """Let no usual friction of the model be larger than the deviation of its drive's torque.
 
     It is guessed from efforts, which many URDFs have as placeholders: offsets in its units would pass for weights.

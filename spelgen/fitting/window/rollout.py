@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
-from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.dynamics.residuals import idle_residuals
 from spelgen.errors import Diagnostic, RunError
 from spelgen.fitting.optimizers import WindowOptimizer
 from spelgen.fitting.rollout import rollout_loss
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.objective import fit_torques, torque_samples
+from spelgen.fitting.tuning import LoopTuning
 from spelgen.fitting.window.momentum import MomentumObjective
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.windows import Windows
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import Rollout, TorqueFit
-from spelgen.settings.tuning.fitting import LoopTuning
 
 if TYPE_CHECKING:
     from spelgen.fitting.objective import Status
@@ -46,7 +46,7 @@ class RolloutObjective(MomentumObjective):
 
     def begin(self) -> list[Diagnostic]:
         """Fit torques, and measure the model then."""
-        if self.config.torque_first and has_rigid_bodies(self.model):
+        if self.config.torque_first and isinstance(self.model, RigidBodyDynamics):
             samples = torque_samples(self.model, self.data)
             if samples is not None:
                 self.notes += fit_torques(self.model, samples, TorqueFit())
