@@ -157,7 +157,7 @@ def true_mass(urdf: Path, q: torch.Tensor) -> torch.Tensor:
     """Return M of a URDF and its settings by Pinocchio, rotor inertias included.
 
     Args:
-        urdf: Path of the URDF; its settings are beside it.
+        urdf: Path of the URDF; its settings are in the YAML file of the same name.
         q: (T, n) positions [rad, m].
 
     Returns:

@@ -1,4 +1,4 @@
-"""A comparison from its arms to its results: prepare the inputs, estimate the time, run what is not finished."""
+"""A comparison from its arms to its results: prepare the inputs, estimate the time, run the unfinished jobs."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SIMULATED_PRESETS: tuple[str, ...] = ("phnode", "spel", "spel-kan", "minimal", "
 class Study:
     """A comparison that is ready to run.
 
-    jobs: all runs. results: those that are finished, by the name of the run. failures: reason, by the name of an arm or
+    jobs: all runs. results: of finished runs, by name. failures: reason, by the name of an arm or
     run. estimates: expected time of the other runs [s], by name.
     """
 
@@ -57,7 +57,7 @@ class Study:
         return arms
 
     def announcement(self, parallel: int) -> str:
-        """Return the number of runs, and an estimate of the time of those that are not finished."""
+        """Return the number of runs, and an estimate of the time of the unfinished ones."""
         counts = [
             counted(len({job.arm for job in self.jobs}), "arm"),
             counted(len({job.design for job in self.jobs}), "preset"),
