@@ -57,11 +57,13 @@ def built(
     assume: str = "kinematics",
     preset: str = "hybrid",
     design: Design | None = None,
+    *,
+    standalone: bool = False,
 ) -> tuple[str, Structure]:
-    """Source and structure of one of the robots that come with spelgen."""
-    loaded = _loaded(robot)
-    options = Options(preset=preset, design=design, assume=assume)
-    return emit(make_spec(loaded, options)), loaded.structure_for(assume)
+    """Return the source of a module, and the structure, of one of the robots that come with spelgen."""
+    arm = _loaded(robot)
+    spec = derive_spec(arm, Options(preset=preset, design=design, assume=assume))
+    return module_text(spec, standalone=standalone), derive(arm.arm, assume)
 
 
 @cache

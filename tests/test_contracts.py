@@ -1,5 +1,7 @@
 """Contracts of an emitted module: they hold for each preset, robot, batch shape, and for any parameters."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from emitted import GANTRY, SIX, built, import_source, randomise
@@ -7,20 +9,20 @@ from torch import Tensor, nn
 from torch.func import hessian, jacfwd, jacrev, jvp, vmap
 
 import spelgen
+from spelgen.design import load_design
 from tests.test_closed_form import FOLLOWED
 
-VARIANTS = {  # preset and networks
-    "phnode": ("phnode", "mlp"),
-    "phnode-kan": ("phnode", "kan"),
-    "spel": ("spel", "mlp"),
-    "spel-kan": ("spel-kan", "kan"),
-    "hybrid": ("hybrid", "mlp"),
-    "hybrid-kan": ("hybrid", "kan"),
-    "minimal": ("minimal", "mlp"),
+VARIANTS = {  # preset and design
+    "phnode": ("phnode", None),
+    "phnode-kan": ("phnode", replace(load_design("phnode"), net="kan")),
+    "spel": ("spel", None),
+    "spel-kan": ("spel-kan", None),
+    "hybrid": ("hybrid", None),
+    "minimal": ("minimal", None),
     "closed-form": ("closed-form", None),
 }
 ALL_ROBOTS = ("hybrid", "minimal", "closed-form")  # variants with the derived structure of each robot
-WITH_FRICTION_STATE = ("hybrid", "hybrid-kan", "closed-form")
+WITH_FRICTION_STATE = ("hybrid", "closed-form")
 THREE = ("two_link", "rpr", "six_dof")
 URDFS = {"mimic": FOLLOWED, "gantry": GANTRY}  # arms in addition to the robots of the repository
 # Standard deviations of random parameters; None: as `randomise` scales them. With 1.0 the bound of M is active.
@@ -46,12 +48,12 @@ def module_of(tmp_path_factory):
 
     def module(variant, robot):
         if (variant, robot) not in modules:
-            preset, net = VARIANTS[variant]
+            preset, design = VARIANTS[variant]
             if robot in URDFS:
                 (folder / f"{robot}.urdf").write_text(URDFS[robot], encoding="utf-8")
                 source = spelgen.generate(folder / f"{robot}.urdf", preset)
             else:
-                source = built(robot, preset=preset, net=net)[0]
+                source = built(robot, preset=preset, design=design)[0]
             name = f"{robot}_{variant}.py".replace("-", "_")
             modules[variant, robot] = import_source(source, folder / name)
         return modules[variant, robot]
