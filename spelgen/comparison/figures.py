@@ -87,7 +87,9 @@ def simulated_figures(
     steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = spread_windows(testing, steps + 1, decimation)
     # smallest eigenvalue of M: where the arm can be; error of M: where the arm has been
-    low, high = torch.tensor(list(map(working_range, load_arm(truth).arm.coordinates)), dtype=torch.float64).T
+    joints = fit.record.joints
+    ranges = list(map(working_range, load_arm(truth, joints).arm.coordinates))
+    low, high = torch.tensor(ranges, dtype=torch.float64).T
     visited = far.q[:, 0]
     example = predict_example(of_dynamics("", model, far), testing, steps, decimation)
     mass = None if example is None else model.mass_matrix(torch.from_numpy(example.q)).numpy()
@@ -97,7 +99,7 @@ def simulated_figures(
         test=prediction_loss(model, spread_windows(testing, config.window, decimation), substeps),
         prediction=prediction_loss(model, far, substeps),
         invariants=invariants(model, far, low, high),
-        mass_error=mass_error(model.mass_matrix(visited), true_mass(truth, visited)),
+        mass_error=mass_error(model.mass_matrix(visited), true_mass(truth, visited, joints)),
         step_seconds=step_seconds(model, training, config, decimation),
         mass=mass,
         example=example,
