@@ -220,7 +220,7 @@ def fit_truth(case: truth.Case, folder: Path) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--recordings", type=Path, help="what benchmarks/recordings.py made")
+    parser.add_argument("--recordings", type=Path, help="folder of benchmarks/recordings.py")
     parser.add_argument("--arms-folder", type=Path, default=truth.ARMS, help="URDFs of the simulated arms")
     parser.add_argument("--only", default="", help="mechanisms whose names hold this")
     parser.add_argument("--case", default="", help="robots whose names hold this")

@@ -2,7 +2,7 @@
 
     python benchmarks/arms.py [FOLDER]
 
-FOLDER is what `python benchmarks/recordings.py FOLDER` made, by default runs/recordings. nMSE: mean squared torque
+FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. nMSE: mean squared torque
 error by the torque's variance, mean of the joints, pauses included. The presets are fitted as `spelgen train` does,
 everything else to the same samples. Networks have two hidden layers of 64 units: one of q, qd and qdd; the same for
 what least squares leaves; and a Deep Lagrangian network (Lutter, Ritter and Peters, ICLR 2019: a factor of M, and V)

@@ -2,7 +2,7 @@
 
     python benchmarks/real_logs.py [FOLDER]
 
-FOLDER is what `python benchmarks/recordings.py FOLDER` made, by default runs/recordings. Torque errors are nMSE (mean
+FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. Torque errors are nMSE (mean
 squared error by the torque's variance, mean of the joints), once over the samples that move and once with the pauses
 between motions; the second is how the baselines' published figures were made. Nothing is chosen here: the settings are
 the defaults of spelgen, and fits are those of `spelgen train`, with the delay of torques that it finds; least squares

@@ -4,8 +4,7 @@
 
 Each source is read at the commit of `SOURCES`, by `git show`. FOLDER is runs/recordings by default, where the
 benchmarks look for it. A repository is cloned into DIR (by default FOLDER/clones), unless DIR/<its name> exists.
-Licences are those that the repositories state; where none is stated all rights are the authors', and what may be done
-with their recordings is for the user to find out.
+Licences are quoted from the repositories; if none is stated, all rights are the authors'.
 
 Recordings are Parquet files with the columns t [s], and q_<joint> [rad], qd_<joint> [rad/s], tau_<joint> [Nm] per
 joint; sample times are as recorded.

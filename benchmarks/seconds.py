@@ -2,7 +2,7 @@
 
     python benchmarks/seconds.py [FOLDER] [--repeats 5]
 
-FOLDER is what `python benchmarks/recordings.py FOLDER` made, by default runs/recordings; the
+FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings; the
 arm is its UR10e, 100 s of training logs and three tests.
 """
 

@@ -83,7 +83,7 @@ def simulate(
     tip: Tip = None,
     angle_tolerance: AngleTolerance = 2e-3,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Random seed; default: that of the robot's settings.")
+        int | None, typer.Option(min=0, help="Random seed; default: the seed in the robot's settings.")
     ] = None,
     as_built: Annotated[
         int | None,
