@@ -47,15 +47,15 @@ from torch.func import grad, jvp
 
 import spelgen
 from spelgen.arm.arm import Arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.linear_friction import FrictionModel
-from spelgen.dynamics.pinocchio_urdf import has_drives, urdf_dynamics
+from spelgen.dynamics.pinocchio_urdf import drives_known, urdf_dynamics
+from spelgen.emission.build import build
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 
 Split = tuple[str, Path, list[Trajectory], list[Trajectory]]
 
@@ -222,7 +222,7 @@ def recorded(model: Any, effects: Sequence[str], seed: int, noise: float = 0.0) 
 def of_the_urdf(urdf: Path, arm: Arm) -> Torque:
     """The URDF as it is, with the settings' drives where there are any."""
     names = [x.name for x in arm.coordinates]
-    dynamics = urdf_dynamics(urdf, names, drives=has_drives(urdf, names))
+    dynamics = urdf_dynamics(urdf, names, drives=drives_known(urdf, names))
     return torque_of(dynamics)
 
 

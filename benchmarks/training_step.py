@@ -30,11 +30,11 @@ from published_phnode import ByJvp, Published
 
 from spelgen.design import Design
 from spelgen.dynamics.equations import unbounded
+from spelgen.emission.build import build
 from spelgen.fitting.rollout import position_difference
-from spelgen.pipeline.build import build
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 ROBOT = Path(__file__).parents[1] / "robots" / "six_dof.urdf"
 PRESETS: dict[str, str | Design] = {
@@ -72,7 +72,7 @@ def rk4(rate: Callable[..., tuple[Tensor, Tensor]], q: Tensor, p: Tensor) -> tup
     return q, p, k1[0]
 
 
-def plain_mass(model: EmittedModel) -> EmittedModel | None:
+def plain_mass(model: ArmModel) -> ArmModel | None:
     """The model with M as it comes; None where nothing is done to it."""
     if not hasattr(getattr(model, "mass", None), "fraction"):
         return None
@@ -81,7 +81,7 @@ def plain_mass(model: EmittedModel) -> EmittedModel | None:
     return plain
 
 
-def training_step(model: EmittedModel, data: Data) -> None:
+def training_step(model: ArmModel, data: Data) -> None:
     """Loss of the windows, and its gradient: geodesic distance and velocity, as in eq. 8 of the paper."""
     model.zero_grad()
     prepared = model.prepare()
@@ -97,7 +97,7 @@ def training_step(model: EmittedModel, data: Data) -> None:
     (distance.square().mean() + velocity.square().mean()).backward()
 
 
-def networks_alone(model: EmittedModel, data: Data) -> None:
+def networks_alone(model: ArmModel, data: Data) -> None:
     """The floor: each network forward and backward once for every evaluation in the step, and nothing else."""
     model.zero_grad()
     dynamics, q, qd = model, data.q[:, 0], data.qd[:, 0]
@@ -142,7 +142,7 @@ def seconds(work: Callable[[], None]) -> float:
     return time.perf_counter() - start
 
 
-def sizes(model: EmittedModel) -> str:
+def sizes(model: ArmModel) -> str:
     """Outputs of the networks of M, D, G and V, and inputs of that of M."""
     if not hasattr(model, "mass"):
         return ""

@@ -1,4 +1,4 @@
-"""`spelgen logs`: what it measures is what was put in, and what is wrong is found."""
+"""`spelgen logs` reports the properties that simulated logs have, and finds each inserted fault."""
 
 import json
 import re
@@ -11,6 +11,7 @@ from scipy.integrate import cumulative_trapezoid
 from typer.testing import CliRunner
 
 from spelgen.arm.actuation import Drives
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.dynamics.regressor import body_chain, regressor, urdf_parameters
 from spelgen.errors import LogError, SpelgenError, SpelgenErrors
@@ -26,7 +27,6 @@ from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.render.logs_page import page
 from spelgen.settings.log_mapping import LogMapping
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 from emitted import import_source
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.body_regressor import regressor_of
-from spelgen.pipeline.generate import generate
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import generate
 from spelgen.structure.pseudo_inertia import pseudo_inertia
 from spelgen.structure.sampling import float_energies
 

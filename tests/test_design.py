@@ -1,4 +1,4 @@
-"""The design space: every combination is a model that works, or is refused with the two options that clash."""
+"""Each combination of design options is a model that works, or is refused with the two options in conflict."""
 
 import itertools
 from dataclasses import asdict, replace
@@ -7,12 +7,12 @@ from typing import get_args
 import pytest
 import torch
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.certificate.module_check import check
 from spelgen.design import CHOICES, PRESETS, Design, Preset, load_design
+from spelgen.emission.build import build, generate
 from spelgen.emission.loading import load_module
 from spelgen.errors import SettingsError, SpelgenError
-from spelgen.pipeline.build import build
-from spelgen.pipeline.generate import check, generate
-from spelgen.pipeline.loaded_arm import load_arm
 
 COMBINATIONS = [dict(zip(CHOICES, values, strict=True)) for values in itertools.product(*CHOICES.values())]
 

@@ -1,4 +1,4 @@
-"""A run folder from elsewhere runs nothing, belongs to one training at a time, and is whole whenever that is killed."""
+"""Run folders: foreign modules are not executed, one training at a time, and no kill corrupts them."""
 
 import functools
 import json
@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from killing import killed
-from machine import in_time
+from process_kill import killed
+from time_bounds import in_time
 from typer.testing import CliRunner
 
 import spelgen
 from spelgen.cli.main import app
+from spelgen.emission.build import generate
 from spelgen.errors import ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.exporting.export import export
@@ -31,7 +32,6 @@ from spelgen.fitting.tuning import WindowTuning
 from spelgen.fitting.window import momentum
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.generate import generate, require_own_module
 from spelgen.render.report_page import render_report
 from spelgen.settings.fits import Rollout
 
@@ -339,6 +339,7 @@ def test_facts_of_another_type_or_size_are_told(plain, tmp_path, case):
             use(run)
 
 
+@pytest.mark.timed
 def test_a_huge_file_is_not_read(plain, start, tmp_path):
     run = copied(plain, tmp_path)
     with (run / "notes.bin").open("wb") as file:

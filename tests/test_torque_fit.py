@@ -1,4 +1,4 @@
-"""Closed-form models fitted to torques: known arms found again, in blocks as at once, adapted to a load, real ones."""
+"""Torque fits of closed-form models recover known arms, in blocks or at once, and adapt to loads."""
 
 import json
 from dataclasses import replace
@@ -6,14 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from characters import TESTS, read_characters, write_arm
+from delan_characters import TESTS, read_characters, write_arm
 from emitted import import_source
 from lxml import etree
 from motions import smooth_motion
 from scipy.optimize import minimize_scalar
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
+from spelgen.emission.build import build, generate
 from spelgen.emission.loading import load_module
 from spelgen.errors import LogError
 from spelgen.fitting.fit import fit
@@ -34,9 +36,6 @@ from spelgen.fitting.torque.weights import NONE, RIGID, RigidWeights, moved_bodi
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.build import build
-from spelgen.pipeline.generate import generate
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.fits import GaussianPrior, Rollout, TorqueFit
 from tests.test_closed_form import FOLLOWED, drawn
 
@@ -414,8 +413,8 @@ def test_logs_too_slow_for_accelerations_are_fitted_by_windows(emitted, robots):
     logs = sparse(drawn(emitted["rpr"][0], seed=0))
     found = fit(model, logs, Rollout(epochs=1, momentum_steps=0, urdf_weight=0.0))
     assert [note.code for note in found.diagnostics].count("no-torque-fit") == 1
-    assert default_objective(model, [20.0]) == "rollout"
-    assert default_objective(model, [20.0, 100.0]) == "torque"
+    assert default_objective(model, lambda: [20.0]) == "rollout"
+    assert default_objective(model, lambda: [20.0, 100.0]) == "torque"
     for adapt, what in ((None, "to fit torques to"), ("load", "to adapt to")):
         with pytest.raises(LogError, match=f"no motion {what}, expected samples at 24 Hz or more that move"):
             fit(model, logs, TorqueFit(adapt=adapt))

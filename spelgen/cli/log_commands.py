@@ -26,7 +26,7 @@ from spelgen.errors import SpelgenErrors
 from spelgen.files import write_text
 
 if TYPE_CHECKING:
-    from spelgen.pipeline.loaded_arm import LoadedArm
+    from spelgen.arm.configured_arm import ConfiguredArm
 
 
 def excite(
@@ -157,7 +157,7 @@ def logs(
         raise typer.Exit(FAILED)
 
 
-def _suggested(paths: list[Path], arm: LoadedArm, file: Path) -> Path:
+def _suggested(paths: list[Path], arm: ConfiguredArm, file: Path) -> Path:
     """Write the mapping that the first log suggests, and return its file; exit with 1 if the log lacks columns."""
     from spelgen.errors import collect
     from spelgen.logs.formats import log_files

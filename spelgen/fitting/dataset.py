@@ -24,7 +24,7 @@ from spelgen.logs.windows import Split, Windows, cut_windows, split_validation, 
 from spelgen.settings.fits import DEFAULTS, Solver
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = ValidationTuning()
 
@@ -149,7 +149,7 @@ class Validation:
 
     def __init__(
         self,
-        model: EmittedModel,
+        model: ArmModel,
         data: TrainingData,
         device: str = "cpu",
         *,

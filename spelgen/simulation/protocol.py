@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.joint_friction import Friction, joint_friction
+from spelgen.dynamics.joint_friction import DriveFriction, joint_friction
 from spelgen.errors import SettingsError, collect
 from spelgen.logs.trajectory import Trajectory, trajectory_listing
 from spelgen.settings.settings import Settings
@@ -27,7 +27,7 @@ class SimulatedLogs(list[Trajectory]):
         return trajectory_listing(self).html()
 
 
-def make_friction(arm: Arm, settings: Settings, speeds: np.ndarray | None = None) -> Friction:
+def make_friction(arm: Arm, settings: Settings, speeds: np.ndarray | None = None) -> DriveFriction:
     """Return the friction of the arm: a joint's settings where it has some, else its URDF's <dynamics>.
 
     speeds: C (n, n) of the drives. Where they move several joints, a joint's friction is that of its drive, as in the

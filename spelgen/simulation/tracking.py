@@ -13,7 +13,7 @@ import numpy as np
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.joint_friction import Friction
+from spelgen.dynamics.joint_friction import DriveFriction
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import SettingsError
@@ -96,7 +96,7 @@ def tuned_gains(inertia: np.ndarray, bandwidth: float) -> Gains:
 
 def computed_torque(
     dynamics: PinocchioDynamics,
-    friction: Friction,
+    friction: DriveFriction,
     motion: tuple[np.ndarray, np.ndarray, np.ndarray],
     error: np.ndarray,
     lag: np.ndarray,
@@ -118,7 +118,7 @@ def computed_torque(
 
 def record(
     dynamics: PinocchioDynamics,
-    friction: Friction,
+    friction: DriveFriction,
     inputs: np.ndarray,
     path: Motion,
     gains: Gains,

@@ -61,20 +61,18 @@ class ServoObjective(Objective):
         request, model = self.request, self.model
         self._logs = request.logs
         for log in self._logs:
-            require_joints(log, model.facts.joints)
+            require_joints(log, model.joint_names)
             require_commands(log)
-        notes = check(self._logs, model.facts.joints, model.joint_types)
+        notes = check(self._logs, model.joint_names, model.joint_types)
         self._windows = servo_windows(self._logs, request.preprocessing)
         return PreparedLogs(
             config=request.config,
             preprocessing=request.preprocessing,
-            record={
-                "data_digest": digest(self._logs),
-                "training": [log.name for log in self._logs],
-                "validation": [],
-                "training_windows": len(self._windows.q),
-                "validation_windows": 0,
-            },
+            digest=digest(self._logs),
+            training=[log.name for log in self._logs],
+            validation=[],
+            training_windows=len(self._windows.q),
+            validation_windows=0,
             notes=notes,
         )
 
