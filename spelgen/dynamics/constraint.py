@@ -23,7 +23,7 @@ class Constraint:
 
 
 def mimic_constraint(robot: Robot, coordinates: Sequence[str]) -> Constraint:
-    """Return the constraint of all joints of ``robot``: coordinates, mimic joints, and others, which are locked at 0."""
+    """Return the constraint of all joints of ``robot``: coordinates, mimic joints, and locked joints (0)."""
     columns = {name: k for k, name in enumerate(coordinates)}
     moving = [joint.name for joint in robot.joints if joint.moves]
     jacobian, offset = np.zeros((len(moving), len(columns))), np.zeros(len(moving))

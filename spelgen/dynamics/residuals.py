@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.runtime.masked_mlp import MaskedMLP
+from spelgen.runtime.parts import Network
 from spelgen.runtime.residual_dynamics import ResidualDynamics
 
 Model = TypeVar("Model")
