@@ -256,7 +256,7 @@ def test_c_carries_frictions_memory(tmp_path):
     relative = np.abs(qd) / law.stribeck_velocity
     rounding = law.stribeck_rounding
     dry = law.coulomb + law.stribeck / (1 + (1 + rounding) * relative**2 / (relative + rounding) / 8) ** 8
-    dry += law.load_dependence * np.hypot(called("gravity", given)["gravity"], law.least_load)
+    dry += law.load_dependence * np.hypot(called("gravity", given)["gravity"], law.min_load)
     straight = called("friction", given | {"z": np.zeros((5, 4))})["friction"]
     bent = (FRACTIONS / REACH * given["z"].reshape(5, 2, 2)).sum(axis=-1)
     np.testing.assert_allclose(called("friction", given)["friction"], straight + dry * bent)

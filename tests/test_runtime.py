@@ -241,7 +241,7 @@ def test_friction_is_dissipative_and_equals_its_formula():
     near(constants.coulomb, torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64))
     gravity = torch.tensor([3.0, -4.0, 5.0], dtype=torch.float64)
     fast = 1e3 * torch.ones(3, dtype=torch.float64)
-    dry = constants.coulomb + constants.load_dependence * torch.hypot(gravity, constants.least_load)
+    dry = constants.coulomb + constants.load_dependence * torch.hypot(gravity, constants.min_load)
     dry += constants.stribeck / (1 + (fast / constants.stribeck_velocity) ** 2)
     expected = constants.viscous * fast + dry * fast * turning(fast, constants.coulomb_smoothing_velocity)
     expected += constants.saturation * fast * turning(fast, constants.saturation_velocity)

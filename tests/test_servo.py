@@ -67,14 +67,18 @@ def results(fitted, logs):
 def test_ratios_to_kp_are_found(fitted):
     model, kp = fitted.model, np.array(TRUTH.kp)
     with torch.no_grad():
-        found = {name: getattr(model, name).numpy() / model.kp.numpy() for name in ("kd", "coulomb")}
+        fitted_kp = model.servo.kp()
+        found = {
+            name: (x / fitted_kp).numpy()
+            for name, x in (("kd", model.servo.kd()), ("coulomb", model.coulomb))
+        }
         pointing = torch.tensor([[0.0, np.pi / 2]]).double()
-        weight = (model.gravity(pointing) / model.kp).numpy()[0, 1]
-        inertia = (model.mass_matrix(pointing)[0].diagonal() / model.kp).numpy()
+        weight = (model.gravity(pointing) / fitted_kp).numpy()[0, 1]
+        inertia = (model.mass_matrix(pointing)[0].diagonal() / fitted_kp).numpy()
     assert found["kd"] == pytest.approx(np.array(TRUTH.kd) / kp, rel=0.05)
     assert abs(weight) == pytest.approx(GRAVITY * MASS[1] * COM[1] / kp[1], rel=0.03)
     assert inertia[1] == pytest.approx((6e-4 + MASS[1] * COM[1] ** 2 + TRUTH.armature[1]) / kp[1], rel=0.08)
-    assert float(model.delay) == pytest.approx(TRUTH.delay, abs=0.004)
+    assert float(model.servo.delay) == pytest.approx(TRUTH.delay, abs=0.004)
 
 
 def test_replay_of_another_motion_beats_the_baselines(fitted, logs, results):
@@ -123,7 +127,7 @@ def test_joints_get_the_laws_that_they_have(fitted):
         dry = laws.dry(speeds[:, None].expand(-1, 2), torch.zeros(4, 2).double())
     falling = TRUTH.coulomb[1] + TRUTH.stribeck[1] * torch.exp(-((speeds / STRIBECK_VELOCITY) ** 2))
     torch.testing.assert_close(
-        dry[:, 1] / fitted.model.kp[1].detach(), falling / TRUTH.kp[1], rtol=0.06, atol=0
+        dry[:, 1] / fitted.model.servo.kp()[1].detach(), falling / TRUTH.kp[1], rtol=0.06, atol=0
     )
 
 
@@ -249,7 +253,7 @@ def test_exports_hold_the_servos(fitted, arm, tmp_path, monkeypatch):
     found = re.findall(r'<position name="\w+" joint="\w+" kp="([^"]+)" kv="([^"]+)" forcerange="-6 6"', xml)
     assert np.array(found, dtype=float) == pytest.approx(np.stack([kp, kd], axis=1))
     held = yaml.safe_load(spelgen.export(fitted, to="urdf").files[".urdf.friction.yaml"])
-    assert held["delay"] == pytest.approx(float(fitted.model.delay))
+    assert held["delay"] == pytest.approx(float(fitted.model.servo.delay))
     assert held["joints"]["elbow"]["servo"]["kp"] == pytest.approx(kp[1])
     monkeypatch.setattr(fitted.model.servo, "dead_zone", torch.tensor([0.01, 0.0]).double())
     assert "dead zones are left out" in spelgen.export(fitted, to="mjcf").files[".xml.README.md"].decode()

@@ -18,7 +18,7 @@ def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) ->
     bent = ca.reshape(z * (law.bristle_fractions / model.reach).ravel(), model.reach.shape[1], model.n)
     # from -1 to 1: a joint's dry friction follows velocity or bristles
     direction = law.memoryless * _turned(qd, law.coulomb_smoothing_velocity) + ca.sum1(bent).T
-    load = ca.sqrt(gravity**2 + law.least_load**2)
+    load = ca.sqrt(gravity**2 + law.min_load**2)
     speed = ca.fabs(qd) / law.stribeck_velocity
     rounding = law.stribeck_rounding
     slow = 1 / (1 + (1 + rounding) / 8 * speed**2 / (speed + rounding))

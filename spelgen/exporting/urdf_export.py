@@ -22,7 +22,7 @@ from spelgen.urdf.document import urdf_bytes
 _LAW = (
     "viscous qd + saturation turned(qd, saturation_velocity) + dry direction, with "
     "dry = coulomb + stribeck / (1 + (1 + r) v^2 / (v + r) / 8)^8 + "
-    "load_dependence sqrt(gravity torque^2 + least_load^2), v = |qd| / stribeck_velocity, r = stribeck_rounding "
+    "load_dependence sqrt(gravity torque^2 + min_load^2), v = |qd| / stribeck_velocity, r = stribeck_rounding "
     "and turned(x, width) = x / sqrt(x^2 + width^2); direction: memoryless turned(qd, coulomb_smoothing_velocity) "
     "plus the sum of bristle_fractions z / bristle_reach, with z' = qd up to |z| = bristle_reach; "
     "all of it times a factor that goes with the joint's position, between the two numbers of "

@@ -75,7 +75,7 @@ def divided(problem: ServoProblem, x: ServoParameters, fraction: float) -> Servo
     with torch.no_grad():
         dry = sliding_friction(problem.model.friction, problem.along.qd, problem.load.gravity)
     row, joints = problem.rows.row, x.joints.clone()
-    joints[row(DEAD_ZONE)] = fraction * dry / problem.model.kp.detach()
+    joints[row(DEAD_ZONE)] = fraction * dry / problem.model.servo.kp().detach()
     # the parameter is a logarithm
     joints[row(COULOMB)] += torch.tensor(1 - fraction).log()
     return replace(x, joints=joints, active=torch.ones_like(x.active))

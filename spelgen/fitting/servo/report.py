@@ -131,10 +131,10 @@ def identifiable(windows: NormalEquations, precision: torch.Tensor, unknowns: to
 def ratios(model: ArmModel, qd: torch.Tensor, gravity: torch.Tensor) -> dict[str, torch.Tensor]:
     """Return the ratios to kp, each (n,), of a model that moved at qd under gravity's torques, (..., n)."""
     dead_zone = model.servo.dead_zone
-    dry = sliding_friction(model.friction, qd, gravity) / model.kp
+    dry = sliding_friction(model.friction, qd, gravity) / model.servo.kp()
     return {
-        "kd": model.kd / model.kp,
-        "armature": model.armature / model.kp,
+        "kd": model.servo.kd() / model.servo.kp(),
+        "armature": model.armature / model.servo.kp(),
         "dry": dry,
         "static_error": dry + dead_zone,
         "dead_zone": dead_zone,
@@ -181,7 +181,7 @@ def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Conte
     dead_zones = problem.rows.row(DEAD_ZONE) * model.n + torch.arange(model.n)
     distinct = identifiable(solution.windows, solution.precision, dead_zones).tolist()
     for joint, name in enumerate(model.joint_names):
-        kp = {"value": float(model.kp[joint].detach()), "known": not float(model.servo.trained[joint])}
+        kp = {"value": float(model.servo.kp()[joint].detach()), "known": not float(model.servo.trained[joint])}
         record: Content = {"joint": name, "kp": kp}
         for ratio, (of_joints, deviations) in values.items():
             value = float(of_joints[joint])
