@@ -23,8 +23,8 @@ from spelgen.files import write_json
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.servo import objective
-from spelgen.fitting.servo.problem import ServoProblem
 from spelgen.fitting.servo.report import covariance, servo_summary
+from spelgen.fitting.servo.rollouts import ServoRollouts
 from spelgen.fitting.servo.windows import servo_windows
 from spelgen.listing import number
 from spelgen.logs.commands import delayed_commands
@@ -152,9 +152,9 @@ def test_intervals_leave_out_whole_motions(logs):
     numbers = {}
     for count in (1, 3, 4, 5):
         windows = servo_windows(logs[:count], Preprocessing())
-        stretches = windows.stretches(4, 6).tolist()
+        stretches = windows.blocks(4, 6).tolist()
         numbers[count] = len(set(stretches))
-        by_log = {(log.name, stretch) for (log, _), stretch in zip(windows.parts, stretches, strict=True)}
+        by_log = {(log.name, stretch) for (log, _), stretch in zip(windows.rows, stretches, strict=True)}
         assert len(by_log) == numbers[count]  # none is of two logs
     # three logs are too few to tell how their motions differ: each is cut in two
     assert numbers == {1: 5, 3: 6, 4: 4, 5: 5}
@@ -162,7 +162,7 @@ def test_intervals_leave_out_whole_motions(logs):
 
 def test_a_known_kp_stays(tmp_path, logs, monkeypatch):
     monkeypatch.setattr(objective, "TUNING", replace(objective.TUNING, steps=1))
-    monkeypatch.setattr(objective, "ROUNDS", 1)
+    monkeypatch.setattr(objective, "OUTER_ITERATIONS", 1)
     settings = "input: position\njoints: {shoulder: {kp: 14.0}}\n"
     model = spelgen.build(write_servo_arm(tmp_path, settings), "closed-form")
     fit = spelgen.fit(model, [x[:100] for x in logs[:2]])
@@ -336,10 +336,11 @@ def test_presets_are_not_compared_under_servos(tmp_path):
 def test_joints_by_themselves_move_as_the_arm_does(arm):
     model = spelgen.build(arm, "closed-form")
     windows = replace(servo_windows(moved(model, 3.0), Preprocessing()), steps=24)
-    problem = ServoProblem(model, windows, torch.full((2,), 1e-5).double())
-    # all laws, as the logs have
-    start = replace(problem.start, active=torch.ones_like(problem.start.active))
+    rollouts = ServoRollouts.of(model, windows)
+    x = rollouts.parameters.prior_mean
+    # all friction effects, as the logs have
+    x = replace(x, active=torch.ones_like(x.active))
     for _ in range(2):
-        problem.linearise(start, problem.predicted_path(start))
-    errors = problem.residual(start).square().mean(dim=(0, 1)).sqrt()
+        rollouts = rollouts.linearized(x, rollouts.predicted_motion(x))
+    errors = rollouts.residual(x).square().mean(dim=(0, 1)).sqrt()
     assert errors.max() < 6e-4
