@@ -13,7 +13,7 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.emission.build import build
 from spelgen.evaluation import invariants
 from spelgen.evaluation.horizons import end_errors
-from spelgen.exporting.mjcf_file import mjcf_text
+from spelgen.exporting.mjcf_export import mjcf_text
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo import laws

@@ -1,4 +1,4 @@
-"""--to ros2: a colcon package around the C, a plugin of the package inverse_dynamics_solver."""
+"""--to ros2: a colcon package with the C files and a plugin of the package inverse_dynamics_solver."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PLACES = {
 
 
 def export_ros2(trained: Trained) -> Exported:
-    """The package. Raises RunError where its C does not give what the model gives."""
+    """Return the package. Raises RunError if its C differs from the model."""
     trained = replace(trained, entries=_CALLED)
     model = trained.described
     sources, checked = c_files(trained)
@@ -40,10 +40,10 @@ def export_ros2(trained: Trained) -> Exported:
         files[place] = text.encode()
     use = (
         f"Put this folder into a workspace, colcon build --packages-select {package}; "
-        f"the plugin is {package}/Solver, for whatever loads an inverse_dynamics_solver::InverseDynamicsSolver."
+        f"the plugin {package}/Solver is an inverse_dynamics_solver::InverseDynamicsSolver."
     )
     about = (
-        "getTorques includes friction, whose state follows the positions of its calls; "
-        "initialize starts it anew."
+        "getTorques includes friction, and updates its state by the positions of successive calls; "
+        "initialize resets it."
     )
     return folder_export(trained, "ros2", "for ROS 2", files, use=use, about=about, checked=checked)

@@ -1,4 +1,4 @@
-"""--to urdf: the arm's own files with the learned numbers in them, and the friction that no URDF has words for."""
+"""--to urdf: the arm's URDF and settings with the trained parameters, and a file with the friction model."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _SERVO = (
 
 
 def export_urdf(trained: Trained) -> Exported:
-    """Return the URDF, its settings, and the friction of a trained model."""
+    """Return the URDF, the settings, and the friction of a trained model."""
     projection = rigid_body_projection(trained.model, trained.arm)
     use = (
         "The .urdf contains inertials, viscous and Coulomb friction, which simulators ignore; the .yaml beside it, "
@@ -52,14 +52,14 @@ def export_urdf(trained: Trained) -> Exported:
 
 
 def _urdf_text(projection: RigidBodyProjection) -> bytes:
-    """Return the arm's URDF with these inertials and friction.
+    """Return the arm's URDF with the inertials and friction of a projection.
 
-    A link that a joint moves gets all that moves with it; the links it carries by fixed or locked joints lose
-    their inertials to it.
+    The link of a moving joint gets the inertia of its body; links that are fixed to it by fixed or locked joints lose
+    their <inertial>.
     """
     robot = projection.arm.robot
     arm = projection.arm.arm
-    # a robot's file may come from anywhere
+    # the URDF is untrusted
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
     root = etree.fromstring(urdf_bytes(robot.path), parser)
     links = {element.get("name"): element for element in root.findall("link")}
@@ -70,7 +70,7 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
         for link in body.links:
             _remove(links[link.name], "inertial")
         name = body.joint.child
-        # of the body's frame, whose z is the joint's axis, in the link's
+        # from the body frame, whose z is the joint axis, to the link frame
         rotation = np.array(lumped.frames[name].rotation.T, dtype=float)
         _set_inertial(links[name], inertia, rotation)
     # a URDF has one Coulomb friction for both directions
@@ -86,7 +86,7 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
 
 
 def _settings_text(projection: RigidBodyProjection) -> str:
-    """Return the settings beside the arm's URDF with these drives and friction, in both directions."""
+    """Return the settings of the arm with the armature and friction of a projection."""
     path = projection.arm.robot.path.with_suffix(".yaml")
     content: dict[str, dict[str, dict[str, object]]] = {}
     if path.exists():
@@ -94,7 +94,7 @@ def _settings_text(projection: RigidBodyProjection) -> str:
     joints = content.setdefault("joints", {})
     friction = projection.friction
     for index, coordinate in enumerate(projection.arm.arm.coordinates):
-        # settings have the rotor's own inertia, the model that of the joint's side
+        # settings have the inertia at the rotor, the model has the inertia at the joint
         gear = projection.arm.settings.joint(coordinate.name).gear
         joint = joints.setdefault(coordinate.name, {})
         joint["rotor_inertia"] = _rounded(projection.armature[index] / gear**2)
@@ -105,16 +105,16 @@ def _settings_text(projection: RigidBodyProjection) -> str:
 
 
 def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
-    """Return YAML: viscous and Coulomb friction of each joint, and its own law and servo where the model has one."""
+    """Return YAML: viscous and Coulomb friction per joint, and constants of the friction model and the servos."""
     content: dict[str, object] = {
         "units": "Nm, Nm s/rad and rad/s of revolute joints; N, N s/m and m/s of prismatic ones",
         "viscous_coulomb": "viscous qd + coulomb[0] where qd > 0, + coulomb[1] where qd < 0",
     }
     coulomb = np.stack([projection.friction.forward, projection.friction.backward], axis=1)
-    # by section and name, (n, ...) each
+    # by section and name: (n,) or (n, K) each
     sections = {"viscous_coulomb": {"viscous": projection.friction.viscous, "coulomb": coulomb}}
-    # networks have no law with constants
-    if projection.own:
+    # friction networks have no constants
+    if projection.exact:
         content["law"] = _LAW
         sections["law"] = _law_constants(trained, projection)
     servos = projection.servos
@@ -133,7 +133,7 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
 
 
 def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[str, np.ndarray]:
-    """Return the constants of the model's own law of friction by name, (n, ...) each."""
+    """Return the constants of the friction model by name, (n,) or (n, K) each."""
     model = trained.model
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}
     factor = array(friction_factor(model, sampled_positions(projection.arm.arm)))
@@ -143,19 +143,25 @@ def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[st
 
 
 def _plain(value: np.ndarray) -> float | list[float]:
-    """Return a number, or a row of numbers, for YAML."""
+    """Return the numbers of an array () or (K,) for YAML."""
     if value.ndim == 0:
         return _rounded(float(value))
     return list(map(_rounded, value.tolist()))
 
 
 def _rounded(value: float) -> float:
-    """Return a number of twelve digits: what a person may read, far beyond what a fit finds."""
+    """Return a number rounded to twelve digits: readable, and more precise than any fit."""
     return float(_number(value))
 
 
 def _set_inertial(link: etree._Element, inertia: np.ndarray, rotation: np.ndarray) -> None:
-    """Set the inertial of a link in whose frame the body's stands at ``rotation``."""
+    """Replace the <inertial> of a link.
+
+    Args:
+        link: of the URDF.
+        inertia: (10,), in the body frame.
+        rotation: (3, 3), from the body frame to the link frame.
+    """
     _remove(link, "inertial")
     mass, center, tensor = about_center(inertia)
     center = rotation @ center
@@ -166,7 +172,7 @@ def _set_inertial(link: etree._Element, inertia: np.ndarray, rotation: np.ndarra
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     moments = list(map(_number, tensor[np.triu_indices(3)]))
     etree.SubElement(inertial, "inertia", dict(zip(names, moments, strict=True)))
-    # first, as most URDFs have it
+    # as the first child, as in most URDFs
     link.insert(0, inertial)
 
 

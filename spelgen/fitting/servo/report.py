@@ -98,7 +98,7 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
 
 
 def sum_by_block(windows: NormalEquations, numbers: torch.Tensor) -> NormalEquations:
-    """Return sums of normal equations, (W, k, k) and (W, k), over the windows of each block; numbers: of blocks (W,)."""
+    """Return sums of normal equations, (W, k, k) and (W, k), over the windows of each block, by number (W,)."""
 
     def summed(terms: torch.Tensor) -> torch.Tensor:
         sums = terms.new_zeros(int(numbers.max()) + 1, *terms.shape[1:])
