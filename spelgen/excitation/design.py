@@ -1,4 +1,4 @@
-"""Design the motion that shows an arm's parameters best: random starts, the best of them improved by L-BFGS."""
+"""Design of exciting motions: the best of random motions, improved by L-BFGS."""
 
 from __future__ import annotations
 
@@ -29,14 +29,23 @@ def excite(
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Excitation:
-    """Return an exciting motion of this duration [s], sampled at about `sample_rate` [Hz]; same arguments, same motion.
+    """Return an exciting motion, which starts and ends at rest; the same arguments give the same motion.
 
-    It starts and ends at rest and keeps the part `reach` of the joints' ranges and `speed` of their velocity
-    limits; effort limits too, where the URDF has them and inertials, and where any motion can. Joints that follow
-    others by <mimic> keep their limits as well. Collisions are not checked.
-    harmonics: of the period `duration`; by default 0.4 a second, at least 5. trials: motions that the search looks
-    at, beside 40 at random that it starts from. progress: called with the trials done and all.
-    Raises SettingsError for a value that cannot be, ArmError for a joint without room between its limits.
+    The motion keeps effort limits too if the URDF has limits and inertials, and if any motion that was found keeps
+    them. <mimic> joints keep their own limits. Collisions are not checked.
+
+    Args:
+        arm: configured arm.
+        duration: of the motion, its period [s].
+        sample_rate: approximate sample rate [Hz].
+        harmonics: number of harmonics; default: 0.4 per second, at least 5.
+        reach: fraction of the position ranges that is used.
+        speed: fraction of the velocity limits that is used.
+        trials: evaluations of the criterion by the optimizer, in addition to 40 random motions.
+        seed: of the random motions.
+        progress: is called with the numbers of finished and of all trials.
+
+    Raises SettingsError for an invalid value, ArmError for a joint whose limits are not increasing.
     """
     positive = {"duration": duration, "sample_rate": sample_rate, "reach": reach, "speed": speed}
     for name, value in positive.items():
@@ -45,7 +54,7 @@ def excite(
             expected = "more than 0, at most 1" if is_fraction else "a positive number"
             raise SettingsError(repr(value), element=f"excite: {name}", expected=expected)
     if harmonics is None:
-        harmonics = max(TUNING.fewest_harmonics, round(TUNING.harmonics_per_second * duration))
+        harmonics = max(TUNING.min_harmonics, round(TUNING.harmonics_per_second * duration))
     elif harmonics < 2:
         raise SettingsError(repr(harmonics), element="excite: harmonics", expected="2 or more")
     bounds = motion_bounds(arm.arm, reach, speed, arm.robot.joint)
@@ -67,18 +76,20 @@ def excite(
 
 
 def _improved(
-    criterion: Criterion, start: np.ndarray, trials: int, progress: Callable[[int, int], None]
+    criterion: Criterion, initial: np.ndarray, trials: int, progress: Callable[[int, int], None]
 ) -> np.ndarray:
-    """Return the best of so many trials from a start on.
+    """Return the best parameters (size,) of `trials` evaluations by L-BFGS, from initial parameters (size,).
 
-    The criterion has kinks, where singular values meet and where another sample is the fastest: L-BFGS gets far on
-    such functions (Lewis and Overton, Math. Program. 141:135, 2013), and what it saw counts, not where it ended.
+    The criterion is not differentiable if singular values are equal, or if two samples have the largest speed. L-BFGS
+    is efficient for such functions (Lewis and Overton, Math. Program. 141:135, 2013). Its last iterate need not be the
+    best one, so all evaluations are compared.
     """
-    best, lowest, done = start, criterion.value(start), 0
+    best, lowest, done = initial, criterion.value(initial), 0
     if not isfinite(lowest):
-        return start
+        return initial
 
     def evaluate(parameters: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return criterion and gradient (size,), and keep the best parameters (size,)."""
         nonlocal best, lowest, done
         value, gradient = criterion.value_and_gradient(parameters)
         done += 1
@@ -87,6 +98,6 @@ def _improved(
         progress(min(done, trials), trials)
         return value, gradient
 
-    options = {"maxfun": trials, "maxiter": trials, "maxcor": TUNING.memory, "ftol": 0.0}
-    minimize(evaluate, start, jac=True, method="L-BFGS-B", options=options)
+    options = {"maxfun": trials, "maxiter": trials, "maxcor": TUNING.history, "ftol": 0.0}
+    minimize(evaluate, initial, jac=True, method="L-BFGS-B", options=options)
     return best
