@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from textwrap import wrap
 
@@ -62,12 +63,13 @@ def c_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> list[
 def write_c(model: TrainedModel, functions: Sequence[CFunction], folder: Path) -> Path:
     """Write header and source into a folder; return the path of the source."""
     source = folder / f"{model.name}.c"
-    source.write_text(c_source(model, functions))
-    source.with_suffix(".h").write_text(_c_header(model, functions))
+    for suffix, text in c_texts(model, functions).items():
+        source.with_suffix(suffix).write_text(text)
     return source
 
 
-def _c_header(model: TrainedModel, functions: Sequence[CFunction]) -> str:
+def c_texts(model: TrainedModel, functions: Sequence[CFunction]) -> dict[str, str]:
+    """Return the texts of header and source, by suffix."""
     # the time is bounded: no branch depends on data
     longest = max(functions, key=lambda function: function.operations)
     facts = [f"At most {longest.operations} operations, in {longest.entry.name}, without those of networks."]
@@ -77,32 +79,16 @@ def _c_header(model: TrainedModel, functions: Sequence[CFunction]) -> str:
             f"command of {model.servos.delay:.4g} s before as u.",
             _WIDTH - 4,
         )
-    memory = ": none, and z may be NULL"
-    if model.memory:
-        memory = f": joint by joint, {model.breakaway.shape[1]} each"
-    return render(
-        "model.h.jinja",
-        facts=facts,
-        joints=", ".join(model.identifiers),
-        name=model.name,
-        upper=model.name.upper(),
-        n=model.n,
-        memory=model.memory,
-        memory_note=memory,
-        functions=functions,
+    note = (
+        f": joint by joint, {model.breakaway.shape[1]} each" if model.memory else ": none, and z may be NULL"
     )
-
-
-def c_source(model: TrainedModel, functions: Sequence[CFunction]) -> str:
-    """Return the text of the source file."""
-    return render(
-        "model.c.jinja",
-        n=model.n,
-        name=model.name,
-        upper=model.name.upper(),
-        residuals=network_source(model) + joint_function_source(model),
-        functions=functions,
-    )
+    names = {"name": model.name, "upper": model.name.upper(), "n": model.n, "functions": functions}
+    joints, residuals = ", ".join(model.identifiers), network_source(model) + joint_function_source(model)
+    header = {"facts": facts, "joints": joints, "memory": model.memory, "memory_note": note}
+    return {
+        ".h": render("model.h.jinja", **names, **header),
+        ".c": render("model.c.jinja", **names, residuals=residuals),
+    }
 
 
 def _c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -> CFunction:
@@ -134,16 +120,14 @@ def _c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -
     symbol = f"{model.name}_{entry.name}"
     listed = ",\n    ".join(parameters)
     signature = f"void {symbol}(\n    {listed})"
-    written: list[str] = []
-    for line in body:
-        written += wrap(line, _WIDTH, initial_indent="    ", subsequent_indent="        ")
+    wrapped = [wrap(line, _WIDTH, initial_indent="    ", subsequent_indent="        ") for line in body]
     return CFunction(
         entry=entry,
         symbol=symbol,
         shapes=shapes,
         about="\n * ".join(wrap(about, _WIDTH - 6)),
         signature=signature,
-        definition="\n".join([signature, "{", *written, "}"]),
+        definition="\n".join([signature, "{", *chain(*wrapped), "}"]),
         operations=len(lines) - function.nnz_out(),
     )
 
