@@ -79,11 +79,11 @@ def _silent_exporter() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _cross(left: Tensor, right: Tensor, *, dim: int) -> Tensor:
-    """Return the cross product along a dimension of size 3; left, right: (...,), of equal shapes."""
+def _cross(a: Tensor, b: Tensor, *, dim: int) -> Tensor:
+    """Return the cross product along a dimension of size 3; a, b: (...,), of equal shapes."""
     second, third = torch.tensor([1, 2, 0]), torch.tensor([2, 0, 1])
-    forward = left.index_select(dim, second) * right.index_select(dim, third)
-    return forward - left.index_select(dim, third) * right.index_select(dim, second)
+    forward = a.index_select(dim, second) * b.index_select(dim, third)
+    return forward - a.index_select(dim, third) * b.index_select(dim, second)
 
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:

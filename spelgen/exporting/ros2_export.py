@@ -14,7 +14,7 @@ _CALLED = (
 )  # fmt: skip
 """The functions that the plugin calls."""
 
-_PLACES = {
+_PATHS = {
     "package.xml": "package.xml",
     "CMakeLists.txt": "CMakeLists.txt",
     "plugin.xml": "plugin.xml",
@@ -29,7 +29,7 @@ def export_ros2(trained: Trained) -> Exported:
     sources, checked = c_files(trained)
     package = f"{model.name}_solver"
     files = {f"src/{name}": content for name, content in sources.items()}
-    for template, place in _PLACES.items():
+    for template, path in _PATHS.items():
         text = render(
             f"ros2/{template}.jinja",
             package=package,
@@ -37,7 +37,7 @@ def export_ros2(trained: Trained) -> Exported:
             upper=model.name.upper(),
             joints=", ".join(model.identifiers),
         )
-        files[place] = text.encode()
+        files[path] = text.encode()
     use = (
         f"Put this folder into a workspace, colcon build --packages-select {package}; "
         f"the plugin {package}/Solver is an inverse_dynamics_solver::InverseDynamicsSolver."

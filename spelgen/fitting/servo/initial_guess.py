@@ -37,16 +37,16 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
     coefficients, significance = _regression(columns[:, windows.burn_in :], error[:, windows.burn_in :])
     damping, inertia, dry, compliance, offset = coefficients.unbind(-1)
     with torch.no_grad():
-        known = servo.trained == 0
+        is_known = servo.trained == 0
         factor = 1 / (compliance * servo.nominal_kp).clamp(min=1e-12)
         # gravity determines kp of the joints that it loads; the nominal kp of other joints gets the median factor
-        determined = ~known & (significance[:, 3] > TUNING.significance)
+        determined = ~is_known & (significance[:, 3] > TUNING.significance)
         determined &= factor.log().abs() < np.log(TUNING.kp_range)
         common = torch.ones(()).double()
         if determined.any():
             common = factor[determined].median()
         factor = torch.where(determined, factor, common)
-        factor[known] = 1.0
+        factor[is_known] = 1.0
         kp, smallest = factor * servo.nominal_kp, TUNING.min_friction
         servo.raw_kp.copy_(factor.log())
         servo.raw_kd.copy_((kp * damping.clamp(min=smallest**2) / servo.nominal_kd).log())

@@ -102,10 +102,10 @@ class ParameterMap:
 
     def named(self, joints: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return P sets of joint parameters (P, p, n) as tensors by name, each (P, 1, n) or (P, 1, n, K)."""
-        parts = joints.unsqueeze(1).mT.split(self._widths, dim=-1)  # (P, 1, n, K)
+        columns = joints.unsqueeze(1).mT.split(self._widths, dim=-1)  # (P, 1, n, K)
         named = {}
-        for (name, tensor), part in zip(self.tensors.items(), parts, strict=True):
-            named[name] = part.reshape(*part.shape[:2], *tensor.shape)
+        for (name, tensor), column in zip(self.tensors.items(), columns, strict=True):
+            named[name] = column.reshape(*column.shape[:2], *tensor.shape)
         return named
 
     def write(self, x: ServoParameters) -> None:
@@ -119,8 +119,8 @@ class ParameterMap:
     def precision(self, x: ServoParameters) -> torch.Tensor:
         """Return the precision of the prior, (k,): inverse variances of independent parameters."""
         joints = torch.where(x.active, self._deviations, FIXED)
-        others = torch.tensor([1.0] * len(x.bodies) + [TUNING.delay]).double()
-        return torch.cat([joints.flatten(), others]) ** -2
+        shared = torch.tensor([1.0] * len(x.bodies) + [TUNING.delay]).double()
+        return torch.cat([joints.flatten(), shared]) ** -2
 
     def inertial(self, bodies: torch.Tensor) -> torch.Tensor:
         """Return the inertial parameters of all bodies, (10 B,), at coordinates (r,) along the directions."""

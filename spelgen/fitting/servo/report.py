@@ -244,7 +244,7 @@ def _listing(record: Content) -> Listing:
     columns = [ratio for ratio in RATIOS if any(ratio in joint for joint in record["joints"])]
     rows = []
     for joint in record["joints"]:
-        cells = [_shown(joint.get(column)) for column in columns]
+        cells = [_cell(joint.get(column)) for column in columns]
         rows.append((joint["joint"], number(joint["kp"]["value"]), *cells))
     head = ("joint", "kp [Nm/rad]", *("{} [{}]".format(*RATIOS[column]) for column in columns))
     return Listing("Servos", head, tuple(rows), f"All columns but kp are {ABOUT}.")
@@ -262,7 +262,7 @@ def _undetermined(record: Content) -> str:
     return f"Not determined by these logs: {', '.join(names)}"
 
 
-def _shown(interval: Content | None) -> str:
+def _cell(interval: Content | None) -> str:
     if interval is None:
         return "none"
     if not interval["determined"]:

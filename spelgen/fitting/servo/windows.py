@@ -62,9 +62,9 @@ class ServoWindows:
 
     def subsampled(self, count: int) -> ServoWindows:
         """Return at most `count` of the windows, evenly spread, with half the integration steps."""
-        kept = slice(None, None, -(-len(self.q) // count))
-        q, qd, dt = self.q[kept], self.qd[kept], self.dt[kept]
-        return ServoWindows(self.rows[kept], q, qd, dt, self.burn_in, -(-self.steps // 2))
+        selection = slice(None, None, -(-len(self.q) // count))
+        q, qd, dt = self.q[selection], self.qd[selection], self.dt[selection]
+        return ServoWindows(self.rows[selection], q, qd, dt, self.burn_in, -(-self.steps // 2))
 
     def blocks(self, min_logs: int, min_blocks: int) -> torch.Tensor:
         """Return the number of the block of each window, (W,): errors are assumed independent between blocks.
@@ -128,10 +128,10 @@ def servo_windows(
     rows = rows[:: -(-len(rows) // count)]  # evenly spread: the first motions may not move all joints
     smooth_velocities = {id(segment): velocities(segment) for segment in segments if len(segment) >= length}
     q, qd, dt, steps = [], [], [], 0
-    for log, part in rows:
-        q.append(log.q[part])
-        qd.append(smooth_velocities[id(log)][part])
-        dt.append(np.diff(log.t[part]))
+    for log, samples in rows:
+        q.append(log.q[samples])
+        qd.append(smooth_velocities[id(log)][samples])
+        dt.append(np.diff(log.t[samples]))
         steps = max(steps, steps_between(log))
     tensors = torch.from_numpy(np.stack(q)), torch.from_numpy(np.stack(qd)), torch.from_numpy(np.stack(dt))
     return ServoWindows(tuple(rows), *tensors, burn_in, steps)
@@ -158,12 +158,12 @@ def body_load(model: ArmModel, motion: MidpointMotion) -> BodyLoad:
         prepared, armature = model.prepare(), model.armature
         flat = [x.flatten(0, 1).split(BATCH) for x in motion]
         for q, qd, qdd in zip(*flat, strict=True):
-            at = model.configuration(q, prepared)
-            mass = at.mass
+            configuration = model.configuration(q, prepared)
+            mass = configuration.mass
             inertia = mass.diagonal(dim1=-2, dim2=-1) - armature
             coupling = (mass @ qdd.unsqueeze(-1)).squeeze(-1) - (inertia + armature) * qdd
-            bias = model.nonlinear_effects(at, qd) + coupling
+            bias = model.nonlinear_effects(configuration, qd) + coupling
             regressor = regressor_of(model.chain, q, qd, qdd)
-            batches.append(BodyLoad(inertia, bias, model.gravity(at), regressor))
+            batches.append(BodyLoad(inertia, bias, model.gravity(configuration), regressor))
     shape = motion.q.shape[:2]
     return BodyLoad(*(torch.cat(columns).unflatten(0, shape) for columns in zip(*batches, strict=True)))
