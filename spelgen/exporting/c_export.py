@@ -14,7 +14,7 @@ import numpy as np
 from spelgen.errors import RunError
 from spelgen.exporting.c_source import FRICTION_STATES, CFunction, c_functions, write_c
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.exported import Exported, folder_export
+from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.tuning import TUNING
 
@@ -30,13 +30,13 @@ def export_c(trained: Trained) -> Exported:
         "nothing is allocated or kept, so every function may be called from any thread."
     )
     about = f"matrices row by row; z is the friction state, which {name}_friction_step updates."
-    return folder_export(trained, "c", "in C99", files, use=use, about=about, checked=checked)
+    return with_readme(trained, "c", files, use=use, about=about, summary=[checked])
 
 
 def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
     """Return header and source by name, and a sentence with the result of the parity check."""
     functions = c_functions(trained.described, trained.entry_points)
-    checked = "Not checked: no C compiler was there."
+    checked = "Not checked: there is no C compiler"
     program = compiler()
     with tempfile.TemporaryDirectory() as folder:
         source = write_c(trained.described, functions, Path(folder))
@@ -44,7 +44,7 @@ def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
         if program is not None:
             library = called_by_c(compile_library(source, program), functions)
             parity = check_parity(library, trained, list(trained.entry_points), TUNING.tolerance)
-            checked = f"Checked when exported, compiled by {Path(program).name}: {parity.summary}."
+            checked = f"Checked when exported, compiled by {Path(program).name}: {parity.summary}"
     return files, checked
 
 

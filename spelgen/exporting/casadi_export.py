@@ -12,7 +12,7 @@ import numpy as np
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.entry_points import ENTRY_POINTS, EntryPoint
-from spelgen.exporting.exported import Exported, folder_export
+from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.model_expressions import expression_functions, residuals_needed
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.residual_expressions import residual_values
@@ -24,14 +24,14 @@ def export_casadi(trained: Trained) -> Exported:
     model = trained.described
     functions = casadi_functions(model, trained.entry_points)
     parity = check_parity(called_by_state(functions), trained, list(functions), TUNING.tolerance)
-    checked = f"Checked when exported, by CasADi {ca.CasadiMeta.version()}: {parity.summary}."
+    checked = f"Checked when exported, by CasADi {ca.CasadiMeta.version()}: {parity.summary}"
     use = (
         "qdd = casadi.Function.load('forward_dynamics.casadi')(q, qd, tau, z) takes numbers or symbols: "
         "its derivatives, of any order, are CasADi's."
     )
     about = f"z is the friction state, {model.memory} numbers: casadi.DM(0, 1) where there are none."
     files = {f"{name}.casadi": _saved(function) for name, function in functions.items()}
-    return folder_export(trained, "casadi", "in CasADi", files, use=use, about=about, checked=checked)
+    return with_readme(trained, "casadi", files, use=use, about=about, summary=[checked])
 
 
 def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:

@@ -22,25 +22,27 @@ class Exporter:
     """A format of exports.
 
     function_name: module and name of a function from ``Trained`` to ``Exported``, imported on use, because most formats
-    need packages that are extras. suffix: of the file; empty for a format that is a folder. choice: whether the
-    functions can be selected.
+    need packages that are extras. title: end of the title of the README. suffix: of the file; empty for a format that
+    is a folder. choice: whether the functions can be selected.
     """
 
     function_name: str
+    title: str = ""
     suffix: str = ""
     choice: bool = False
 
 
 EXPORTERS = {
-    "urdf": Exporter("spelgen.exporting.urdf_export:export_urdf", suffix=".urdf"),
-    "mjcf": Exporter("spelgen.exporting.mjcf_export:export_mjcf", suffix=".xml"),
-    "c": Exporter("spelgen.exporting.c_export:export_c", choice=True),
-    "casadi": Exporter("spelgen.exporting.casadi_export:export_casadi", choice=True),
-    "onnx": Exporter("spelgen.exporting.onnx_export:export_onnx", choice=True),
-    "torch": Exporter("spelgen.exporting.torch_export:export_torch", choice=True),
-    "ros2": Exporter("spelgen.exporting.ros2_export:export_ros2"),
+    "urdf": Exporter("spelgen.exporting.urdf_export:export_urdf", "as a URDF", suffix=".urdf"),
+    "mjcf": Exporter("spelgen.exporting.mjcf_export:export_mjcf", "for MuJoCo", suffix=".xml"),
+    "c": Exporter("spelgen.exporting.c_export:export_c", "in C99", choice=True),
+    "casadi": Exporter("spelgen.exporting.casadi_export:export_casadi", "in CasADi", choice=True),
+    "onnx": Exporter("spelgen.exporting.onnx_export:export_onnx", "in ONNX", choice=True),
+    "torch": Exporter("spelgen.exporting.torch_export:export_torch", "in torch", choice=True),
+    "ros2": Exporter("spelgen.exporting.ros2_export:export_ros2", "for ROS 2"),
 }
 """The formats, by the values of --to."""
+_BY_SUFFIX = {exporter.suffix: name for name, exporter in EXPORTERS.items() if exporter.suffix}
 
 if TYPE_CHECKING:
     Format = str
@@ -87,10 +89,9 @@ class Exported:
 
 def format_by_extension(path: Path) -> str:
     """Return the format of files with this extension. Raises RunError if there is none."""
-    name = _format_of(path)
-    if name is None:
+    if path.suffix not in _BY_SUFFIX:
         raise RunError(f"the name {path.name!r}", expected="FILE.urdf, FILE.xml or --to FORMAT")
-    return name
+    return _BY_SUFFIX[path.suffix]
 
 
 def require_fitting(to: str, path: Path) -> None:
@@ -99,26 +100,21 @@ def require_fitting(to: str, path: Path) -> None:
     if path.suffix == suffix or (not suffix and path.is_dir()):
         return
     expected = f"FILE{suffix}" if suffix else "a folder, named without an extension"
-    fitting = _format_of(path)
-    advice = None if fitting is None else f"--to {fitting} writes such a file"
+    advice = None
+    if path.suffix in _BY_SUFFIX:
+        advice = f"--to {_BY_SUFFIX[path.suffix]} writes such a file"
     raise RunError(f"the name {path.name!r} for --to {to}", expected=expected, do=advice)
 
 
-def _format_of(path: Path) -> str | None:
-    """Return the format of files with the extension of a path; None if there is none."""
-    for name, exporter in EXPORTERS.items():
-        if exporter.suffix and exporter.suffix == path.suffix:
-            return name
-    return None
-
-
-def folder_export(
-    trained: Trained, to: str, tool: str, files: Mapping[str, bytes], *, use: str, about: str, checked: str
+def with_readme(
+    trained: Trained, to: str, files: Mapping[str, bytes], *, use: str, about: str, summary: Sequence[str]
 ) -> Exported:
-    """Return an export of several files and a README; about: follows the units in its conventions."""
-    title = f"Dynamics of {trained.robot} {tool}"
-    text = readme(title, use, trained.joint_names, f"{UNITS}; {about}", checked)
-    return Exported(to, trained.robot, {**files, "README.md": text}, (checked,))
+    """Return an export with a README. about: follows the units in its conventions. summary: without full stops."""
+    exporter, conventions = EXPORTERS[to], f"{UNITS}; {about}"
+    title, result = f"Dynamics of {trained.robot} {exporter.title}", f"{'; '.join(summary)}."
+    name = f"{exporter.suffix}.README.md" if exporter.suffix else "README.md"
+    text = readme(title, use, trained.joint_names, conventions, result)
+    return Exported(to, trained.robot, {**files, name: text}, tuple(summary))
 
 
 def readme(title: str, use: str, joints: Sequence[str], conventions: str, checked: str) -> bytes:

@@ -13,7 +13,7 @@ from spelgen.arm.arm import Arm, Coordinate
 from spelgen.dynamics.rigid_bodies import about_center, quaternion
 from spelgen.exporting.describe import Trained, tip_frame
 from spelgen.exporting.description import Servos
-from spelgen.exporting.exported import UNITS, Exported, readme
+from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Parity, Values, random_inputs, relative, require_parity
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection, rigid_body_projection
 from spelgen.exporting.tuning import TUNING
@@ -42,11 +42,9 @@ def export_mjcf(trained: Trained) -> Exported:
         "mujoco.MjModel.from_xml_path(FILE.xml): bodies by the names of the links that their joints move, armature, "
         f"viscous friction as damping and Coulomb friction as frictionloss, {actuators}"
     )
-    about = f"{UNITS}; a body's frame has its joint's axis as z; torque offsets of the sensors are left out."
-    result = f"{'; '.join((checked, *projection.summary))}."
-    text_of_readme = readme(f"{trained.robot} for MuJoCo", use, trained.joint_names, about, result)
-    files = {".xml": text, ".xml.README.md": text_of_readme}
-    return Exported("mjcf", trained.robot, files, (*projection.summary, checked))
+    about = "a body's frame has its joint's axis as z; torque offsets of the sensors are left out."
+    summary = [*projection.summary, checked]
+    return with_readme(trained, "mjcf", {".xml": text}, use=use, about=about, summary=summary)
 
 
 def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNING.states) -> Parity:
@@ -171,8 +169,7 @@ def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> d
         # the rotor of a motor that several joints rotate is the armature of a tendon
         "armature": 0.0 if is_coupled[k] else projection.armature[k],
         "damping": friction.viscous[k],
-        # the mean: MuJoCo has the same Coulomb friction in both directions
-        "frictionloss": (friction.forward[k] - friction.backward[k]) / 2,
+        "frictionloss": friction.coulomb[k],
         "solimpfriction": " ".join(f"{number:g}" for number in TUNING.friction_impedance),
         "range": projection.arm.arm.coordinates[k].limits,
     }

@@ -19,7 +19,7 @@ from torch.overrides import TorchFunctionMode
 from spelgen.dynamics.prepared import PreparedModel
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.entry_points import select_names
-from spelgen.exporting.exported import Exported, folder_export
+from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.torch_export import PROGRAMS, export_program, program_inputs, program_output
 from spelgen.exporting.tuning import TUNING
@@ -32,7 +32,7 @@ def export_onnx(trained: Trained) -> Exported:
     for name in select_names(trained.entries, PROGRAMS):
         models[name] = files[f"{name}.onnx"] = onnx_model(model, name)
     parity = check_parity(called_by_onnx(models), trained, list(models), TUNING.onnx_tolerance)
-    checked = f"Checked when exported, by ONNX Runtime {onnxruntime.__version__}: {parity.summary}."
+    checked = f"Checked when exported, by ONNX Runtime {onnxruntime.__version__}: {parity.summary}"
     use = (
         "onnxruntime.InferenceSession('forward_dynamics.onnx').run(['qdd'], {'q': q, 'qd': qd, 'tau': tau}), "
         "float64 (batch, n), any batch."
@@ -41,7 +41,7 @@ def export_onnx(trained: Trained) -> Exported:
     about = f"one file per entry point: {', '.join(models)}."
     if size:
         about = f"z, the friction state, is (batch, {size}); {about}"
-    return folder_export(trained, "onnx", "in ONNX", files, use=use, about=about, checked=checked)
+    return with_readme(trained, "onnx", files, use=use, about=about, summary=[checked])
 
 
 def onnx_model(model: PreparedModel, name: str) -> bytes:

@@ -39,6 +39,11 @@ class NearestFriction(NamedTuple):
     backward: np.ndarray
     error: np.ndarray
 
+    @property
+    def coulomb(self) -> np.ndarray:
+        """Mean Coulomb friction of both directions, (n,): a URDF and MuJoCo have one number."""
+        return (self.forward - self.backward) / 2
+
 
 @dataclass(frozen=True, eq=False)
 class RigidBodyProjection:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from spelgen.exporting.c_export import c_files
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.exported import Exported, folder_export
+from spelgen.exporting.exported import Exported, with_readme
 from spelgen.templates import render
 
 _CALLED = (
@@ -46,4 +46,4 @@ def export_ros2(trained: Trained) -> Exported:
         "getTorques includes friction, and updates its state by the positions of successive calls; "
         "initialize resets it."
     )
-    return folder_export(trained, "ros2", "for ROS 2", files, use=use, about=about, checked=checked)
+    return with_readme(trained, "ros2", files, use=use, about=about, summary=[checked])

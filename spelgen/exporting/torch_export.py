@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from spelgen.dynamics.prepared import PreparedModel
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.entry_points import ENTRY_POINTS, select_names
-from spelgen.exporting.exported import Exported, folder_export
+from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.tuning import TUNING
 
@@ -35,7 +35,7 @@ def export_torch(trained: Trained) -> Exported:
     for name in select_names(trained.entries, PROGRAMS):
         programs[name] = files[f"{name}.pt2"] = _saved(export_program(model, name))
     parity = check_parity(_called_by_torch(programs, model), trained, list(programs), TUNING.tolerance)
-    checked = f"Checked when exported, by torch {torch.__version__}: {parity.summary}."
+    checked = f"Checked when exported, by torch {torch.__version__}: {parity.summary}"
     # clones, since safetensors refuses shared memory
     parameters = {key: x.cpu().contiguous().clone() for key, x in trained.model.state_dict().items()}
     use = (
@@ -45,7 +45,7 @@ def export_torch(trained: Trained) -> Exported:
     )
     about = "the programs have no gradients with respect to parameters."
     files["model.safetensors"] = save(parameters)
-    return folder_export(trained, "torch", "in torch", files, use=use, about=about, checked=checked)
+    return with_readme(trained, "torch", files, use=use, about=about, summary=[checked])
 
 
 def _saved(program: torch.export.ExportedProgram) -> bytes:

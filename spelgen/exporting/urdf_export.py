@@ -11,7 +11,7 @@ from spelgen.arm.lump_links import lump_links
 from spelgen.dynamics.residuals import friction_factor
 from spelgen.dynamics.rigid_bodies import about_center
 from spelgen.exporting.describe import Trained, array
-from spelgen.exporting.exported import UNITS, Exported, readme
+from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.rigid_body_projection import (
     RigidBodyProjection,
     rigid_body_projection,
@@ -40,15 +40,13 @@ def export_urdf(trained: Trained) -> Exported:
         "The .urdf contains inertials, viscous and Coulomb friction, which simulators ignore; the .yaml beside it, "
         "which spelgen reads, rotor inertia and friction in both directions; .urdf.friction.yaml the model's own law."
     )
-    about = f"{UNITS}; inertials of a body stand with the link that its joint moves."
-    title, checked = f"{trained.robot} as a URDF", f"{'; '.join(projection.summary)}."
+    about = "the link that a joint moves has the inertial of the whole body."
     files = {
         ".urdf": _urdf_text(projection),
         ".yaml": _settings_text(projection).encode(),
         ".urdf.friction.yaml": _friction_text(trained, projection).encode(),
-        ".urdf.README.md": readme(title, use, trained.joint_names, about, checked),
     }
-    return Exported("urdf", trained.robot, files, projection.summary)
+    return with_readme(trained, "urdf", files, use=use, about=about, summary=projection.summary)
 
 
 def _urdf_text(projection: RigidBodyProjection) -> bytes:
@@ -73,13 +71,11 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
         # from the body frame, whose z is the joint axis, to the link frame
         rotation = np.array(lumped.frames[name].rotation.T, dtype=float)
         _set_inertial(links[name], inertia, rotation)
-    # a URDF has one Coulomb friction for both directions
     friction = projection.friction
-    coulomb = (friction.forward - friction.backward) / 2
     for index, coordinate in enumerate(arm.coordinates):
         element = joints[coordinate.name]
         _remove(element, "dynamics")
-        values = {"damping": _number(friction.viscous[index]), "friction": _number(coulomb[index])}
+        values = {"damping": _number(friction.viscous[index]), "friction": _number(friction.coulomb[index])}
         etree.SubElement(element, "dynamics", values)
     text: bytes = etree.tostring(root, xml_declaration=True, encoding="utf-8")
     return text + b"\n"

@@ -29,7 +29,7 @@ class ServoRollouts:
     joints gives the derivatives of all joints; parameters that joints share, those of the bodies and the delay, need
     one rollout each. All of them are one batch.
 
-    motion, load, inertial: the fixed motion, the load, and phi(x0) (10 B,). step: of finite differences.
+    motion, load, inertial: the fixed motion, the load, and phi(x0) (10 B,). difference_step: of finite differences.
     """
 
     model: ArmModel
@@ -38,7 +38,7 @@ class ServoRollouts:
     motion: MidpointMotion
     load: BodyLoad
     inertial: torch.Tensor
-    step: float = ServoCostTuning().step
+    difference_step: float = ServoCostTuning().difference_step
 
     @classmethod
     def of(cls, model: ArmModel, windows: ServoWindows) -> ServoRollouts:
@@ -72,7 +72,7 @@ class ServoRollouts:
             (r + 1, W, K', n), with respect to the coordinates of the bodies and the delay.
         """
         rows = x.active.any(dim=1).nonzero().squeeze(-1)  # parameters that any joint has
-        p, r, step = len(rows), len(x.bodies), self.step
+        p, r, step = len(rows), len(x.bodies), self.difference_step
         # one batch: unchanged, each joint parameter, each coordinate of the bodies, the delay
         joints = x.joints.expand(p + r + 2, -1, -1).clone()
         joints[torch.arange(p) + 1, rows] += step

@@ -44,7 +44,7 @@ class ServoCostTuning:
     # [s] Largest correlation time of the errors; most measured ones are above 0.2 s.
     correlation_time: float = 0.5
     # [1] Finite-difference step of the parameters: rollouts in double precision lose half of their digits.
-    step: float = 1e-4
+    difference_step: float = 1e-4
 
 
 @dataclass(frozen=True)
