@@ -42,7 +42,8 @@ class NearestFriction(NamedTuple):
     @property
     def coulomb(self) -> np.ndarray:
         """Mean Coulomb friction of both directions, (n,): a URDF and MuJoCo have one number."""
-        return (self.forward - self.backward) / 2
+        mean: np.ndarray = (self.forward - self.backward) / 2
+        return mean
 
 
 @dataclass(frozen=True, eq=False)
