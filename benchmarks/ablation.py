@@ -1,6 +1,6 @@
 """Switch off each mechanism of the torque fits, one after the other, and print what it is worth.
 
-    python benchmarks/ablation.py [--logs ../shared/logs] [--only NAME] [--case NAME]
+    python benchmarks/ablation.py [--recordings FOLDER] [--arms-folder URDFS] [--only NAME] [--case NAME]
 
 Cases: the real logs of benchmarks/arms.py (torque nMSE of `hybrid` on the test logs), three seconds of the UR10e, and
 simulated arms of benchmarks/truth.py (error of M(q), too). A cell is the error without the mechanism by the
@@ -28,6 +28,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import arms
 import truth
 from real_logs import first, mean, samples_of, torque_of, trained
+from recordings import folder_of
 
 import spelgen
 from spelgen.dynamics.residuals import residual_torque
@@ -182,6 +183,8 @@ def fit_and_judge(urdf: Path, training: Any, tests: Any) -> Callable[[], dict[st
 def simulated_cases(folder: Path) -> Iterator[tuple[str, Callable[[], dict[str, float]]]]:
     """Fits to arms whose truth is known."""
     for case in SIMULATED:
+        if case.arm != "random" and not (folder / f"{case.arm}.urdf").exists():
+            continue
         springs = ", springs" * case.springs
         yield f"{case.arm}, {case.friction}{springs}", lambda case=case: fit_truth(case, folder)
 
@@ -217,14 +220,16 @@ def fit_truth(case: truth.Case, folder: Path) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--logs", type=Path, default=Path(__file__).parents[2] / "shared" / "logs")
+    parser.add_argument("--recordings", type=Path, help="folder of benchmarks/recordings.py")
+    parser.add_argument("--arms-folder", type=Path, default=truth.ARMS, help="URDFs of the simulated arms")
     parser.add_argument("--only", default="", help="mechanisms whose names hold this")
     parser.add_argument("--case", default="", help="robots whose names hold this")
     options = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     chosen = [each for each in mechanisms() if options.only in each.name]
-    cases = [*real_cases(options.logs), *effect_cases(), *simulated_cases(options.logs.parent / "arms")]
+    recordings = folder_of(options.recordings)
+    cases = [*real_cases(recordings), *effect_cases(), *simulated_cases(options.arms_folder)]
     for name, run in cases:
         if options.case not in name:
             continue
