@@ -79,7 +79,11 @@ def test_same_bytes_under_any_hash_seed_and_from_any_folder(tmp_path):
 
 
 def test_emitted_code_is_held_to_the_rules_of_written_code(tmp_path):
-    for robot, preset in [*(("rpr", preset) for preset in PRESETS), ("panda", "hybrid"), ("six_dof", "minimal")]:
+    for robot, preset in [
+        *(("rpr", preset) for preset in PRESETS),
+        ("panda", "hybrid"),
+        ("six_dof", "minimal"),
+    ]:
         for form in ("thin", "standalone"):
             text = built(robot, preset=preset, standalone=form == "standalone")[0]
             (tmp_path / f"{robot}_{preset}_{form}.py".replace("-", "_")).write_text(text, encoding="utf-8")
@@ -129,7 +133,6 @@ HOSTILE = [
 def test_no_text_of_the_urdf_becomes_code(tmp_path, standalone):
     """The syntax tree of a module with hostile names is that of the same arm with plain names, string constants apart."""
     from xml.sax.saxutils import quoteattr
-
 
     def written(robot, names, file):
         links = "".join(f'<link name="l{k}"/>' for k in range(len(names) + 1))

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 import torch
+from planar_model import JOINTS, write_module
 
 from spelgen.errors import LogError, RunError, SpelgenErrors
 from spelgen.fitting.fit import RunOptions, fit
@@ -21,8 +22,6 @@ from spelgen.logs.read import read_bounded_logs, read_logs, write_logs
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, split_at_gaps
 from spelgen.settings.fits import Rollout
 
-STAND_IN = Path(__file__).with_name("stand_in.py")
-JOINTS = ("shoulder", "elbow")
 ROW = 8 * 7  # bytes of a row: t, and q, qd, tau of two joints
 SEGMENT = 50
 
@@ -147,21 +146,21 @@ def test_a_fit_of_reduced_logs_is_one_of_its_samples(tmp_path, bound):
     """The same weights, split and digest as of the kept samples in memory; a resumed run finds the same samples."""
     write_logs(tmp_path / "train.parquet", recordings(), JOINTS)
     bound(1600)
-    config = Rollout(epochs=2)
-    found = train(STAND_IN, [tmp_path / "train.parquet"], tmp_path / "run", config)
+    config, module = Rollout(epochs=2), write_module(tmp_path)
+    found = train(module, [tmp_path / "train.parquet"], tmp_path / "run", config)
     logs, _ = read_bounded_logs([tmp_path / "train.parquet"], JOINTS)
-    expected = fit(load_module(STAND_IN), logs, config, folder=tmp_path / "other")
+    expected = fit(load_module(module), logs, config, folder=tmp_path / "other")
     assert "subsampled" in {note.code for note in found.diagnostics}
     for name, value in expected.model.state_dict().items():
         torch.testing.assert_close(found.model.state_dict()[name], value, rtol=0, atol=0)
     records = [RunFolder(tmp_path / name).read_config() for name in ("run", "other")]
     for key in ("data_digest", "training", "validation", "training_windows"):
         assert records[0][key] == records[1][key]
-    resumed = train(STAND_IN, [tmp_path / "train.parquet"], tmp_path / "run", options=RunOptions(resume=True))
+    resumed = train(module, [tmp_path / "train.parquet"], tmp_path / "run", options=RunOptions(resume=True))
     assert resumed.status == found.status
     write_logs(tmp_path / "train.parquet", recordings(9), JOINTS)
     with pytest.raises(RunError, match="data"):
-        train(STAND_IN, [tmp_path / "train.parquet"], tmp_path / "run", options=RunOptions(resume=True))
+        train(module, [tmp_path / "train.parquet"], tmp_path / "run", options=RunOptions(resume=True))
 
 
 CHILD = """

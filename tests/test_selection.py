@@ -251,7 +251,6 @@ def test_straying_from_the_urdf_costs_what_the_docs_say(robots, monkeypatch):
 
     monkeypatch.setattr(torque_objective, "fit_networks", fit_networks)
     networks = SimpleNamespace(mass_matrix=model.mass_matrix, gravity=model.gravity, named_modules=lambda: [])
-    monkeypatch.setattr(torque_objective, "has_rigid_bodies", lambda model: False)
     fit_torques(networks, SimpleNamespace(seen=1, count=1), TorqueFit(urdf_weight=0.7), regularizer)
     assert penalties == [pytest.approx(0.7 * expected)]
 

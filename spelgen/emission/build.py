@@ -5,16 +5,19 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.design import PRESET_NAMES, Design, load_design
-from spelgen.emission.assemble import ArmModel, assemble
 from spelgen.emission.plan import plan_model
 from spelgen.emission.text import module_text
 from spelgen.errors import ModuleError
 from spelgen.spec import ModelSpec, Options
 from spelgen.structure.structure import derive
 from spelgen.urdf.robot import Assume
+
+if TYPE_CHECKING:
+    from spelgen.emission.assemble import ArmModel
 
 
 def build(
@@ -37,6 +40,8 @@ def build(
 
     Raises what ``load_arm`` raises, and SettingsError for a design of no model.
     """
+    from spelgen.emission.assemble import assemble  # torch: not for a module's text
+
     return assemble(make_spec(arm, preset, width=width, depth=depth, assume=assume), seed)
 
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import ast
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from spelgen.emission.assemble import ArmModel, assemble
 from spelgen.emission.text import module_text
 from spelgen.errors import ModuleError
 from spelgen.files import read_bytes
 from spelgen.spec import ModelSpec, spec_from_json
+
+if TYPE_CHECKING:
+    from spelgen.emission.assemble import ArmModel
 
 # Largest module that is read [bytes]: the largest that `spelgen build` writes has a tenth.
 MAX_MODULE = 2**22
@@ -21,6 +24,8 @@ def load_module(module: str | Path, *, seed: int = 0) -> ArmModel:
 
     module: the file, or its text. Raises ModuleError for a file that was edited or is no such module.
     """
+    from spelgen.emission.assemble import assemble  # torch: not for a specification
+
     is_text = isinstance(module, str) and "\n" in module
     file = None if is_text else Path(module)
     text = str(module) if file is None else read_source(file)

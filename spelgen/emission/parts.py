@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import pi
 
 from spelgen.design import BRISTLE_REACH, SERVO_STRIBECK_ROUNDING
 from spelgen.emission.entry_sums import mean_mass
 from spelgen.emission.source import Call, Code, call
 from spelgen.emission.tuning import TUNING
-from spelgen.runtime.rows import Joint
 from spelgen.spec import JointSpec, LinkSpec, ModelSpec
 
 GENERATOR, JOINTS, LINKS = Code("generator"), Code("JOINTS"), Code("LINKS")
@@ -97,8 +97,12 @@ def _joint(joint: JointSpec) -> Call:
     fields |= {"friction": joint.friction, "armature": joint.armature}
     if joint.gear != 1:
         fields["gear"] = joint.gear
-    limits = Joint(joint.name, joint.joint_type, joint.lower, joint.upper, 1.0, 1.0, 1.0)
-    if (limits.center, limits.half_range) != (joint.center, joint.half_range):
+    # what `Joint` of the runtime, which imports torch, computes from the limits
+    range_of_limits = (0.0, pi)
+    if joint.lower is not None and joint.upper is not None:
+        middle, half = (joint.lower + joint.upper) / 2, (joint.upper - joint.lower) / 2
+        range_of_limits = (float(f"{middle:.6g}"), float(f"{half:.6g}"))
+    if range_of_limits != (joint.center, joint.half_range):
         fields["typical_range"] = (joint.center, joint.half_range)
     return call("Joint", joint.name, joint.joint_type, **fields)
 
