@@ -138,7 +138,7 @@ def test_phnode_is_its_three_axis_model_held_by_bearings(net, tmp_path):
 
     def inverse_mass(at: torch.Tensor) -> torch.Tensor:
         pose = model.at(at)
-        return model.mass.inverse(pose.encoded, pose.prepared["mass"])
+        return model.mass.inverse(pose.encoded, pose.parameters["mass"])
 
     inverse = inverse_mass(q).detach()
     assert torch.linalg.eigvalsh(inverse)[:, 0].min() > 0

@@ -245,8 +245,8 @@ def test_a_run_of_any_preset_has_its_page(run, robots, preset):
     told = " ".join(" ".join(page.text).split())
     assert ("Masses, centres of mass" in told) == (preset == "closed-form")
     assert f"Preset {preset} ," in told
-    build = told[told.index(f"spelgen build RUN/robot.urdf --preset {preset} ") :]
-    assert "--width 8 -o module.py spelgen train module.py --robot RUN/robot.urdf --data LOGS" in build
+    command = told[told.index(f"spelgen build RUN/robot.urdf --preset {preset} ") :]
+    assert "--width 8 -o module.py spelgen train module.py --robot RUN/robot.urdf --data LOGS" in command
     units = {"Nm": "joint1", "N": "joint2"}
     for unit, joint in units.items():
         assert f"Torque of {joint}" in text and f"torque [{unit}]" in text

@@ -3,18 +3,18 @@
 import ast
 import json
 import math
-import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from emitted import ROBOTS, SIX, built, import_source
+from emitted import SIX, built, import_source
 from exported_runs import arm_of
 from torch import Tensor
 from torch.func import jacrev, jvp, vjp
 
 from spelgen.design import PRESET_NAMES, load_design
+from spelgen.dynamics.body_regressor import pseudo_inertia
 from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
 from spelgen.emission.build import build
 from spelgen.emission.standalone import bundle, load_runtime, names_in
@@ -271,8 +271,10 @@ def test_a_thin_module_is_short_and_shows_the_entries():
     for robot in SIX:
         for preset in PRESET_NAMES:
             lines = built(robot, preset=preset)[0].splitlines()
-            assert len(lines) <= 250, f"{robot}, {preset}: {len(lines)} lines"
-            assert robot != "rpr" or len(lines) <= longest.get(preset, 120)
+            most = (
+                longest.get(preset, 110) if robot == "rpr" else 325
+            )  # spel of panda: 27 functions of 7 joints
+            assert len(lines) <= most, f"{robot}, {preset}: {len(lines)} lines"
     assert "return symmetric([f3], [f1, c2], [f2, 0, c1])" in built("rpr")[0]
     assert "m22 = f9 + 2 * f12 - f5" in built("six_dof")[0]
 
@@ -284,6 +286,17 @@ def test_values_are_in_units(tmp_path):
     closed.friction.raw_coulomb.data[:] = math.log(2)
     near(closed.coulomb, 2 * closed.friction.nominal)
     assert closed.inertial_parameters.shape == (3, 10)
+
+
+def factors_of_first_stage(ten: Tensor, robot: str) -> Tensor:
+    """Factors of inertial parameters with as many digits as modules stated then.
+
+    The inertia of link3 of rpr is at the limit of physical consistency: the nearest consistent one had six digits.
+    """
+    digits = [6 if (robot, index) == ("rpr", 2) else 10 for index in range(len(ten))]
+    rounded = [[float(f"{x:.{k}g}") for x in row] for row, k in zip(ten.tolist(), digits, strict=True)]
+    pseudo = pseudo_inertia(torch.tensor(rounded, dtype=torch.float64))
+    return torch.linalg.cholesky(pseudo.flip(-1, -2)).flip(-1, -2)
 
 
 def weights_of_first_stage(bodies):
@@ -352,9 +365,11 @@ def test_numbers_equal_those_of_the_first_release(case, tmp_path):
     generator = torch.Generator().manual_seed(1)
     q, qd, tau = (torch.randn(model.n, generator=generator, dtype=torch.float64) for _ in range(3))
     with torch.no_grad():
+        nominal = model.inertial_parameters if preset == "closed-form" else None
         for weight in model.parameters():
             weight += 0.01
         if preset == "closed-form":
+            model.bodies.factors.copy_(factors_of_first_stage(nominal, robot))
             model.bodies.raw.copy_(weights_of_first_stage(model.bodies))
         else:
             drawn = torch.Generator().manual_seed(3)
