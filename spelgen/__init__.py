@@ -12,8 +12,9 @@ if TYPE_CHECKING:
     from spelgen.design import Design
     from spelgen.dynamics.linear_friction import FrictionModel
     from spelgen.dynamics.tip import tip_kinematics
-    from spelgen.emission.build import build, generate
+    from spelgen.emission.build import build
     from spelgen.emission.loading import load_module
+    from spelgen.emission.specify import generate
     from spelgen.errors import SpelgenError
     from spelgen.evaluation.evaluate import evaluate
     from spelgen.evaluation.results import Results
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from spelgen.logs.read import read_logs, write_logs
     from spelgen.logs.trajectory import Trajectory
     from spelgen.settings.fits import GaussianPrior, MomentumFit, Rollout, TorqueFit
+    from spelgen.simulation.as_built import as_built
     from spelgen.simulation.simulate import simulate
 
 
@@ -36,7 +38,7 @@ _HOME = {
     "ConfiguredArm": "arm.configured_arm",
     "inspect": "certificate.inspection",
     "Inspection": "certificate.inspection",
-    "generate": "emission.build",
+    "generate": "emission.specify",
     "Design": "design",
     "build": "emission.build",
     "load_module": "emission.loading",
@@ -47,6 +49,7 @@ _HOME = {
     "check_logs": "log_checks.check_logs",
     "Preprocessing": "logs.preprocessing",
     "simulate": "simulation.simulate",
+    "as_built": "simulation.as_built",
     "excite": "excitation.design",
     "identify": "identification.identify",
     "LeastSquares": "identification.identification",
@@ -87,6 +90,7 @@ __all__ = [
     "TorqueFit",
     "Trajectory",
     "__version__",
+    "as_built",
     "build",
     "check",
     "check_logs",

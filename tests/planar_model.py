@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from spelgen.emission.build import generate
+from spelgen.emission.specify import generate
 from spelgen.runtime import Joint, PortHamiltonian
 
 JOINTS = ("shoulder", "elbow")

@@ -9,7 +9,7 @@ from emitted import ROBOTS, SIX, import_source, randomise
 
 from spelgen.design import PRESET_NAMES
 from spelgen.emission.assemble import assemble
-from spelgen.emission.build import make_spec
+from spelgen.emission.specify import make_spec
 from spelgen.emission.text import module_text
 from spelgen.errors import ModuleError
 from spelgen.spec import ModelSpec, spec_from_json

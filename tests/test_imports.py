@@ -39,10 +39,9 @@ OURS = {f"spelgen.{name}" for name in LAYERS}
 SYMBOLIC = {"sympy", "flint", "spelgen.arm", "spelgen.structure"}
 PLAIN = {"spelgen.arm.actuation"}  # G by the files, without the exact arithmetic of its folder
 DERIVING = ("urdf.", "arm.", "structure.", "emission.", "certificate.")
-DERIVES = [x for x in LAYERS if x.startswith(DERIVING) and x != "emission.assemble"]
+MODELS = {f"emission.{name}" for name in ("assemble", "build", "loading")}  # models in memory
+DERIVES = [x for x in LAYERS if x.startswith(DERIVING) and x not in MODELS]
 OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "page", "scene")}
-# Imports inside the one function that makes a model, which need torch: a module's text and specification do not.
-MAKE_MODELS = {"emission.build": "spelgen.emission.assemble", "emission.loading": "spelgen.emission.assemble"}
 LEAST_SQUARES = ("fitting.fit", "fitting.train")  # fit least squares as well, whose base parameters are exact
 FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.")) and x not in LEAST_SQUARES]
 NEVER = {
@@ -98,8 +97,7 @@ def reached(name: str) -> set[str]:
     found: set[str] = set()
     waiting = [name]
     while waiting:
-        file = waiting.pop()
-        new = imported(file) - found - {MAKE_MODELS.get(file)}
+        new = imported(waiting.pop()) - found
         found |= new
         waiting += [module.removeprefix("spelgen.") for module in new if module.startswith("spelgen.")]
     return found

@@ -12,7 +12,8 @@ from emitted import built
 from planar_model import write_module
 
 from spelgen.emission.build import build
-from spelgen.emission.loading import load_module, read_spec
+from spelgen.emission.loading import load_module
+from spelgen.emission.module_file import read_spec
 from spelgen.emission.text import module_text
 from spelgen.errors import ModuleError
 

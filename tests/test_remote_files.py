@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
-from spelgen.emission.build import make_spec
+from spelgen.emission.specify import make_spec
 from spelgen.errors import LogError, SpelgenError
 from spelgen.files import local
 from spelgen.fitting.run_folder import RunFolder

@@ -11,7 +11,8 @@ from html_page import Page
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.design import PRESETS
-from spelgen.emission.build import build, make_spec
+from spelgen.emission.build import build
+from spelgen.emission.specify import make_spec
 from spelgen.errors import RunError
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.run_folder import RunFolder

@@ -46,9 +46,16 @@ class DriveFriction:
         dissipative: its product with v = C qd is not negative.
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
-        s = np.tanh(v / self.smoothing_velocity)
+        return self.torque(qd, np.tanh(v / self.smoothing_velocity))
+
+    def torque(self, qd: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Return the joint torque (..., n) at velocity qd (..., n), with the direction of dry friction given.
+
+        direction: (..., n) in [-1, 1], of the drives: s in the formula of `__call__`, or that of a friction state.
+        """
+        v = qd if self.speeds is None else qd @ self.speeds.T
         odd, even = self.forward - self.backward, self.forward + self.backward
-        torque: np.ndarray = self.viscous * v + 0.5 * s * (odd + s * even)
+        torque: np.ndarray = self.viscous * v + 0.5 * direction * (odd + direction * even)
         return torque if self.speeds is None else torque @ self.speeds
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import pi
 
 from spelgen.design import BRISTLE_REACH, SERVO_STRIBECK_ROUNDING
 from spelgen.emission.entry_sums import mean_mass
@@ -97,14 +96,17 @@ def _joint(joint: JointSpec) -> Call:
     fields |= {"friction": joint.friction, "armature": joint.armature}
     if joint.gear != 1:
         fields["gear"] = joint.gear
-    # what `Joint` of the runtime, which imports torch, computes from the limits
-    range_of_limits = (0.0, pi)
-    if joint.lower is not None and joint.upper is not None:
-        middle, half = (joint.lower + joint.upper) / 2, (joint.upper - joint.lower) / 2
-        range_of_limits = (float(f"{middle:.6g}"), float(f"{half:.6g}"))
-    if range_of_limits != (joint.center, joint.half_range):
+    if (joint.center, joint.half_range) != _range_of_limits(joint):
         fields["typical_range"] = (joint.center, joint.half_range)
     return call("Joint", joint.name, joint.joint_type, **fields)
+
+
+def _range_of_limits(joint: JointSpec) -> tuple[float, float] | None:
+    """Return center and half range of the limits, as `runtime.rows.Joint` rounds them; None without limits."""
+    if joint.lower is None or joint.upper is None:
+        return None
+    middle, half = (joint.lower + joint.upper) / 2, (joint.upper - joint.lower) / 2
+    return float(f"{middle:.6g}"), float(f"{half:.6g}")
 
 
 def _link(spec: ModelSpec, link: LinkSpec) -> Call:

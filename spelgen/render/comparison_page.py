@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from spelgen.comparison.figures import SimulatedFigures, true_mass
+from spelgen.comparison.figures import SimulatedFigures
 from spelgen.comparison.inputs import ArmInputs
 from spelgen.comparison.study import Study
 from spelgen.comparison.tables import ArmSection, comparison_sentence
 from spelgen.evaluation.plain import array
+from spelgen.evaluation.truth import true_mass
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.labels import counted, named_joints
@@ -67,10 +68,10 @@ def _curves(study: Study, section: ArmSection, inputs: ArmInputs, truth: Path) -
     prediction, mass = [], []
     if examples:
         prediction = trajectory_panels(examples, styles, named_joints(arm.joint_names, arm.joint_types))
-        learned = {name: array(first[name].mass) for name in examples}
+        learned = {name: figures.mass for name, figures in first.items() if figures.mass is not None}
         # all presets have the same test logs, and therefore the same example
         along = next(iter(examples.values()))
-        true = true_mass(truth, torch.from_numpy(along.q)).numpy()
+        true = true_mass(truth, torch.from_numpy(along.q), arm.joint_names).numpy()
         rows, columns = np.tril_indices(len(arm.joint_types))
         entries = {name: m[:, rows, columns].T for name, m in {"true": true, **learned}.items()}
         mass = mass_panels(along.t, entries, {"true": "truth", **styles}, arm.joint_types, width=400)
