@@ -88,7 +88,9 @@ class ServoProblem:
     def refined(self, steps: int, difference_step: float) -> ServoProblem:
         """Return the problem with other integration steps per sample interval and another finite-difference step."""
         windows = replace(self.rollouts.windows, steps=steps)
-        return replace(self, rollouts=replace(self.rollouts, windows=windows, difference_step=difference_step))
+        return replace(
+            self, rollouts=replace(self.rollouts, windows=windows, difference_step=difference_step)
+        )
 
     @property
     def parameters(self) -> ParameterMap:
