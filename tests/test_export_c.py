@@ -246,7 +246,7 @@ def test_bristles_follow_their_law_along_a_displacement():
 def test_c_carries_frictions_memory(tmp_path):
     """Two elements a joint: z turns dry friction, and long sliding bends it fully. NZ says how many numbers."""
     model = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
-    model = replace(model, reach=REACH, friction=model.friction._replace(bristle_fractions=FRACTIONS))
+    model = replace(model, breakaway=REACH, friction=model.friction._replace(bristle_fractions=FRACTIONS))
     functions = c_functions(model, ENTRIES)
     source = write_c(model, functions, tmp_path)
     assert "#define TWO_LINK_NZ 4" in source.with_suffix(".h").read_text()
