@@ -72,7 +72,7 @@ def c_texts(model: TrainedModel, functions: Sequence[CFunction]) -> dict[str, st
     """Return the texts of header and source, by suffix."""
     # the time is bounded: no branch depends on data
     longest = max(functions, key=lambda function: function.operations)
-    facts = [f"At most {longest.operations} operations, in {longest.entry.name}, without those of networks."]
+    facts = [f"At most {longest.operations} operations, in {longest.entry.name}, without networks."]
     if model.servos is not None:
         facts += wrap(
             f"Joints are under position servos: tau of {model.name}_servo_torque goes into forward_dynamics, with the "
@@ -135,7 +135,7 @@ def _c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -
 def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the variables of a C function and its statements, one per CasADi instruction.
 
-    The names of arrays are those of the inputs of `function`, and ``outputs``, row-major. Outputs are dense, so that
+    Arrays have the names of the inputs of `function` and of ``outputs``, and are row-major. Outputs are dense, so that
     each number is written once. A variable is a slot of CasADi's work vector, which is reused.
     """
     inputs = function.name_in()

@@ -51,8 +51,8 @@ class Residuals:
     """The residual terms of a model that are not zero.
 
     entries: row and column of the entries of M's lower triangle that ``mass`` is added to, one per output. potential:
-    is added to V, one output. torque, ripple: contributions to dV/dq [Nm, N], by joint. friction: logarithm of a factor
-    on the friction of a drive, by joint. Splines are cubic, and zero outside of their knots.
+    is added to V, one output. torque, ripple: contributions to dV/dq [Nm, N] per joint. friction: logarithm of a factor
+    on the friction of a drive, per joint. Splines are cubic, and zero outside of their knots.
     """
 
     entries: tuple[tuple[int, int], ...]

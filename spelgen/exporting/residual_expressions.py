@@ -101,7 +101,7 @@ def symbol_jacobians(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX,
 
 
 def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
-    """Return expressions for the symbols except those of derivatives, at q and qd (n, 1); qd: None if not needed."""
+    """Return expressions for the symbols, without derivatives, at q and qd (n, 1); qd: None if not needed."""
     residuals = model.residuals
     values: dict[str, ca.MX] = {}
     encoded = ca.vertcat(ca.cos(q), ca.sin(q), q)

@@ -2,7 +2,7 @@
 
 Bodies are expressed in the frames of their joints, whose z is the joint axis (Featherstone, Rigid Body Dynamics
 Algorithms, 2008, section 5.3, in the classical form of Khalil and Dombre, 2002, section 9.5). CasADi omits structural
-zeros: those of the geometry, and velocities of ``ca.SX(n, 1)``.
+zeros: of the geometry, and velocities of ``ca.SX(n, 1)``.
 """
 
 from __future__ import annotations

@@ -44,8 +44,8 @@ def without_small_dead_zones(problem: ServoProblem, x: ServoParameters) -> Servo
 def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, torch.Tensor]:
     """Minimize the cost of each joint over its own parameters; return the parameters and the costs, (n,).
 
-    These are n independent Levenberg-Marquardt solvers in one batch, each with its own damping and termination: with a
-    common damping the joint with the worst initial guess would slow down all others.
+    The n joints have independent Levenberg-Marquardt solvers in one batch, each with its own damping and termination:
+    with a common damping the joint with the worst initial guess would slow down all others.
     """
     errors = problem.residual(x)
     costs = problem.joint_costs(x, errors)

@@ -45,8 +45,8 @@ class Likelihood:
         # 1.4826 times the median of |error| is the standard deviation of a Gaussian; outliers do not change the median
         scale = torch.maximum(1.4826 * errors.abs().flatten(0, 1).median(dim=0).values, noise)
         robust = errors / (1 + (errors / scale).square() / 4)
-        # The variance of a sum over a block of m samples is m times that of a sample for independent errors, up to m^2
-        # times for equal ones: the ratio is the number of samples per independent error.
+        # The variance of a sum over a block of m samples is m times the variance of a sample for independent errors, up
+        # to m^2 times for equal ones: the ratio is the number of samples per independent error.
         size = min(max_samples, errors.shape[1])
         blocks = robust[:, : errors.shape[1] // size * size].unflatten(1, (-1, size))
         of_sums = blocks.sum(dim=2).square().mean(dim=(0, 1))
@@ -125,7 +125,7 @@ class ServoProblem:
         return self.with_prior(self.window_equations(x, errors), x)
 
     def with_prior(self, windows: NormalEquations, x: ServoParameters) -> NormalEquations:
-        """Return the sum of normal equations of windows (W, k, k), (W, k), plus those of the prior at x."""
+        """Return the sum of normal equations of windows (W, k, k), (W, k), plus normal equations of the prior at x."""
         precision = self.parameters.precision(x)
         descent = windows.descent.sum(dim=0) - precision * (x.flat - self.parameters.prior_mean.flat)
         return NormalEquations(windows.curvature.sum(dim=0) + torch.diag(precision), descent)

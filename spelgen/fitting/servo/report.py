@@ -79,7 +79,7 @@ class ServoSolution:
 def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, ServoSolution]:
     """Return the parameters after one more step from x, and the solution there.
 
-    x: of a fit with longer integration steps than those of `problem`. The step, the effect of the integration error, is
+    x: of a fit with longer integration steps than in `problem`. The step, the effect of the integration error, is
     added to the covariance. The parameters remain x if the step raises the cost.
     """
     # dead zones of all joints: fixed at zero, they would make dry friction seem better determined
@@ -113,13 +113,12 @@ def covariance(blocks: NormalEquations, precision: torch.Tensor, change: torch.T
     J is the jackknife covariance of the steps without each block, and S the Hessian of all blocks and the prior.
 
     Args:
-        blocks: normal equations of B blocks, (B, k, k) and (B, k), with gradients that add up to that of the prior.
-        precision: P of the prior, (k,).
-        change: d (k,), change of the parameters by half the integration step.
+        blocks: normal equations of B blocks, (B, k, k) and (B, k), with gradients that balance the gradient of the
+        prior. precision: P of the prior, (k,). change: d (k,), change of the parameters by half the integration step.
     """
     count, prior = len(blocks.curvature), torch.diag(precision)
     hessian = blocks.curvature.sum(dim=0) + prior
-    # Newton steps without each block: its gradient is minus that of all others
+    # Newton steps without each block: its gradient is minus the sum of all others
     shifts = torch.linalg.solve(hessian - blocks.curvature, -blocks.descent.unsqueeze(-1)).squeeze(-1)
     shifts = shifts - shifts.mean(dim=0)
     inverse = torch.linalg.inv(hessian)
@@ -129,7 +128,7 @@ def covariance(blocks: NormalEquations, precision: torch.Tensor, change: torch.T
 
 
 def identifiable(blocks: NormalEquations, precision: torch.Tensor, indices: torch.Tensor) -> torch.Tensor:
-    """Return whether the logs distinguish parameters from all others, by their variance inflation factors, (m,).
+    """Test by variance inflation factors if the logs distinguish parameters from all others; return (m,) booleans.
 
     Derivatives of the errors with respect to a dead zone and to dry friction are proportional at joints without gravity
     load: a linear approximation cannot separate the two.

@@ -26,7 +26,7 @@ class ServoRollouts:
 
     The load is computed once, for parameters x0: a change of the body parameters adds regressor (phi(x) - phi(x0)),
     with the inertial parameters phi. Since joints are independent, one rollout in which a parameter is changed at all
-    joints gives the derivatives of all joints; parameters that joints share, those of the bodies and the delay, need
+    joints gives the derivatives of all joints; parameters that joints share (body parameters, delay) need
     one rollout each. All of them are one batch.
 
     motion, load, inertial: the fixed motion, the load, and phi(x0) (10 B,). difference_step: of finite differences.

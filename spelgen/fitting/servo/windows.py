@@ -84,7 +84,7 @@ class ServoWindows:
     def motion(self, q: torch.Tensor | None = None, qd: torch.Tensor | None = None) -> MidpointMotion:
         """Return the measured motion between samples.
 
-        Derivatives are those of a prediction q, qd (W, K, n), if there is one, plus the smoothed derivatives of
+        The derivatives of a prediction q, qd (W, K, n), if there is one, are used, plus smoothed derivatives of
         measured minus predicted positions: smoothing then does not attenuate fast motion that is predicted.
         """
         if q is None or qd is None:
