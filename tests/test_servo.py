@@ -101,7 +101,7 @@ def test_a_module_of_servos_stands_alone_and_says_so(arm, tmp_path):
         assert float(model.servo.stored_energy(u, q)) == pytest.approx(0.5 * 12.0 * 0.04)
         far = model.servo(u + 9, q, torch.zeros_like(q))
     assert far.tolist() == [[6.0, 6.0]]  # the URDF's effort
-    assert "in ratio to kp only" in " ".join(arm.inspect().text().split())
+    assert "in ratio to kp only" in " ".join(spelgen.inspect(arm).text().split())
 
 
 def test_within_its_dead_zone_a_servo_gives_nothing(arm):
