@@ -25,7 +25,8 @@ FILE = re.compile(r"`((?:[a-z][a-z_]*/)+(?:[a-z][a-z_]*(?:\.[a-z]+)+)?)(?:::\w+)
 BLOCK = re.compile(r"^```(console|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CELL = re.compile(r"^```python\n(.*?)^```\n(?:\n```output\n(.*?)^```\n)?", re.MULTILINE | re.DOTALL)
 HISTORY = re.compile(
-    r"\b(?:formerly|the former (?:fit|version|code|release|graph)|previously|no longer|used to|until release|earlier release|not taken|was tried)\b",
+    r"\b(?:formerly|the former (?:fit|version|code|release|graph)|previously|no longer|used to|until release"
+    r"|earlier release|not taken|was tried)\b",
     re.IGNORECASE,
 )
 SLOW = {"tutorial_servo.md"}  # a fit of half a minute: only `pytest --update` runs it
