@@ -198,7 +198,7 @@ def fit_position_actuators(arm: ConfiguredArm, windows: ServoWindows, trained: A
     is_known = trained.servo.trained.numpy() == 0
     untrained = spelgen.build(arm, "closed-form").requires_grad_(False)
     initial = PositionActuators(arm.arm, untrained, start, np.zeros(n), float(trained.servo.delay))
-    steps = max(steps_between(log, FIT_STEP) for log, _ in windows.parts)
+    steps = max(steps_between(log, FIT_STEP) for log, _ in windows.rows)
     windows = replace(windows, steps=steps)
     q, qd = windows.q.numpy(), windows.qd.numpy()
 
@@ -216,7 +216,7 @@ def fit_position_actuators(arm: ConfiguredArm, windows: ServoWindows, trained: A
         model.opt.timestep = 1 / windows.rate / steps
         commands = windows.commands(candidate.delay).numpy() + candidate.offset
         error = _positions(model, q[:, 0], qd[:, 0], commands) - q[:, 1:]
-        return error[:, windows.settling :].ravel()
+        return error[:, windows.burn_in :].ravel()
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.stack([errors(column) for column in x.T], axis=1)

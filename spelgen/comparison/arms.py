@@ -115,5 +115,7 @@ def _missing_files(comparison: Comparison, document: Document) -> Iterator[Setti
                 yield _error(document, ("arms", name, key), f"no such file: {file}", "check the path")
 
 
-def _error(document: Document, place: Location, got: str, do: str) -> SettingsError:
-    return SettingsError(got, file=document.path, line=document.line(place), element=dotted(place), do=do)
+def _error(document: Document, location: Location, got: str, do: str) -> SettingsError:
+    return SettingsError(
+        got, file=document.path, line=document.line(location), element=dotted(location), do=do
+    )
