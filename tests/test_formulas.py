@@ -100,9 +100,9 @@ def test_sympy_proves_each_expression(robot):
     generators = [function for q in found.q for function in (sympy.sin(q), sympy.cos(q), q)]
     circles = [sympy.cos(q) ** 2 + sympy.sin(q) ** 2 - 1 for q in found.q]
     for row in found.rows:
-        element = expansion.written.potential
+        element = expansion.energies.potential
         if row.entry != "V":
-            element = expansion.written.mass[row.entry[0] - 1, row.entry[1] - 1]
+            element = expansion.energies.mass[row.entry[0] - 1, row.entry[1] - 1]
         expanded = sympy.Integer(0)
         for each in found.base:
             polynomial = expansion.polynomial(element, each.index, Budget(10**6))

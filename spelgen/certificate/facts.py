@@ -13,10 +13,10 @@ from spelgen.arm.arm import Arm
 from spelgen.certificate import reasons
 from spelgen.certificate.axes import Axes, is_plain
 from spelgen.labels import axes_told, entry_name, joints_told, listed
-from spelgen.structure.structure import Entry, Structure
+from spelgen.structure.structure import MassEntry, Structure
 
 Reason = str | None
-EntryReason = Callable[[Axes, Structure, Entry], Reason]
+EntryReason = Callable[[Axes, Structure, MassEntry], Reason]
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class _Words:
         self, kind: str, why: EntryReason, statement: str, means_one: str, means_several: str
     ) -> Iterator[Fact]:
         """Yield what holds of the entries of this kind; those with one reason make one sentence."""
-        groups: dict[Reason, list[Entry]] = {}
+        groups: dict[Reason, list[MassEntry]] = {}
         for entry in self.structure.entries:
             if entry.kind == kind:
                 groups.setdefault(self._reason(why, entry), []).append(entry)

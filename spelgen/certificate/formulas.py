@@ -218,9 +218,9 @@ class _Writer:
 
     def _polynomials(self, entry: Entry, budget: Budget) -> dict[str, fmpq_mpoly]:
         """Return by what each base parameter is multiplied, without the constant part of V. Raises TooLarge."""
-        element = self._expansion.written.potential
+        element = self._expansion.energies.potential
         if entry != "V":
-            element = self._expansion.written.mass[entry[0] - 1, entry[1] - 1]
+            element = self._expansion.energies.mass[entry[0] - 1, entry[1] - 1]
         polynomials = {}
         total = self._expansion.context.from_dict({})
         for base in self.base:

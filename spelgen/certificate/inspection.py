@@ -18,7 +18,7 @@ from spelgen.errors import Diagnostic
 from spelgen.labels import counted, joint_ranges, joints_in_ranges, printable, short_name
 from spelgen.listing import WIDTH, Listing
 from spelgen.structure.servo_rank import servo_rank
-from spelgen.structure.structure import Entry, Structure, derive
+from spelgen.structure.structure import MassEntry, Structure, derive
 from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:  # SymPy is read in only for formulas
@@ -109,7 +109,7 @@ class Inspection:
     def _names(self, joints: Iterable[int]) -> list[str]:
         return [self.structure.joints[joint] for joint in joints]
 
-    def _entry(self, entry: Entry) -> dict[str, object]:
+    def _entry(self, entry: MassEntry) -> dict[str, object]:
         return {
             "row": entry.row + 1,
             "col": entry.column + 1,

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 
 from spelgen.certificate.axes import Axes
 from spelgen.labels import axes_told, entry_name, joints_told
-from spelgen.structure.structure import Entry, Structure
+from spelgen.structure.structure import MassEntry, Structure
 
 
-def zero_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None:
+def zero_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str | None:
     """Return why ``entry`` is zero."""
     later, earlier = entry.row, entry.column
     slider = later if axes.slides[later] else earlier
@@ -25,7 +25,7 @@ def zero_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None:
     return balance_reason(axes, structure, entry)
 
 
-def constant_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None:
+def constant_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str | None:
     """Return why ``entry`` is constant."""
     later, earlier = entry.row, entry.column
     if later == earlier:
@@ -60,7 +60,7 @@ def _diagonal_reason(axes: Axes, structure: Structure, joint: int) -> str | None
     return None
 
 
-def balance_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None:
+def balance_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str | None:
     """Return why an entry of a balanced last body is what it is: it is Izz times the cosine between the axes."""
     last, other = len(structure.joints) - 1, entry.column
     if structure.assume != "inertials" or not axes.balanced or entry.row != last:

@@ -117,7 +117,7 @@ def _smallest_form(structure: Structure, samples: NumericSamples) -> _Fact:
     remainder = samples.mass
     sizes = []
     for term in (*structure.outputs, *structure.constants):
-        reads = row_of(term.reads, n)
+        reads = row_of(term.functional, n)
         values = samples.mass @ (reads * samples.scale)
         remainder = remainder - values[..., None] * row_of(term.basis, n) / samples.scale
         # relative to what the sum would be if nothing cancelled

@@ -88,7 +88,7 @@ def plan_model(
         constants=constants,
         potential=potential,
         potential_scale=sizes.potential_scale,
-        margin=float(f"{max(TUNING.margin * sizes.least_eigenvalue, 1e-4):.0e}"),
+        margin=float(f"{max(TUNING.margin * sizes.min_eigenvalue, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
         links=links,
         inputs=tuple(inputs),
