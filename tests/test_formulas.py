@@ -18,8 +18,7 @@ from random_arms import arms
 
 from spelgen.arm.arm import make_arm
 from spelgen.arm.configured_arm import load_arm
-from spelgen.certificate.formula_files import latex, sympy_source
-from spelgen.certificate.formula_text import text
+from spelgen.certificate.formula_files import latex, sympy_source, text
 from spelgen.certificate.formulas import WRITABLE, formulas
 from spelgen.certificate.numeric_samples import with_random_inertias
 from spelgen.files import write_text

@@ -26,7 +26,7 @@ def page(
     """
     text = None
     if closed:  # SymPy is read in only for formulas
-        from spelgen.certificate.formula_text import text as written
+        from spelgen.certificate.formula_files import text as written
 
         text = written(closed, width=100)
     return render_page(

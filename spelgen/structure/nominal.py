@@ -26,8 +26,8 @@ _DIGITS = 6
 class Nominal:
     """Means and standard deviations over the workspace, rounded to six digits for reproducibility across machines.
 
-    ``output_*``: per output of the structure. ``constant*``: per constant. Others: per coordinate. ``joint_torque``: root
-    mean square of the gravity torque and of the diagonal of M times unit acceleration [Nm, N].
+    ``output_*``: per output of the structure. ``constant*``: per constant. Others: per coordinate.
+    ``joint_torque``: root mean square of the gravity torque and of the diagonal of M times unit acceleration [Nm, N].
     """
 
     output_means: tuple[float, ...]
