@@ -117,8 +117,8 @@ class Axes:
 def _configuration(arm: Arm, generator: random.Random) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return axes, n times (3,), and twists, n times (6,), of the joints in the root frame, at a random configuration.
 
-    A twist is the velocity of a body for a unit rate: linear velocity (3,) at the origin of the root frame, then angular
-    velocity (3,). All numbers are rational.
+    A twist is the velocity of a body for a unit rate: linear velocity (3,) at the origin of the root frame, then
+    angular velocity (3,). All numbers are rational.
     """
     axes, twists = [], []
     rotation, origin = IDENTITY, ZERO

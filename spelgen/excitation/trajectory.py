@@ -16,7 +16,7 @@ from torch import Tensor
 from spelgen.arm.arm import Arm
 from spelgen.errors import ArmError, SpelgenError, collect
 from spelgen.excitation.tuning import TUNING
-from spelgen.urdf.robot import Joint
+from spelgen.urdf.robot import UrdfJoint
 
 BETWEEN = cos(pi / TUNING.grid)  # of a series' largest value, what a grid shows at least
 # where the URDF names no limit, and for endless joints: [rad/s, m/s], and [rad, m] to both sides of 0
@@ -34,7 +34,7 @@ class MotionBounds:
 
 
 def motion_bounds(
-    arm: Arm, reach: float, speed: float, joints: Mapping[str, Joint] | None = None
+    arm: Arm, reach: float, speed: float, joints: Mapping[str, UrdfJoint] | None = None
 ) -> MotionBounds:
     """Return the arm's limits, of the range the middle part `reach`, of the velocity limits the part `speed`.
 

@@ -50,7 +50,7 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
     rng = np.random.default_rng(0)
     ranges = list(map(working_range, arm.coordinates))
     q = np.stack([rng.uniform(lower, upper, TUNING.points) for lower, upper in ranges], axis=-1)
-    from_urdf = arm.has_inertials and _gives_usable_mass(arm, q)
+    from_urdf = arm.inertials_complete and _gives_usable_mass(arm, q)
     inertias = nominal_inertias(arm, from_urdf)
     # Averages over the workspace: at zero position many couplings vanish.
     mass, potential = float_energies(arm, q, inertias)

@@ -62,7 +62,7 @@ class Structure:
 @lru_cache(maxsize=16)  # the same arm is often used with several settings or logs
 def derive(arm: Arm, assume: Assume = "kinematics") -> Structure:
     """Return the structure of ``arm``. Raises ArmError for ``inertials`` if a body has no inertial values."""
-    if assume == "inertials" and not arm.has_inertials:
+    if assume == "inertials" and not arm.inertials_complete:
         raise ArmError(
             "links without inertial values",
             expected="an <inertial> on every moving body",
