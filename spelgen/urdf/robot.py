@@ -16,7 +16,7 @@ Assume = Literal["kinematics", "inertials"]
 """Values of the URDF that determine the structure: the kinematics, or also zeros and symmetries of inertials."""
 
 MOVING = ("revolute", "continuous", "prismatic")
-"""UrdfJoint types with one degree of freedom."""
+"""Types of joints with one degree of freedom."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Mimic:
 class UrdfJoint:
     """A joint at ``xyz`` [m] and ``rpy`` [rad] in the frame of the parent link; ``axis`` is in the frame of the joint.
 
-    Limits are in rad or m, N m or N, and per second, None if absent; ``axis`` is not normalised, and (1, 0, 0) if absent.
+    Limits are in rad or m, N m or N, and per second, None if absent. ``axis`` is not normalised; (1, 0, 0) if absent.
     """
 
     name: str

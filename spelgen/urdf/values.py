@@ -45,7 +45,7 @@ class Notes:
 
 
 def first_child(notes: Notes, element: etree._Element, tag: str, where: str) -> etree._Element | None:
-    """Return the first child with this tag, or None; a warning reports repeated ones, which parsers treat differently."""
+    """Return the first child with this tag, or None; repeated ones, which parsers treat differently, are reported."""
     children = element.findall(tag)
     if len(children) > 1:
         message = f"{len(children)} <{tag}> elements: the first is taken, the others are ignored"
@@ -87,7 +87,7 @@ def _parsed(
 ) -> list[float] | None:
     """Return ``count`` finite numbers; None, with an error, for other text.
 
-    bounded: whether magnitudes are at most MAX_MAGNITUDE; limits of joints, which may mean "unlimited", are not bounded.
+    bounded: whether magnitudes are at most MAX_MAGNITUDE; not for limits of joints, which may mean "unlimited".
     """
     if "${" in text or "$(" in text:
         note_unexpanded(notes, element, where, text)
