@@ -1,7 +1,7 @@
 """spelgen: a URDF in, a PyTorch model of the arm's dynamics with its exact structure out."""
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from spelgen.version import __version__
 
@@ -112,9 +112,9 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name in _HOME:
-        return getattr(import_module(f"spelgen.{_HOME[name]}"), name)
+        return vars(import_module(f"spelgen.{_HOME[name]}"))[name]
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -164,7 +164,7 @@ class ModelSpec:
     margin: float
     """Smallest eigenvalue of M relative to the nominal mean of M, below which M is corrected."""
     started_from_urdf: bool
-    """Whether initial inertial parameters are those of the URDF."""
+    """Whether the initial inertial parameters are from the URDF."""
     links: tuple[LinkSpec, ...] = ()
     """Of a model of rigid bodies."""
     inputs: tuple[InputSpec, ...] = ()

@@ -12,8 +12,8 @@ from spelgen.arm.rational import Vector
 from spelgen.spec import LinkSpec, Triple
 from spelgen.structure.pseudo_inertia import parameters_of, pseudo_inertia, reference_factor
 
-# Significant digits of inertial parameters: more than any URDF is accurate to, and few enough that the decimals of a
-# URDF come out as they are written there.
+# Significant digits of inertial parameters: more than the accuracy of a URDF, and few enough to reproduce the decimals
+# of the URDF.
 DIGITS = 12
 # Smallest second moment of mass about the center of mass, relative to the largest: above the error of rounding.
 THIN = 1e-10
@@ -22,7 +22,7 @@ LIGHT = 0.01
 
 
 def link_specs(arm: Arm, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[LinkSpec, ...]:
-    """Return the links of ``arm`` with these inertial parameters, the nearest physically consistent ones if necessary.
+    """Return the links of ``arm`` with these inertial parameters, made physically consistent if necessary.
 
     Args:
         arm: the arm.
@@ -68,14 +68,14 @@ def _consistent(
     pseudo = factor @ factor.T
     mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
     moments = pseudo[:3, :3] - mass * np.outer(center, center)
-    # below it, rounding of the digits could make the body inconsistent
+    # With smaller moments, rounding to DIGITS could make the body inconsistent.
     values, vectors = np.linalg.eigh(moments)
     pseudo[:3, :3] += (vectors * (np.maximum(values, 2 * THIN * values[-1]) - values)) @ vectors.T
     return _rounded(parameters_of(pseudo), DIGITS)
 
 
 def _smallest_moment(ten: np.ndarray) -> float:
-    """Return the smallest second moment of mass about the center of mass, relative to the largest."""
+    """Return the smallest second moment of mass about the center of mass, relative to the largest, of ten (10,)."""
     center = ten[1:4] / ten[0]
     moments = np.linalg.eigvalsh(pseudo_inertia(ten)[:3, :3] - ten[0] * np.outer(center, center))
     return float(moments[0] / moments[-1]) if moments[-1] > 0 else 0.0
@@ -84,11 +84,11 @@ def _smallest_moment(ten: np.ndarray) -> float:
 def _about_center(
     ten: Sequence[Fraction | float],
 ) -> tuple[float, Triple, tuple[float, float, float, float, float, float]]:
-    """Return mass, center of mass, and inertia about the center of mass, rounded; exact before."""
+    """Return mass, center of mass, and inertia about the center of mass: computed exactly, then rounded."""
     m, hx, hy, hz, *tensor = [Fraction(value) for value in ten]
     x, y, z = hx / m, hy / m, hz / m
     steiner = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
-    inertia = [value - m * part for value, part in zip(tensor, steiner, strict=True)]
+    inertia = [value - m * square for value, square in zip(tensor, steiner, strict=True)]
     # rounding errors of an inertia that was made consistent
     noise = max(map(abs, inertia)) / 10 ** (DIGITS + 3)
     inertia = [value if abs(value) > noise else Fraction(0) for value in inertia]

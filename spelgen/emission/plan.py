@@ -1,4 +1,4 @@
-"""Structure and nominal sizes -> ModelSpec: the decisions that the emitted module then merely spells out."""
+"""Structure and nominal values -> ModelSpec."""
 
 from __future__ import annotations
 
@@ -43,10 +43,16 @@ def plan_model(
     drives: Mapping[str, JointSettings] | None = None,
     servos: bool = False,
 ) -> ModelSpec:
-    """The model of ``arm`` under ``options``; ``urdf`` is the file's name without its folder.
+    """Return the specification of the model of an arm.
 
-    ``drives``: what is known of the joints' motors and gears; where no rotor inertia is, one is guessed.
-    ``servos``: whether positions are commanded. Raises SettingsError where the design has no friction that remembers.
+    Args:
+        arm, structure, actuation: the arm, its structure, and its input matrix.
+        options: of `spelgen build`.
+        urdf, urdf_sha256: name of the file without its folder, and its digest.
+        drives: settings of motors and gears by the name of the joint; an absent rotor inertia is estimated.
+        servos: whether inputs are commanded positions.
+
+    Raises SettingsError for servos with a design without bristle friction.
     """
     design = load_design(options.design or options.preset)
     if servos and design.memory == "none":
@@ -98,7 +104,7 @@ def plan_model(
 
 
 def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[OutputSpec, ...]:
-    """The functions of M, each with the joints that it reads, its mean and its scale."""
+    """Return the functions of M, each with the joints that it depends on, its mean and its scale."""
     outputs = []
     for output, mean, scale in zip(structure.outputs, sizes.output_means, sizes.output_scales, strict=True):
         joints = output.joints
@@ -109,17 +115,13 @@ def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[Outp
 
 
 def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]:
-    """The constants of M, each with its start and its unit."""
-    constants = []
-    for constant, start, scale in zip(
-        structure.constants, sizes.constants, sizes.constant_scales, strict=True
-    ):
-        constants.append(ConstantSpec(_floats(constant.basis), start, scale))
-    return tuple(constants)
+    """Return the constants of M, each with its initial value and its scale."""
+    values = zip(structure.constants, sizes.constants, sizes.constant_scales, strict=True)
+    return tuple(ConstantSpec(_floats(constant.basis), initial, scale) for constant, initial, scale in values)
 
 
 def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
-    """Return C, by which motors' speeds are C qd; empty where each motor moves its own joint alone."""
+    """Return C, with which the motors rotate at C qd; empty if each motor moves its own joint only."""
     speeds = actuation.drives().speeds
     if np.array_equal(speeds, np.eye(actuation.joints)):
         return ()
@@ -133,7 +135,7 @@ def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSetti
         lower = upper = None
     lower, upper = (None if x is None or not isfinite(x) else float(f"{x:.6g}") for x in (lower, upper))
     if not speed or speed > TUNING.largest_speed:
-        speed = TUNING.usual_turning if coordinate.kind == "revolute" else TUNING.usual_sliding
+        speed = TUNING.angular_speed if coordinate.kind == "revolute" else TUNING.linear_speed
     return JointSpec(
         name=coordinate.name,
         joint_type=coordinate.kind,
@@ -151,7 +153,7 @@ def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSetti
 
 
 def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
-    """The servo of a joint: one that nothing is known of gives its full effort half a unit from its command."""
+    """Return the servo of a joint; an unknown servo has its full effort at half a unit from its command."""
     effort = coordinate.effort
     if not effort or effort > TUNING.largest_effort:
         effort = None
@@ -160,7 +162,7 @@ def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
 
 
 def _guessed_armature(coordinate: Coordinate) -> float:
-    """Return a geared drive's own inertia: its full effort takes ``rise`` seconds to its full speed."""
+    """Return an estimate of the armature: the full effort accelerates it to full speed in ``rise`` seconds."""
     effort, speed = coordinate.effort, coordinate.velocity
     if not effort or not speed or effort > TUNING.largest_effort or speed > TUNING.largest_speed:
         return 0.0
@@ -168,21 +170,20 @@ def _guessed_armature(coordinate: Coordinate) -> float:
 
 
 def _friction(coordinate: Coordinate, sizes: Nominal, index: int) -> float:
-    """Return the size of friction to start from [Nm, N].
+    """Return the initial friction torque [Nm, N].
 
-    It is a share of the drive's effort where the URDF names a plausible one, or of the torques that the nominal arm
-    needs.
+    It is a fraction of the effort in the URDF if plausible, else of the torque of the nominal arm.
     """
     if coordinate.effort and coordinate.effort <= TUNING.largest_effort:
         return TUNING.friction_of_effort * coordinate.effort
-    # a wrist may need next to no torque by itself, but its gear rubs like its neighbour's
+    # The torque of a wrist may be negligible, but the friction of its gear is similar to the friction of other gears.
     return TUNING.friction_of_torque * max(sizes.joint_torque[index], 0.01 * max(sizes.joint_torque))
 
 
 def _with_armature(joints: Sequence[JointSpec], mass: np.ndarray) -> list[JointSpec]:
     """Return the joints with a small armature for drives without data, from the diagonal of M (n,)."""
-    initial = [float(f"{TUNING.least_armature * value:.3g}") for value in mass]
-    return [replace(x, armature=x.armature or least) for x, least in zip(joints, initial, strict=True)]
+    initial = [float(f"{TUNING.min_armature * value:.3g}") for value in mass]
+    return [replace(x, armature=x.armature or value) for x, value in zip(joints, initial, strict=True)]
 
 
 def _floats(weights: Weights) -> Entries:
