@@ -15,10 +15,9 @@ from typing import Literal
 
 from spelgen.design import Design
 from spelgen.errors import ModuleError, SettingsError
-from spelgen.urdf.robot import Assume
+from spelgen.urdf.robot import Assume, JointType
 
 Kind = Literal["zero", "constant", "varying"]
-JointType = Literal["revolute", "prismatic"]
 Triple = tuple[float, float, float]
 Entries = tuple[tuple[int, int, float], ...]
 """A sparse symmetric matrix by its lower triangle: (row, column, value), from 0."""

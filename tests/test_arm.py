@@ -176,7 +176,12 @@ class TestCoordinates:
         dynamics = '<dynamics damping="0.5" friction="0.25"/>'
         arm = make_arm(robot(joint("a", "0", "1", "continuous", inside=dynamics), joint("b", "1", "2")))
         first, second = arm.coordinates
-        assert (first.kind, first.continuous, first.lower, first.effort) == ("revolute", True, None, 3.0)
+        assert (first.joint_type, first.continuous, first.lower, first.effort) == (
+            "revolute",
+            True,
+            None,
+            3.0,
+        )
         assert (first.damping, first.friction, first.passive) == (0.5, 0.25, False)
         assert (second.continuous, second.lower, second.upper, second.velocity) == (False, -1.0, 2.0, 4.0)
 
@@ -400,7 +405,7 @@ class Ours:
     def __init__(self, arm):
         self.model = pin.Model()
         for body in arm.bodies:
-            kind = pin.JointModelRZ() if body.kind == "revolute" else pin.JointModelPZ()
+            kind = pin.JointModelRZ() if body.joint_type == "revolute" else pin.JointModelPZ()
             pose = pin.SE3(np.array(body.rotation, dtype=float), np.array(body.translation, dtype=float))
             index = self.model.addJoint(body.parent + 1, kind, pose, body.name)
             if body.inertia is not None:

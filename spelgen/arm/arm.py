@@ -6,16 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import pi
-from typing import Literal
 
 from spelgen.arm.chain import Chain, choose_chain, leaders
 from spelgen.arm.lump_links import MovingJoint, lump_links
 from spelgen.arm.placement import TenVector
 from spelgen.arm.rational import Matrix, Vector, as_matrix, as_vector, exact
 from spelgen.errors import ArmError, Diagnostic
-from spelgen.urdf.robot import Robot, UrdfJoint
-
-Kind = Literal["revolute", "prismatic"]
+from spelgen.urdf.robot import JointType, Robot, UrdfJoint
 
 # Largest number of joints: the cost of the derivation increases with about the fifth power.
 MAX_JOINTS = 16
@@ -28,7 +25,7 @@ class Coordinate:
     """A degree of freedom; limits as in the file (rad or m, N m or N, per second), None if absent."""
 
     name: str
-    kind: Kind
+    joint_type: JointType
     continuous: bool
     lower: float | None
     upper: float | None
@@ -59,7 +56,7 @@ class Body:
 
     name: str
     link: str
-    kind: Kind
+    joint_type: JointType
     parent: int
     coordinate: int
     multiplier: Fraction
@@ -90,9 +87,9 @@ class Arm:
         return tuple(coordinate.name for coordinate in self.coordinates)
 
     @property
-    def joint_types(self) -> tuple[Kind, ...]:
+    def joint_types(self) -> tuple[JointType, ...]:
         """Types of the coordinates."""
-        return tuple(coordinate.kind for coordinate in self.coordinates)
+        return tuple(coordinate.joint_type for coordinate in self.coordinates)
 
     @property
     def inertials_complete(self) -> bool:
@@ -159,7 +156,7 @@ def _body(moved: MovingJoint, coordinate: int) -> Body:
     return Body(
         name=moved.joint.name,
         link=moved.joint.child,
-        kind=_kind(moved.joint),
+        joint_type=_joint_type(moved.joint),
         parent=moved.pose.parent,
         coordinate=coordinate,
         multiplier=moved.followed.multiplier,
@@ -173,7 +170,7 @@ def _body(moved: MovingJoint, coordinate: int) -> Body:
 def _coordinate(joint: UrdfJoint) -> Coordinate:
     return Coordinate(
         name=joint.name,
-        kind=_kind(joint),
+        joint_type=_joint_type(joint),
         continuous=joint.type == "continuous",
         lower=joint.lower,
         upper=joint.upper,
@@ -185,7 +182,7 @@ def _coordinate(joint: UrdfJoint) -> Coordinate:
     )
 
 
-def _kind(joint: UrdfJoint) -> Kind:
+def _joint_type(joint: UrdfJoint) -> JointType:
     if joint.type == "prismatic":
         return "prismatic"
     return "revolute"

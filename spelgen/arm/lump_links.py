@@ -44,7 +44,9 @@ def lump_links(robot: Robot, chain: Chain, angle_tolerance: float) -> LumpedLink
     following = leaders(robot)
     poses: list[tuple[UrdfJoint, Pose]] = []
     locked: list[UrdfJoint] = []
-    for joint in _chain_first(robot, chain):
+    # bodies have this order: parents first, and the chain before followers on branches
+    path = robot.path_to(chain.joints[-1].child)
+    for joint in dict.fromkeys([*path, *robot.joints_from_root]):
         followed = following[joint.name]
         if joint.moves and followed.leader.name in chain.names and followed.multiplier:
             poses.append((joint, placement.move(joint)))
@@ -66,13 +68,6 @@ def lump_links(robot: Robot, chain: Chain, angle_tolerance: float) -> LumpedLink
     ]
     diagnostics.sort(key=lambda diagnostic: diagnostic.line or 0)
     return LumpedLinks(tuple(moved), tuple(locked), placement.frames, tuple(diagnostics))
-
-
-def _chain_first(robot: Robot, chain: Chain) -> list[UrdfJoint]:
-    """Return all joints, parents first, and the joints from the root to the tip of the chain before all others."""
-    path = robot.path_to(chain.joints[-1].child)
-    # bodies are numbered in this order
-    return list(dict.fromkeys([*path, *robot.joints_from_root]))
 
 
 def _lumps(robot: Robot, placement: Placement, count: int) -> list[list[UrdfLink]]:

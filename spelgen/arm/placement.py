@@ -66,7 +66,8 @@ class Placement:
         """Add the child of a joint that is locked at ``value`` [rad, m]."""
         frame = self._joint_origin(joint)
         if value and joint.type == "prismatic":
-            frame = self._slid(frame, self._rounding.axis(joint), value)
+            axis = np.array(list(map(exact, self._rounding.axis(joint).tolist())))
+            frame = self._turned(frame, self._offset(frame, exact(value) * axis), None)
         elif value:
             turn = rotation_about(self._rounding.axis(joint), self._rounding.angle(value))
             frame = self._turned(frame, frame.position, turn)
@@ -113,11 +114,6 @@ class Placement:
     def _offset(self, frame: Frame, offset: np.ndarray) -> np.ndarray:
         """Return the position (3,) [m] at ``offset`` (3,) in ``frame``, in the frame of the body."""
         return self._rounding.position(frame.position + frame.rotation @ offset)
-
-    def _slid(self, frame: Frame, axis: np.ndarray, value: float) -> Frame:
-        """Return ``frame`` translated by ``value`` [m] along a unit vector (3,)."""
-        position = self._offset(frame, exact(value) * np.array(list(map(exact, axis.tolist()))))
-        return Frame(frame.body, frame.composed, frame.rotation, position)
 
     def _turned(self, frame: Frame, position: np.ndarray, turn: np.ndarray | None) -> Frame:
         """Return ``frame`` rotated by ``turn`` (3, 3), if not None, with its origin at ``position`` (3,)."""

@@ -103,7 +103,7 @@ class Axes:
     @cached_property
     def _last_inertia(self) -> Sequence[Fraction]:
         body = self.arm.bodies[-1]
-        if body.inertia is not None and body.kind == "revolute":
+        if body.inertia is not None and body.joint_type == "revolute":
             return body.inertia
         # For a prismatic joint no test of balance applies: ones are neither centred nor balanced.
         return (Fraction(1),) * 10
@@ -128,7 +128,7 @@ def _configuration(arm: Arm, generator: random.Random) -> tuple[list[np.ndarray]
         axis = rotation[:, 2]
         axes.append(axis)
         t = Fraction(generator.randrange(1, _GRID), generator.randrange(1, _GRID))
-        if body.kind == "prismatic":
+        if body.joint_type == "prismatic":
             twists.append(np.concatenate([axis, ZERO]))
             origin = origin + t * axis
         else:

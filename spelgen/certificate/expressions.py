@@ -87,7 +87,7 @@ def parallel_runs(arm: Arm) -> list[list[int]]:
 
     If bodies share coordinates (mimic joints), each coordinate is its own group.
     """
-    turning = sorted({body.coordinate for body in arm.bodies if body.kind == "revolute"})
+    turning = sorted({body.coordinate for body in arm.bodies if body.joint_type == "revolute"})
     if not is_plain(arm):
         return [[joint] for joint in turning]
     axes = Axes(arm)

@@ -15,13 +15,7 @@ from flint import fmpq_mpoly
 from sympy import Expr, Integer, Matrix, Rational, Symbol
 
 from spelgen.arm.arm import Arm
-from spelgen.certificate.expressions import (
-    PolynomialWriter,
-    coordinate,
-    grouped,
-    parameter,
-    weighted_sum,
-)
+from spelgen.certificate.expressions import PolynomialWriter, coordinate, grouped, parameter, weighted_sum
 from spelgen.certificate.printing import latex
 from spelgen.certificate.tuning import TUNING
 from spelgen.errors import SpelgenError

@@ -70,10 +70,7 @@ class Inspection:
                 "constants": len(structure.constants),
                 "output_joints": [self._names(output.joints) for output in structure.outputs],
             },
-            "potential_energy": {
-                "kind": potential,
-                "joints": self._names(structure.potential),
-            },
+            "potential_energy": {"kind": potential, "joints": self._names(structure.potential)},
             "input_matrix": self._input_matrix(),
             "base_parameters": structure.base_parameter_count,
             "facts": list(map(asdict, self.facts)),
@@ -181,7 +178,9 @@ class Inspection:
         names = [short_name(coordinate.name) for coordinate in self.arm.coordinates]
         width = max(map(len, names))
         for index, coordinate in enumerate(self.arm.coordinates):
-            line = f"  {index + 1:>2}  {names[index]:<{width}}  {coordinate.kind:<9}  {reach(coordinate)}"
+            line = (
+                f"  {index + 1:>2}  {names[index]:<{width}}  {coordinate.joint_type:<9}  {reach(coordinate)}"
+            )
             if index in self.structure.passive:
                 line += ", passive"
             lines.append(line)
@@ -261,7 +260,7 @@ def reach(coordinate: Coordinate) -> str:
     if coordinate.lower is None or coordinate.upper is None:
         return "no limits"
     unit = "m"
-    if coordinate.kind == "revolute":
+    if coordinate.joint_type == "revolute":
         unit = "rad"
     return f"{coordinate.lower:g} .. {coordinate.upper:g} {unit}"
 

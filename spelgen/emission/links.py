@@ -38,7 +38,7 @@ def link_specs(arm: Arm, inertias: Sequence[Sequence[Fraction | float]]) -> tupl
             name=names[index],
             parent=body.parent,
             joint=body.coordinate,
-            joint_type=body.kind,
+            joint_type=body.joint_type,
             ratio=float(body.multiplier),
             offset=body.offset,
             position=_floats(body.translation),

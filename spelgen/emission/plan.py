@@ -135,10 +135,10 @@ def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSetti
         lower = upper = None
     lower, upper = (None if x is None or not isfinite(x) else float(f"{x:.6g}") for x in (lower, upper))
     if not speed or speed > TUNING.largest_speed:
-        speed = TUNING.angular_speed if coordinate.kind == "revolute" else TUNING.linear_speed
+        speed = TUNING.angular_speed if coordinate.joint_type == "revolute" else TUNING.linear_speed
     return JointSpec(
         name=coordinate.name,
-        joint_type=coordinate.kind,
+        joint_type=coordinate.joint_type,
         lower=lower,
         upper=upper,
         center=float(f"{(low + high) / 2:.6g}"),

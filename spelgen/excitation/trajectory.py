@@ -43,9 +43,9 @@ def motion_bounds(
     """
     limits, speeds = np.zeros((len(arm.coordinates), 2)), np.zeros(len(arm.coordinates))
     for k, coordinate in enumerate(arm.coordinates):
-        half = REACHES[coordinate.kind]
+        half = REACHES[coordinate.joint_type]
         limits[k] = sorted(coordinate.limits or (-half, half))
-        speeds[k] = coordinate.velocity or SPEEDS[coordinate.kind]
+        speeds[k] = coordinate.velocity or SPEEDS[coordinate.joint_type]
     for body in arm.bodies:
         k, factor = body.coordinate, float(body.multiplier)
         follower = (joints or {}).get(body.name)

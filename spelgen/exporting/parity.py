@@ -117,7 +117,7 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
 
 def usual_speeds(coordinates: Sequence[Coordinate]) -> np.ndarray:
     """Return the URDF's limits of velocity, or usual speeds where it has none, (n,) [rad/s, m/s]."""
-    return np.array([joint.velocity or _USUAL_SPEED[joint.kind] for joint in coordinates])
+    return np.array([joint.velocity or _USUAL_SPEED[joint.joint_type] for joint in coordinates])
 
 
 def relative(values: np.ndarray, expected: np.ndarray) -> float:

@@ -34,7 +34,7 @@ def page(
         found=inspection,
         cells=matrix(inspection.arm, inspection.structure),
         arm=None if urdf is None else arm_section(inspection.arm, urdf),
-        joints=[(joint.name, joint.kind, reach(joint)) for joint in inspection.arm.coordinates],
+        joints=[(joint.name, joint.joint_type, reach(joint)) for joint in inspection.arm.coordinates],
         closed=text,
         proof=proof,
     )

@@ -85,7 +85,7 @@ def nominal(arm: Arm, structure: Structure) -> Nominal:
 def working_range(coordinate: Coordinate) -> tuple[float, float]:
     """Return the range of a coordinate [rad, m]: its limits if usable, else one revolution or one metre."""
     lower, upper = coordinate.lower, coordinate.upper
-    is_revolute = coordinate.kind == "revolute"
+    is_revolute = coordinate.joint_type == "revolute"
     if coordinate.continuous or lower is None or upper is None or not 0 < upper - lower < 1e3:
         half_range = pi if is_revolute else 0.5
         return -half_range, half_range

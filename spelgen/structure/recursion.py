@@ -122,10 +122,7 @@ def energies(
 
 
 def coefficients(
-    arm: Arm,
-    positions: Sequence[Position],
-    units: Sequence[Element],
-    number: Callable[[Fraction], Element],
+    arm: Arm, positions: Sequence[Position], units: Sequence[Element], number: Callable[[Fraction], Element]
 ) -> list[Element]:
     """Return the coefficients of the inertial parameters in the entries of M, row after row, and then in V.
 
@@ -144,7 +141,7 @@ def _motions(
     motions = []
     for body in arm.bodies:
         position = positions[body.coordinate]
-        if body.kind == "prismatic":
+        if body.joint_type == "prismatic":
             slide = position.value
             if body.multiplier != 1:
                 slide = number(body.multiplier) * slide
@@ -174,7 +171,7 @@ def base_denominators(arm: Arm) -> list[int]:
     """Return for each coordinate q the integer d for which the angle of every body is an integer multiple of q / d."""
     denominators = [1] * len(arm.coordinates)
     for body in arm.bodies:
-        if body.kind == "revolute":
+        if body.joint_type == "revolute":
             index = body.coordinate
             denominators[index] = lcm(denominators[index], body.multiplier.denominator)
     return denominators
@@ -201,7 +198,7 @@ def _column(
     """Return the entries of the mass matrix of the bodies' joints: of joint ``index`` with itself and its ancestors."""
     body = arm.bodies[index]
     (hx, hy, _), tensor = inertia.moment, inertia.tensor
-    if body.kind == "revolute":
+    if body.joint_type == "revolute":
         wrench = _Wrench((-hy, hx, 0), (tensor[2], tensor[4], tensor[5]))
     else:
         wrench = _Wrench((0, 0, inertia.mass), (hy, -hx, 0))
@@ -215,7 +212,7 @@ def _column(
 
 
 def _along(body: Body, wrench: _Wrench) -> Element:
-    return wrench.moment[2] if body.kind == "revolute" else wrench.force[2]
+    return wrench.moment[2] if body.joint_type == "revolute" else wrench.force[2]
 
 
 def _add_entry(
@@ -244,7 +241,7 @@ def _sum(a: _Inertia, b: _Inertia) -> _Inertia:
 
 def _moved_inertia(body: Body, motion: _JointMotion, inertia: _Inertia) -> _Inertia:
     """Return the inertia in the joint's frame at q = 0 after the joint has moved about or along z."""
-    if body.kind == "prismatic":
+    if body.joint_type == "prismatic":
         return _translated(((2, motion.slide),), inertia)
     c, s = motion.cos, motion.sin
     hx, hy, hz = inertia.moment
@@ -268,7 +265,7 @@ def _moved_inertia(body: Body, motion: _JointMotion, inertia: _Inertia) -> _Iner
 
 def _moved_wrench(body: Body, motion: _JointMotion, wrench: _Wrench) -> _Wrench:
     (fx, fy, fz), (mx, my, mz) = wrench.force, wrench.moment
-    if body.kind == "prismatic":
+    if body.joint_type == "prismatic":
         return _Wrench(wrench.force, (mx - motion.slide * fy, my + motion.slide * fx, mz))
     c, s = motion.cos, motion.sin
     return _Wrench((c * fx - s * fy, s * fx + c * fy, fz), (c * mx - s * my, s * mx + c * my, mz))

@@ -16,20 +16,22 @@ _UNIT_AXIS = 1e-3
 
 def lint(robot: Robot) -> list[Diagnostic]:
     """Return the warnings on inertials, joints and rigid groups, in no particular order."""
-    return [*_lint_inertials(robot), *_lint_placeholders(robot), *_lint_joints(robot), *_lint_groups(robot)]
+    warnings = [*_lint_placeholders(robot), *_lint_groups(robot)]
+    for link in robot.links:
+        warnings += _lint_inertial(link)
+    for joint in robot.joints:
+        warnings += _lint_joint(joint)
+    return warnings
 
 
 def _warning(code: str, where: str, line: int, message: str) -> Diagnostic:
     return Diagnostic("warning", code, where, line, message)
 
 
-def _lint_inertials(robot: Robot) -> Iterator[Diagnostic]:
-    for link in robot.links:
-        if link.inertial is not None:
-            yield from _lint_inertial(link, link.inertial)
-
-
-def _lint_inertial(link: UrdfLink, inertial: Inertial) -> Iterator[Diagnostic]:
+def _lint_inertial(link: UrdfLink) -> Iterator[Diagnostic]:
+    inertial = link.inertial
+    if inertial is None:
+        return
     where, line, tensor = f"link {link.name!r} inertial", inertial.line, inertial.tensor
     if inertial.mass < 0:
         yield _warning("negative-mass", where, line, f"the mass is {inertial.mass:g} kg")
@@ -75,13 +77,9 @@ def _lint_placeholders(robot: Robot) -> Iterator[Diagnostic]:
         yield _warning("placeholder-inertial", "robot", repeated[0], message)
 
 
-def _lint_joints(robot: Robot) -> Iterator[Diagnostic]:
-    for joint in robot.joints:
-        if joint.moves:
-            yield from _lint_joint(joint)
-
-
 def _lint_joint(joint: UrdfJoint) -> Iterator[Diagnostic]:
+    if not joint.moves:
+        return
     where = f"joint {joint.name!r}"
     # negative friction adds energy: simulations diverge
     for name, value in (("damping", joint.damping), ("friction", joint.friction)):

@@ -12,6 +12,8 @@ from spelgen.errors import Diagnostic, UrdfError
 Vector = tuple[float, float, float]
 Tensor = tuple[float, float, float, float, float, float]
 
+JointType = Literal["revolute", "prismatic"]
+
 Assume = Literal["kinematics", "inertials"]
 """Values of the URDF that determine the structure: the kinematics, or also zeros and symmetries of inertials."""
 
