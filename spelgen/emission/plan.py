@@ -1,15 +1,16 @@
-"""Structure and nominal values -> ModelSpec."""
+"""Arm, structure and nominal values -> ModelSpec: the function ``derive_spec``."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from math import isfinite
 
 import numpy as np
 
 from spelgen.arm.actuation import Actuation
-from spelgen.arm.arm import Arm, Coordinate
+from spelgen.arm.arm import Coordinate
+from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.design import Design, load_design
 from spelgen.emission.entry_sums import mean_mass
 from spelgen.emission.links import link_specs
@@ -29,62 +30,39 @@ from spelgen.spec import (
 )
 from spelgen.structure.basis import Weights
 from spelgen.structure.nominal import Nominal, exact_inertias, nominal, working_range
-from spelgen.structure.structure import Structure
+from spelgen.structure.structure import Structure, derive
 
 
-def plan_model(
-    arm: Arm,
-    structure: Structure,
-    actuation: Actuation,
-    options: Options,
-    *,
-    urdf: str,
-    urdf_sha256: str,
-    drives: Mapping[str, JointSettings] | None = None,
-    servos: bool = False,
-) -> ModelSpec:
-    """Return the specification of the model of an arm.
+def derive_spec(arm: ConfiguredArm, options: Options) -> ModelSpec:
+    """Return the specification of the model of ``arm`` with these options.
 
-    Args:
-        arm, structure, actuation: the arm, its structure, and its input matrix.
-        options: of `spelgen build`.
-        urdf, urdf_sha256: name of the file without its folder, and its digest.
-        drives: settings of motors and gears by the name of the joint; an absent rotor inertia is estimated.
-        servos: whether inputs are commanded positions.
-
-    Raises SettingsError for servos with a design without bristle friction.
+    Raises SettingsError for position servos with a design without bristle friction.
     """
     design = load_design(options.design or options.preset)
-    if servos and design.memory == "none":
+    has_servos = arm.settings.input == "position"
+    if has_servos and design.memory == "none":
         raise SettingsError(
             f"position servos with the preset {options.preset}", element="input",
             expected="a preset with bristle friction, which position servos need", do="--preset closed-form",
         )  # fmt: skip
-    everything = tuple(range(len(arm.coordinates)))
-    sizes = nominal(arm, structure)
-    joints, servo_specs = [], []
-    for index, coordinate in enumerate(arm.coordinates):
-        drive = (drives or {}).get(coordinate.name, JointSettings())
+    structure = derive(arm.arm, options.assume)
+    sizes = nominal(arm.arm, structure)
+    joints, servos = [], []
+    for index, coordinate in enumerate(arm.arm.coordinates):
+        drive = arm.settings.joint(coordinate.name)
         joints.append(_joint(coordinate, sizes, index, drive))
-        if servos:
-            servo_specs.append(_servo(coordinate, drive))
-    inputs = []
-    if design.input == "derived" and not (actuation.direct and len(actuation.entries) == len(joints)):
-        for entry in actuation.entries:
-            inputs.append(InputSpec(entry.row, entry.column, entry.value, entry.kind == "gain"))
+        if has_servos:
+            servos.append(_servo(coordinate, drive))
     links: tuple[LinkSpec, ...] = ()
     outputs, constants = _outputs(structure, sizes, design), _constants(structure, sizes)
     if design.mass == "closed-form":
-        links = link_specs(arm, exact_inertias(arm, sizes.from_urdf))
+        links = link_specs(arm.arm, exact_inertias(arm.arm, sizes.from_urdf))
         joints = _with_armature(joints, np.diagonal(mean_mass(len(joints), outputs, constants)))
-    potential = structure.potential
-    if design.potential == "dense":
-        potential = everything
-    x, y, z = map(float, arm.gravity)
+    x, y, z = map(float, arm.arm.gravity)
     return ModelSpec(
-        robot=arm.name,
-        urdf=urdf,
-        urdf_sha256=urdf_sha256,
+        robot=arm.arm.name,
+        urdf=arm.robot.path.name,
+        urdf_sha256=arm.robot.digest,
         gravity=(x, y, z),
         options=options,
         design=design,
@@ -92,15 +70,23 @@ def plan_model(
         entries=tuple((e.row, e.column, e.kind, e.joints) for e in structure.entries),
         outputs=outputs,
         constants=constants,
-        potential=potential,
+        potential=tuple(range(len(joints))) if design.potential == "dense" else structure.potential,
         potential_scale=sizes.potential_scale,
         margin=float(f"{max(TUNING.margin * sizes.min_eigenvalue, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
         links=links,
-        inputs=tuple(inputs),
-        motor_speeds=_motor_speeds(actuation),
-        servos=tuple(servo_specs),
+        inputs=_inputs(arm.actuation, design),
+        motor_speeds=_motor_speeds(arm.actuation),
+        servos=tuple(servos),
     )
+
+
+def _inputs(actuation: Actuation, design: Design) -> tuple[InputSpec, ...]:
+    """Return the entries of G; empty if each input is the torque of its own joint, or if G is learned."""
+    entries = actuation.entries
+    if design.input != "derived" or (actuation.direct and len(entries) == actuation.joints):
+        return ()
+    return tuple(InputSpec(x.row, x.column, x.value, x.kind == "gain") for x in entries)
 
 
 def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[OutputSpec, ...]:
