@@ -15,13 +15,14 @@ _UNIT_AXIS = 1e-3
 
 
 def lint(robot: Robot) -> list[Diagnostic]:
-    """Return the warnings on inertials, joints and rigid groups, in no particular order."""
-    warnings = [*_lint_placeholders(robot), *_lint_groups(robot)]
+    """Return the warnings on inertials, joints and rigid groups, which the reader sorts by line."""
+    warnings: list[Diagnostic] = []
     for link in robot.links:
         warnings += _lint_inertial(link)
+    warnings += _lint_placeholders(robot)
     for joint in robot.joints:
         warnings += _lint_joint(joint)
-    return warnings
+    return [*warnings, *_lint_groups(robot)]
 
 
 def _warning(code: str, where: str, line: int, message: str) -> Diagnostic:
