@@ -15,9 +15,7 @@ import numpy as np
 
 from spelgen.arm.arm import Arm
 from spelgen.arm.rational import IDENTITY, ZERO, turn_about
-
-_CONFIGURATIONS = 2
-_GRID = 10**6
+from spelgen.certificate.tuning import TUNING
 
 
 def is_plain(arm: Arm) -> bool:
@@ -36,7 +34,7 @@ class Axes:
         self.slides = [kind == "prismatic" for kind in arm.joint_types]
         generator = random.Random(0)  # reproducible reports
         # per configuration: directions (n, 3) and twists (n, 6) of the axes
-        self._configurations = [_configuration(arm, generator) for _ in range(_CONFIGURATIONS)]
+        self._configurations = [_configuration(arm, generator) for _ in range(TUNING.configurations)]
 
     def parallel(self, a: int, b: int) -> bool:
         return all(_are_parallel(axes[a], axes[b]) for axes, _ in self._configurations)
@@ -127,7 +125,7 @@ def _configuration(arm: Arm, generator: random.Random) -> tuple[list[np.ndarray]
         rotation = rotation @ np.array(body.rotation)
         axis = rotation[:, 2]
         axes.append(axis)
-        t = Fraction(generator.randrange(1, _GRID), generator.randrange(1, _GRID))
+        t = Fraction(generator.randrange(1, TUNING.grid), generator.randrange(1, TUNING.grid))
         if body.joint_type == "prismatic":
             twists.append(np.concatenate([axis, ZERO]))
             origin = origin + t * axis

@@ -23,8 +23,6 @@ from spelgen.structure.basis import row_of
 from spelgen.structure.structure import Structure
 from spelgen.urdf.robot import Robot
 
-_SPARE = 6  # samples in addition to the largest possible rank: they would reveal a larger rank
-
 
 @dataclass(frozen=True)
 class _Magnitude:
@@ -68,7 +66,7 @@ class _DerivedFact:
 def verify(robot: Robot, arm: Arm, structure: Structure, *, seed: int = 0) -> Verification:
     """Verify the structure of ``arm``, and the arm against the file of ``robot``, at random configurations."""
     # r samples have the rank r of a space; additional samples would reveal a larger rank
-    count = len(structure.entries) + _SPARE
+    count = len(structure.entries) + TUNING.spare_samples
     rng = np.random.default_rng(seed)
     inertials = "the URDF's inertial values"
     if structure.assume == "kinematics":

@@ -9,16 +9,9 @@ import numpy as np
 
 from spelgen.arm.arm import Arm
 from spelgen.arm.rational import Vector
+from spelgen.emission.tuning import TUNING
 from spelgen.spec import LinkSpec, Triple
 from spelgen.structure.pseudo_inertia import parameters_of, pseudo_inertia, reference_factor
-
-# Significant digits of inertial parameters: more than the accuracy of a URDF, and few enough to reproduce the decimals
-# of the URDF.
-DIGITS = 12
-# Smallest second moment of mass about the center of mass, relative to the largest: above the error of rounding.
-THIN = 1e-10
-# Mass of a link without mass, relative to the heaviest link.
-LIGHT = 0.01
 
 
 def link_specs(arm: Arm, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[LinkSpec, ...]:
@@ -61,17 +54,18 @@ def _consistent(
 ) -> Sequence[Fraction | float]:
     """Return physically consistent inertial parameters, (10,)."""
     if ten[0] <= 0:
-        ten = _light_ball(_length(arm, index), LIGHT * heaviest)
+        ten = _light_ball(_length(arm, index), TUNING.default_mass * heaviest)
     factor, is_consistent = reference_factor(np.array(ten, dtype=float))
-    if is_consistent and _smallest_moment(np.array(ten, dtype=float)) > THIN:
+    if is_consistent and _smallest_moment(np.array(ten, dtype=float)) > TUNING.min_second_moment:
         return ten
     pseudo = factor @ factor.T
     mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
     moments = pseudo[:3, :3] - mass * np.outer(center, center)
-    # With smaller moments, rounding to DIGITS could make the body inconsistent.
+    # With smaller moments, rounding of the digits could make the body inconsistent.
     values, vectors = np.linalg.eigh(moments)
-    pseudo[:3, :3] += (vectors * (np.maximum(values, 2 * THIN * values[-1]) - values)) @ vectors.T
-    return _rounded(parameters_of(pseudo), DIGITS)
+    raised = np.maximum(values, 2 * TUNING.min_second_moment * values[-1])
+    pseudo[:3, :3] += (vectors * (raised - values)) @ vectors.T
+    return _rounded(parameters_of(pseudo))
 
 
 def _smallest_moment(ten: np.ndarray) -> float:
@@ -90,14 +84,16 @@ def _about_center(
     steiner = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
     inertia = [value - m * square for value, square in zip(tensor, steiner, strict=True)]
     # rounding errors of an inertia that was made consistent
-    noise = max(map(abs, inertia)) / 10 ** (DIGITS + 3)
+    noise = max(map(abs, inertia)) / 10 ** (TUNING.inertia_digits + 3)
     inertia = [value if abs(value) > noise else Fraction(0) for value in inertia]
-    cx, cy, cz = _rounded((x, y, z), DIGITS)
-    xx, xy, xz, yy, yz, zz = _rounded(inertia, DIGITS)
-    return _rounded([m], DIGITS)[0], (cx, cy, cz), (xx, xy, xz, yy, yz, zz)
+    cx, cy, cz = _rounded((x, y, z))
+    xx, xy, xz, yy, yz, zz = _rounded(inertia)
+    return _rounded([m])[0], (cx, cy, cz), (xx, xy, xz, yy, yz, zz)
 
 
-def _rounded(values: Iterable[Fraction | float], digits: int) -> list[float]:
+def _rounded(values: Iterable[Fraction | float]) -> list[float]:
+    """Return values with the significant digits of inertial parameters."""
+    digits = TUNING.inertia_digits
     return [float(f"{float(value):.{digits}g}") + 0.0 for value in values]  # no -0.0
 
 

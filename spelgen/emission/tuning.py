@@ -19,6 +19,13 @@ class ModelTuning:
     largest_effort: float = 1e4
     # [rad/s, m/s] A larger velocity in a URDF is a placeholder.
     largest_speed: float = 100.0
+    # [1] Significant digits of inertial parameters: more than the accuracy of a URDF, and few enough to reproduce its
+    # decimals.
+    inertia_digits: int = 12
+    # [1] Smallest second moment of mass about the center of mass, relative to the largest: above the error of rounding.
+    min_second_moment: float = 1e-10
+    # [1] Mass of a link without mass, as a fraction of the heaviest link.
+    default_mass: float = 0.01
     # [rad/s] Speed of a revolute joint without a velocity limit.
     angular_speed: float = 2.0
     # [m/s] Speed of a prismatic joint without a velocity limit.

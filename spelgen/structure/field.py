@@ -17,7 +17,7 @@ PRIME = 2**61 - 1
 _P = np.uint64(PRIME)
 # Shifts and masks of halves of 31 and 30 bits, whose products fit into 64 bits.
 _BITS_61, _BITS_31, _BITS_30 = map(np.uint64, (61, 31, 30))
-_LOW_31, _LOW_30 = map(np.uint64, (2**31 - 1, 2**30 - 1))
+_LOW_31, _LOW_30 = _P >> _BITS_30, _P >> _BITS_31
 
 
 class Residues:

@@ -14,12 +14,9 @@ import numpy as np
 from spelgen.arm.arm import Arm
 from spelgen.structure.recursion import triangle
 from spelgen.structure.sampling import float_energies
+from spelgen.structure.tuning import TUNING
 
 PARAMETERS = ("kp", "kd", "armature", "dry")
-# Relative to the largest singular value: smaller singular values are rounding errors.
-ROUNDING = 1e-9
-# Components of null vectors with a smaller difference are equal; they have a thousand times the error of the columns.
-EQUAL = 1e-6
 
 
 @dataclass(frozen=True)
@@ -59,12 +56,12 @@ def servo_rank(arm: Arm) -> ServoRank:
     undetermined = []
     for joint in range(n):
         for group in groups:
-            if np.abs(changes[group[0], 0] - changes[joint, 0]).max() < EQUAL:
+            if np.abs(changes[group[0], 0] - changes[joint, 0]).max() < TUNING.equal_components:
                 group.append(joint)
                 break
         else:
             groups.append([joint])
-        differs = np.abs(changes[joint] - changes[joint, 0]).max(axis=-1) > EQUAL
+        differs = np.abs(changes[joint] - changes[joint, 0]).max(axis=-1) > TUNING.equal_components
         undetermined += [(PARAMETERS[k], joint) for k in np.flatnonzero(differs)]
     undetermined.sort(key=lambda entry: PARAMETERS.index(entry[0]))
     return ServoRank(tuple(map(tuple, groups)), tuple(undetermined))
@@ -102,5 +99,5 @@ def torque_rows(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.
 def _row_and_null_space(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return orthonormal bases of row space and null space, (k, rank) and (k, k - rank), of a matrix (m, k), m >= k."""
     _, singular_values, directions = np.linalg.svd(matrix, full_matrices=False)
-    rank = int((singular_values > ROUNDING * singular_values[0]).sum())
+    rank = int((singular_values > TUNING.zero_singular_value * singular_values[0]).sum())
     return directions[:rank].T, directions[rank:].T

@@ -14,6 +14,11 @@ class StructureTuning:
     all_subsets_up_to: int = 8
     # [1] Samples in addition to the largest possible dimension of a span: they would reveal a larger dimension.
     spare_samples: int = 4
+    # [1] A smaller singular value, relative to the largest, is a rounding error.
+    zero_singular_value: float = 1e-9
+    # [1] Components of null vectors with a smaller difference are equal; their errors are a thousand times larger than
+    # the errors of the matrix.
+    equal_components: float = 1e-6
     # [1] Random configurations of the workspace over which magnitudes are averaged.
     points: int = 512
     # [1] Smallest expected magnitude of an output, as a fraction of the entries that it contributes to.
