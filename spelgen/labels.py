@@ -68,16 +68,16 @@ def entry_name(row: int, column: int) -> str:
     return f"M{row + 1}{column + 1}"
 
 
-def joints_told(joints: Sequence[int]) -> str:
+def joints_in_words(joints: Sequence[int]) -> str:
     """Return ``joint 2``, or ``joints 2, 3 and 5``."""
     return f"{_plural('joint', joints)} {listed([str(joint + 1) for joint in sorted(joints)])}"
 
 
-def axes_told(joints: Sequence[int]) -> str:
+def axes_in_words(joints: Sequence[int]) -> str:
     """Return ``the axis of joint 2``, or ``the axes of joints 2 and 3``."""
     if len(joints) == 1:
-        return f"the axis of {joints_told(joints)}"
-    return f"the axes of {joints_told(joints)}"
+        return f"the axis of {joints_in_words(joints)}"
+    return f"the axes of {joints_in_words(joints)}"
 
 
 def listed(names: Sequence[str]) -> str:

@@ -12,7 +12,7 @@ from fractions import Fraction
 from spelgen.arm.arm import Arm
 from spelgen.certificate import reasons
 from spelgen.certificate.axes import Axes, is_plain
-from spelgen.labels import axes_told, entry_name, joints_told, listed
+from spelgen.labels import axes_in_words, entry_name, joints_in_words, listed
 from spelgen.structure.structure import MassEntry, Structure
 
 Reason = str | None
@@ -81,7 +81,7 @@ class _Sentences:
                 # The subject of a reason is the joint closer to the tip, unless the joint closer to the root slides.
                 slides = self.axes.slides
                 joints = sorted({entry.row if slides[entry.column] else entry.column for entry in group})
-                reason = reason.format(axes=axes_told(joints), joints=joints_told(joints))
+                reason = reason.format(axes=axes_in_words(joints), joints=joints_in_words(joints))
             names = listed([entry_name(entry.row, entry.column) for entry in group])
             if len(group) == 1:
                 yield Fact(f"{names} is {statement}", means_one, reason)
@@ -131,4 +131,4 @@ class _Sentences:
         for reason, group in groups.items():
             pronoun = "it" if len(group) == 1 else "them"
             means = f"The network of V does not read {pronoun}"
-            yield Fact(f"V does not depend on {joints_told(group)}", means, reason)
+            yield Fact(f"V does not depend on {joints_in_words(group)}", means, reason)

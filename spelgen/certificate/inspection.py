@@ -177,10 +177,8 @@ class Inspection:
         lines = ["Joints"]
         names = [short_name(coordinate.name) for coordinate in self.arm.coordinates]
         width = max(map(len, names))
-        for index, coordinate in enumerate(self.arm.coordinates):
-            line = (
-                f"  {index + 1:>2}  {names[index]:<{width}}  {coordinate.joint_type:<9}  {reach(coordinate)}"
-            )
+        for index, joint in enumerate(self.arm.coordinates):
+            line = f"  {index + 1:>2}  {names[index]:<{width}}  {joint.joint_type:<9}  {range_text(joint)}"
             if index in self.structure.passive:
                 line += ", passive"
             lines.append(line)
@@ -253,7 +251,7 @@ def _remark(diagnostic: Diagnostic) -> str:
     return printable(f"{diagnostic.severity}: {line}{diagnostic.where}: {diagnostic.message}")
 
 
-def reach(coordinate: Coordinate) -> str:
+def range_text(coordinate: Coordinate) -> str:
     """Return the range of a joint with its unit."""
     if coordinate.continuous:
         return "continuous"

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from spelgen.certificate.axes import Axes
-from spelgen.labels import axes_told, entry_name, joints_told
+from spelgen.labels import axes_in_words, entry_name, joints_in_words
 from spelgen.structure.structure import MassEntry, Structure
 
 
@@ -35,14 +35,14 @@ def constant_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str |
     if axes.slides[later] and not axes.slides[earlier] and axes.keep_offset(later, earlier):
         return (
             f"the mass that joint {later + 1} carries keeps its distance from the plane through "
-            f"{axes_told([earlier])} along its slide"
+            f"{axes_in_words([earlier])} along its slide"
         )
     turn = not axes.slides[later] and not axes.slides[earlier]
     if turn and axes.same_twist(later, earlier) and _diagonal_reason(axes, structure, later):
         same = entry_name(later, later)
         if axes.opposed(later, earlier):
             same = f"-{same}"
-        return f"{joints_told([earlier, later])} turn about one line, so it is {same}"
+        return f"{joints_in_words([earlier, later])} turn about one line, so it is {same}"
     return balance_reason(axes, structure, entry)
 
 
@@ -86,14 +86,14 @@ def equality_reason(axes: Axes, structure: Structure, entries: Sequence[tuple[in
         return None
     if all(axes.same_twist(columns[0], column) for column in columns[1:]):
         if axes.slides[columns[0]]:
-            return f"{joints_told(columns)} slide along one direction"
-        return f"{joints_told(columns)} turn about one line"
+            return f"{joints_in_words(columns)} slide along one direction"
+        return f"{joints_in_words(columns)} turn about one line"
     last = len(structure.joints) - 1
     if entries[0][0] == last and structure.assume == "inertials" and axes.balanced:
         turn = not any(axes.slides[column] for column in columns)
         if turn and all(axes.parallel(columns[0], column) for column in columns[1:]):
             balanced = f"what joint {last + 1} carries is balanced about its axis"
-            return f"{balanced}, and {joints_told(columns)} are parallel"
+            return f"{balanced}, and {joints_in_words(columns)} are parallel"
     return None
 
 
@@ -104,7 +104,7 @@ def idle_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
     # M does not depend on the pose of the base: a joint that commutes with all joints before it acts as the first.
     nearer = list(range(joint))
     if all(axes.commute(joint, earlier) for earlier in nearer):
-        return f"it does not move {axes_told(nearer)}, as if it moved the whole arm"
+        return f"it does not move {axes_in_words(nearer)}, as if it moved the whole arm"
     if joint == len(axes.slides) - 1 and structure.assume == "inertials" and axes.symmetric:
         return "what it carries is symmetric about its axis"
     return None
