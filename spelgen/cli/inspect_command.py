@@ -78,7 +78,7 @@ def _text(
     if format == "json":
         data = inspection.to_dict()
         if closed:
-            from spelgen.certificate.formula_text import to_dict
+            from spelgen.certificate.formula_files import to_dict
 
             data["formulas"] = to_dict(closed)
         if proof:
@@ -87,9 +87,9 @@ def _text(
     if closed is None:
         result = inspection.text()
     else:
-        from spelgen.certificate import formula_text
+        from spelgen.certificate import formula_files
 
-        result = formula_text.text(closed)
+        result = formula_files.text(closed)
     if proof:
         result += f"\n\n{proof.text()}"
     return result + "\n"

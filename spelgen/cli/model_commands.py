@@ -45,7 +45,7 @@ def init(
     options.require_free(path, force=force)
     # without the sidecar, which this command is about to write
     arm = make_arm(read_urdf(robot), joints=options.names(joints), tip=tip)
-    drives = [StarterJoint(x.name, x.kind, x.damping, x.friction) for x in arm.coordinates]
+    drives = [StarterJoint(x.name, x.joint_type, x.damping, x.friction) for x in arm.coordinates]
     say(f"wrote {write_text(path, starter(robot.name, drives))}")
 
 

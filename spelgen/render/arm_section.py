@@ -140,7 +140,7 @@ def _sweep(arm: Arm) -> Motion:
     t = np.linspace(0, 12, 121)
     low, high = np.array(list(map(working_range, arm.coordinates))).T
     # limits of a hundred turns, as some URDFs have them, would show a blur
-    widest = [WIDEST[coordinate.kind] for coordinate in arm.coordinates]
+    widest = [WIDEST[coordinate.joint_type] for coordinate in arm.coordinates]
     joint = np.arange(len(low))
     phase = 2 * np.pi / 12 * t[:, None] * (1 + joint % 3) + joint
     q = (low + high) / 2 + np.minimum(0.4 * (high - low), widest) * np.sin(phase)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spelgen.certificate.inspection import Inspection, reach
+from spelgen.certificate.inspection import Inspection, range_text
 from spelgen.certificate.verification import Verification
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import render_page
@@ -26,7 +26,7 @@ def page(
     """
     text = None
     if closed:  # SymPy is read in only for formulas
-        from spelgen.certificate.formula_text import text as written
+        from spelgen.certificate.formula_files import text as written
 
         text = written(closed, width=100)
     return render_page(
@@ -34,7 +34,7 @@ def page(
         found=inspection,
         cells=matrix(inspection.arm, inspection.structure),
         arm=None if urdf is None else arm_section(inspection.arm, urdf),
-        joints=[(joint.name, joint.kind, reach(joint)) for joint in inspection.arm.coordinates],
+        joints=[(joint.name, joint.joint_type, range_text(joint)) for joint in inspection.arm.coordinates],
         closed=text,
         proof=proof,
     )

@@ -77,7 +77,7 @@ def base_table(model: ArmModel | None, arm: ConfiguredArm, identified: Record) -
     nominal = base.combination[:, : 10 * len(arm.arm.bodies)] @ urdf_parameters(arm.arm)
     # a file says nothing of friction and drives, and some say nothing of bodies
     nominal[base.bodies :] = np.nan
-    if not arm.arm.has_inertials:
+    if not arm.arm.inertials_complete:
         nominal[:] = np.nan
     columns = {"parameter": names, "URDF": list(map(_number, nominal))}
     note = "The intervals are those of least squares on the training logs [kg, m, s]"
@@ -131,7 +131,7 @@ def _body_table(values: np.ndarray, arm: ConfiguredArm | None) -> Listing:
     nominal = None
     if arm is not None:
         names = [body.name for body in arm.arm.bodies]
-        if arm.arm.has_inertials:
+        if arm.arm.inertials_complete:
             nominal = urdf_parameters(arm.arm).reshape(-1, 10)
     rows = []
     # the URDF below the model, body by body: differences are read down a column

@@ -18,7 +18,7 @@ from spelgen.evaluation.plain import Curve
 from spelgen.render.shapes import Shape, joined, tube, visual_shapes
 from spelgen.render.tuning import TUNING
 from spelgen.urdf.read import read_urdf
-from spelgen.urdf.robot import Joint, Robot
+from spelgen.urdf.robot import Robot, UrdfJoint
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,13 +134,13 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
     return joined(meshes)
 
 
-def _axis(joint: Joint) -> np.ndarray:
+def _axis(joint: UrdfJoint) -> np.ndarray:
     axis = np.array(joint.axis, dtype=float)
     unit: np.ndarray = axis / (np.linalg.norm(axis) or 1.0)
     return unit
 
 
-def _rotation(joint: Joint) -> np.ndarray:
+def _rotation(joint: UrdfJoint) -> np.ndarray:
     """Return the rotation of roll, pitch and yaw, about fixed axes."""
     matrix: np.ndarray = Rotation.from_euler("xyz", joint.rpy).as_matrix()
     return matrix
