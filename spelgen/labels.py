@@ -29,9 +29,9 @@ class NamedJoint:
     name: str
     units: Units
 
-    def axis(self, quantity: str) -> str:
-        """Return ``position [rad]``, or likewise of ``velocity`` or ``torque``."""
-        return f"{quantity} [{getattr(self.units, quantity)}]"
+    def axis(self, quantity: str, label: str = "") -> str:
+        """Return ``label [rad]`` with the unit of ``position``, ``velocity`` or ``torque``."""
+        return f"{label or quantity} [{getattr(self.units, quantity)}]"
 
 
 def named_joints(names: Sequence[str], kinds: Sequence[str]) -> list[NamedJoint]:

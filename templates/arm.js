@@ -160,7 +160,7 @@ const arm = (() => {
     report(motion);
   };
   const ground = (eye, size, wide, high) => {
-    const { middle, ground: z } = scene.motions[state.motion], step = 1000 * scene.reach / 4;
+    const { middle, ground: z } = scene.motions[state.motion], step = 1000 * scene.extent / 4;
     context.strokeStyle = css(ink.ground, 1);
     context.lineWidth = 1;
     context.beginPath();

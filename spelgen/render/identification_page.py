@@ -1,19 +1,19 @@
-"""An identification as one self-contained HTML page."""
+"""The page of an identification by least squares."""
 
 from __future__ import annotations
 
 from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.fitting.run_record import Content
 from spelgen.identification.identification import Identification
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import render_page
 from spelgen.render.parameters import DETERMINED, base_table
-from spelgen.render.plots import Record
 from spelgen.structure.structure import derive
 
 
 def page(identification: Identification, arm: ConfiguredArm) -> str:
-    """The page about an identification: what was determined and how surely, the arm, and the torque that is left."""
-    record: Record = identification.to_dict()
+    """Return the page: base parameters with confidence intervals, the arm, and the torque residual."""
+    record: Content = identification.to_dict()
     words = [parameter["determined"] for parameter in record["base_parameters"]]
     never = [name for name, visibility in record["identifiability"].items() if visibility == "never"]
     return render_page(

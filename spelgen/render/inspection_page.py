@@ -1,4 +1,4 @@
-"""A derived structure as one self-contained HTML page."""
+"""The page of a derived structure."""
 
 from __future__ import annotations
 
@@ -20,12 +20,16 @@ def page(
     proof: Verification | None = None,
     urdf: Path | None = None,
 ) -> str:
-    """The page about the inspection, with the closed forms, the proof and the arm of the URDF where they are given.
+    """Return the page about an inspection.
 
-    It needs no other file, and all that comes from the URDF is escaped.
+    Args:
+        inspection: The derived structure.
+        closed: Closed forms of the entries of M and V.
+        proof: Verification of the structure.
+        urdf: URDF of the arm, for a picture of it.
     """
     text = None
-    if closed:  # SymPy is read in only for formulas
+    if closed:  # SymPy is imported only for formulas
         from spelgen.certificate.formula_text import text as written
 
         text = written(closed, width=100)
