@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
 from spelgen.errors import SettingsError, collect, suggestion
-from spelgen.settings.yaml_document import Document, read_document
+from spelgen.settings.yaml_document import YamlDocument, read_document
 
 Preset = Literal["hybrid", "closed-form", "minimal", "spel", "spel-kan", "phnode"]
 """Those that come with spelgen."""
@@ -85,7 +85,7 @@ def _read(path: Path) -> Design:
     return Design(**values)
 
 
-def validate(values: Mapping[str, Any], document: Document | None = None) -> None:
+def validate(values: Mapping[str, Any], document: YamlDocument | None = None) -> None:
     """Raise SettingsError, or SpelgenErrors of several, unless ``values`` are a design.
 
     ``document`` is the file that they come from: it is then named, with the lines.

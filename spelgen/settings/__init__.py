@@ -1,1 +1,1 @@
-"""What a URDF does not say about a robot: the sidecar YAML beside it, checked key by key."""
+"""The sidecar YAML beside a URDF: settings that a URDF cannot express."""

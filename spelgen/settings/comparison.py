@@ -8,11 +8,16 @@ from spelgen.settings.values import Count, Group, NonNegative, Positive, Whole
 
 
 class PublishedFigures(Group):
-    """Figures of one preset on this robot in a publication; None: not published.
+    """Figures of one preset on this robot in a publication; without a value: not published.
 
-    train_loss, test_loss, prediction_loss: squared errors of predicted windows, summed over joints [rad, m, s].
-    velocity, position: mean squared errors over 1 s, summed over joints. step_seconds: time of a training step on the
-    authors' machine [s].
+    Attributes:
+        parameters: Number of trained parameters.
+        step_seconds: Duration of a training step on the authors' machine [s].
+        train_loss: Squared error of predicted training windows, summed over the joints.
+        test_loss: Squared error of predicted test windows, summed over the joints.
+        prediction_loss: Squared error of long predictions, summed over the joints.
+        velocity: Mean squared error of the velocity over 1 s, summed over the joints.
+        position: Mean squared error of the position over 1 s, summed over the joints.
     """
 
     parameters: Count | None = None
@@ -27,10 +32,15 @@ class PublishedFigures(Group):
 class ComparisonSettings(Group):
     """Training of all presets on simulated logs of this robot by `spelgen compare`.
 
-    first: duration of the part of each training motion that is trained on [s]; None: all. steps: smallest number of
-    training steps on predicted windows. momentum_steps: steps on the weak form before them. weight_decay: of all
-    presets; None: as in `training`. seeds: number of runs of each preset. width, depth: of hidden layers. published:
-    published figures, by preset.
+    Attributes:
+        first: Duration of the initial part of each training motion that is used; default: the whole motion [s].
+        steps: Smallest number of training steps on predicted windows.
+        momentum_steps: Number of training steps on the weak form before these.
+        weight_decay: Weight decay of all presets; default: as in `training`.
+        seeds: Number of runs of each preset.
+        width: Units per hidden layer.
+        depth: Number of hidden layers.
+        published: Published figures, by preset.
     """
 
     first: Positive | None = None

@@ -12,11 +12,18 @@ from spelgen.settings.values import Count, Group, NonNegative, Number, Positive,
 
 
 class TrainingSettings(Group):
-    """Hold the defaults of `spelgen train` for a robot; command-line flags override them. None: not set here.
+    """Defaults of `spelgen train` for one robot; options of the command line take precedence.
 
-    objective: what is fitted; an option that belongs to others only is an error beside it. The options are those of
-    `TorqueFit`, `MomentumFit` and `Rollout`; those of `Preprocessing` stand beside them.
-    validation_fraction: part of the training trajectories held out to watch the validation loss.
+    Attributes:
+        objective: Objective of the fit; default: torque for rigid bodies, rollout for networks only, servo for
+            position servos. With an objective, options of other objectives are errors.
+        cutoff: Cutoff frequency of the zero-phase low-pass filter on q, qd and tau; 0: no filter; default: 8 Hz, and
+            no filter for windows of logs at 50 Hz or less [Hz].
+        decimation: Samples from one sample of a window to the next; default: the largest number that the filter allows.
+        gap: A recording is split at time steps longer than this number of median steps.
+        torque_delay: Delay of the logged torques relative to the positions; default: estimated in a torque fit [s].
+        validation_fraction: Fraction of the training trajectories for the validation loss.
+        seed: Seed of all random numbers.
     """
 
     objective: Objective | None = None
