@@ -77,10 +77,10 @@ def compare(
     given = {name: value for name, value in changes.items() if value is not None}
     comparison = _comparison(target, data, mapping).model_copy(update=given)
     name = target.stem + ("-logs" if data else "") + ("-ablation" if ablation else "")
-    # workers have working folders of their own, so paths must be absolute
+    # the working folders of workers differ, so paths must be absolute
     folder = (output or Path("comparisons") / name).absolute()
     parallel = jobs or default_jobs()
-    # two comparisons in one folder would overwrite the runs of one another
+    # two simultaneous comparisons in one folder would overwrite each other's runs
     with locked(folder), termination_as_interrupt():
         with progress_bar("simulating") as progress:
             study = prepare_study(comparison, folder, progress)
@@ -100,7 +100,7 @@ def compare(
 
 
 def _comparison(target: Path, data: list[Path] | None, mapping: Path | None) -> Comparison:
-    """Return the comparison of a URDF with these logs, or that of a YAML file."""
+    """Return the comparison of a URDF with these logs, or the comparison in a YAML file."""
     from spelgen.comparison.arms import YAML, ComparedArm, Comparison, load_comparison
 
     if target.suffix not in YAML:

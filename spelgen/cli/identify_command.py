@@ -1,4 +1,4 @@
-"""The command `identify`: least squares on logs, before or beside any network."""
+"""The command `identify`: base parameters and friction by least squares."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def identify(
         str | None,
         typer.Option(
             metavar="stribeck,polynomial,memory",
-            help="Friction terms beside viscous and Coulomb friction: Stribeck effect; qd |qd| and qd^3; bristles "
-            "(hysteresis).",
+            help="Friction terms in addition to viscous and Coulomb friction: Stribeck effect; qd |qd| and qd^3; "
+            "bristles (hysteresis).",
         ),
     ] = None,
     accept: Accept = None,
@@ -60,17 +60,16 @@ def identify(
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs
 
-    # names and no flags: effects combine in any way
     effects = options.names(friction) or []
     for name in effects:
         if name not in EFFECTS:
             raise typer.BadParameter(f"{name!r} is none of {', '.join(EFFECTS)}", param_hint="'--friction'")
     method = LeastSquares(weights, FrictionModel(**dict.fromkeys(effects, True)))
     arm = options.load(robot, joints, tip, angle_tolerance)
-    # codes are accepted for this command alone; the sidecar holds those for always
+    # codes on the command line are accepted in addition to those in the settings
     log_mapping = options.log_mapping(arm, mapping, accept)
     logs = read_logs(paths, arm, log_mapping, role="train")
-    # least squares would fit wrong units without a word
+    # least squares would fit logs in wrong units without an error
     for diagnostic in require_sound_logs(logs, arm, log_mapping):
         note(diagnostic)
     result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
@@ -78,7 +77,7 @@ def identify(
         note(diagnostic)
 
     def page() -> str:
-        # pages and charts are imported where they are asked for
+        # pages and charts are imported only for this format
         from spelgen.render.identification_page import page
 
         return page(result, arm)

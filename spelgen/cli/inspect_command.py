@@ -45,7 +45,7 @@ def inspect(
 
     arm = options.load(robot, joints, tip, angle_tolerance)
     inspection = inspect_arm(arm, assume=assume)
-    # other programs, which take seconds
+    # takes seconds: Pinocchio and SymPy
     proof = verified(arm.robot, arm.arm, inspection.structure) if verify else None
     closed = None
     if formulas or chosen_entry is not None or chosen in ("latex", "sympy"):
@@ -65,7 +65,7 @@ def inspect(
 def _text(
     format: str, inspection: Inspection, closed: Formulas | None, proof: Verification | None, urdf: Path
 ) -> str:
-    """Return the result with a line end; with ``closed``, the closed forms."""
+    """Return the result in a format, with a line end; closed: closed forms of M and V."""
     if closed and format in ("latex", "sympy"):
         return _formula_file(format, closed, proof)
     if format == "html":
@@ -93,7 +93,7 @@ def _text(
 
 
 def _formula_file(format: str, closed: Formulas, proof: Verification | None) -> str:
-    """Return a file of formulas; what has no place in it goes to stderr."""
+    """Return a file of formulas. The proof and the names of omitted formulas are printed to stderr."""
     from spelgen.certificate import formula_files
 
     names = [formula.name for formula in closed.unwritten]

@@ -26,7 +26,7 @@ FIELD_SEPARATOR = "."
 
 
 class UsageError(typer.BadParameter):
-    """An option that does not apply to what is fitted; the message names the option itself."""
+    """An option that does not apply; the message names the option."""
 
     def format_message(self) -> str:
         """Return the message without the name of a parameter before it."""
@@ -34,9 +34,9 @@ class UsageError(typer.BadParameter):
 
 
 class Assignments(TrainingSettings):
-    """The keys of `--set`: a robot's settings, which parameters are adapted, and where and how a fit runs.
+    """The keys of `--set`: training settings of a robot, and options of one fit.
 
-    device, threads: of torch. progress: whether it is shown.
+    adapt: see `TorqueFit`. device, threads: of torch. progress: whether a progress bar is shown.
     """
 
     adapt: Adaptation | None = None
@@ -77,7 +77,7 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     Raises a usage error for an unknown key, with the nearest known one, and for an invalid value.
     """
     keys = Assignments.model_fields.keys() - {"objective"}  # an option of its own
-    # first gathered: fields of one group are checked together
+    # all assignments first, since the fields of one group are checked together
     texts: dict[str, Any] = {}
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
@@ -95,7 +95,8 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     except ValidationError as error:
         wrong = explain(error.errors(include_url=False)[0], None, Assignments)
         raise UsageError(f"--set {wrong}") from error
-    return {name: getattr(checked, name) for name in texts}
+    values = dict(checked)
+    return {name: values[name] for name in texts}
 
 
 def new_run(urdf: Path | None, request: Request) -> Start:
@@ -110,7 +111,7 @@ def new_run(urdf: Path | None, request: Request) -> Start:
     if request.warm_start and objective == "rollout":
         defaults["torque_first"] = False  # a torque fit would discard the weights of the run
     if objective is None and TIME_LIMIT in options:
-        # the user cannot know which objective the logs will lead to
+        # the objective is chosen from the logs, so the option is not an error for any objective
         defaults[TIME_LIMIT] = options.pop(TIME_LIMIT)
     return Start(FitOptions(objective, options, defaults), request.settings(settings))
 
@@ -122,14 +123,14 @@ def resumed_run(folder: Path, request: Request) -> Start:
 
     run = RunFolder(folder)
     record = run.read_record()
-    # validation logs that were passed from Python are not in any file
+    # validation logs that were passed from Python are in no file
     if record.validation_fraction is None and record.validation:
         raise RunError(
             "a run whose validation logs were passed from Python",
             file=folder,
             do="resume it by spelgen.fit(..., folder=..., options=spelgen.RunOptions(resume=True))",
         )
-    # not validated again: Python allows more than settings files do
+    # not validated: Python accepts values that settings files do not
     recorded = {"seed": record.seed, **asdict(record.preprocessing)}
     if record.validation_fraction is not None:
         recorded["validation_fraction"] = record.validation_fraction

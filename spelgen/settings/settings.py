@@ -132,12 +132,12 @@ def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) ->
         except SpelgenError as error:
             errors = error.errors if isinstance(error, SpelgenErrors) else (error,)
         # a group that only one step reads must not stop the other steps: it is replaced by a placeholder
-        for error in errors:
-            group = (error.element or "").partition(".")[0]
+        for each in errors:
+            group = (each.element or "").partition(".")[0]
             if group not in OF_A_STEP:
                 collect([*errors, *(x for placeholder in unusable.values() for x in placeholder.errors)])
             previous = unusable.get(group, Unusable(()))
-            unusable[group] = Unusable((*previous.errors, error))
+            unusable[group] = Unusable((*previous.errors, each))
             content.pop(group, None)
     # the logs have the input of the arm, so that a file states it only once
     if settings.input == "position" and not isinstance(settings.logs, Unusable):
