@@ -10,8 +10,9 @@ import torch
 from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.module_check import check
 from spelgen.design import CHOICES, PRESETS, Design, Preset, load_design
-from spelgen.emission.build import build, generate
+from spelgen.emission.build import build
 from spelgen.emission.loading import load_module
+from spelgen.emission.specify import generate
 from spelgen.errors import SettingsError, SpelgenError
 
 COMBINATIONS = [dict(zip(CHOICES, values, strict=True)) for values in itertools.product(*CHOICES.values())]
@@ -73,7 +74,7 @@ def test_a_preset_of_your_own(rpr, robots, tmp_path, monkeypatch):
     own = asdict(load_design("spel")) | {"dissipation": "dense-3n", "about": "Friction of all joints."}
     (tmp_path / "mine.yaml").write_text("".join(f"{key}: {value}\n" for key, value in own.items()))
     source = generate(rpr, "mine.yaml")
-    options = load_module(source).facts.options
+    options = load_module(source).spec.options
     assert (options.preset, options.design.dissipation) == ("mine", "dense-3n")
     (tmp_path / "module.py").write_text(source, encoding="utf-8")
     (tmp_path / "mine.yaml").unlink()  # the module knows how it was made

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.body_chain import ChainConfiguration, chain_of_links
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws, turning
-from spelgen.runtime.parts import Inputs, Row, Rows
+from spelgen.runtime.parts import Configuration, Inputs, Parameters, Row, Rows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
 from spelgen.runtime.position_servo import PositionServo
 from spelgen.runtime.rigid_body import InertialParameters
@@ -23,7 +23,7 @@ class RigidParameters(NamedTuple):
     points: Tensor  # of the bodies in body frames, block diagonal, (4 bodies, 4 bodies)
     armature: Tensor  # inertia of the rotors, part of M, (n, n)
     friction: FrictionConstants
-    residual: Any = None  # of the residual terms
+    residual: Parameters = None  # of the residual terms
 
 
 class RigidConfiguration(NamedTuple):
@@ -34,7 +34,7 @@ class RigidConfiguration(NamedTuple):
     gravity: Tensor  # dV/dq of the bodies, (..., n)
     prepared: RigidParameters
     varied: Tensor | float = 1.0  # factor on friction, (..., n)
-    residual: Any = None  # of the residual terms
+    residual: Configuration = None  # of the residual terms
 
 
 class RigidBodyDynamics(PortHamiltonian):
@@ -89,7 +89,7 @@ class RigidBodyDynamics(PortHamiltonian):
 
     @property
     def inertial_parameters(self) -> Tensor:
-        """(m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of each body about the origin of its joint's frame, (bodies, 10)."""
+        """(m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of bodies about the origin of their joints, (bodies, 10)."""
         root = self.bodies.forward()
         row, column = torch.triu_indices(4, 4)
         xx, xy, xz, x, yy, yz, y, zz, z, m = (root @ root.mT)[..., row, column].unbind(dim=-1)
@@ -162,7 +162,7 @@ class RigidBodyDynamics(PortHamiltonian):
         return qd @ self.motors.mT, at.gravity @ self.loads
 
     def friction_torque(self, q: Tensor | RigidConfiguration, qd: Tensor, *state: Tensor | None) -> Tensor:
-        """Return the friction torque, C^T f(C qd), (..., n) [Nm, N]; state: see ``FrictionConstants.torque``."""
+        """Return the friction torque C^T f(C qd), (..., n) [Nm, N]; state: see ``FrictionConstants``."""
         at: RigidConfiguration = self.at(q, qd)
         torque = at.varied * at.prepared.friction.torque(*self._at_motors(at, qd), *state)
         return torque if self.motors is None else torque @ self.motors
@@ -185,7 +185,7 @@ class RigidBodyDynamics(PortHamiltonian):
 
         Near the smoothing velocity friction is up to 7.4 % larger than without z, far above it the same.
         """
-        # tanh reaches its limit within a few widths: the slow end of an algebraic sign would be a stiff transient
+        # tanh reaches its limit within a few widths: an algebraic sign would be a stiff transient
         direction = (self._motor(qd) / self.friction.prepare().coulomb_smoothing_velocity).tanh()
         return direction.unsqueeze(-1) * self.friction.reach
 
