@@ -51,7 +51,7 @@ class GaussianPrior(Group):
     """Standard deviations of the Gaussian prior of rigid-body and friction parameters, about their initial values.
 
     The parameters are logarithms or fractions without unit. The fit estimates the standard deviations of bodies,
-    armature and offset (see `update_widths`); the values here are their initial values.
+    armature and offset; the values here are their initial values.
 
     Attributes:
         bodies: Log-Cholesky parameters of the inertias; 0.1 is about 10 % of the mass and of the radii of gyration.
@@ -168,7 +168,7 @@ class OnWindows(FitConfig):
     Attributes:
         window: Samples per window.
         stride: Samples from the first sample of one window to that of the next.
-        momentum_steps: Steps on the weak form of the equations (see `momentum_loss`).
+        momentum_steps: Training steps on the weak form of the equations.
         optimizer: AdamW on batches, or L-BFGS on all windows; default: lbfgs for at most 1,024 windows, else adamw.
         batch: Windows per step of AdamW; default: 256.
         learning_rate: Largest learning rate of AdamW; default: 0.001.

@@ -48,7 +48,7 @@ class JointSettings(Group):
 
 
 class MotorCoupling(Group):
-    """Joints that are driven by the same motors: joint torques = ``matrix`` times motor torques.
+    """Joints that are driven by the same motors: joint torques = `matrix` times motor torques.
 
     Attributes:
         joints: Names of the n coupled joints.
