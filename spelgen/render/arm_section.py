@@ -15,7 +15,6 @@ from spelgen.certificate.facts import facts
 from spelgen.certificate.formulas import formulas
 from spelgen.certificate.inspection import LETTERS
 from spelgen.certificate.printing import text
-from spelgen.evaluation.drawn_motions import DrawnMotion
 from spelgen.evaluation.plain import Curve, record
 from spelgen.evaluation.traces import Traces
 from spelgen.labels import entry_name, joint_ranges, joints_in_ranges
@@ -43,7 +42,10 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class AnimatedMotion:
-    """Positions q and predicted, (T, n) [rad, m], at times t (T,) [s]; error: (T, n), 1 has the last colour."""
+    """Positions q and predicted, (T, n) [rad, m], at times t (T,) [s]; error: (T, n), 1 has the last colour.
+
+    name: of the charts whose time axis belongs to the motion. label: in the list of motions.
+    """
 
     name: str
     label: str
@@ -116,28 +118,14 @@ def _motions(traces: Traces) -> list[AnimatedMotion]:
         # the error of a joint that hardly moves is divided by 1 % of the largest extent of the joints
         error = (example.predicted_q - example.q) / np.maximum(extent, 1e-2 * extent.max() + 1e-9)
         label = f"{example.which} prediction and measured motion ({example.trajectory})"
-        motions.append(_motion(f"prediction {example.which}", label, example, error, example.predicted_q))
+        name, colour = f"prediction {example.which}", (np.abs(error) / TUNING.worst_error).round(3)
+        motions.append(AnimatedMotion(name, label, example.t, example.q, colour, example.predicted_q))
     for trace in traces.torques:
         error = (trace.measured - trace.predicted[MODEL]) / np.maximum(trace.measured.std(axis=0), 1e-9)
         label = f"residual torque, {trace.which} trajectory ({trace.trajectory})"
-        motions.append(_motion(f"torque {trace.which}", label, trace, error))
+        colour = (np.abs(error) / TUNING.worst_error).round(3)
+        motions.append(AnimatedMotion(f"torque {trace.which}", label, trace.t, trace.q, colour))
     return motions
-
-
-def _motion(
-    name: str, label: str, drawn: DrawnMotion, error: np.ndarray, predicted: np.ndarray | None = None
-) -> AnimatedMotion:
-    """Return a motion for the script.
-
-    Args:
-        name: Name that charts of the same motion refer to.
-        label: Text for the list of motions.
-        drawn: Times and positions.
-        error: (T, n), error divided by the extent of the motion or by the standard deviation of the torque.
-        predicted: Predicted positions, (T, n) [rad, m].
-    """
-    colour = np.abs(error) / TUNING.worst_error
-    return AnimatedMotion(name, label, drawn.t, drawn.q, colour.round(3), predicted)
 
 
 def _sweep(arm: Arm) -> AnimatedMotion:

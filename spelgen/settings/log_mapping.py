@@ -217,7 +217,7 @@ class LogMapping(Group):
         return self.model_copy(update={"joints": joints})
 
     def unit(self, quantity: str, joint: str) -> str | None:
-        """Return the unit of "q", "qd", "tau" or "u" of a joint, None without a setting; the default of u is the unit of q."""
+        """Return the unit of "q", "qd", "tau" or "u" of a joint, None without a setting; u has the unit of q."""
         unit: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
         if unit is None and quantity == "u":
             return self.unit("q", joint)

@@ -12,12 +12,11 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from spelgen.errors import Diagnostic, SettingsError, SpelgenError, SpelgenErrors, collect
-from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.joint import JointSettings, MotorCoupling
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.messages import unknown_name, validated
 from spelgen.settings.simulation import SimulationSettings, TrackingSettings
-from spelgen.settings.training import TrainingSettings
+from spelgen.settings.training import ComparisonSettings, TrainingSettings
 from spelgen.settings.values import Group, Number
 from spelgen.settings.yaml_document import Location, YamlDocument, read_document
 
