@@ -11,10 +11,10 @@ from html_page import Page
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.design import PRESETS
+from spelgen.emission.assemble import assemble
 from spelgen.emission.build import build
 from spelgen.emission.specify import make_spec
 from spelgen.errors import RunError
-from spelgen.fitting.fitted import load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.render.report_page import render_report, write_report
 from spelgen.render.run_facts import commands
@@ -178,7 +178,7 @@ def test_learned_constants_are_those_of_the_weights(run):
     state["raw_armature"] += math.log(3.0)
     torch.save(state, run / "model.pt")
     page = render_report(run)
-    for start in load_run(run).model.armature.tolist():
+    for start in assemble(RunFolder(run).read_spec()).armature.tolist():
         assert f"{3 * start:.3g} " in page
 
 
@@ -251,6 +251,13 @@ def test_a_run_of_any_preset_has_its_page(run, robots, preset):
     units = {"Nm": "joint1", "N": "joint2"}
     for unit, joint in units.items():
         assert f"Torque of {joint}" in text and f"torque [{unit}]" in text
+
+
+def test_a_constant_entry_of_the_mass_matrix_has_the_value_in_the_table(run, robots):
+    model = build(robots / "rpr.urdf", "spel", width=8)
+    write_model(run, model)
+    entry = model.mass_matrix(torch.tensor([0.3, 0.2, 0.1]).double())[1, 1] - model.mass.armature()[1]
+    assert f'<th scope="row">M22</th><td>{entry.item():.4g}</td><td>kg</td>' in render_report(run)
 
 
 def test_the_report_is_available_as_json(run, robots):

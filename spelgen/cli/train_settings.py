@@ -1,4 +1,4 @@
-"""The settings of the command `train`: the command line, then the robot's settings or those of the resumed run."""
+"""The settings of the command `train`: the command line, then the robot's settings or the record of the resumed run."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Request:
         return {name: self.values[name] for name in keys if name in self.values}
 
     def settings(self, defaults: TrainingSettings) -> TrainingSettings:
-        """Return the settings with those of the command line for preprocessing and split."""
+        """Return `defaults` with the preprocessing, split and seed of the command line."""
         return defaults.model_copy(update=self.values_of(OF_LOGS))
 
 
@@ -78,7 +78,7 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     """
     keys = Assignments.model_fields.keys() - {"objective"}  # an option of its own
     # all assignments first, since the fields of one group are checked together
-    texts: dict[str, Any] = {}
+    texts: dict[str, str | dict[str, str]] = {}
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         name, _, field = key.strip().replace("-", "_").partition(FIELD_SEPARATOR)
@@ -88,8 +88,10 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
             raise UsageError(f"--set: unknown key {name!r}; {suggestion(name, sorted(keys))}")
         if not field:
             texts[name] = text
-        elif isinstance(texts.setdefault(name, {}), dict):
-            texts[name][field] = text
+            continue
+        group = texts.setdefault(name, {})
+        if isinstance(group, dict):
+            group[field] = text
     try:
         checked = Assignments.model_validate(texts)
     except ValidationError as error:

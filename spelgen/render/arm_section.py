@@ -111,7 +111,7 @@ def arm_section(arm: Arm, urdf: Path, traces: Traces | None = None) -> AnimatedA
 
 
 def _motions(traces: Traces) -> list[AnimatedMotion]:
-    """Return predictions, coloured by position error, then test motions, coloured by torque residual."""
+    """Return predictions, with the position error as colour, then test motions with the torque residual as colour."""
     motions = []
     for example in traces.trajectories:
         extent = np.ptp(example.q, axis=0)

@@ -3,6 +3,8 @@
 The limits are needed because mesh formats contain archives, names of other files and repetition counts.
 """
 
+from __future__ import annotations
+
 import gc
 import io
 import json
@@ -10,13 +12,16 @@ import os
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from spelgen.errors import SpelgenError
 from spelgen.files import read_bytes
 from spelgen.render.tuning import TUNING
+
+if TYPE_CHECKING:
+    from yourdfpy import Visual
 
 MEMORY = 1_073_741_824  # bytes
 SECONDS = 30  # of processor time, of which imports and the simplification of fine meshes take most
@@ -84,7 +89,7 @@ def main(urdf: str, links: list[str], output: IO[bytes]) -> None:
     output.write(buffer.getbuffer())
 
 
-def _shape(visual: Any, urdf: Path) -> Any:
+def _shape(visual: Visual, urdf: Path) -> Any:
     """Return the mesh of one <visual> in the frame of its link."""
     from trimesh import creation
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +36,10 @@ STYLES = defaultdict(
     },
 )
 """CSS class of the lines of each predictor."""
+MEASURES: tuple[tuple[str, str, Callable[[Growth], Mapping[str, Quantiles]]], ...] = (
+    ("Relative error", "error / motion", lambda growth: growth.relative),
+    ("Tip error", "tip error [mm]", lambda growth: growth.tip_mm),
+)
 
 
 @dataclass(frozen=True)
@@ -105,18 +109,12 @@ def growth_panels(
         styles: CSS classes, by the names of the lines.
         banded: Names of the lines with a band from the 10 % to the 90 % quantile.
     """
-    relative, tip = {}, {}
-    for name, (growth, predictor) in growths.items():
-        relative[name] = growth, growth.relative.get(predictor)
-        tip[name] = growth, growth.tip_mm.get(predictor)
     panels = []
-    for title, label, errors_by_name in (
-        ("Relative error", "error / motion", relative),
-        ("Tip error", "tip error [mm]", tip),
-    ):
+    for title, label, errors_of in MEASURES:
         marks: list[Mark] = []
         errors: dict[str, Quantiles] = {}
-        for name, (growth, error) in errors_by_name.items():
+        for name, (growth, predictor) in growths.items():
+            error = errors_of(growth).get(predictor)
             if error is None:
                 continue
             errors[name] = error
@@ -198,7 +196,7 @@ def mass_panels(
 
     Args:
         t: Times, (T,) [s].
-        masses: Lower triangles of M, row by row, (entries, T) [kg m^2, kg m, kg], by the names of the lines.
+        masses: Lower triangles of M in row-major order, (entries, T) [kg m^2, kg m, kg], by the names of the lines.
         styles: CSS classes, by the names of the lines.
         joint_types: Types of the joints, for the units of the entries.
         width: Width of each chart [pixels].

@@ -1,1 +1,1 @@
-"""The sidecar YAML beside a URDF: settings that a URDF cannot express."""
+"""The settings file of a robot: values that a URDF cannot express."""

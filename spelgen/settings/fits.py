@@ -167,7 +167,7 @@ class OnWindows(FitConfig):
 
     Attributes:
         window: Samples per window.
-        stride: Samples from the first sample of one window to that of the next.
+        stride: Samples from the start of one window to the start of the next.
         momentum_steps: Training steps on the weak form of the equations.
         optimizer: AdamW on batches, or L-BFGS on all windows; default: lbfgs for at most 1,024 windows, else adamw.
         batch: Windows per step of AdamW; default: 256.

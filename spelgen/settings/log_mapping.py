@@ -75,7 +75,7 @@ PLAIN = LogColumns().model_dump()
 
 
 class JointColumns(Group):
-    """Names of the columns of one joint, in place of those of all joints.
+    """Names of the columns of one joint, in place of the names for all joints.
 
     Attributes:
         q: Position.
@@ -209,7 +209,7 @@ class LogMapping(Group):
         return self.model_copy(update={"columns": LogColumns(**named)})
 
     def with_joint_columns(self, columns: Mapping[str, Mapping[str, str | None]]) -> LogMapping:
-        """Return the mapping with these columns of joints, by joint and quantity."""
+        """Return the mapping with these columns: joint -> quantity -> column."""
         joints = dict(self.joints)
         for joint, names in columns.items():
             logged = self.joint(joint)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal, NoReturn
 
 from pydantic import Field, field_validator, model_validator
 
@@ -30,7 +30,7 @@ class Unusable:
     def __init__(self, errors: Sequence[SpelgenError]) -> None:
         self.errors = tuple(errors)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> NoReturn:
         if not name.startswith("__"):
             collect(self.errors)
         raise AttributeError(name)

@@ -61,7 +61,7 @@ class TrainingSettings(Group):
         return value
 
     @property
-    def options(self) -> dict[str, Any]:
+    def options(self) -> dict[str, object]:
         """Options of any objective that are set."""
         return self.model_dump(include=set(OWNERS), exclude_none=True)
 
