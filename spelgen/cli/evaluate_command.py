@@ -125,9 +125,10 @@ def report(
         from spelgen.render.report_page import write_report
 
         path, evaluation = write_report(runs[0], output, robot), RunFolder(runs[0]).evaluation
-        found = summary(Results.from_dict(read_json(evaluation, RunError))) if evaluation.exists() else None
-        if found is not None:
-            say(found.text() + "\n")
+        if evaluation.exists():
+            listing = summary(Results.from_dict(read_json(evaluation, RunError)))
+            if listing is not None:
+                say(listing.text() + "\n")
         say(f"wrote {path}: the report, for any browser")
     else:
         from spelgen.render.runs_page import write_runs

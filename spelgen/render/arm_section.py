@@ -32,9 +32,9 @@ ENTRY = re.compile(r"M\d+(?:,\d+)?")
 
 @dataclass(frozen=True)
 class Cell:
-    """An entry of M: zero, constant or varying; its text; the joints it depends on (0-based); the reason."""
+    """An entry of M. style: zero, constant or varying. joints: on which it depends (0-based)."""
 
-    kind: str
+    style: str
     text: str
     joints: tuple[int, ...]
     explanation: str

@@ -75,7 +75,7 @@ class Line:
     x: Values
     y: Values
     style: str
-    kind = "line"
+    shape = "line"
 
     @property
     def heights(self) -> np.ndarray:
@@ -105,7 +105,7 @@ class Line:
 class Dots(Line):
     """Points without a connecting line."""
 
-    kind = "dots"
+    shape = "dots"
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
         """Return lines of length zero, whose round caps are the dots, for the points within both axes."""
@@ -124,7 +124,7 @@ class Band:
     low: Values
     high: Values
     style: str
-    kind = "band"
+    shape = "band"
 
     @property
     def heights(self) -> np.ndarray:
@@ -207,8 +207,8 @@ def line_chart(
     for mark in marks:
         inside = y_axis.contains(_shown([mark.heights], log))
         if inside.any():
-            legend.append(LegendEntry(f"{mark.kind} {mark.style}", mark.label))
-        if mark.kind == "line" and not inside.all():
+            legend.append(LegendEntry(f"{mark.shape} {mark.style}", mark.label))
+        if mark.shape == "line" and not inside.all():
             beyond.append(mark.label)
     svg = render(
         "chart.html.jinja",
@@ -219,7 +219,7 @@ def line_chart(
         y_label=y_label,
         motion=motion,
         # lines are drawn above bands and dots, the model's line above the baselines' lines
-        marks=sorted(marks, key=lambda mark: (mark.kind == "line", mark.style == "model")),
+        marks=sorted(marks, key=lambda mark: (mark.shape == "line", mark.style == "model")),
         beyond=beyond,
     )
     return Chart(svg, tuple(legend))

@@ -47,8 +47,8 @@ def mesh_file(urdf: Path, name: str) -> Path:
 
     The folder of the URDF and all its parents are searched, since any of these may be the folder of a package.
     """
-    scheme, _, rest = name.rpartition("://")
-    path = Path(rest)
+    scheme, _, path_text = name.rpartition("://")
+    path = Path(path_text)
     inner = Path(*path.parts[scheme == "package" :])
     for file in (urdf.parent / inner, path, *(folder / inner for folder in urdf.parents)):
         if os.path.isfile(file):  # unlike Path.is_file it raises no error for an invalid name

@@ -55,10 +55,8 @@ def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
             off = f"{number(distance)} {thousandths(spec.joint_types)} off"
             title = f"{which} log replayed: {example.trajectory}, {off}"
         else:
-            start = f"{example.start:.3g} s into it"
-            title = (
-                f"{which} prediction: {example.trajectory}, {start}, relative error {number(example.error)}"
-            )
+            title = f"{which} prediction: {example.trajectory}, {example.start:.3g} s into it, "
+            title += f"relative error {number(example.error)}"
         motion, lines = f"prediction {example.which}", {"predicted": example}
         trajectories[title] = trajectory_panels(lines, {"predicted": "predicted"}, joints, motion)
     return drawn | {"torques": torques, "trajectories": trajectories}

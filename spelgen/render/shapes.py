@@ -80,8 +80,8 @@ def visual_shapes(urdf: Path, links: Sequence[str]) -> dict[str, Shape]:
 def _any_visual(urdf: Path, links: Sequence[str]) -> bool:
     """Return True if any of these links has a visual shape. Raises FileNotFoundError if a mesh is not found."""
     root = etree.fromstring(urdf.read_bytes(), etree.XMLParser(resolve_entities=False, no_network=True))
-    shown = [link for link in root.iterfind("link") if link.get("name") in links]
-    for link in shown:
+    elements = [link for link in root.iterfind("link") if link.get("name") in links]
+    for link in elements:
         for mesh in link.iterfind("visual/geometry/mesh"):
             mesh_child.mesh_file(urdf, mesh.get("filename", ""))
-    return any(link.find("visual") is not None for link in shown)
+    return any(link.find("visual") is not None for link in elements)

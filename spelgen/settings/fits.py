@@ -40,7 +40,7 @@ class WindowFitDefaults:
 
 
 DEFAULTS = WindowFitDefaults()
-UNLESS = {  # option: (other option, its required value, its excluded value)
+UNLESS = {  # option: (option that it depends on, its required value, its excluded value)
     "batch": ("optimizer", "adamw", "lbfgs"),
     "learning_rate": ("optimizer", "adamw", "lbfgs"),
     "substeps": ("solver", "rk4", "dopri5"),
@@ -109,9 +109,9 @@ class FitConfig(Group):
     @model_validator(mode="after")
     def _agree(self) -> Self:
         options = dict(self)
-        for name, (other, required, excluded) in UNLESS.items():
-            if options.get(name) is not None and options.get(other) == excluded:
-                raise OptionError(name, f"belongs to the {other} {required}, this is {excluded}")
+        for name, (condition, required, excluded) in UNLESS.items():
+            if options.get(name) is not None and options.get(condition) == excluded:
+                raise OptionError(name, f"belongs to the {condition} {required}, this is {excluded}")
         return self
 
     def require(self, *, rigid_bodies: bool) -> None:
@@ -275,11 +275,11 @@ def fit_config(
     config_type, options = CONFIGS[objective], dict(options or {})
     applicable = config_type.model_fields.keys() - config_type.unused(rigid_bodies=rigid_bodies)
     settings = {name: value for name, value in (defaults or {}).items() if name in applicable}
-    for name, (other, _, excluded) in UNLESS.items():
-        if options.get(other, settings.get(other)) == excluded:
+    for name, (condition, _, excluded) in UNLESS.items():
+        if options.get(condition, settings.get(condition)) == excluded:
             settings.pop(name, None)
-        elif name in options and other not in options and settings.get(other) == excluded:
-            settings.pop(other)
+        elif name in options and condition not in options and settings.get(condition) == excluded:
+            settings.pop(condition)
     config = validated(config_type, settings | options)
     config.require(rigid_bodies=rigid_bodies)
     return config

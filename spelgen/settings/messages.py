@@ -63,10 +63,10 @@ def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[Bas
 
 
 def unknown_name(
-    location: Location, kind: str, name: str, names: Iterable[str], document: YamlDocument | None
+    location: Location, noun: str, name: str, names: Iterable[str], document: YamlDocument | None
 ) -> SettingsError:
-    """Return the error for a name that is not among `names`, with the nearest known name; kind: key or joint."""
-    error = _error_at(location, document, f"unknown {kind} {name!r}")
+    """Return the error for a name that is not among `names`, with the nearest known name; noun: key or joint."""
+    error = _error_at(location, document, f"unknown {noun} {name!r}")
     error.element, error.do = dotted(location[:-1]), suggestion(name, names)
     return error
 
