@@ -17,10 +17,9 @@ import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
 from spelgen.cli import (
+    arm_commands,
     compare_command,
     evaluate_command,
-    identify_command,
-    inspect_command,
     log_commands,
     model_commands,
     train_command,
@@ -98,11 +97,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    inspect_command.inspect,
+    arm_commands.inspect,
     model_commands.init,
     model_commands.build,
     log_commands.simulate,
-    identify_command.identify,
+    arm_commands.identify,
     log_commands.excite,
     log_commands.logs,
     train_command.train,

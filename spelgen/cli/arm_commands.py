@@ -1,4 +1,4 @@
-"""The command `inspect`: the exact structure of an arm's dynamics, in each of its formats."""
+"""Commands about an arm: `inspect`, the exact structure of its dynamics, and `identify`, its base parameters."""
 
 from __future__ import annotations
 
@@ -10,14 +10,30 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, deliver, note, refuse_warnings
-from spelgen.cli.options import AngleTolerance, Assumption, Entry, Joints, Output, Robot, Strict, Tip
+from spelgen.cli.options import (
+    Accept,
+    AngleTolerance,
+    Assumption,
+    Data,
+    Entry,
+    Filter,
+    Joints,
+    MappingFile,
+    MoreData,
+    Output,
+    Robot,
+    Strict,
+    Tip,
+)
 
 if TYPE_CHECKING:
     from spelgen.certificate.formulas import Formulas
     from spelgen.certificate.inspection import Inspection
     from spelgen.certificate.verification import Verification
 
-Format = Literal["text", "json", "html", "latex", "sympy"]
+InspectionFormat = Literal["text", "json", "html", "latex", "sympy"]
+IdentificationFormat = Literal["text", "json", "html"]
+EFFECTS = ("stribeck", "polynomial", "memory")
 
 
 def inspect(
@@ -30,7 +46,7 @@ def inspect(
         bool, typer.Option("--formulas", help="Write M and V as expressions in q and base parameters.")
     ] = False,
     entry: Entry = None,
-    format: Annotated[Format | None, options.result_format()] = None,
+    format: Annotated[InspectionFormat | None, options.result_format()] = None,
     output: Output = None,
     strict: Strict = False,
     verify: Annotated[
@@ -39,7 +55,7 @@ def inspect(
 ) -> None:
     """Show the exact structure of an arm's dynamics."""
     chosen_entry = options.entry(entry)
-    chosen = options.choose_format(format, output, get_args(Format))
+    chosen = options.choose_format(format, output, get_args(InspectionFormat))
     from spelgen.certificate.inspection import inspect as inspect_arm
     from spelgen.certificate.verify import verify as verified
 
@@ -104,3 +120,63 @@ def _formula_file(format: str, closed: Formulas, proof: Verification | None) -> 
     if format == "latex":
         return formula_files.latex(closed)
     return formula_files.sympy_source(closed)
+
+
+def identify(
+    robot: Robot,
+    extra_logs: MoreData = None,
+    data: Data = None,
+    mapping: MappingFile = None,
+    joints: Joints = None,
+    tip: Tip = None,
+    angle_tolerance: AngleTolerance = 2e-3,
+    filter: Filter = None,
+    weights: Annotated[
+        Literal["equal", "range", "noise"],
+        typer.Option(help="Weights of the joints: equal, by torque range, or by torque noise."),
+    ] = "noise",
+    friction: Annotated[
+        str | None,
+        typer.Option(
+            metavar="stribeck,polynomial,memory",
+            help="Friction terms in addition to viscous and Coulomb friction: Stribeck effect; qd |qd| and qd^3; "
+            "bristles (hysteresis).",
+        ),
+    ] = None,
+    accept: Accept = None,
+    format: Annotated[IdentificationFormat | None, options.result_format()] = None,
+    output: Output = None,
+) -> None:
+    """Identify base parameters and friction by least squares."""
+    paths = options.logs(data, extra_logs)
+    from spelgen.dynamics.linear_friction import FrictionModel
+    from spelgen.identification.identification import LeastSquares
+    from spelgen.identification.identify import identify as identify_arm
+    from spelgen.log_checks.check_logs import require_sound_logs
+    from spelgen.logs.preprocessing import Preprocessing
+    from spelgen.logs.read import read_logs
+
+    effects = options.names(friction) or []
+    for name in effects:
+        if name not in EFFECTS:
+            raise typer.BadParameter(f"{name!r} is none of {', '.join(EFFECTS)}", param_hint="'--friction'")
+    method = LeastSquares(weights, FrictionModel(**dict.fromkeys(effects, True)))
+    arm = options.load(robot, joints, tip, angle_tolerance)
+    # codes on the command line are accepted in addition to those in the settings
+    log_mapping = options.log_mapping(arm, mapping, accept)
+    logs = read_logs(paths, arm, log_mapping, role="train")
+    # least squares would fit logs in wrong units without an error
+    for diagnostic in require_sound_logs(logs, arm, log_mapping):
+        note(diagnostic)
+    result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
+    for diagnostic in result.diagnostics:
+        note(diagnostic)
+
+    def page() -> str:
+        # pages and charts are imported only for this format
+        from spelgen.render.identification_page import page
+
+        return page(result, arm)
+
+    forms = {"text": result.text, "json": lambda: json.dumps(result.to_dict(), indent=2), "html": page}
+    options.write_result(format, output, forms)
