@@ -85,9 +85,9 @@ def _text(
     if closed and format in ("latex", "sympy"):
         return _formula_file(format, closed, proof)
     if format == "html":
-        from spelgen.render.inspection_page import page
+        from spelgen.render.arm_pages import inspection_page
 
-        return page(inspection, closed, proof, urdf)
+        return inspection_page(inspection, closed, proof, urdf)
     if format == "json":
         data = inspection.to_dict()
         if closed:
@@ -174,9 +174,9 @@ def identify(
 
     def page() -> str:
         # pages and charts are imported only for this format
-        from spelgen.render.identification_page import page
+        from spelgen.render.arm_pages import identification_page
 
-        return page(result, arm)
+        return identification_page(result, arm)
 
     forms = {"text": result.text, "json": lambda: json.dumps(result.to_dict(), indent=2), "html": page}
     options.write_result(format, output, forms)
