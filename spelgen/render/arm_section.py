@@ -135,6 +135,7 @@ def _sweep(arm: Arm) -> AnimatedMotion:
     # some URDFs have limits of 100 turns, at which the picture would be a blur
     largest = [AMPLITUDES[coordinate.kind] for coordinate in arm.coordinates]
     joint = np.arange(len(low))
+    # periods of 12, 6 and 4 s, so that the motion of neighbouring joints is distinguishable and the whole is periodic
     phase = 2 * np.pi / 12 * t[:, None] * (1 + joint % 3) + joint
     q = (low + high) / 2 + np.minimum(0.4 * (high - low), largest) * np.sin(phase)
     return AnimatedMotion("sweep", "a motion through the joints' ranges", t.round(3), q.round(4))

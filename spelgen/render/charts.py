@@ -249,6 +249,7 @@ def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool
     low, high = float(values.min()), float(values.max())
     if log:
         low = max(low, high * 10.0**-TUNING.decades)
+        # margins of equal width on a logarithmic axis are equal factors
         factor = (high / low) ** pad if high > low else 2.0
         return Axis(low / factor, high * factor, start, end, log=True)
     room = pad * (high - low)
@@ -260,6 +261,7 @@ def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool
 
 def _log_steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
     """Return ticks (K,) and labels: powers of ten; for fewer than three, 1, 2 and 5 times these, or `_steps`."""
+    # the tolerance keeps a power of ten at the end of the axis in spite of rounding
     first, last = math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9)
     powers = range(first, last + 1, max(1, (last - first) // 5 + 1))
     if len(powers) >= 3:
@@ -274,6 +276,7 @@ def _log_steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
 
 def _steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
     """Return ticks (K,) and labels: multiples of 1, 2 or 5 times a power of ten."""
+    # the smallest step of 1, 2, 5 or 10 times a power of ten that gives at most five intervals
     rough = (high - low) / 5
     fine = 10.0 ** math.floor(math.log10(rough)) * np.array([1, 2, 5, 10])
     step = fine[fine >= rough * (1 - 1e-9)][

@@ -80,6 +80,7 @@ def main(urdf: str, links: list[str], output: IO[bytes]) -> None:
         if not (np.isfinite(mesh.vertices).all() and mesh.area < np.inf) or len(mesh.faces) > MAX_FACES:
             raise ValueError(f"{link.name}: too many triangles, or corners that are no numbers")
         if len(mesh.faces) > TUNING.faces // len(links):
+            # an equal number of faces per link bounds the size of the page
             mesh = mesh.simplify_quadric_decimation(face_count=TUNING.faces // len(links), aggression=3)
         index = links.index(link.name)
         arrays |= {f"v{index}": np.asarray(mesh.vertices), f"f{index}": np.asarray(mesh.faces)}

@@ -103,6 +103,7 @@ def friction_panels(
         values = [curve]
         for trace in torques:
             qd, modelled = trace.qd[:, k], trace.parts["friction"][:, k]
+            # measured friction = measured torque - (model torque - model friction)
             measured = modelled + trace.measured[:, k] - trace.predicted[MODEL][:, k]
             values.append(measured)
             marks.append(Dots("measured", qd, measured, "truth"))

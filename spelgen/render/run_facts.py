@@ -58,6 +58,7 @@ def head_numbers(
 
 def best_epoch(metrics: Sequence[Content]) -> int:
     """Return the epoch of the best model; 0: no epoch was better than the initial model."""
+    # the last record has the smallest validation loss, which is the initial loss if no epoch improved it
     best = metrics[-1]["best"]
     return next((epoch["epoch"] for epoch in metrics if epoch["validation"] == best), 0)
 

@@ -126,6 +126,7 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
     if not below and inertial is not None:
         meshes += tube(np.zeros(3), np.array(inertial.com, dtype=float), 0.7 * radius)
     if joint is not None and joint.moves:
+        # a square block for a prismatic joint, a drum for a revolute joint; radius and half length in tube radii
         sides, width, half = (4, 1.8, 2.4) if joint.type == "prismatic" else (10, 1.5, 1.725)
         ends = half * radius * _axis(joint)
         meshes += tube(-ends, ends, width * radius, sides)
