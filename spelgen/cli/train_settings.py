@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from spelgen.errors import RunError, suggestion
 from spelgen.settings.fits import OWNERS, Adaptation
 from spelgen.settings.messages import explain
-from spelgen.settings.training import TrainingSettings
+from spelgen.settings.training import PREPROCESSING, TrainingSettings
 from spelgen.settings.values import Count
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from spelgen.settings.log_mapping import LogMapping
 
 TIME_LIMIT = "max_minutes"
-OF_LOGS = {"cutoff", "decimation", "gap", "torque_delay", "validation_fraction", "seed"}
+OF_LOGS = PREPROCESSING | {"validation_fraction", "seed"}
 FIELD_SEPARATOR = "."
 
 

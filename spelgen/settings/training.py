@@ -10,6 +10,8 @@ from spelgen.settings.fits import OWNERS, GaussianPrior, Objective, Optimizer, S
 from spelgen.settings.log_mapping import LONGEST_DELAY
 from spelgen.settings.values import Count, Group, NonNegative, Number, Positive, Whole
 
+PREPROCESSING = {"cutoff", "decimation", "gap", "torque_delay"}
+
 
 class TrainingSettings(Group):
     """Defaults of `spelgen train` for one robot; options of the command line take precedence.
@@ -68,7 +70,7 @@ class TrainingSettings(Group):
     @property
     def preprocessing(self) -> dict[str, Any]:
         """Options of `Preprocessing` that are set."""
-        return self.model_dump(include={"cutoff", "decimation", "gap", "torque_delay"}, exclude_none=True)
+        return self.model_dump(include=PREPROCESSING, exclude_none=True)
 
 
 class PublishedFigures(Group):
