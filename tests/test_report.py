@@ -11,7 +11,6 @@ from html_page import Page
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.design import PRESETS
-from spelgen.emission.assemble import assemble
 from spelgen.emission.build import build
 from spelgen.emission.specify import make_spec
 from spelgen.errors import RunError
@@ -178,7 +177,7 @@ def test_learned_constants_are_those_of_the_weights(run):
     state["raw_armature"] += math.log(3.0)
     torch.save(state, run / "model.pt")
     page = render_report(run)
-    for start in assemble(RunFolder(run).read_spec()).armature.tolist():
+    for start in RunFolder(run).untrained_model().armature.tolist():
         assert f"{3 * start:.3g} " in page
 
 

@@ -57,12 +57,15 @@ def inspect(
     chosen_entry = options.entry(entry)
     chosen = options.choose_format(format, output, get_args(InspectionFormat))
     from spelgen.certificate.inspection import inspect as inspect_arm
-    from spelgen.certificate.verify import verify as verified
 
     arm = options.load(robot, joints, tip, angle_tolerance)
     inspection = inspect_arm(arm, assume=assume)
-    # takes seconds: Pinocchio and SymPy
-    proof = verified(arm.robot, arm.arm, inspection.structure) if verify else None
+    proof = None
+    if verify:
+        # imported here: Pinocchio and SymPy, which take seconds
+        from spelgen.certificate.verify import verify as verified
+
+        proof = verified(arm.robot, arm.arm, inspection.structure)
     closed = None
     if formulas or chosen_entry is not None or chosen in ("latex", "sympy"):
         from spelgen.certificate.formulas import WRITABLE

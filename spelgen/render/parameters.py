@@ -194,14 +194,12 @@ def _constant_table(mass: DerivedMass | ConstantMass, joint_types: Sequence[str]
     """Return the learned constants of M with the entries that contain them."""
     count = len(mass.raw_constants)
     # dM / d constant, (constants, n, n): M is linear in its functions and constants
-    functions = torch.zeros(
-        len(mass.function_mean) if isinstance(mass, DerivedMass) else 0, count, dtype=torch.float64
-    )
+    functions = len(mass.function_mean) if isinstance(mass, DerivedMass) else 0
+    zeros = torch.zeros(functions, count, dtype=torch.float64)
     units = torch.eye(count, dtype=torch.float64)
     rows = []
-    for basis, value in zip(
-        mass.entries(*functions.unbind(), *units.unbind()), mass.constants().tolist(), strict=True
-    ):
+    bases = mass.entries(*zeros.unbind(), *units.unbind())
+    for basis, value in zip(bases, mass.constants().tolist(), strict=True):
         indices = basis.tril().nonzero().tolist()
         terms = [f"{basis[row, column].item():+.4g} {entry_name(row, column)}" for row, column in indices]
         # a constant that occurs in entries of different units has the unit of the first one
