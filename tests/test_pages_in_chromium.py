@@ -7,6 +7,7 @@ from chromium import Chromium, executable
 from test_report import run  # noqa: F401  (a fixture)
 
 from spelgen.arm.configured_arm import load_arm
+from spelgen.certificate.inspection import inspect
 from spelgen.render.arm_pages import inspection_page
 from spelgen.render.report_page import write_report
 
@@ -42,7 +43,7 @@ def pages(run, robots, tmp_path):  # noqa: F811
     (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
     panda = load_arm(robots / "panda.urdf")
     (tmp_path / "panda.html").write_text(
-        inspection_page(panda.inspect(), urdf=panda.robot.path), encoding="utf-8"
+        inspection_page(inspect(panda), urdf=panda.robot.path), encoding="utf-8"
     )
     return [write_report(run), tmp_path / "panda.html"]
 
