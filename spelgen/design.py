@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal, get_args, get_type_hints
 
 from spelgen.errors import SettingsError, collect, suggestion
-from spelgen.settings.yaml_document import Document, read_document
+from spelgen.settings.yaml_document import YamlDocument, read_document
 
 Preset = Literal["hybrid", "closed-form", "minimal", "spel", "spel-kan", "phnode"]
 """The presets of spelgen."""
@@ -83,7 +83,7 @@ def _read(path: Path) -> Design:
     return Design(**values)
 
 
-def validate(values: Mapping[str, object], document: Document | None = None) -> None:
+def validate(values: Mapping[str, object], document: YamlDocument | None = None) -> None:
     """Raise SettingsError, or SpelgenErrors of several, unless ``values`` are a design.
 
     ``document``: the file of the values, which errors name with lines.

@@ -29,9 +29,9 @@ class NamedJoint:
     name: str
     units: Units
 
-    def axis(self, quantity: str) -> str:
-        """Return a quantity with its unit: ``position [rad]``."""
-        return f"{quantity} [{asdict(self.units)[quantity]}]"
+    def axis(self, quantity: str, label: str = "") -> str:
+        """Return ``label [rad]`` with the unit of ``position``, ``velocity`` or ``torque``."""
+        return f"{label or quantity} [{asdict(self.units)[quantity]}]"
 
 
 def named_joints(names: Sequence[str], joint_types: Sequence[str]) -> list[NamedJoint]:
