@@ -158,7 +158,9 @@ class PositionActuators:
                 fullinertia=tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]],
             )
             parents.append(element)
-            kind = mujoco.mjtJoint.mjJNT_HINGE if body.kind == "revolute" else mujoco.mjtJoint.mjJNT_SLIDE
+            kind = (
+                mujoco.mjtJoint.mjJNT_HINGE if body.joint_type == "revolute" else mujoco.mjtJoint.mjJNT_SLIDE
+            )
             element.add_joint(
                 name=body.name,
                 type=kind,

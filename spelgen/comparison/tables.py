@@ -14,7 +14,7 @@ from spelgen.comparison.study import Study
 from spelgen.evaluation.tables import Row, Table, table
 from spelgen.labels import counted, listed
 from spelgen.listing import number
-from spelgen.settings.comparison import PublishedFigures
+from spelgen.settings.training import PublishedFigures
 
 BASELINE = "phnode"
 Runs = Mapping[str, Sequence[RunResult]]

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.design import BRISTLE_REACH
+from spelgen.design import BREAKAWAY
 
-BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BRISTLE_REACH["revolute"])))
+BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BREAKAWAY["revolute"])))
 
 # [rad/s, m/s] Velocity at which the additional dry friction of slow motion has fallen to 1/e.
 STRIBECK_VELOCITY = 0.1

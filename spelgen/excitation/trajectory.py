@@ -16,7 +16,7 @@ from torch import Tensor
 from spelgen.arm.arm import Arm
 from spelgen.errors import ArmError, SpelgenError, collect
 from spelgen.excitation.tuning import TUNING
-from spelgen.urdf.robot import Joint
+from spelgen.urdf.robot import UrdfJoint
 
 # Smallest ratio of the maximum of a series on the grid to its maximum over time.
 GRID_RATIO = cos(pi / TUNING.grid)
@@ -36,7 +36,7 @@ class MotionBounds:
 
 
 def motion_bounds(
-    arm: Arm, range_fraction: float, speed_fraction: float, joints: Mapping[str, Joint] | None = None
+    arm: Arm, range_fraction: float, speed_fraction: float, joints: Mapping[str, UrdfJoint] | None = None
 ) -> MotionBounds:
     """Return the central fraction of the position ranges, and a fraction of the velocity limits.
 
@@ -45,9 +45,9 @@ def motion_bounds(
     """
     limits, speeds = np.zeros((len(arm.coordinates), 2)), np.zeros(len(arm.coordinates))
     for k, coordinate in enumerate(arm.coordinates):
-        half = HALF_RANGES[coordinate.kind]
+        half = HALF_RANGES[coordinate.joint_type]
         limits[k] = sorted(coordinate.limits or (-half, half))
-        speeds[k] = coordinate.velocity or SPEEDS[coordinate.kind]
+        speeds[k] = coordinate.velocity or SPEEDS[coordinate.joint_type]
     for body in arm.bodies:
         k, factor = body.coordinate, float(body.multiplier)
         mimic = (joints or {}).get(body.name)

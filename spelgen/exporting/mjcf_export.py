@@ -132,7 +132,7 @@ def mjcf_text(projection: RigidBodyProjection) -> bytes:
         # the order of MuJoCo: xx, yy, zz, xy, xz, yz
         moments = tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         _add(element, "inertial", mass=mass, pos=center, fullinertia=moments)
-        joint_type = "hinge" if body.kind == "revolute" else "slide"
+        joint_type = "hinge" if body.joint_type == "revolute" else "slide"
         joint = {"name": body.name, "axis": (0, 0, 1), "type": joint_type}
         leader = arm.coordinates[body.coordinate]
         if leader.name == body.name:

@@ -141,7 +141,7 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
 
 def nominal_speeds(coordinates: Sequence[Coordinate]) -> np.ndarray:
     """Return the velocity limits of the URDF, or nominal speeds of joints without a limit, (n,) [rad/s, m/s]."""
-    return np.array([joint.velocity or _NOMINAL_SPEEDS[joint.kind] for joint in coordinates])
+    return np.array([joint.velocity or _NOMINAL_SPEEDS[joint.joint_type] for joint in coordinates])
 
 
 def relative(values: np.ndarray, expected: np.ndarray) -> float:

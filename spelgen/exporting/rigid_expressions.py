@@ -31,7 +31,7 @@ def body_frames(bodies: Sequence[Body], q: ca.SX) -> list[tuple[ca.SX, ca.SX]]:
         rotation = ca.SX(constant(body.rotation))
         position = ca.SX(constant(body.translation))
         displacement = float(body.multiplier) * q[body.coordinate] + body.offset
-        if body.kind == "revolute":
+        if body.joint_type == "revolute":
             rotation = rotation @ rotation_about_z(displacement)
         else:
             position = position + rotation[:, 2] * displacement
@@ -62,7 +62,7 @@ def rigid_torque(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.
         acceleration = rotation.T @ (acceleration + spin @ position)
         w, rate = rotation.T @ w, rotation.T @ rate
         turning = ca.cross(w, _Z) * speed
-        if body.kind == "revolute":
+        if body.joint_type == "revolute":
             w = w + _Z * speed
             rate = rate + _Z * added + turning
         else:
@@ -82,7 +82,7 @@ def rigid_torque(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.
     # children come after their parents
     for index in reversed(range(len(bodies))):
         body, force, torque = bodies[index], forces[index], torques[index]
-        along_axis = torque[2] if body.kind == "revolute" else force[2]
+        along_axis = torque[2] if body.joint_type == "revolute" else force[2]
         # mimic joints share the coordinate of their leader
         joint_torques[body.coordinate] += float(body.multiplier) * along_axis
         if body.parent >= 0:
@@ -123,7 +123,7 @@ def tip_kinematics(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
         # the axis is z of the body's frame
         axis, origin = poses[index + 1][:3, 2], poses[index + 1][:3, 3]
         column = ca.vertcat(axis, ca.SX(3, 1))
-        if body.kind == "revolute":
+        if body.joint_type == "revolute":
             column = ca.vertcat(ca.cross(axis, pose[:3, 3] - origin), axis)
         jacobian[:, body.coordinate] += float(body.multiplier) * column
         index = body.parent

@@ -1,4 +1,4 @@
-"""Write a comparison as one self-contained HTML page: the result in a sentence and a table, then curves."""
+"""The page of a comparison: the result in a sentence and a table, then curves."""
 
 from __future__ import annotations
 
@@ -57,6 +57,7 @@ def write_comparison(study: Study, sections: Sequence[ArmResults]) -> Path:
 
 
 def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -> SimulatedCurves:
+    """Return the curves of one arm; truth: URDF of the simulated arm."""
     first: dict[str, SimulatedFigures] = {}
     for result in section.results:
         if result.simulated is not None:
@@ -79,7 +80,7 @@ def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -
 
 
 def _losses(folders: Mapping[str, Path], styles: Mapping[str, str]) -> Chart:
-    """Return the validation loss of each preset by training step."""
+    """Return the best validation loss of each preset over the training steps; folders, styles: by preset."""
     lines = []
     for name, style in styles.items():
         records = RunFolder(folders[name]).read_metrics()
