@@ -31,7 +31,7 @@ from real_logs import first, mean, samples_of, torque_of, trained
 from recordings import folder_of
 
 import spelgen
-from spelgen.dynamics.residuals import residual_torque
+from spelgen.dynamics.parameters import residual_torque
 from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
 from spelgen.fitting.torque import fit as torque_fit
 from spelgen.fitting.torque import joint_functions, residual_stage, stages

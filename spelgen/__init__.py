@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from spelgen.certificate.inspection import Inspection, inspect
     from spelgen.certificate.module_check import check
     from spelgen.design import Design
-    from spelgen.dynamics.linear_friction import FrictionModel
+    from spelgen.dynamics.friction import FrictionModel
     from spelgen.dynamics.tip import tip_kinematics
     from spelgen.emission.build import build
     from spelgen.emission.loading import load_module

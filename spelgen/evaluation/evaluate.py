@@ -13,8 +13,8 @@ from spelgen.baselines.baseline import EvaluatedArm
 from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import Predictor, accurate_solver, of_dynamics
 from spelgen.baselines.registry import command_followers, torque_predictors
+from spelgen.dynamics.parameters import used_parameter_count, without_idle_residuals
 from spelgen.dynamics.protocol import input_of
-from spelgen.dynamics.residuals import used_parameter_count, without_idle_residuals
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import Diagnostic, LogError, in_one_line
 from spelgen.evaluation.horizons import (
@@ -71,7 +71,7 @@ def evaluate(
     """Predict the states and torques of test logs and measure the errors.
 
     Dynamics are evaluated open loop, and with the constant disturbance that a momentum observer estimates before a
-    prediction starts (see `momentum_observer.py`). The result is deterministic, and nothing is written.
+    prediction starts (see `horizons.observe`). The result is deterministic, and nothing is written.
 
     Args:
         model: an emitted model, a fit, or the folder of a run.

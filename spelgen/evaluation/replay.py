@@ -11,7 +11,7 @@ import torch
 
 from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import CommandFollower
-from spelgen.dynamics.residuals import without_idle_residuals
+from spelgen.dynamics.parameters import without_idle_residuals
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.tuning import TUNING

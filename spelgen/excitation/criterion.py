@@ -13,8 +13,8 @@ from torch import Tensor
 
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.body_regressor import regressor_of
-from spelgen.dynamics.linear_friction import FrictionModel
-from spelgen.dynamics.regressor import body_chain, urdf_parameters
+from spelgen.dynamics.friction import FrictionModel
+from spelgen.dynamics.regressor_dynamics import body_chain, urdf_parameters
 from spelgen.excitation.trajectory import ExcitationTrajectory
 from spelgen.excitation.tuning import TUNING
 from spelgen.identification.base_parameters import base_parameters

@@ -15,8 +15,13 @@ from spelgen.files import write_json
 from spelgen.fitting.fitted import Fit, load_run, required_spec
 from spelgen.fitting.objective import FitRequest, Objective, RunOptions, Status, new_record
 from spelgen.fitting.objectives import FitOptions, choose_config, objective_of
-from spelgen.fitting.process import locked, require_device, termination_as_interrupt, threads_of_torch
-from spelgen.fitting.progress import TrainingProgress
+from spelgen.fitting.process import (
+    TrainingProgress,
+    locked,
+    require_device,
+    termination_as_interrupt,
+    threads_of_torch,
+)
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_record import Checkpoint
 from spelgen.logs.dynamics_samples import SHORTEST

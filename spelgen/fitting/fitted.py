@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
-from spelgen.dynamics.residuals import used_parameter_count
+from spelgen.dynamics.parameters import used_parameter_count
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.files import write_json

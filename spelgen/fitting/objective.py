@@ -25,7 +25,7 @@ from spelgen.settings.messages import validated
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
-    from spelgen.fitting.progress import TrainingProgress
+    from spelgen.fitting.process import TrainingProgress
 
 Status = Literal["finished", "stopped early", "out of time", "interrupted"]
 

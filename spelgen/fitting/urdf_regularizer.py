@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
+from spelgen.dynamics.pinocchio_dynamics import urdf_dynamics
 from spelgen.fitting.tuning import RegularizerTuning
 from spelgen.logs.windows import Windows
 

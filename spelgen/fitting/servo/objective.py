@@ -36,7 +36,7 @@ from spelgen.logs.checks import check
 from spelgen.logs.trajectory import require_commands, require_joints
 
 if TYPE_CHECKING:
-    from spelgen.fitting.progress import TrainingProgress
+    from spelgen.fitting.process import TrainingProgress
 
 TUNING = ServoSolverTuning()
 ROUNDS = 3  # on few windows with half the steps; on few, with dead zones; on all

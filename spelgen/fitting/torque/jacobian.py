@@ -10,8 +10,8 @@ import torch
 from torch.autograd import grad as gradient
 
 from spelgen.dynamics.body_regressor import regressor_of
+from spelgen.dynamics.parameters import friction_factor, residual_torque
 from spelgen.dynamics.protocol import motors_of
-from spelgen.dynamics.residuals import friction_factor, residual_torque
 from spelgen.fitting.functional_model import NamedTensors, evaluate_with
 from spelgen.fitting.torque import linearization
 from spelgen.fitting.torque.linearization import (

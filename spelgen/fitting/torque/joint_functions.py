@@ -15,9 +15,14 @@ import torch
 import torch.nn.functional as F
 
 from spelgen.dynamics.protocol import motors_of
-from spelgen.fitting.torque.bayesian_ridge import BayesianRidge, append_target, bayesian_ridge
 from spelgen.fitting.torque.jacobian import ResidualSamples
-from spelgen.fitting.torque.linearization import LinearTerms, RigidProjection
+from spelgen.fitting.torque.linearization import (
+    BayesianRidge,
+    LinearTerms,
+    RigidProjection,
+    append_target,
+    bayesian_ridge,
+)
 from spelgen.runtime.residual_terms import LARGEST, SPLINES, ResidualTerms
 
 if TYPE_CHECKING:

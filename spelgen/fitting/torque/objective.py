@@ -13,8 +13,8 @@ import torch
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.bristles import bristle_reach
+from spelgen.dynamics.parameters import without_idle_residuals
 from spelgen.dynamics.protocol import known_past, motors_of
-from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import TrainingData, Validation
 from spelgen.fitting.objective import PreparedLogs, TorqueLogObjective

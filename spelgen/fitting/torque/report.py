@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch.autograd.functional import jacobian
 
+from spelgen.dynamics.parameters import idle_residuals
 from spelgen.dynamics.protocol import residual_terms
-from spelgen.dynamics.residuals import idle_residuals
 from spelgen.errors import Diagnostic
 from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.torque.fit import TorqueSolution

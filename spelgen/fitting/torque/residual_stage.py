@@ -10,7 +10,7 @@ import torch
 
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.joint_functions import TermKey, clear_terms, refit_terms
-from spelgen.fitting.torque.network_selection import select_networks
+from spelgen.fitting.torque.networks import select_networks
 from spelgen.fitting.torque.problem import TorqueEstimate, refine
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.selection import (

@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from spelgen.fitting.torque.bayesian_ridge import append_target, bayesian_ridge
 from spelgen.fitting.torque.jacobian import ResidualSamples
 from spelgen.fitting.torque.joint_functions import JointFunction, TermKey, joint_functions, rms_per_joint
-from spelgen.fitting.torque.linearization import RigidProjection
+from spelgen.fitting.torque.linearization import RigidProjection, append_target, bayesian_ridge
 from spelgen.fitting.torque.tuning import SELECTION
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from spelgen.logs.windows import Windows
 from spelgen.settings.fits import DEFAULTS, Solver, WindowConfig
 
 if TYPE_CHECKING:
-    from spelgen.fitting.progress import TrainingProgress
+    from spelgen.fitting.process import TrainingProgress
 
 TUNING = WindowTuning()
 

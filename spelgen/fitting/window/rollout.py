@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
-from spelgen.dynamics.residuals import idle_residuals
+from spelgen.dynamics.parameters import idle_residuals
 from spelgen.errors import Diagnostic, RunError
 from spelgen.fitting.optimizers import WindowOptimizer
 from spelgen.fitting.rollout import rollout_loss
@@ -24,7 +24,7 @@ from spelgen.settings.fits import Rollout, TorqueFit
 
 if TYPE_CHECKING:
     from spelgen.fitting.objective import Status
-    from spelgen.fitting.progress import TrainingProgress
+    from spelgen.fitting.process import TrainingProgress
 
 TUNING = LoopTuning()
 
