@@ -32,7 +32,6 @@ class BristleReach:
         return int(self.values.shape[1])
 
 
-NO_BRISTLES = BristleReach(np.zeros((0, 0)))
 # Samples that are computed at a time: several arrays of this size are in memory.
 BLOCK = 2**14
 

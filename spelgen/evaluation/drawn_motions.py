@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from scipy.integrate import cumulative_trapezoid
 from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import States
 from spelgen.dynamics.bristles import bristles_along
+from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.evaluation.horizons import EvaluatedLogs
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.torque import friction_past, mean_nmse, predicted_torques
@@ -23,9 +24,6 @@ from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
-
-if TYPE_CHECKING:
-    from spelgen.dynamics.protocol import RigidDynamics
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

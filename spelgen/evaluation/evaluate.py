@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
+from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.baselines.baseline import EvaluatedArm
 from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import Predictor, accurate_solver, of_dynamics
 from spelgen.baselines.registry import command_followers, torque_predictors
 from spelgen.dynamics.parameters import used_parameter_count, without_idle_residuals
-from spelgen.dynamics.protocol import input_of
+from spelgen.dynamics.protocol import RigidDynamics, input_of
 from spelgen.dynamics.tip import tip_kinematics
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, LogError, in_one_line
 from spelgen.evaluation.horizons import (
     EvaluatedLogs,
@@ -32,6 +34,7 @@ from spelgen.evaluation.torque import TorqueErrors, coarse_torques, torque_error
 from spelgen.evaluation.traces import Traces, motion_traces, replay_traces
 from spelgen.evaluation.truth import mass_errors
 from spelgen.evaluation.tuning import TUNING
+from spelgen.fitting.fitted import Fit
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import SHORTEST, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
@@ -44,12 +47,6 @@ from spelgen.logs.trajectory import (
     require_torques,
 )
 from spelgen.logs.windows import Windows
-
-if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import ConfiguredArm
-    from spelgen.dynamics.protocol import RigidDynamics
-    from spelgen.emission.assemble import ArmModel
-    from spelgen.fitting.fitted import Fit
 
 STEPS: Sequence[int] = (1, 10)
 SECONDS: Sequence[float] = (1.0,)

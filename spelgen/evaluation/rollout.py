@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from spelgen.dynamics.protocol import RigidDynamics, integrable
+from spelgen.emission.assemble import ArmModel
 from spelgen.evaluation.tuning import TUNING
 from spelgen.fitting.rollout import roll_out
 from spelgen.logs.windows import Windows
 from spelgen.settings.fits import Solver
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 
 def rollout(

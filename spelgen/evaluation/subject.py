@@ -6,14 +6,14 @@ import copy
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.baselines.baseline import FittedBaselines, arm_of_model
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
-from spelgen.emission.assemble import spec_of
+from spelgen.emission.assemble import ArmModel, spec_of
 from spelgen.evaluation.tuning import TUNING
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
@@ -24,9 +24,6 @@ from spelgen.settings.fits import OnWindows
 from spelgen.settings.settings import load_mapping
 from spelgen.spec import ModelSpec
 from spelgen.urdf.read import read_urdf
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 
 @dataclass(frozen=True)

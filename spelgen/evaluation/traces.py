@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from spelgen.baselines.names import MODEL, is_drawn
+from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.evaluation.drawn_motions import (
     DrawnMotion,
     PredictedMotion,
@@ -31,9 +31,6 @@ from spelgen.evaluation.replay import PositionErrors
 from spelgen.evaluation.tuning import TRACES as TUNING
 from spelgen.fitting.rollout import AT_REST, loss_scales, position_difference
 from spelgen.logs.trajectory import Trajectory, coverage, joined_column
-
-if TYPE_CHECKING:
-    from spelgen.dynamics.protocol import RigidDynamics
 
 
 @dataclass(frozen=True, eq=False)

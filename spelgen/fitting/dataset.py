@@ -7,12 +7,12 @@ import hashlib
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from spelgen.dynamics.bristles import BristleReach
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.rollout import LossScales, choose_substeps, loss_scales, rollout_loss
 from spelgen.fitting.run_record import Content
@@ -22,9 +22,6 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 from spelgen.logs.windows import Split, Windows, cut_windows, split_validation, thinned
 from spelgen.settings.fits import DEFAULTS, Solver
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 TUNING = ValidationTuning()
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -30,9 +29,6 @@ from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import FitConfig
 from spelgen.spec import ModelSpec
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 
 @dataclass(frozen=True, eq=False, repr=False)

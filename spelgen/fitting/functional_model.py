@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch.func import functional_call
 
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
+from spelgen.emission.assemble import ArmModel
 
 NamedTensors = Mapping[str, torch.Tensor]
 """Tensors by the names of a model's parameters and buffers."""

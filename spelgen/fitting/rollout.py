@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
 from spelgen.dynamics.equations import mass_as_learned, runge_kutta
 from spelgen.dynamics.protocol import known_past, memory_after, memory_along, sliding_memory
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import LogError
 from spelgen.fitting.tuning import AdaptiveTuning, IntegrationTuning
 from spelgen.logs.windows import Windows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import Solver
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 TUNING, ADAPTIVE = IntegrationTuning(), AdaptiveTuning()
 SOLVER: dict[str, Any] = {"method": "dopri5", "rtol": ADAPTIVE.relative, "atol": ADAPTIVE.absolute}

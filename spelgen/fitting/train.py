@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from spelgen.emission.assemble import ArmModel
 from spelgen.emission.loading import load_module
 from spelgen.errors import Diagnostic, ModuleError, RunError
 from spelgen.fitting.fit import AUTOMATIC, QUIET, RunOptions, fit, sample_rates
@@ -22,9 +22,6 @@ from spelgen.settings.fits import FitConfig
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.spec import ModelSpec
 from spelgen.urdf.document import urdf_bytes
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 
 def train(

@@ -7,16 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 
 from spelgen.dynamics.pinocchio_dynamics import urdf_dynamics
+from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.tuning import RegularizerTuning
 from spelgen.logs.windows import Windows
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 TUNING = RegularizerTuning()
 

@@ -22,7 +22,7 @@ from spelgen.excitation.trajectory import Motion
 from spelgen.files import require_regular_file
 from spelgen.logs.csv_files import csv_columns
 from spelgen.settings.settings import Settings
-from spelgen.simulation.protocol import SimulatedLogs, make_friction, paths
+from spelgen.simulation.protocol import SimulatedLogs, make_friction, paths, sample_times
 from spelgen.simulation.tracking import Recording, measured, quantized
 from spelgen.simulation.tuning import AS_BUILT
 
@@ -102,8 +102,7 @@ def prescribed(
     dynamics = arm_dynamics(arm, settings)
     to_motors = np.eye(len(arm.coordinates)) if drives is None else np.linalg.inv(drives.inputs)
     if not motions:
-        t = np.arange(round(protocol.duration * protocol.sample_rate) + 1) / protocol.sample_rate
-        motions = paths(arm, settings, t)
+        motions = paths(arm, settings, sample_times(protocol))
     logs = []
     for number, motion in enumerate(motions):
         rng = np.random.default_rng([protocol.seed, number])
@@ -115,8 +114,7 @@ def prescribed(
         recording = Recording(motion.t, states, quantized(motion.q, settings.tracking), tau)
         logs.append(measured(recording, settings.tracking, f"motion_{number:02d}"))
         progress(number + 1, len(motions))
-    trained = len(logs) - min(round(protocol.test_fraction * len(logs)), len(logs) - 1)
-    return SimulatedLogs(logs[:trained], logs[trained:])
+    return SimulatedLogs.split(logs, protocol.test_fraction)
 
 
 def friction_along(friction: DriveFriction, arm: Arm, motion: Motion, presliding: float) -> np.ndarray:

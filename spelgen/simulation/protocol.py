@@ -13,6 +13,7 @@ from spelgen.excitation.trajectory import SPEEDS, ExcitationTrajectory, Motion, 
 from spelgen.excitation.tuning import TUNING as EXCITATION
 from spelgen.logs.trajectory import Trajectory, trajectory_listing
 from spelgen.settings.settings import Settings
+from spelgen.settings.simulation import SimulationSettings
 from spelgen.simulation.tuning import TUNING as SIMULATION
 
 
@@ -23,11 +24,22 @@ class SimulatedLogs(list[Trajectory]):
         super().__init__([*train, *test])
         self.train, self.test = tuple(train), tuple(test)
 
+    @classmethod
+    def split(cls, logs: Sequence[Trajectory], test_fraction: float) -> SimulatedLogs:
+        """Return the logs, the last of which are for testing; at least one remains for training."""
+        trained = len(logs) - min(round(test_fraction * len(logs)), len(logs) - 1)
+        return cls(logs[:trained], logs[trained:])
+
     def __repr__(self) -> str:
         return f"<SimulatedLogs: {len(self.train)} to train, {len(self.test)} to test>"
 
     def _repr_html_(self) -> str:
         return trajectory_listing(self).html()
+
+
+def sample_times(simulation: SimulationSettings) -> np.ndarray:
+    """Return the times of the samples of one trajectory, (T,) [s]."""
+    return np.arange(round(simulation.duration * simulation.sample_rate) + 1) / simulation.sample_rate
 
 
 def make_friction(arm: Arm, settings: Settings, speeds: np.ndarray | None = None) -> DriveFriction:

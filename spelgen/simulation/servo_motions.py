@@ -11,7 +11,7 @@ from spelgen.arm.arm import Arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
-from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction
+from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction, sample_times
 from spelgen.simulation.tuning import SERVOS as TUNING
 
 SWEEPS = 4  # Gauss-Seidel iterations over the joints, for dry friction
@@ -33,7 +33,7 @@ def servo_motions(
     protocol = settings.simulation
     lowest, highest = initial_range(arm, settings)
     middle, width = (lowest + highest) / 2, np.minimum((highest - lowest) / 2, TUNING.widest)
-    t = np.arange(round(protocol.duration * protocol.sample_rate) + 1) / protocol.sample_rate
+    t = sample_times(protocol)
     encoder = np.array([ENCODER if x.kind == "revolute" else ENCODER / 10 for x in arm.coordinates])
     logs: list[Trajectory] = []
     for number, seed in enumerate(np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories)):
@@ -43,8 +43,7 @@ def servo_motions(
         qd, tau = np.gradient(q, t, axis=0), np.zeros((len(t), 0))
         logs.append(Trajectory(t, q, qd, tau, f"traj_{number:02d}", u=u))
         progress(number + 1, protocol.trajectories)
-    trained = len(logs) - min(round(protocol.test_fraction * len(logs)), len(logs) - 1)
-    return SimulatedLogs(logs[:trained], logs[trained:])
+    return SimulatedLogs.split(logs, protocol.test_fraction)
 
 
 def _commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:

@@ -20,7 +20,7 @@ from spelgen.settings.simulation import ControlledSimulation, ServoSimulation, S
 from spelgen.settings.yaml_document import Document
 from spelgen.simulation.integration import rollout
 from spelgen.simulation.prescribed import prescribed
-from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction
+from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction, sample_times
 from spelgen.simulation.servo_motions import servo_motions
 from spelgen.simulation.tracking import track
 from spelgen.simulation.tuning import TUNING
@@ -53,7 +53,7 @@ def random_inputs(
         joint = settings.joint(coordinate.name)
         is_driven = joint.actuated and not coordinate.passive
         torques.append(np.array(joint.inputs or protocol.inputs) if is_driven else np.zeros(1))
-    t = np.arange(round(protocol.duration * protocol.sample_rate) + 1) / protocol.sample_rate
+    t = sample_times(protocol)
     # one seed per trajectory: the first trajectories do not depend on their number
     split_seed, *seeds = np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories + 1)
     trajectories = []

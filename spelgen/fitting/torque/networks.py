@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
 
 import torch
 
 from spelgen.dynamics.parameters import residual_torque
+from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.optimizers import minimise
 from spelgen.fitting.torque.jacobian import ResidualSamples
 from spelgen.fitting.torque.joint_functions import ALL, rms_per_joint
@@ -21,10 +21,6 @@ from spelgen.fitting.torque.selection import (
 )
 from spelgen.fitting.torque.tuning import SELECTION
 from spelgen.settings.fits import DEFAULTS, Adaptation
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-
 
 ADAPTED_PARTS: dict[Adaptation, tuple[str, ...]] = {
     "load": ("mass.", "potential."),

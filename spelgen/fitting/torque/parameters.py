@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 
 from spelgen.dynamics.parameters import parameter_table
 from spelgen.dynamics.protocol import motors_of
+from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.functional_model import NamedTensors
 from spelgen.fitting.torque.samples import SampleBlock
 from spelgen.fitting.torque.tuning import TUNING
 from spelgen.logs.tuning import SAMPLES
 from spelgen.runtime.rigid_body import body_factor
 from spelgen.settings.fits import Adaptation
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 MIN_SPEED = SAMPLES.moving
 RIGID_GROUPS = (

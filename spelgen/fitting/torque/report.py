@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import compress
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,15 +11,13 @@ from torch.autograd.functional import jacobian
 
 from spelgen.dynamics.parameters import idle_residuals
 from spelgen.dynamics.protocol import residual_terms
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic
 from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.torque.fit import TorqueSolution
 from spelgen.fitting.torque.parameters import ParameterVector
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TorqueReportTuning
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 TUNING = TorqueReportTuning()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 
@@ -13,14 +13,12 @@ from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import Measured, Validation
 from spelgen.fitting.objective import FitRequest, PreparedLogs, Status, TorqueLogObjective
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
+from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.rollout import momentum_loss
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.tuning import WindowTuning
 from spelgen.logs.windows import Windows
 from spelgen.settings.fits import DEFAULTS, Solver, WindowConfig
-
-if TYPE_CHECKING:
-    from spelgen.fitting.process import TrainingProgress
 
 TUNING = WindowTuning()
 

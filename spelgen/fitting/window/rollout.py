@@ -5,13 +5,15 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 
 from spelgen.dynamics.parameters import idle_residuals
 from spelgen.errors import Diagnostic, RunError
+from spelgen.fitting.objective import Status
 from spelgen.fitting.optimizers import WindowOptimizer
+from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.rollout import rollout_loss
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.objective import fit_torques, torque_samples
@@ -21,10 +23,6 @@ from spelgen.logs.rates import SLOWEST
 from spelgen.logs.windows import Windows
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import Rollout, TorqueFit
-
-if TYPE_CHECKING:
-    from spelgen.fitting.objective import Status
-    from spelgen.fitting.process import TrainingProgress
 
 TUNING = LoopTuning()
 
