@@ -32,14 +32,14 @@ from recordings import folder_of
 
 import spelgen
 from spelgen.dynamics.parameters import residual_torque
-from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
 from spelgen.fitting.torque import fit as torque_fit
 from spelgen.fitting.torque import joint_functions, residual_stage, stages
-from spelgen.fitting.torque import prior as torque_prior
+from spelgen.fitting.torque import parameters as torque_prior
 from spelgen.fitting.torque import problem as torque_problem
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.linearization import RigidProjection
 from spelgen.fitting.torque.tuning import SELECTION, TUNING
+from spelgen.fitting.tuning import TUNING as DAMPING
 from spelgen.logs.tuning import SAMPLES
 
 NEVER = float("inf")

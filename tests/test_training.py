@@ -40,7 +40,7 @@ from spelgen.fitting.rollout import (
 )
 from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.train import train
-from spelgen.fitting.tuning import WindowTuning
+from spelgen.fitting.tuning import FittingTuning
 from spelgen.fitting.window.rollout import RolloutObjective
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
@@ -239,7 +239,7 @@ class Interrupted(TrainingProgress):
 
 @pytest.mark.parametrize(("optimizer", "steps"), [("adamw", 20), ("lbfgs", 3)])
 def test_resuming_repeats_what_would_have_been(module, logs, tmp_path, monkeypatch, optimizer, steps):
-    monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", WindowTuning(epoch_steps=steps))
+    monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", FittingTuning(epoch_steps=steps))
     config = quick(optimizer=optimizer, momentum_steps=20 if optimizer == "adamw" else 0)
     straight, broken = tmp_path / "straight", tmp_path / "broken"
     train(module, [logs], straight, config)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ State = tuple[Tensor, Tensor, Tensor]
 
 
 def roll_out_stiff(
-    dynamics: Any, windows: Windows, substeps: int, disturbance: Tensor | None = None
+    dynamics: object, windows: Windows, substeps: int, disturbance: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return positions and velocities (W, K-1, n) at samples 1..K-1 of each window, from its sample 0.
 
@@ -57,7 +57,9 @@ def roll_out_stiff(
     return positions, velocities
 
 
-def _stepper(dynamics: Any, width: Tensor, disturbance: Tensor) -> Callable[[State, Tensor, Tensor], State]:
+def _stepper(
+    dynamics: object, width: Tensor, disturbance: Tensor
+) -> Callable[[State, Tensor, Tensor], State]:
     """Return the function that takes a step of M qdd = force from a state, under tau.
 
     width: (n,) finite-difference steps of velocity. disturbance: a force if the state has momenta, else acceleration.
@@ -104,7 +106,7 @@ def _stepper(dynamics: Any, width: Tensor, disturbance: Tensor) -> Callable[[Sta
 
 
 def _friction_slopes(
-    dynamics: Any, pose: MotionEquations, qd: Tensor, z: Tensor, width: Tensor
+    dynamics: object, pose: MotionEquations, qd: Tensor, z: Tensor, width: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return D and K, (W, n): the friction of a joint depends on its own motion only."""
     # central differences: dry friction jumps at standstill

@@ -18,7 +18,7 @@ from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.evaluation.horizons import EvaluatedLogs
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.torque import friction_past, mean_nmse, predicted_torques
-from spelgen.evaluation.tuning import TRACES as TUNING
+from spelgen.evaluation.tuning import TUNING
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory
@@ -127,7 +127,7 @@ def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
     for samples in [*logs.samples, *(_steps(piece, logs) for piece in slow)]:
         count = min(len(samples.q), round(TUNING.torque_seconds * samples.rate) + 1)
         start = (len(samples.q) - count) // 2
-        motions.append(samples[start : start + count : -(-count // TUNING.samples)])
+        motions.append(samples[start : start + count : -(-count // TUNING.curve_samples)])
     return motions
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -172,11 +171,8 @@ def _evaluate_torques(
     masses = {}
     if truth is not None:
         masses = mass_errors(all_dynamics, truth, tested.joints, torch.from_numpy(joined_column(logs, "q")))
-    return _results(
-        tested,
-        logs,
-        notes,
-        motion_traces(all_dynamics, tests, longest, tip),
+    return replace(
+        _results(tested, logs, notes, motion_traces(all_dynamics, tests, longest, tip)),
         cutoff=used.cutoff or None,
         substeps=solver.substeps,
         horizons=tuple(horizons),
@@ -198,7 +194,7 @@ def _baselines(
 
 
 def _results(
-    tested: Subject, logs: Sequence[Trajectory], notes: Sequence[Diagnostic], traces: Traces, **figures: Any
+    tested: Subject, logs: Sequence[Trajectory], notes: Sequence[Diagnostic], traces: Traces
 ) -> Results:
     """Return the results with the names of the arm and the logs."""
     return Results(
@@ -209,7 +205,6 @@ def _results(
         parameters=used_parameter_count(tested.model),
         diagnostics=tuple(notes),
         traces=traces,
-        **figures,
     )
 
 
@@ -219,7 +214,7 @@ def _evaluate_commands(tested: Subject, logs: Sequence[Trajectory], notes: list[
         require_commands(trajectory)
     followers = command_followers(tested.linear_servos, notes)
     errors, missed = replays(tested.model, logs, followers, notes)
-    return _results(tested, logs, notes, replay_traces(missed), replays=errors)
+    return replace(_results(tested, logs, notes, replay_traces(missed)), replays=errors)
 
 
 def _tip(tested: Subject, notes: list[Diagnostic]) -> TipPosition | None:

@@ -8,7 +8,7 @@ import numpy as np
 from lxml import etree
 
 from spelgen.arm.arm import Coordinate
-from spelgen.dynamics.rigid_bodies import about_center, quaternion
+from spelgen.dynamics.body_regressor import about_center, quaternion
 from spelgen.exporting.describe import tip_frame
 from spelgen.exporting.description import Servos
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection

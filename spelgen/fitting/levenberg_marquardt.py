@@ -15,9 +15,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import torch
 
-from spelgen.fitting.tuning import DampingTuning
-
-TUNING = DampingTuning()
+from spelgen.fitting.tuning import TUNING
 
 Parameters = TypeVar("Parameters")
 
@@ -107,7 +105,10 @@ class LeastSquaresProblem(Protocol[Parameters]):
 
 
 def initial_state(
-    problem: LeastSquaresProblem[Parameters], x: Parameters, damping: float = TUNING.initial, steps: int = 0
+    problem: LeastSquaresProblem[Parameters],
+    x: Parameters,
+    damping: float = TUNING.initial_damping,
+    steps: int = 0,
 ) -> SolverState[Parameters]:
     """Return the state at x before the first step."""
     residual = problem.residual(x)
@@ -164,9 +165,9 @@ def _accepted_step(
             return Termination.SMALL_PREDICTION
         best = _best_candidate(problem, state, step, predicted)
         if best.cost < state.cost:
-            next_damping = max(damping / TUNING.factor, TUNING.min_damping)
+            next_damping = max(damping / TUNING.damping_factor, TUNING.min_damping)
             return replace(best, damping=next_damping), Iteration(best.cost, predicted, damping)
-        damping *= TUNING.factor
+        damping *= TUNING.damping_factor
     return Termination.NO_DECREASE
 
 

@@ -12,13 +12,16 @@ from spelgen.dynamics.equations import mass_as_learned, runge_kutta
 from spelgen.dynamics.protocol import known_past, memory_after, memory_along, sliding_memory
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import LogError
-from spelgen.fitting.tuning import AdaptiveTuning, IntegrationTuning
+from spelgen.fitting.tuning import TUNING
 from spelgen.logs.windows import Windows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import Solver
 
-TUNING, ADAPTIVE = IntegrationTuning(), AdaptiveTuning()
-SOLVER: dict[str, Any] = {"method": "dopri5", "rtol": ADAPTIVE.relative, "atol": ADAPTIVE.absolute}
+SOLVER: dict[str, Any] = {
+    "method": "dopri5",
+    "rtol": TUNING.adaptive_rtol,
+    "atol": TUNING.adaptive_atol,
+}
 AT_REST = 1e-6  # [rad, m] below the resolution of encoders
 
 
@@ -213,7 +216,7 @@ def integration_error(coarse: torch.Tensor, fine: torch.Tensor) -> float:
         coarse: (W, K-1, 2n) scaled errors of the rollout.
         fine: (W, K-1, 2n) scaled errors with twice as many steps.
     """
-    model_error = max(fine.square().mean().sqrt().item(), TUNING.least_error)
+    model_error = max(fine.square().mean().sqrt().item(), TUNING.min_model_error)
     error = (coarse - fine).square().mean().sqrt().item() / model_error
     return error if math.isfinite(error) else math.inf
 
@@ -221,9 +224,9 @@ def integration_error(coarse: torch.Tensor, fine: torch.Tensor) -> float:
 def choose_substeps(model: ArmModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
     """Return the minimum number of rk4 steps per sample interval, at least `start`, with a small integration error."""
     substeps, coarse = start, probed(model, windows, scales, start)
-    while substeps < TUNING.most_substeps:
+    while substeps < TUNING.max_substeps:
         fine = probed(model, windows, scales, 2 * substeps)
-        if integration_error(coarse, fine) < TUNING.fraction:
+        if integration_error(coarse, fine) < TUNING.integration_fraction:
             break
         substeps, coarse = 2 * substeps, fine
     return substeps

@@ -13,11 +13,11 @@ from typing import Any
 
 import torch
 
-from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo.parameters import COULOMB, DEAD_ZONE, ServoParameters
 from spelgen.fitting.servo.problem import LONGEST_STEP, ServoProblem
 from spelgen.fitting.servo.tuning import ServoLawTuning, ServoSolverTuning
+from spelgen.fitting.tuning import TUNING as DAMPING
 
 TUNING, SOLVER = ServoLawTuning(), ServoSolverTuning()
 
@@ -48,7 +48,7 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
     """
     errors = problem.residual(x)
     costs = problem.joint_costs(x, errors)
-    damping, active = torch.full_like(costs, DAMPING.initial), torch.ones_like(costs).bool()
+    damping, active = torch.full_like(costs, DAMPING.initial_damping), torch.ones_like(costs).bool()
     p, n = x.joints.shape
     for _ in range(TUNING.steps):
         normal = problem.normal_equations(x, errors)
@@ -63,7 +63,7 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
         x = replace(x, joints=torch.where(better, moved.joints, x.joints))
         errors = torch.where(better, moved_errors, errors)
         costs = torch.where(better, moved_costs, costs)
-        damping = torch.where(better, damping / DAMPING.factor, damping * DAMPING.factor / 2)
+        damping = torch.where(better, damping / DAMPING.damping_factor, damping * DAMPING.damping_factor / 2)
         if not active.any():
             break
     return x, costs

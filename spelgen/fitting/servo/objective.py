@@ -20,7 +20,6 @@ import torch
 from spelgen.dynamics.bristles import encoder_step
 from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import digest
-from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
 from spelgen.fitting.levenberg_marquardt import SolverState, initial_state, levenberg_marquardt
 from spelgen.fitting.objective import FitRequest, Objective, PreparedLogs, Status
 from spelgen.fitting.run_record import Content
@@ -32,6 +31,7 @@ from spelgen.fitting.servo.report import servo_record, solution
 from spelgen.fitting.servo.start import start_servos
 from spelgen.fitting.servo.tuning import ServoSolverTuning
 from spelgen.fitting.servo.windows import servo_windows
+from spelgen.fitting.tuning import TUNING as DAMPING
 from spelgen.logs.checks import check
 from spelgen.logs.trajectory import require_commands, require_joints
 
@@ -101,7 +101,7 @@ class ServoObjective(Objective):
         while True:
             number = len(self._rounds)
             show = partial(_show_progress, progress, number)
-            x, damping = self._rounds[-1], DAMPING.initial
+            x, damping = self._rounds[-1], DAMPING.initial_damping
             if number > 1:  # near the minimum from where the round before ended
                 damping = TUNING.later_damping
             result = levenberg_marquardt(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch.autograd import grad as gradient
@@ -252,7 +252,7 @@ class TorqueJacobian:
         """
         samples = block.samples
 
-        def torques(model: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        def torques(model: ArmModel) -> tuple[torch.Tensor, torch.Tensor]:
             constants, theta = model.friction.prepare(), model.inertial_parameters.flatten()
             gravity = block.load_regressor @ theta if load is None else load
             friction = constants.torque(block.speed, gravity, samples.z, samples.direction)

@@ -17,14 +17,12 @@ from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.rollout import rollout_loss
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.objective import fit_torques, torque_samples
-from spelgen.fitting.tuning import LoopTuning
+from spelgen.fitting.tuning import TUNING
 from spelgen.fitting.window.momentum import MomentumObjective
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.windows import Windows
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import Rollout, TorqueFit
-
-TUNING = LoopTuning()
 
 
 class RolloutObjective(MomentumObjective):
@@ -184,12 +182,12 @@ class RolloutObjective(MomentumObjective):
         """Restore the state before a diverged epoch, and halve all further learning rates."""
         self.rollbacks += 1
         self.model.load_state_dict(weights)
-        if self.rollbacks > TUNING.rollbacks:
+        if self.rollbacks > TUNING.max_rollbacks:
             advice = "check units and signs of the logs"
             if self.request.folder is not None:
                 advice += "; the best model so far is kept in model.pt"
             raise RunError(
-                f"losses that are not finite, after {TUNING.rollbacks} attempts at half the learning rate each",
+                f"losses that are not finite, after {TUNING.max_rollbacks} attempts at half the learning rate each",
                 file=self.request.folder,
                 do=advice,
             )
