@@ -53,7 +53,7 @@ _HOME = {
     "excite": "excitation.design",
     "identify": "identification.identify",
     "LeastSquares": "identification.identification",
-    "FrictionModel": "dynamics.linear_friction",
+    "FrictionModel": "dynamics.friction",
     "Identification": "identification.identification",
     "fit": "fitting.fit",
     "Fit": "fitting.fitted",

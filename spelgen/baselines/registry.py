@@ -89,10 +89,10 @@ class IdentifiedArm(Baseline):
         methods = [LeastSquares(friction=friction) for _, friction in FRICTION.values()]
         try:
             require_torques(logs)
-            found = identify_by(arm, logs, methods, preprocessing)
+            identified = identify_by(arm, logs, methods, preprocessing)
         except (LogError, np.linalg.LinAlgError):
             return {}
-        fits = {key: fit for (key, _), fit in zip(FRICTION.values(), found, strict=True)}
+        fits = {key: fit for (key, _), fit in zip(FRICTION.values(), identified, strict=True)}
         # base parameters and intervals are those of Coulomb friction; of bristles only the parameters are kept
         parameters = {key: fit.parameters.tolist() for key, fit in fits.items()}
         return {**fits["parameters"].to_dict(), **parameters}

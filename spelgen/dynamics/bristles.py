@@ -69,8 +69,8 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     drives, reach = np.arange(path.shape[1]), torch.from_numpy(bristles.values)
     turned_at = np.take_along_axis(path, corners, axis=0)
     at_corners = [torch.zeros_like(reach)]
-    for way in torch.from_numpy(np.diff(turned_at, axis=0)):
-        at_corners.append(moved_bristles(at_corners[-1], way[:, None], reach))
+    for displacement in torch.from_numpy(np.diff(turned_at, axis=0)):
+        at_corners.append(moved_bristles(at_corners[-1], displacement[:, None], reach))
     turned_with, z = torch.stack(at_corners), np.empty((*q.shape, bristles.elements))
     for start in range(0, len(q), BLOCK):
         block = slice(start, start + BLOCK)

@@ -68,9 +68,9 @@ def idle_residuals(model: object) -> list[str]:
     if terms is None:
         return []
     idle = [name for name, weights in terms.named_parameters(recurse=False) if not weights.any()]
-    for part, network in (("mass", terms.mass), ("potential", terms.potential)):
+    for prefix, network in (("mass", terms.mass), ("potential", terms.potential)):
         if _is_idle(network):
-            idle += [name for name, _ in terms.named_parameters() if name.startswith(f"{part}.")]
+            idle += [name for name, _ in terms.named_parameters() if name.startswith(f"{prefix}.")]
     return [f"residuals.{name}" for name in idle]
 
 

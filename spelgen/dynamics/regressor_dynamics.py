@@ -110,9 +110,9 @@ class RegressorDynamics:
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """Return qdd, (..., n), under the inputs tau (..., n)."""
-        at = self.equations_at(q)
-        force = at.force(qd, tau, z).unsqueeze(-1)  # one column: vectors would need the same batch
-        qdd: Tensor = torch.linalg.solve(at.mass, force)
+        equations = self.equations_at(q)
+        force = equations.force(qd, tau, z).unsqueeze(-1)  # one column: vectors would need the same batch
+        qdd: Tensor = torch.linalg.solve(equations.mass, force)
         return qdd.squeeze(-1)
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
@@ -123,8 +123,8 @@ class RegressorDynamics:
 
     def joint_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """Return the torque of all joints, passive ones included, for qdd, (..., n) [Nm, N]."""
-        at = self.equations_at(q)
-        return applied(at.mass, qdd) - at.force(qd, torch.zeros_like(qdd), z)
+        equations = self.equations_at(q)
+        return applied(equations.mass, qdd) - equations.force(qd, torch.zeros_like(qdd), z)
 
     def equations_at(self, q: Tensor) -> MotionEquations:
         """Return the equations of motion at q, (T, n); see `equations.equations_of`."""

@@ -183,13 +183,13 @@ def _evaluate_torques(
 
 
 def _baselines(
-    tested: Subject, given: Mapping[str, RigidDynamics], probe: Windows, notes: list[Diagnostic]
+    tested: Subject, additional: Mapping[str, RigidDynamics], probe: Windows, notes: list[Diagnostic]
 ) -> list[Predictor]:
     """Return the baselines of the registry, and the given ones. probe: windows that determine integrator steps."""
     arm = EvaluatedArm(tested.joints, tested.urdf, tested.fitted_baselines, tested.fitted_arm, probe, notes)
     return [
         *torque_predictors(arm),
-        *(of_dynamics(name, dynamics, probe) for name, dynamics in given.items()),
+        *(of_dynamics(name, dynamics, probe) for name, dynamics in additional.items()),
     ]
 
 

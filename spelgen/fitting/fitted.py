@@ -18,7 +18,7 @@ from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.files import write_json
 from spelgen.fitting.objective import Status
 from spelgen.fitting.process import locked
-from spelgen.fitting.run_folder import RunFolder, trained_model
+from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import Checkpoint, Content, Record
 from spelgen.listing import Listing
 from spelgen.logs.dynamics_samples import dynamics_samples
@@ -208,7 +208,7 @@ def load_run(folder: Path | str) -> Fit:
     run = RunFolder(folder)
     record = run.read_record()  # a missing run is reported before its model is assembled
     return Fit(
-        model=trained_model(run),
+        model=fitted_model(run).requires_grad_(False).eval(),
         history=run.read_metrics(),
         diagnostics=(),
         status=None,

@@ -52,17 +52,17 @@ def as_built(arm: ConfiguredArm, seed: int, path: Path | str) -> ConfiguredArm:
 
 def _settings(arm: ConfiguredArm, seed: int) -> dict[str, object]:
     """Return the settings of the arm as built, without drives: how it is mounted, wired and moved."""
-    given = arm.settings
-    own = given.model_dump(
+    nominal = arm.settings
+    carried = nominal.model_dump(
         mode="json",
         include={"gravity", "input", "torque", "couplings", "simulation", "tracking"},
         exclude_unset=True,
     )
     names = list(arm.arm.joint_names)
-    settings: dict[str, object] = {"about": ABOUT.format(seed), "moving_joints": names} | own
+    settings: dict[str, object] = {"about": ABOUT.format(seed), "moving_joints": names} | carried
     # a joint without a motor cannot be moved along a path: such an arm is driven as its own settings state
-    if given.input == "position" or any(joint.passive for joint in arm.arm.coordinates):
-        settings["simulation"] = own.get("simulation", {}) | {"seed": seed}
+    if nominal.input == "position" or any(joint.passive for joint in arm.arm.coordinates):
+        settings["simulation"] = carried.get("simulation", {}) | {"seed": seed}
         return settings
     bounds = motion_bounds(arm.arm, 1.0, 1.0, arm.robot.joint)
     ranges = np.stack([bounds.low, bounds.high], axis=1).tolist()
@@ -74,7 +74,8 @@ def _settings(arm: ConfiguredArm, seed: int) -> dict[str, object]:
         "test_fraction": 0.5,
         "presliding": AS_BUILT.presliding,
         "torque_noise": AS_BUILT.torque_noise,
-        "positions": dict(zip(names, ranges, strict=True)) | own.get("simulation", {}).get("positions", {}),
+        "positions": dict(zip(names, ranges, strict=True))
+        | carried.get("simulation", {}).get("positions", {}),
         "seed": seed,
     }
     settings["tracking"] = {"paths": "excitation", "resolution": AS_BUILT.resolution}
@@ -110,10 +111,12 @@ def _drives(
     armature = rng.uniform(*AS_BUILT.armature, len(joints)) * inertia
     drives: dict[str, dict[str, object]] = {}
     for k, joint in enumerate(joints):
-        given = arm.settings.joint(joint.name)
-        kept = given.model_dump(mode="json", include={"gear", "actuated", "kp", "inputs"}, exclude_none=True)
-        drives[joint.name] = kept | {
-            "rotor_inertia": _rounded(armature[k] / given.gear**2),
+        drive = arm.settings.joint(joint.name)
+        unchanged = drive.model_dump(
+            mode="json", include={"gear", "actuated", "kp", "inputs"}, exclude_none=True
+        )
+        drives[joint.name] = unchanged | {
+            "rotor_inertia": _rounded(armature[k] / drive.gear**2),
             "viscous": _rounded(viscous[k]),
             "coulomb": [
                 _rounded(coulomb[k] * (1 + asymmetry[k])),

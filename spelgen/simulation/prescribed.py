@@ -40,11 +40,11 @@ def read_motion(file: Path, joints: Sequence[str]) -> Motion:
         joints: Names of the n joints, in the order of the coordinates.
     """
     require_regular_file(file, LogError)
-    wanted = ["t", *(f"{quantity}_{joint}" for quantity in ("q", "qd", "qdd") for joint in joints)]
+    columns = ["t", *(f"{quantity}_{joint}" for quantity in ("q", "qd", "qdd") for joint in joints)]
     do = "`spelgen excite` writes such files for the same arm"
     try:
         table = csv_columns(file)
-        missing = [name for name in wanted if name not in table.column_names]
+        missing = [name for name in columns if name not in table.column_names]
         if missing:
             raise LogError(
                 f"no column {', '.join(missing[:3])}",
@@ -52,7 +52,7 @@ def read_motion(file: Path, joints: Sequence[str]) -> Motion:
                 expected="t, q_, qd_ and qdd_ per joint",
                 do=do,
             )
-        values = np.stack([table[name].cast(pa.float64()).to_numpy() for name in wanted], axis=1)
+        values = np.stack([table[name].cast(pa.float64()).to_numpy() for name in columns], axis=1)
     except (pa.ArrowException, UnicodeError) as error:
         raise LogError(
             f"unreadable ({in_one_line(error)})", file=file, expected="CSV of numbers", do=do

@@ -60,8 +60,8 @@ class ParameterVector:
 
     def unflatten(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return views of a vector (K,) by name, each in the shape of its parameter."""
-        parts = zip(self.initial.items(), x.split(self._lengths), strict=True)
-        return {name: part.view_as(tensor) for (name, tensor), part in parts}
+        blocks = zip(self.initial.items(), x.split(self._lengths), strict=True)
+        return {name: block.view_as(tensor) for (name, tensor), block in blocks}
 
     def flatten(self, parameters: NamedTensors) -> torch.Tensor:
         """Return parameters by name as one vector (K,)."""
@@ -70,8 +70,8 @@ class ParameterVector:
     def write(self, x: torch.Tensor) -> None:
         """Copy the parameters x (K,) into the model."""
         with torch.no_grad():
-            for name, part in self.unflatten(x).items():
-                self._tensors[name].copy_(part)
+            for name, values in self.unflatten(x).items():
+                self._tensors[name].copy_(values)
 
     def mask(self, *groups: str) -> torch.Tensor:
         """Return a mask (K,) of the parameters of these groups."""

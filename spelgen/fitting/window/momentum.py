@@ -32,7 +32,7 @@ class MomentumObjective(TorqueLogObjective):
 
     name: ClassVar[str] = "momentum"
     config: WindowConfig  # resolved by `prepare`
-    kept: ClassVar[tuple[str, ...]] = (
+    saved_attributes: ClassVar[tuple[str, ...]] = (
         "epoch", "step", "best_epoch", "best_loss", "best_weights", "seconds", "substeps", "momentum_done",
     )  # fmt: skip
     """Attributes that are saved in a checkpoint."""
@@ -75,7 +75,7 @@ class MomentumObjective(TorqueLogObjective):
 
     def checkpoint(self) -> Content:
         """See `Objective`."""
-        return {name: vars(self)[name] for name in self.kept}
+        return {name: vars(self)[name] for name in self.saved_attributes}
 
     def _set_up(self, solver: Solver = "rk4", substeps: int | None = None) -> None:
         """Validate the current model; solver, substeps: of the validation, see `Rollout`."""
@@ -97,7 +97,7 @@ class MomentumObjective(TorqueLogObjective):
 
     def _restore(self, checkpoint: Content) -> None:
         """Restore the attributes of a checkpoint, and its best weights."""
-        for name in self.kept:
+        for name in self.saved_attributes:
             setattr(self, name, checkpoint[name])
         self.model.load_state_dict(self.best_weights)
 

@@ -36,8 +36,8 @@ class RolloutObjective(MomentumObjective):
 
     name: ClassVar[str] = "rollout"
     config: Rollout
-    kept: ClassVar[tuple[str, ...]] = (
-        *MomentumObjective.kept, "rollbacks", "learning_rate_factor", "fixed", "stage_from", "stage_epoch",
+    saved_attributes: ClassVar[tuple[str, ...]] = (
+        *MomentumObjective.saved_attributes, "rollbacks", "learning_rate_factor", "fixed", "stage_from", "stage_epoch",
     )  # fmt: skip
 
     def begin(self) -> list[Diagnostic]:
@@ -116,7 +116,7 @@ class RolloutObjective(MomentumObjective):
     def _run_epoch(self) -> Content:
         """Run one epoch; if its losses are not finite, repeat it at a lower learning rate."""
         while True:
-            before = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
+            state = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
             steps, start = self._steps_in_time(), self.seconds_now()
             # NaN if the loss or gradient of any step is not finite
             loss = self.optimizer.run(self._rollout_loss, self.training, steps, self._rate)
@@ -126,7 +126,7 @@ class RolloutObjective(MomentumObjective):
             self._validation_seconds = self.seconds_now() - trained
             if math.isfinite(validation):
                 break
-            self._roll_back(*before)
+            self._roll_back(*state)
         self.epoch += 1
         if validation < self.best_loss:
             self.best_loss, self.best_epoch = validation, self.epoch
