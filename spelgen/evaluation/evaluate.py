@@ -186,7 +186,8 @@ def _baselines(
     tested: Subject, additional: Mapping[str, RigidDynamics], probe: Windows, notes: list[Diagnostic]
 ) -> list[Predictor]:
     """Return the baselines of the registry, and the given ones. probe: windows that determine integrator steps."""
-    arm = EvaluatedArm(tested.joints, tested.urdf, tested.fitted_baselines, tested.fitted_arm, probe, notes)
+    fitted = tested.fit.baselines if tested.fit else {}
+    arm = EvaluatedArm(tested.joints, tested.urdf, fitted, tested.fitted_arm, probe, notes)
     return [
         *torque_predictors(arm),
         *(of_dynamics(name, dynamics, probe) for name, dynamics in additional.items()),
