@@ -19,7 +19,7 @@ from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo import laws
 from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.torque import jacobian as torque_jacobian
-from spelgen.fitting.torque import joint_functions, network_selection, selection, stages
+from spelgen.fitting.torque import joint_functions, networks, selection, stages
 from spelgen.fitting.torque import objective as torque_objective
 from spelgen.fitting.torque import problem as torque_problem
 from spelgen.fitting.torque.jacobian import ResidualSamples
@@ -142,12 +142,12 @@ def test_a_network_is_fitted_to_what_functions_of_joints_leave(robots, monkeypat
     left = []
 
     def fitted(model, network, samples, *_):
-        left.append(network_selection._remaining_residual(model, samples))
+        left.append(networks._remaining_residual(model, samples))
         return 0.5
 
-    monkeypatch.setattr(network_selection, "_fit_network", fitted)
+    monkeypatch.setattr(networks, "_fit_network", fitted)
     q = torch.linspace(-1, 1, 2000).double().unsqueeze(-1).expand(-1, 2)
-    assert len(list(network_selection.select_networks(model, samples(q.sin(), q), 1.0))) == 2
+    assert len(list(networks.select_networks(model, samples(q.sin(), q), 1.0))) == 2
     for missing in left:
         torch.testing.assert_close(missing, q.sin())
 
