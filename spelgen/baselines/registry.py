@@ -60,9 +60,8 @@ class UrdfValues(Baseline):
             if drives_known(arm.urdf, arm.joints):
                 driven = urdf_dynamics(arm.urdf, arm.joints, drives=True)
                 predictors.append(of_dynamics(URDF_WITH_DRIVES, driven, arm.probe))
-        except (
-            Exception
-        ) as error:  # Pinocchio and its parser raise many kinds; the evaluation continues without it
+        # Pinocchio and its parser raise many kinds; the evaluation continues without it
+        except Exception as error:
             arm.notes.append(_missing(arm.urdf.name, in_one_line(error)))
             return []
         return predictors

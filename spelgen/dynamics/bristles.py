@@ -112,10 +112,8 @@ def encoded(q: np.ndarray) -> np.ndarray:
     step = encoder_step(q)
     if not step.any():
         return q
-    low, high = (
-        q - step,
-        q + step,
-    )  # the composition of two clamps is a clamp: log2(T) passes over all samples in place of T
+    # the composition of two clamps is a clamp: log2(T) passes over all samples in place of T
+    low, high = q - step, q + step
     shift = 1
     while shift < len(q):
         earlier, later = slice(None, -shift), slice(shift, None)

@@ -153,12 +153,8 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
     if missing:
         raise ValueError(f"Pinocchio sees no joint {', '.join(missing)}")
     motors = derive_actuation(robot, settings, joints).drives()
-    by_joint, speeds = (
-        {},
-        None,
-    )  # friction of the URDF acts at the joints, friction of the settings at the motors
-    if drives:
-        by_joint, speeds = settings.joints, motors.speeds
+    # friction of the URDF acts at the joints, friction of the settings at the motors
+    by_joint, speeds = (settings.joints, motors.speeds) if drives else ({}, None)
     for name in joints:
         if name in by_joint:
             model.armature[model.joints[model.getJointId(name)].idx_v] = by_joint[name].armature
