@@ -75,8 +75,8 @@ def train(
 ) -> None:
     """Fit a module to logs.
 
-    Defaults come from `training` in the robot's settings; --set takes the same keys, which docs/cli.md lists. A key
-    that does not apply to the objective is an error.
+    Defaults come from `training` in the robot's settings; --set takes the same keys, which docs/cli_runs.md lists.
+    A key that does not apply to the objective is an error.
     """
     start_time = time.monotonic()  # max_minutes counts from here, reading of logs included
     # before anything is read: a misspelt key costs no time
