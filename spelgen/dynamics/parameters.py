@@ -1,4 +1,4 @@
-"""Parameters of a model: their meaning, their number, and those of its residual terms, with the model without these."""
+"""Parameters of a model: meaning and number; its residual terms, and the model without residual terms."""
 
 from __future__ import annotations
 
