@@ -158,7 +158,9 @@ class PositionActuators:
                 fullinertia=tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]],
             )
             parents.append(element)
-            kind = mujoco.mjtJoint.mjJNT_HINGE if body.kind == "revolute" else mujoco.mjtJoint.mjJNT_SLIDE
+            kind = (
+                mujoco.mjtJoint.mjJNT_HINGE if body.joint_type == "revolute" else mujoco.mjtJoint.mjJNT_SLIDE
+            )
             element.add_joint(
                 name=body.name,
                 type=kind,
@@ -198,7 +200,7 @@ def fit_position_actuators(arm: ConfiguredArm, windows: ServoWindows, trained: A
     is_known = trained.servo.trained.numpy() == 0
     untrained = spelgen.build(arm, "closed-form").requires_grad_(False)
     initial = PositionActuators(arm.arm, untrained, start, np.zeros(n), float(trained.servo.delay))
-    steps = max(steps_between(log, FIT_STEP) for log, _ in windows.parts)
+    steps = max(steps_between(log, FIT_STEP) for log, _ in windows.rows)
     windows = replace(windows, steps=steps)
     q, qd = windows.q.numpy(), windows.qd.numpy()
 
@@ -216,7 +218,7 @@ def fit_position_actuators(arm: ConfiguredArm, windows: ServoWindows, trained: A
         model.opt.timestep = 1 / windows.rate / steps
         commands = windows.commands(candidate.delay).numpy() + candidate.offset
         error = _positions(model, q[:, 0], qd[:, 0], commands) - q[:, 1:]
-        return error[:, windows.settling :].ravel()
+        return error[:, windows.burn_in :].ravel()
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.stack([errors(column) for column in x.T], axis=1)

@@ -40,7 +40,9 @@ def chain(
         for i, (kind, rotation, offset) in enumerate(links)
     )
     coordinates = tuple(
-        Coordinate(body.name, body.kind, body.kind == "revolute", None, None, None, None, 0.0, 0.0, False)
+        Coordinate(
+            body.name, body.joint_type, body.joint_type == "revolute", None, None, None, None, 0.0, 0.0, False
+        )
         for body in bodies
     )
     return Arm("arm", coordinates, bodies, tuple(Fraction(str(g)) for g in gravity), (), ())

@@ -19,7 +19,7 @@ from torch import nn
 
 from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.design import Design
-from spelgen.emission.specify import derive_spec
+from spelgen.emission.plan import derive_spec
 from spelgen.emission.text import module_text
 from spelgen.spec import Options
 from spelgen.structure.structure import Structure, derive
@@ -184,13 +184,13 @@ def exact_model(robot: str, folder: Path) -> nn.Module:
     mass.nominal_armature.zero_()
     true = polynomials(_loaded(robot).arm, inertials=True)
     if structure.outputs:
-        functions = [true.combination(output.reads) for output in structure.outputs]
+        functions = [true.combination(output.functional) for output in structure.outputs]
         encoding = model.encoding
         mass.network = ExactFunctions(functions, mass.function_mean, mass.function_scale, encoding)
     if structure.potential:
         scale = model.scale[0]
         model.potential = ExactFunctions([true.potential], torch.zeros_like(scale), scale, model.encoding)
-    constants = [true.combination(constant.reads) for constant in structure.constants]
+    constants = [true.combination(constant.functional) for constant in structure.constants]
     assert all(sum(c.degrees()) == 0 for c in constants), "a constant depends on q"
     values = torch.tensor([_float(c.leading_coefficient()) for c in constants], dtype=torch.float64)
     mass.raw_constants.data = values / mass.constant_scale

@@ -36,10 +36,10 @@ class Seen:
         return [place.copy() for place in self.engine.data.oMi[1:]]
 
     def slides(self, *joints: int) -> bool:
-        return all(self.arm.coordinates[joint - 1].kind == "prismatic" for joint in joints)
+        return all(self.arm.coordinates[joint - 1].joint_type == "prismatic" for joint in joints)
 
     def turns(self, *joints: int) -> bool:
-        return all(self.arm.coordinates[joint - 1].kind == "revolute" for joint in joints)
+        return all(self.arm.coordinates[joint - 1].joint_type == "revolute" for joint in joints)
 
     def parallel(self, *joints: int) -> bool:
         first, rest = self.axes[:, [joints[0] - 1]], self.axes[:, [joint - 1 for joint in joints]]

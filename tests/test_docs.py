@@ -15,6 +15,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import settings_page
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
@@ -86,6 +87,15 @@ def test_tutorials_are_notebooks(page, request):
     if request.config.getoption("--update"):
         path.write_text(notebook(page), encoding="utf-8")
     assert path.read_text(encoding="utf-8") == notebook(page)
+
+
+def test_the_tables_of_settings_are_up_to_date(request):
+    """docs/settings.md has every key of the settings with its values, default, unit and meaning."""
+    path = settings_page.PAGE
+    if request.config.getoption("--update"):
+        path.write_text(settings_page.page(path.read_text(encoding="utf-8")), encoding="utf-8")
+    text = path.read_text(encoding="utf-8")
+    assert text == settings_page.page(text)
 
 
 def run_commands(block: str, folder: Path) -> str:

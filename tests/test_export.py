@@ -15,6 +15,7 @@ from spelgen.emission.build import build
 from spelgen.errors import RunError
 from spelgen.exporting.export import export
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
+from spelgen.structure.base_parameters import base_parameters
 
 pytest.importorskip("pinocchio")
 
@@ -144,11 +145,10 @@ def test_exported_bodies_have_the_models_base_parameters(robot, tmp_path):
     export(run.path, "urdf", tmp_path / "learned.urdf")
     arm = load_arm(ROBOTS / f"{robot}.urdf")
     ten = model.inertial_parameters.detach().flatten().tolist()
-    learned = {
-        each.name: sum(float(weight) * ten[k] for k, weight in each.weights) for each in arm.base_parameters
-    }
-    exact = {each.name: float(each.value) for each in load_arm(tmp_path / "learned.urdf").base_parameters}
-    before = {each.name: float(each.value) for each in arm.base_parameters}
+    parameters, exported = (base_parameters(x.arm) for x in (arm, load_arm(tmp_path / "learned.urdf")))
+    learned = {each.name: sum(float(weight) * ten[k] for k, weight in each.weights) for each in parameters}
+    exact = {each.name: float(each.value) for each in exported}
+    before = {each.name: float(each.value) for each in parameters}
     assert list(exact) == list(learned)
     np.testing.assert_allclose(list(exact.values()), list(learned.values()), rtol=1e-8, atol=1e-9)
     assert max(abs(exact[name] - before[name]) for name in exact) > 0.01

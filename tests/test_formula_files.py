@@ -16,8 +16,7 @@ from typer.testing import CliRunner
 
 from spelgen.arm.arm import make_arm
 from spelgen.arm.configured_arm import load_arm
-from spelgen.certificate.formula_files import sympy_source
-from spelgen.certificate.formula_text import text, to_dict
+from spelgen.certificate.formula_files import sympy_source, text, to_dict
 from spelgen.certificate.formulas import formulas
 from spelgen.certificate.inspection import inspect
 from spelgen.cli.main import app

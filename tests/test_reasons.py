@@ -115,7 +115,7 @@ def test_reference_arms(shared, assume):
     for name, _, arm, structure in reference_arms(shared, assume):
         told = facts(arm, structure)
         assert_statements_hold(arm, structure, told, name)
-        seen = Seen(arm) if arm.has_inertials else None
+        seen = Seen(arm) if arm.inertials_complete else None
         for fact in told:
             if fact.reason is not None:
                 reasons.add(re.sub(r"\d+", "#", fact.reason))

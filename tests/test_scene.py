@@ -13,6 +13,7 @@ from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import json_data
 from spelgen.render.scene import scene
 from spelgen.render.shapes import joined, tube
+from spelgen.structure.structure import derive
 
 
 def frames(links, q):
@@ -73,7 +74,7 @@ def test_tubes_are_closed_and_look_outward():
 
 def test_every_cell_states_its_kind_and_the_reason(robots):
     arm = load_arm(robots / "rpr.urdf")
-    cells = matrix(arm.arm, arm.structure)
+    cells = matrix(arm.arm, derive(arm.arm))
     assert (
         cells[1][1].explanation.startswith("M22 is constant.")
         and "the mass that it carries" in cells[1][1].explanation

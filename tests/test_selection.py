@@ -13,7 +13,7 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.emission.build import build
 from spelgen.evaluation import rollout
 from spelgen.evaluation.horizons import end_errors
-from spelgen.exporting.mjcf_file import mjcf_text
+from spelgen.exporting.mjcf_export import mjcf_text
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo import laws
@@ -246,13 +246,9 @@ def test_the_first_noise_is_that_of_least_squares(correlation):
 def test_a_dead_zone_of_a_servo_is_worth_more_than_luck(monkeypatch):
     """A dead zone that lowers the cost by 1, which a chance does once in six times, is not selected; one of 10 is."""
     without = ServoParameters(torch.ones(1, 1), torch.zeros(0), 0.0, torch.zeros(1, 1, dtype=torch.bool))
-    problem = SimpleNamespace(
-        rows=SimpleNamespace(row=lambda name: 0),
-        residual=lambda x: None,
-        weigh=lambda errors: None,
-    )
+    problem = SimpleNamespace(parameters=SimpleNamespace(row=lambda name: 0), reweighted=lambda x: problem)
     with_zone = replace(without, joints=2 * torch.ones(1, 1))
-    monkeypatch.setattr(laws, "divided", lambda problem, x, fraction: with_zone)
+    monkeypatch.setattr(laws, "with_dead_zones", lambda problem, x, fraction: with_zone)
     for gain, selected in ((1.0, False), (10.0, True)):
         costs = {without: torch.tensor([100.0]), with_zone: torch.tensor([100.0 - gain])}
         monkeypatch.setattr(laws, "_joint_minima", lambda problem, x, costs=costs: (x, costs[x]))

@@ -268,7 +268,7 @@ def test_a_starter_file_states_the_defaults(robots, tmp_path, name):
         == {x.name for x in said.arm.coordinates}
         == said.settings.logs.joints.keys()
     )
-    kinds = [x.kind for x in said.arm.coordinates]
+    kinds = [x.joint_type for x in said.arm.coordinates]
     assert not said.settings.logs.misfits([x.name for x in said.arm.coordinates], kinds)
     ours, theirs = (make_friction(x.arm, x.settings) for x in (plain, said))
     assert np.array_equal(ours(np.ones(len(kinds))), theirs(np.ones(len(kinds))))

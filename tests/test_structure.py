@@ -68,7 +68,7 @@ def test_smallest_form_is_exact(robots, robot):
     mass = float_samples(loaded.arm, "kinematics", 50, seed=9)[0]
     rebuilt = np.zeros_like(mass)
     for term in (*structure.outputs, *structure.constants):
-        value = sum(float(weight) * mass[:, keys.index((i, j))] for i, j, weight in term.reads)
+        value = sum(float(weight) * mass[:, keys.index((i, j))] for i, j, weight in term.functional)
         for i, j, factor in term.basis:
             rebuilt[:, keys.index((i, j))] += float(factor) * value
     assert np.abs(rebuilt - mass).max() < 1e-10 * np.abs(mass).max()

@@ -38,9 +38,9 @@ def _assert_agrees(structure, poly: Polynomials, n: int) -> None:
         assert tuple(sorted(joints)) == entry.joints
         assert (entry.kind == "zero") == (len(poly.mass[entry.row, entry.column]) == 0)
     for output in structure.outputs:
-        assert _joints_of(poly.combination(output.reads), n) == set(output.joints)
+        assert _joints_of(poly.combination(output.functional), n) == set(output.joints)
     for constant in structure.constants:
-        assert not _joints_of(poly.combination(constant.reads), n)
+        assert not _joints_of(poly.combination(constant.functional), n)
     assert _joints_of(poly.potential, n) == set(structure.potential)
 
 

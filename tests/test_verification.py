@@ -7,7 +7,7 @@ import pytest
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.verify import verify
-from spelgen.structure.structure import Entry, derive
+from spelgen.structure.structure import MassEntry, derive
 
 ROBOTS = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")
 
@@ -35,7 +35,7 @@ def test_the_derived_structure_is_confirmed(robots, name, assume):
 def entry(structure, row, column, kind, joints=()):
     """The structure with one entry changed."""
     entries = tuple(
-        Entry(row, column, kind, joints) if (x.row, x.column) == (row, column) else x
+        MassEntry(row, column, kind, joints) if (x.row, x.column) == (row, column) else x
         for x in structure.entries
     )
     return replace(structure, entries=entries)

@@ -10,7 +10,8 @@ import pytest
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.module_check import check
-from spelgen.emission.specify import arm_of_spec, derive_spec, generate
+from spelgen.emission.plan import derive_spec
+from spelgen.emission.specify import arm_of_spec, generate
 from spelgen.errors import SpelgenError
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.train import train

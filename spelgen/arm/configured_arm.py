@@ -51,7 +51,7 @@ def load_arm(
 
     Args:
         path: URDF or xacro file.
-        joints: names of the moving joints; None: those of the settings, or of the longest actuated chain.
+        joints: names of the moving joints; None: the joints in the settings, or of the longest actuated chain.
         tip: name of the last link, in place of ``joints``.
         angle_tolerance: angles within it [rad] of a multiple of pi/2 are rounded to it; 0: none are.
 

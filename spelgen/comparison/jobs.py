@@ -28,9 +28,8 @@ from spelgen.fitting.tuning import TUNING as WINDOWS
 from spelgen.labels import thousandths
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
-from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.fits import Rollout, fit_config
-from spelgen.settings.training import TrainingSettings
+from spelgen.settings.training import ComparisonSettings, TrainingSettings
 from spelgen.settings.values import Group
 from spelgen.version import __version__
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from spelgen.design import BRISTLE_REACH
+from spelgen.design import BREAKAWAY
 from spelgen.dynamics.protocol import motors_of
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
@@ -38,7 +38,7 @@ BLOCK = 2**14
 
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
     """Return the typical break-away displacements of joints of these types."""
-    return BristleReach(np.array([BRISTLE_REACH[kind] for kind in kinds]), motors)
+    return BristleReach(np.array([BREAKAWAY[kind] for kind in kinds]), motors)
 
 
 def bristle_reach(model: PortHamiltonian) -> BristleReach:

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from spelgen.design import BRISTLE_REACH
+from spelgen.design import BREAKAWAY
 from spelgen.settings.joint import JointSettings
 
 
@@ -83,7 +83,7 @@ def joint_friction(
     return DriveFriction(viscous, forward, backward, smoothing_velocity, speeds)
 
 
-BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BRISTLE_REACH["revolute"])))
+BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BREAKAWAY["revolute"])))
 
 # [rad/s, m/s] Velocity at which the additional dry friction of slow motion has fallen to 1/e.
 STRIBECK_VELOCITY = 0.1

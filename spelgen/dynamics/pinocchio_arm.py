@@ -45,7 +45,7 @@ def pinocchio_model(arm: Arm, settings: Settings) -> pin.Model:
     model.name = arm.name
     model.gravity.linear = np.array(arm.gravity, dtype=float)
     for body in arm.bodies:
-        joint = pin.JointModelPZ() if body.kind == "prismatic" else pin.JointModelRZ()
+        joint = pin.JointModelPZ() if body.joint_type == "prismatic" else pin.JointModelRZ()
         placement = pin.SE3(np.array(body.rotation, dtype=float), np.array(body.translation, dtype=float))
         index = model.addJoint(body.parent + 1, joint, placement, body.name)
         model.appendBodyToJoint(index, _inertia(np.array(body.inertia, dtype=float)), pin.SE3.Identity())

@@ -25,7 +25,7 @@ def body_chain(arm: Arm) -> BodyChain:
     rows: list[tuple[Any, ...]] = []
     for body in arm.bodies:
         placement = [(*_row(row), float(x)) for row, x in zip(body.rotation, body.translation, strict=True)]
-        is_revolute, ratio = body.kind == "revolute", float(body.multiplier)
+        is_revolute, ratio = body.joint_type == "revolute", float(body.multiplier)
         rows.append((body.parent, body.coordinate, is_revolute, ratio, body.offset, placement))
     return BodyChain(len(arm.coordinates), _row(arm.gravity), *zip(*rows, strict=True))
 

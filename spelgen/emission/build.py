@@ -26,9 +26,9 @@ def build(
         arm: the result of ``load_arm``, or the path of a URDF.
         preset: name of a preset, path of a YAML file with a design, or a ``Design``.
         width, depth: units of the hidden layers of networks, and their number.
-        assume: ``kinematics``: the structure for any inertial parameters; ``inertials``: for those of the URDF.
+        assume: ``kinematics``: structure for any inertial parameters; ``inertials``: for the parameters of the URDF.
         seed: of the initial weights of networks.
 
-    Raises what ``load_arm`` raises, and SettingsError for a design of no model.
+    Raises the errors of ``load_arm``, and SettingsError for an inconsistent design.
     """
     return assemble(make_spec(arm, preset, width=width, depth=depth, assume=assume), seed)

@@ -8,11 +8,10 @@ from pathlib import Path
 
 from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.design import PRESET_NAMES, Design, load_design
-from spelgen.emission.plan import plan_model
+from spelgen.emission.plan import derive_spec
 from spelgen.emission.text import module_text
 from spelgen.errors import ModuleError
 from spelgen.spec import ModelSpec, Options
-from spelgen.structure.structure import derive
 from spelgen.urdf.robot import Assume
 
 
@@ -63,20 +62,6 @@ def make_spec(
     )
     spec = derive_spec(arm, options)
     return spec if module is None else replace(spec, urdf=_path_of_urdf(module, arm.robot.path))
-
-
-def derive_spec(arm: ConfiguredArm, options: Options) -> ModelSpec:
-    """Return the specification of the model of ``arm`` with these options."""
-    return plan_model(
-        arm.arm,
-        derive(arm.arm, options.assume),
-        arm.actuation,
-        options,
-        urdf=arm.robot.path.name,
-        urdf_sha256=arm.robot.digest,
-        drives={item.name: arm.settings.joint(item.name) for item in arm.arm.coordinates},
-        servos=arm.settings.input == "position",
-    )
 
 
 def arm_of_spec(spec: ModelSpec, urdf: str | Path) -> ConfiguredArm:

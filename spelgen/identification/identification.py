@@ -145,7 +145,7 @@ class Identification:
         """Return two tables: the torque residual per joint, and the base parameters."""
         joints: list[tuple[str, ...]] = []
         for x, rms, nmse in zip(self.arm.coordinates, self.residual, self.nmse, strict=True):
-            joints.append((x.name, f"{rms:.4g}", UNITS[x.kind].torque, f"{nmse:.3g}"))
+            joints.append((x.name, f"{rms:.4g}", UNITS[x.joint_type].torque, f"{nmse:.3g}"))
         parameters: list[tuple[str, ...]] = []
         values = zip(self.base.names, self.values, self.deviations, self.determined, strict=True)
         for name, value, deviation, word in values:

@@ -10,7 +10,7 @@ from spelgen.errors import LogError
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.messages import validated
 from spelgen.settings.settings import Settings, load_mapping
-from spelgen.settings.yaml_document import Document
+from spelgen.settings.yaml_document import YamlDocument
 from spelgen.urdf.robot import Robot
 
 GivenMapping = LogMapping | Mapping[str, object] | Path | str | None
@@ -80,4 +80,4 @@ def _mapping(mapping: GivenMapping, joints: Sequence[str]) -> LogMapping:
         return mapping
     if isinstance(mapping, str | Path):
         return load_mapping(mapping, joints)
-    return validated(LogMapping, dict(mapping or {}), Document(Path("mapping"), None))
+    return validated(LogMapping, dict(mapping or {}), YamlDocument(Path("mapping"), None))

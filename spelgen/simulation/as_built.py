@@ -100,7 +100,7 @@ def _drives(
     q = rng.uniform(bounds.low, bounds.high, (AS_BUILT.positions, len(joints)))
     dynamics = arm_dynamics(bodies.arm, bodies.settings)
     inertia = np.einsum("tii->i", dynamics.mass_matrix(q)) / len(q)
-    speed = np.array([min(joint.velocity or np.inf, SPEEDS[joint.kind]) for joint in joints])
+    speed = np.array([min(joint.velocity or np.inf, SPEEDS[joint.joint_type]) for joint in joints])
     torque = np.hypot(
         np.sqrt(np.square(dynamics.gravity(q)).mean(axis=0)), AS_BUILT.acceleration * speed * inertia
     )

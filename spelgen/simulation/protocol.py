@@ -95,9 +95,9 @@ def paths(arm: Arm, settings: Settings, t: np.ndarray) -> list[Motion]:
         middle, half = (low + high) / 2, SIMULATION.used_range * (high - low) / 2
         speeds = []
         for joint in arm.coordinates:
-            speeds.append(min(SIMULATION.used_range * (joint.velocity or np.inf), SPEEDS[joint.kind]))
+            speeds.append(min(SIMULATION.used_range * (joint.velocity or np.inf), SPEEDS[joint.joint_type]))
         bounds = MotionBounds(middle - half, middle + half, np.array(speeds))
-        motions = ExcitationTrajectory(float(t[-1]), EXCITATION.fewest_harmonics, bounds)
+        motions = ExcitationTrajectory(float(t[-1]), EXCITATION.min_harmonics, bounds)
         return [motions.motion(random.standard_normal(motions.size), t) for random in randoms]
     middle, amplitude = (low + high) / 2, _amplitude(arm, settings, low, high)
     drawn = [random.uniform(0, 2 * np.pi, len(middle)) for random in randoms]

@@ -34,7 +34,7 @@ def servo_motions(
     lowest, highest = initial_range(arm, settings)
     middle, width = (lowest + highest) / 2, np.minimum((highest - lowest) / 2, TUNING.command_amplitude)
     t = sample_times(protocol)
-    encoder = np.array([ENCODER if x.kind == "revolute" else ENCODER / 10 for x in arm.coordinates])
+    encoder = np.array([ENCODER if x.joint_type == "revolute" else ENCODER / 10 for x in arm.coordinates])
     logs: list[Trajectory] = []
     for number, seed in enumerate(np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories)):
         u = middle + width * _commands(np.random.default_rng(seed), t, len(middle))

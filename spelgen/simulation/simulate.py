@@ -17,7 +17,7 @@ from spelgen.logs.trajectory import Trajectory, set_aside
 from spelgen.settings.messages import validated
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import ControlledSimulation, ServoSimulation, SimulationSettings
-from spelgen.settings.yaml_document import Document
+from spelgen.settings.yaml_document import YamlDocument
 from spelgen.simulation.integration import rollout
 from spelgen.simulation.prescribed import prescribed
 from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction, sample_times
@@ -109,7 +109,7 @@ def simulate(
     }  # fmt: skip
     changes = {key: value for key, value in arguments.items() if value is not None}
     values = arm.settings.simulation.model_dump(exclude_unset=True) | changes
-    changed = validated(SimulationSettings, values, Document(Path("simulate"), None))
+    changed = validated(SimulationSettings, values, YamlDocument(Path("simulate"), None))
     settings = _controlled(arm.settings.model_copy(update={"simulation": changed}))
     drives = arm.actuation.drives()
     progress = progress or (lambda done, total: None)
