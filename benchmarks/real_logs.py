@@ -35,8 +35,8 @@ from spelgen.arm.arm import Arm
 from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.predictor import Solver
 from spelgen.dynamics.bristles import bristle_reach, reach_of
-from spelgen.dynamics.linear_friction import FrictionModel
-from spelgen.dynamics.regressor import regressor
+from spelgen.dynamics.friction import FrictionModel
+from spelgen.dynamics.regressor_dynamics import regressor
 from spelgen.emission.build import build
 from spelgen.errors import LogError
 from spelgen.evaluation.horizons import end_errors

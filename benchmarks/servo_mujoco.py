@@ -28,8 +28,8 @@ import spelgen
 from spelgen.arm.arm import Arm
 from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.baselines.registry import command_followers
+from spelgen.dynamics.body_regressor import about_center, quaternion
 from spelgen.dynamics.protocol import motors_of
-from spelgen.dynamics.rigid_bodies import about_center, quaternion
 from spelgen.emission.assemble import ArmModel
 from spelgen.evaluation.replay import replays
 from spelgen.exporting.tuning import TUNING as EXPORT_TUNING

@@ -43,7 +43,7 @@ from figaroh_identification import figaroh_dynamics
 import spelgen
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import memory_along
-from spelgen.dynamics.regressor import regressor
+from spelgen.dynamics.regressor_dynamics import regressor
 from spelgen.errors import SpelgenError
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.objective import torque_delay

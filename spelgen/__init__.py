@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from spelgen.certificate.inspection import inspect as inspect
     from spelgen.certificate.module_check import check as check
     from spelgen.design import Design as Design
-    from spelgen.dynamics.linear_friction import FrictionModel as FrictionModel
+    from spelgen.dynamics.friction import FrictionModel as FrictionModel
     from spelgen.dynamics.tip import tip_kinematics as tip_kinematics
     from spelgen.emission.build import build as build
     from spelgen.emission.loading import load_module as load_module
@@ -61,7 +61,7 @@ _MODULES = {
     "excitation.design": "excite",
     "identification.identify": "identify",
     "identification.identification": "LeastSquares Identification",
-    "dynamics.linear_friction": "FrictionModel",
+    "dynamics.friction": "FrictionModel",
     "fitting.fit": "fit",
     "fitting.fitted": "Fit load_run",
     "fitting.objective": "RunOptions",

@@ -12,14 +12,13 @@ SIDEWAYS = ((0, 0, 1), (1, 0, 0), (0, 1, 0))  # the joint's z along the parent's
 def coordinate(name="a", kind="revolute", **changes):
     """A joint with limits of +-1 and no friction."""
     known = {"lower": -1.0, "upper": 1.0, "effort": 10.0, "velocity": 10.0, "damping": 0.0, "friction": 0.0}
-    return Coordinate(name=name, kind=kind, **({"continuous": False, "passive": False} | known | changes))
+    return Coordinate(name=name, joint_type=kind, **({"continuous": False, "passive": False} | known | changes))
 
 
 def body(name="a", kind="revolute", **changes):
     """A point of mass 1 in the origin of its joint, on the root."""
     known = {
         "parent": -1,
-        "link": name,
         "coordinate": 0,
         "multiplier": Fraction(1),
         "offset": 0.0,
@@ -27,7 +26,7 @@ def body(name="a", kind="revolute", **changes):
         "translation": (0, 0, 0),
         "inertia": point(1),
     }
-    return Body(name=name, link=f"link of {name}", kind=kind, **(known | changes))
+    return Body(name=name, link=f"link of {name}", joint_type=kind, **(known | changes))
 
 
 def point(mass, x=0.0):

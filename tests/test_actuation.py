@@ -12,13 +12,13 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.inspection import inspect
 from spelgen.cli.main import app
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
-from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
+from spelgen.dynamics.pinocchio_dynamics import urdf_dynamics
 from spelgen.emission.specify import generate
 from spelgen.errors import SettingsError, SpelgenError
 from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
 from spelgen.logs.windows import Windows
 from spelgen.simulation.protocol import make_friction
-from spelgen.simulation.random_inputs import random_inputs
+from spelgen.simulation.simulate import random_inputs
 
 pytest.importorskip("pinocchio")
 

@@ -20,9 +20,8 @@ from spelgen.evaluation.truth import mass_error, true_mass
 from spelgen.excitation.trajectory import Motion
 from spelgen.settings.joint import JointSettings
 from spelgen.settings.settings import Settings
-from spelgen.simulation.motion_file import read_motion
-from spelgen.simulation.perturbed_urdf import perturbed_urdf
-from spelgen.simulation.prescribed import friction_along, prescribed
+from spelgen.simulation.as_built import perturbed_urdf
+from spelgen.simulation.prescribed import friction_along, prescribed, read_motion
 from spelgen.simulation.protocol import make_friction
 from spelgen.urdf.read import read_urdf
 from tests.hand_built import arm, body, coordinate, point, slider

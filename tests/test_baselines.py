@@ -13,13 +13,11 @@ import spelgen
 from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.baseline import EvaluatedArm
 from spelgen.baselines.names import URDF, URDF_WITH_DRIVES
-from spelgen.baselines.predictor import accurate_solver
-from spelgen.baselines.rosenbrock import roll_out_stiff
-from spelgen.baselines.urdf import UrdfValues
+from spelgen.baselines.predictor import accurate_solver, roll_out_stiff
+from spelgen.baselines.registry import UrdfValues
 from spelgen.cli.main import app
 from spelgen.dynamics.bristles import moved_bristles
-from spelgen.dynamics.regressor import regressor, urdf_parameters
-from spelgen.dynamics.regressor_dynamics import RegressorDynamics
+from spelgen.dynamics.regressor_dynamics import RegressorDynamics, regressor, urdf_parameters
 from spelgen.emission.specify import generate
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.fitted import load_run

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from spelgen.arm.actuation import Drives
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
-from spelgen.dynamics.regressor import body_chain, regressor, urdf_parameters
+from spelgen.dynamics.regressor_dynamics import body_chain, regressor, urdf_parameters
 from spelgen.errors import LogError, SpelgenError, SpelgenErrors
 from spelgen.identification import drive_samples
 from spelgen.identification.drive_hints import drive_problem, find_coupling

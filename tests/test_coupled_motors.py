@@ -15,7 +15,7 @@ from spelgen.arm.actuation import motor_speeds
 from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.inspection import inspect
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
-from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.emission.build import build
 from spelgen.emission.specify import generate
 from spelgen.fitting.fit import fit

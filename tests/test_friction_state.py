@@ -15,7 +15,7 @@ from spelgen.dynamics.bristles import (
     moved_bristles,
     reach_of,
 )
-from spelgen.dynamics.linear_friction import FrictionModel
+from spelgen.dynamics.friction import FrictionModel
 from spelgen.emission.build import build
 from spelgen.emission.loading import load_module
 from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out

@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.inspection import inspect
 from spelgen.cli.main import app
-from spelgen.dynamics.linear_friction import FrictionModel
-from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.dynamics.friction import FrictionModel
+from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.errors import LogError
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.identification import LeastSquares

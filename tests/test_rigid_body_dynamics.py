@@ -10,10 +10,9 @@ import torch
 from spelgen.arm.arm import make_arm
 from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics, pinocchio_model
-from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
+from spelgen.dynamics.pinocchio_dynamics import urdf_dynamics
 from spelgen.dynamics.protocol import integrable
-from spelgen.dynamics.regressor import urdf_parameters
-from spelgen.dynamics.regressor_dynamics import RegressorDynamics
+from spelgen.dynamics.regressor_dynamics import RegressorDynamics, urdf_parameters
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import ArmError, SpelgenErrors
 from spelgen.settings.joint import JointSettings

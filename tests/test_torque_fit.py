@@ -30,12 +30,15 @@ from spelgen.fitting.torque.joint_functions import FRICTION
 from spelgen.fitting.torque.linearization import RigidProjection
 from spelgen.fitting.torque.networks import adapt_networks
 from spelgen.fitting.torque.parameters import (
+    ESTIMATED_GROUPS,
     NEGLIGIBLE,
     RIGID_GROUPS,
+    ParameterPrior,
     ParameterVector,
+    prior_covariance,
     step_in_inertial_parameters,
+    update_widths,
 )
-from spelgen.fitting.torque.prior import ESTIMATED_GROUPS, ParameterPrior, prior_covariance, update_widths
 from spelgen.fitting.torque.problem import NoiseEstimator, TorqueProblem
 from spelgen.fitting.torque.report import terms_in_use, torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples

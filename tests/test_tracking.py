@@ -13,8 +13,7 @@ from spelgen.errors import SettingsError, SpelgenErrors
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
 from spelgen.simulation import tracking
-from spelgen.simulation.paths import paths, sines
-from spelgen.simulation.protocol import initial_range, make_friction
+from spelgen.simulation.protocol import initial_range, make_friction, paths, sines
 from spelgen.simulation.simulate import simulate
 from spelgen.simulation.tracking import measured, record, track, tuned_gains
 from tests.hand_built import arm, body, coordinate, point, slider

@@ -152,7 +152,7 @@ def identify(
 ) -> None:
     """Identify base parameters and friction by least squares."""
     paths = options.logs(data, extra_logs)
-    from spelgen.dynamics.linear_friction import FrictionModel
+    from spelgen.dynamics.friction import FrictionModel
     from spelgen.identification.identification import LeastSquares
     from spelgen.identification.identify import identify as identify_arm
     from spelgen.log_checks.check_logs import require_sound_logs

@@ -107,7 +107,7 @@ def simulate(
     """
     from spelgen.logs.read import write_logs
     from spelgen.simulation.as_built import as_built as make_as_built
-    from spelgen.simulation.motion_file import read_motion
+    from spelgen.simulation.prescribed import read_motion
     from spelgen.simulation.simulate import simulate as simulate_arm
 
     arm = options.load(robot, joints, tip, angle_tolerance)

@@ -19,8 +19,8 @@ from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.comparison.tuning import ComparisonTuning
 from spelgen.dynamics.parameters import parameter_count
 from spelgen.evaluation.drawn_motions import PredictedMotion, predicted_motion
-from spelgen.evaluation.invariants import Invariants, invariants
 from spelgen.evaluation.plain import Curve, finite
+from spelgen.evaluation.rollout import Invariants, invariants
 from spelgen.evaluation.truth import mass_error, true_mass
 from spelgen.fitting.rollout import loss_scales, position_difference, roll_out, rollout_loss
 from spelgen.logs.trajectory import Trajectory

@@ -24,7 +24,7 @@ from spelgen.files import read_json, write_json
 from spelgen.fitting.fit import RunOptions, fit
 from spelgen.fitting.objectives import FitOptions
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.window.momentum import TUNING as WINDOWS
+from spelgen.fitting.tuning import TUNING as WINDOWS
 from spelgen.labels import thousandths
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics

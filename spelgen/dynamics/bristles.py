@@ -32,7 +32,6 @@ class BristleReach:
         return int(self.values.shape[1])
 
 
-NO_BRISTLES = BristleReach(np.zeros((0, 0)))
 # Samples that are computed at a time: several arrays of this size are in memory.
 BLOCK = 2**14
 
@@ -70,8 +69,8 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     drives, reach = np.arange(path.shape[1]), torch.from_numpy(bristles.values)
     turned_at = np.take_along_axis(path, corners, axis=0)
     at_corners = [torch.zeros_like(reach)]
-    for way in torch.from_numpy(np.diff(turned_at, axis=0)):
-        at_corners.append(moved_bristles(at_corners[-1], way[:, None], reach))
+    for displacement in torch.from_numpy(np.diff(turned_at, axis=0)):
+        at_corners.append(moved_bristles(at_corners[-1], displacement[:, None], reach))
     turned_with, z = torch.stack(at_corners), np.empty((*q.shape, bristles.elements))
     for start in range(0, len(q), BLOCK):
         block = slice(start, start + BLOCK)
@@ -113,10 +112,8 @@ def encoded(q: np.ndarray) -> np.ndarray:
     step = encoder_step(q)
     if not step.any():
         return q
-    low, high = (
-        q - step,
-        q + step,
-    )  # the composition of two clamps is a clamp: log2(T) passes over all samples in place of T
+    # the composition of two clamps is a clamp: log2(T) passes over all samples in place of T
+    low, high = q - step, q + step
     shift = 1
     while shift < len(q):
         earlier, later = slice(None, -shift), slice(shift, None)

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.evaluation.tuning import TUNING
-
-if TYPE_CHECKING:
-    from spelgen.dynamics.protocol import RigidDynamics
 
 
 def true_mass(robot: ConfiguredArm | Path | str, q: Tensor, joints: Sequence[str] | None = None) -> Tensor:

@@ -18,8 +18,8 @@ from torch import Tensor
 from spelgen.arm.arm import Arm
 from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.dynamics.body_regressor import regressor_of
-from spelgen.dynamics.linear_friction import FrictionModel
-from spelgen.dynamics.regressor import body_chain, urdf_parameters
+from spelgen.dynamics.friction import FrictionModel
+from spelgen.dynamics.regressor_dynamics import body_chain, urdf_parameters
 from spelgen.errors import SettingsError
 from spelgen.excitation.excitation import Excitation
 from spelgen.excitation.trajectory import ExcitationTrajectory, motion_bounds

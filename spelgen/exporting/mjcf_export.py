@@ -10,7 +10,7 @@ import torch
 from lxml import etree
 
 from spelgen.arm.arm import Arm, Coordinate
-from spelgen.dynamics.rigid_bodies import about_center, quaternion
+from spelgen.dynamics.body_regressor import about_center, quaternion
 from spelgen.exporting.describe import Trained, tip_frame
 from spelgen.exporting.description import Servos
 from spelgen.exporting.exported import Exported, with_readme

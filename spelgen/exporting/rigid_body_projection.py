@@ -13,8 +13,8 @@ from torch import Tensor
 
 from spelgen.arm.arm import Arm
 from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.dynamics.parameters import without_residuals
 from spelgen.dynamics.protocol import motors_of
-from spelgen.dynamics.residuals import without_residuals
 from spelgen.emission.build import build
 from spelgen.exporting.describe import array, servos_of
 from spelgen.exporting.description import Servos

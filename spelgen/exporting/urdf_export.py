@@ -8,8 +8,8 @@ from lxml import etree
 
 from spelgen.arm.chain import choose_chain
 from spelgen.arm.lump_links import lump_links
-from spelgen.dynamics.residuals import friction_factor
-from spelgen.dynamics.rigid_bodies import about_center
+from spelgen.dynamics.body_regressor import about_center
+from spelgen.dynamics.parameters import friction_factor
 from spelgen.exporting.describe import Trained, array
 from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.rigid_body_projection import (

@@ -6,13 +6,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import input_of
-from spelgen.emission.assemble import spec_of
+from spelgen.emission.assemble import ArmModel, spec_of
 from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import TrainingData, WindowChoice, prepare_data
+from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.rollout import LossScales
 from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
@@ -22,10 +23,6 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import FitConfig
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.messages import validated
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-    from spelgen.fitting.progress import TrainingProgress
 
 Status = Literal["finished", "stopped early", "out of time", "interrupted"]
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.linear_friction import BRISTLES, FrictionModel
-from spelgen.dynamics.regressor import regressor
+from spelgen.dynamics.friction import BRISTLES, FrictionModel
+from spelgen.dynamics.regressor_dynamics import regressor
 from spelgen.identification.tuning import TUNING
 from spelgen.structure.base_parameters import base_parameters as body_base_parameters
 from spelgen.structure.base_parameters import parameter_name

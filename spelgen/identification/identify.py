@@ -12,8 +12,8 @@ from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
 from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.dynamics.bristles import reach_of
-from spelgen.dynamics.linear_friction import FrictionModel
-from spelgen.dynamics.regressor import body_chain, regressor
+from spelgen.dynamics.friction import FrictionModel
+from spelgen.dynamics.regressor_dynamics import body_chain, regressor
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.identification import Identification, LeastSquares

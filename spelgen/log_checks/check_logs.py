@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spelgen.dynamics.regressor import body_chain
+from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.identification.drive_hints import Coupling, drive_problem, find_wrong_torques
 from spelgen.identification.drive_samples import DriveLog

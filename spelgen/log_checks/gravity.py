@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import orth
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.regressor import body_chain, regressor, urdf_parameters
+from spelgen.dynamics.regressor_dynamics import body_chain, regressor, urdf_parameters
 from spelgen.identification.drive_hints import drive_rows
 from spelgen.log_checks.tuning import TUNING
 from spelgen.logs.trajectory import Trajectory, split_at_gaps

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.labels import named_joints
 from spelgen.log_checks.report import LogReport
 from spelgen.logs.trajectory import Trajectory, joined_column, split_at_gaps

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 
 from spelgen.arm.configured_arm import ConfiguredArm
-from spelgen.dynamics.linear_friction import FrictionModel
+from spelgen.dynamics.body_regressor import about_center
+from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.parameters import parameters_of_kind
-from spelgen.dynamics.regressor import urdf_parameters
-from spelgen.dynamics.rigid_bodies import about_center
+from spelgen.dynamics.regressor_dynamics import urdf_parameters
 from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
 from spelgen.fitting.run_record import Content
 from spelgen.identification.base_parameters import base_parameters

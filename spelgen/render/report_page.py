@@ -18,7 +18,7 @@ from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.traces import Traces
 from spelgen.evaluation.verdict import Limits, Verdict, verdict
 from spelgen.files import write_json, write_text
-from spelgen.fitting.run_folder import RunFolder, trained_model
+from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.labels import UNITS, named_joints
@@ -127,7 +127,7 @@ def report_data(folder: Path | str) -> Content:
 
 def _trained(run: Run) -> ArmModel | None:
     """Return the trained model; None of a run without weights."""
-    return trained_model(run.folder) if run.folder.weights.is_file() else None
+    return fitted_model(run.folder).requires_grad_(False).eval() if run.folder.weights.is_file() else None
 
 
 def render_report(folder: Path | str, robot: Path | str | None = None) -> str:

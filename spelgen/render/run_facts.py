@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spelgen.dynamics.residuals import used_parameter_count
+from spelgen.dynamics.parameters import used_parameter_count
 from spelgen.errors import shortened
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import figures

@@ -12,11 +12,11 @@ from dataclasses import replace
 
 import torch
 
-from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo.parameters import COULOMB, DEAD_ZONE, ServoParameters
 from spelgen.fitting.servo.problem import MAX_STEP, ServoProblem
 from spelgen.fitting.servo.tuning import ServoLawTuning, ServoSolverTuning
+from spelgen.fitting.tuning import TUNING as DAMPING
 from spelgen.runtime.friction_laws import FrictionLaws
 
 TUNING, SOLVER = ServoLawTuning(), ServoSolverTuning()
@@ -49,7 +49,7 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
     """
     errors = problem.residual(x)
     costs = problem.joint_costs(x, errors)
-    damping, active = torch.full_like(costs, DAMPING.initial), torch.ones_like(costs).bool()
+    damping, active = torch.full_like(costs, DAMPING.initial_damping), torch.ones_like(costs).bool()
     p, n = x.joints.shape
     for _ in range(TUNING.steps):
         normal = problem.normal_equations(x, errors)
@@ -66,7 +66,7 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
         x = replace(x, joints=torch.where(better, candidate.joints, x.joints))
         errors = torch.where(better, candidate_errors, errors)
         costs = torch.where(better, candidate_costs, costs)
-        damping = torch.where(better, damping / DAMPING.factor, damping * DAMPING.factor / 2)
+        damping = torch.where(better, damping / DAMPING.damping_factor, damping * DAMPING.damping_factor / 2)
         if not active.any():
             break
     return x, costs

@@ -20,7 +20,6 @@ import torch
 from spelgen.dynamics.bristles import encoder_step
 from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import digest
-from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
 from spelgen.fitting.levenberg_marquardt import SolverState, initial_state, levenberg_marquardt
 from spelgen.fitting.objective import FitRequest, Objective, PreparedLogs, Status
 from spelgen.fitting.run_record import Content
@@ -33,11 +32,12 @@ from spelgen.fitting.servo.report import servo_record, solution
 from spelgen.fitting.servo.rollouts import ServoRollouts
 from spelgen.fitting.servo.tuning import ServoSolverTuning
 from spelgen.fitting.servo.windows import servo_windows
+from spelgen.fitting.tuning import TUNING as DAMPING
 from spelgen.logs.checks import check
 from spelgen.logs.trajectory import require_commands, require_joints
 
 if TYPE_CHECKING:
-    from spelgen.fitting.progress import TrainingProgress
+    from spelgen.fitting.process import TrainingProgress
 
 TUNING = ServoSolverTuning()
 # On few windows with half the integration steps; on few windows with dead zones; on all windows.
@@ -114,7 +114,7 @@ class ServoObjective(Objective):
         problem, number = self._problem, len(self._iterates)
         show = partial(_show_progress, progress, number)
         # later iterations start near the minimum
-        damping = DAMPING.initial if number == 1 else TUNING.later_damping
+        damping = DAMPING.initial_damping if number == 1 else TUNING.later_damping
         result = levenberg_marquardt(
             problem,
             initial_state(problem, self._iterates[-1], damping, self._steps),
