@@ -194,7 +194,7 @@ def latency(robot: str = "ur10e") -> None:
             show(name, lambda: session.run(None, states))  # noqa: B023
     print("Pinocchio, Python")
     arm = load_arm(ROBOTS / f"{robot}.urdf")
-    rigid = pinocchio_model(arm.arm, arm.settings)
+    rigid = pinocchio_model(arm.chain, arm.settings)
     data, x = rigid.createData(), np.full(rigid.nv, 0.3)
     show("rnea", lambda: pin.rnea(rigid, data, x, x, x))
     show("aba", lambda: pin.aba(rigid, data, x, x, x))

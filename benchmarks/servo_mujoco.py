@@ -25,8 +25,8 @@ import numpy as np
 from mujoco import minimize, rollout
 
 import spelgen
-from spelgen.arm.arm import Arm
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.arm import Chain
+from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.registry import command_followers
 from spelgen.dynamics.body_regressor import about_center, quaternion
 from spelgen.dynamics.protocol import motors_of
@@ -114,7 +114,7 @@ class PositionActuators:
     of ``delay`` [s] ago plus ``offset`` (n,) [rad, m].
     """
 
-    arm: Arm
+    arm: Chain
     untrained: ArmModel
     drives: np.ndarray
     offset: np.ndarray
@@ -188,10 +188,10 @@ def _positions(model: mujoco.MjModel, q: np.ndarray, qd: np.ndarray, commands: n
     return np.asarray(states[:, steps - 1 :: steps, 1 : 1 + n])
 
 
-def fit_position_actuators(arm: ConfiguredArm, windows: ServoWindows, trained: ArmModel) -> PositionActuators:
+def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -> PositionActuators:
     """Fit to windows, starting from the drives of a ``trained`` model of the arm. Exits if joints are coupled."""
-    n = len(arm.arm.coordinates)
-    if len(arm.arm.bodies) > n or (motors_of(trained).numpy() != np.eye(n)).any():
+    n = len(arm.chain.coordinates)
+    if len(arm.chain.bodies) > n or (motors_of(trained).numpy() != np.eye(n)).any():
         sys.exit("got coupled joints, expected a motor for each joint and a joint for each body")
     servo, friction = trained.servo.prepare(), trained.friction.prepare()
     # kv includes the damping of the joint: they differ only while the torque is limited
@@ -199,7 +199,7 @@ def fit_position_actuators(arm: ConfiguredArm, windows: ServoWindows, trained: A
     start = np.stack([row.detach().numpy() for row in rows])
     is_known = trained.servo.trained.numpy() == 0
     untrained = spelgen.build(arm, "closed-form").requires_grad_(False)
-    initial = PositionActuators(arm.arm, untrained, start, np.zeros(n), float(trained.servo.delay))
+    initial = PositionActuators(arm.chain, untrained, start, np.zeros(n), float(trained.servo.delay))
     steps = max(steps_between(log, FIT_STEP) for log, _ in windows.rows)
     windows = replace(windows, steps=steps)
     q, qd = windows.q.numpy(), windows.qd.numpy()

@@ -103,7 +103,7 @@ class Truth:
         self.case = case
         self.bodies = spelgen.build(urdf, "closed-form")
         n = self.bodies.n
-        self.arm = spelgen.load_arm(urdf).arm
+        self.arm = spelgen.load_arm(urdf).chain
         coordinates = self.arm.coordinates
         self.lower = np.array([_limit(x.lower, -2.0) for x in coordinates])
         self.upper = np.array([_limit(x.upper, 2.0) for x in coordinates])
@@ -400,7 +400,7 @@ def fit_figaroh(urdf: Path, logs: list[spelgen.Trajectory]) -> Fitted:
     loaded = spelgen.load_arm(urdf)
     delay = spelgen.identify(loaded, logs).torque_delay.delay
     samples = dynamics_samples(logs, preprocessing=spelgen.Preprocessing(torque_delay=delay))
-    dynamics = figaroh_dynamics(loaded.arm, loaded.settings, samples)
+    dynamics = figaroh_dynamics(loaded.chain, loaded.settings, samples)
     return Fitted(dynamics, dynamics.inertial_parameters, dynamics.armature)
 
 

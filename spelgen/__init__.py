@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from spelgen.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import ConfiguredArm as ConfiguredArm
+    from spelgen.arm.configured_arm import Arm as Arm
     from spelgen.arm.configured_arm import load_arm as load_arm
     from spelgen.certificate.inspection import Inspection as Inspection
     from spelgen.certificate.inspection import inspect as inspect
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 # Names of the API by the module that defines them; a module is imported at the first use of a name (PEP 562), so that
 # `import spelgen` is fast.
 _MODULES = {
-    "arm.configured_arm": "load_arm ConfiguredArm",
+    "arm.configured_arm": "load_arm Arm",
     "certificate.inspection": "inspect Inspection",
     "emission.specify": "generate",
     "design": "Design",

@@ -17,7 +17,7 @@ from flint import fmpq_mpoly
 from polynomials import polynomials
 from torch import nn
 
-from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.design import Design
 from spelgen.emission.plan import derive_spec
 from spelgen.emission.text import module_text
@@ -63,11 +63,11 @@ def built(
     """Return the source of a module, and the structure, of one of the robots that come with spelgen."""
     arm = _loaded(robot)
     spec = derive_spec(arm, Options(preset=preset, design=design, assume=assume))
-    return module_text(spec, standalone=standalone), derive(arm.arm, assume)
+    return module_text(spec, standalone=standalone), derive(arm.chain, assume)
 
 
 @cache
-def _loaded(robot: str) -> ConfiguredArm:
+def _loaded(robot: str) -> Arm:
     return load_arm(ROBOTS / f"{robot}.urdf")
 
 
@@ -182,7 +182,7 @@ def exact_model(robot: str, folder: Path) -> nn.Module:
     model = frictionless(module.Model())
     mass = model.mass
     mass.nominal_armature.zero_()
-    true = polynomials(_loaded(robot).arm, inertials=True)
+    true = polynomials(_loaded(robot).chain, inertials=True)
     if structure.outputs:
         functions = [true.combination(output.functional) for output in structure.outputs]
         encoding = model.encoding

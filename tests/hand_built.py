@@ -3,7 +3,7 @@
 from fractions import Fraction
 from pathlib import Path
 
-from spelgen.arm.arm import Arm, Body, Coordinate
+from spelgen.arm.arm import Body, Chain, Coordinate
 
 UPRIGHT = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 SIDEWAYS = ((0, 0, 1), (1, 0, 0), (0, 1, 0))  # the joint's z along the parent's x
@@ -12,7 +12,9 @@ SIDEWAYS = ((0, 0, 1), (1, 0, 0), (0, 1, 0))  # the joint's z along the parent's
 def coordinate(name="a", kind="revolute", **changes):
     """A joint with limits of +-1 and no friction."""
     known = {"lower": -1.0, "upper": 1.0, "effort": 10.0, "velocity": 10.0, "damping": 0.0, "friction": 0.0}
-    return Coordinate(name=name, joint_type=kind, **({"continuous": False, "passive": False} | known | changes))
+    return Coordinate(
+        name=name, joint_type=kind, **({"continuous": False, "passive": False} | known | changes)
+    )
 
 
 def body(name="a", kind="revolute", **changes):
@@ -35,7 +37,7 @@ def point(mass, x=0.0):
 
 
 def arm(coordinates, bodies, gravity=(0, 0, 0)):
-    return Arm("hand_built", tuple(coordinates), tuple(bodies), gravity, diagnostics=(), locked=())
+    return Chain("hand_built", tuple(coordinates), tuple(bodies), gravity, diagnostics=(), locked=())
 
 
 def slider(mass=2.0, **changes):

@@ -41,7 +41,7 @@ def emitted(robots, tmp_path_factory):
     for name in (*ROBOTS, "followed"):
         urdf = (folder if name == "followed" else robots) / f"{name}.urdf"
         source = generate(urdf, preset="closed-form")
-        made[name] = import_source(source, folder / f"{name}_closed_form.py"), load_arm(urdf).arm
+        made[name] = import_source(source, folder / f"{name}_closed_form.py"), load_arm(urdf).chain
     return made
 
 

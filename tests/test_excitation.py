@@ -23,7 +23,7 @@ def loaded(robots):
 
 @pytest.fixture(scope="module")
 def arm(loaded):
-    return loaded.arm
+    return loaded.chain
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def test_the_condition_number_is_that_of_the_regressor(arm, found):
 @pytest.mark.parametrize("robot", ["rpr", "scara"])
 def test_the_gradient_is_that_of_the_criterion(robots, robot):
     """rpr's start overruns efforts, scara has prismatic and gravity-free joints; central differences tell."""
-    arm = load_arm(robots / f"{robot}.urdf").arm
+    arm = load_arm(robots / f"{robot}.urdf").chain
     trajectory = ExcitationTrajectory(10.0, 3, motion_bounds(arm, 0.9, 0.7))
     criterion = Criterion(arm, trajectory)
     parameters = np.random.default_rng(4).standard_normal(trajectory.size)

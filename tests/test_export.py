@@ -44,7 +44,7 @@ def heavier(model):
 
 def differences(model, loaded):
     """Largest difference of M and of the gravity torque to Pinocchio's from the exported files."""
-    engine = arm_dynamics(loaded.arm, loaded.settings)
+    engine = arm_dynamics(loaded.chain, loaded.settings)
     q = torch.randn(20, model.n, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
         mass, load_torque = model.mass_matrix(q).numpy(), model.gravity(q).numpy()
@@ -69,8 +69,8 @@ def test_friction_goes_back_as_the_urdf_can_say_it(tmp_path):
     run, model = run_of("rpr", tmp_path, "closed-form", heavier)
     loaded, _ = exported(run, tmp_path / "learned.urdf")
     for index, name in enumerate(model.joint_names):
-        joint = loaded.settings.joint(loaded.arm.coordinates[index].name)
-        urdf = loaded.arm.coordinates[index]
+        joint = loaded.settings.joint(loaded.chain.coordinates[index].name)
+        urdf = loaded.chain.coordinates[index]
         assert joint.viscous >= 0
         assert joint.coulomb[0] > 0 > joint.coulomb[1], name
         assert urdf.friction == pytest.approx((joint.coulomb[0] - joint.coulomb[1]) / 2)
@@ -145,7 +145,7 @@ def test_exported_bodies_have_the_models_base_parameters(robot, tmp_path):
     export(run.path, "urdf", tmp_path / "learned.urdf")
     arm = load_arm(ROBOTS / f"{robot}.urdf")
     ten = model.inertial_parameters.detach().flatten().tolist()
-    parameters, exported = (base_parameters(x.arm) for x in (arm, load_arm(tmp_path / "learned.urdf")))
+    parameters, exported = (base_parameters(x.chain) for x in (arm, load_arm(tmp_path / "learned.urdf")))
     learned = {each.name: sum(float(weight) * ten[k] for k, weight in each.weights) for each in parameters}
     exact = {each.name: float(each.value) for each in exported}
     before = {each.name: float(each.value) for each in parameters}

@@ -48,7 +48,7 @@ print(json.dumps(found))
 @cache
 def written(robot, assume="kinematics"):
     """A robot with its structure and closed forms, all entries written out."""
-    arm = load_arm(ROOT / "robots" / f"{robot}.urdf").arm
+    arm = load_arm(ROOT / "robots" / f"{robot}.urdf").chain
     structure = derive(arm, assume)
     return arm, structure, formulas(arm, structure, longest=WRITABLE)
 

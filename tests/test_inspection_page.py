@@ -38,7 +38,7 @@ def test_formulas_and_proof_only_where_asked(robots, tmp_path, monkeypatch):
     text = " ".join(Page((tmp_path / "rpr.html").read_text()).text)
     assert "\nM22 = m2R\n" in text
     found, arm = inspect(robots / "rpr.urdf"), load_arm(robots / "rpr.urdf")
-    assert verify(arm.robot, arm.arm, found.structure).checks[0].found in text
+    assert verify(arm.robot, arm.chain, found.structure).checks[0].found in text
     plain = inspection_page(found)
     assert "Closed forms" not in plain and "Proof" not in plain
 

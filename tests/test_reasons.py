@@ -11,7 +11,7 @@ import pytest
 from arms import STRAIGHT, chain, reference_arms
 from pinocchio_geometry import NOTHING, Seen
 
-from spelgen.arm.arm import Arm, make_arm
+from spelgen.arm.arm import Chain, make_arm
 from spelgen.certificate.axes import is_plain
 from spelgen.certificate.facts import Fact, facts
 from spelgen.certificate.inspection import inspect
@@ -123,7 +123,7 @@ def test_reference_arms(shared, assume):
     assert len(reasons) > 12
 
 
-def assert_statements_hold(arm: Arm, structure: Structure, told: tuple[Fact, ...], name: str) -> None:
+def assert_statements_hold(arm: Chain, structure: Structure, told: tuple[Fact, ...], name: str) -> None:
     """Every reason is true in Pinocchio at random configurations, with random inertials or the URDF's."""
     keys = triangle(len(structure.joints))
     free = structure.assume == "kinematics"

@@ -213,7 +213,7 @@ def test_pose_and_jacobian_of_the_tip_are_pinocchios(robot, link, robots, tmp_pa
     if robot == "lift":
         path.write_text(LIFT)
     loaded = load_arm(path, ["low", "swing"] if robot == "lift" else None)
-    joints = [c.name for c in loaded.arm.coordinates]
+    joints = [c.name for c in loaded.chain.coordinates]
     tip, dynamics = tip_kinematics(loaded, link), urdf_dynamics(path, joints)
     q = states(len(joints))[0]
     pose, jacobian = tip.pose(q), tip.jacobian(q)

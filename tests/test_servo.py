@@ -233,7 +233,7 @@ def test_what_servo_logs_can_tell_at_all(robots, tmp_path, robot, groups, left):
     path = tmp_path / "sliders.urdf" if robot == "sliders" else robots / f"{robot}.urdf"
     if robot == "sliders":  # at right angles, of which each moves by itself
         path.write_text(SLIDERS)
-    found = servo_rank(spelgen.load_arm(path).arm)
+    found = servo_rank(spelgen.load_arm(path).chain)
     assert found.groups == groups and {*found.open} == left
 
 

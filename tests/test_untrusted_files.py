@@ -118,7 +118,7 @@ def test_logs_that_are_none_are_told_in_our_words(tmp_path, arm, case):
 def test_two_samples_are_too_few_to_judge(arm):
     q = np.array([[0.1, 0.2], [0.3, 0.5]])
     samples = state_samples(Trajectory(np.array([0.0, 0.1]), q, q, q, "two"), np.eye(2))
-    assert find_opposed_inertia(arm.arm, samples, np.eye(2)) is None
+    assert find_opposed_inertia(arm.chain, samples, np.eye(2)) is None
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Robot -> Arm: the serial chain with exact geometry; links on fixed and locked joints are lumped."""
+"""Robot -> Chain: the serial chain with exact geometry; links on fixed and locked joints are lumped."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from math import pi
 
-from spelgen.arm.chain import Chain, choose_chain, leaders
+from spelgen.arm.chain import ChainChoice, choose_chain, leaders
 from spelgen.arm.lump_links import MovingJoint, lump_links
 from spelgen.arm.placement import TenVector
 from spelgen.arm.rational import Matrix, Vector, as_matrix, as_vector, exact
@@ -67,7 +67,7 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Arm:
+class Chain:
     """A serial arm with n coordinates from the root to the tip; parents precede their children in ``bodies``.
 
     ``gravity`` [m/s2] is in the frame of the root link; ``locked`` are the names of locked joints; ``diagnostics`` are
@@ -104,7 +104,7 @@ def make_arm(
     tip: str | None = None,
     angle_tolerance: float = 2e-3,
     gravity: Sequence[float] = (0.0, 0.0, -9.81),
-) -> Arm:
+) -> Chain:
     """Return an arm of a robot; all joints that are not part of the arm are locked at 0.
 
     Args:
@@ -128,7 +128,7 @@ def make_arm(
         bodies.append(_body(moved, chain.names.index(moved.followed.leader.name)))
     # exact, so that the gravity torque of a vertical axis is 0 and not 1e-17
     x, y, z = map(exact, map(float, gravity))
-    return Arm(
+    return Chain(
         name=robot.name,
         coordinates=tuple(map(_coordinate, chain.joints)),
         bodies=tuple(bodies),
@@ -138,7 +138,7 @@ def make_arm(
     )
 
 
-def _require_small(robot: Robot, chain: Chain) -> None:
+def _require_small(robot: Robot, chain: ChainChoice) -> None:
     """Raise ArmError for an arm whose derivation would take more than some seconds."""
     moving = len(chain.joints)
     if moving > MAX_JOINTS:

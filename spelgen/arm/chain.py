@@ -17,7 +17,7 @@ _CHOOSE = "choose one with --tip LINK or --joints A,B,..., or write tip or movin
 
 
 @dataclass(frozen=True)
-class Chain:
+class ChainChoice:
     """The selected joints, root first, and diagnostics of the selection."""
 
     joints: tuple[UrdfJoint, ...]
@@ -38,7 +38,7 @@ class Leader:
     offset: Fraction
 
 
-def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) -> Chain:
+def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) -> ChainChoice:
     """Return the named joints, the joints from the root to the link ``tip``, or the longest serial chain.
 
     The longest chain excludes joints at its end with the name of a gripper or finger. Raises ArmError.
@@ -46,9 +46,9 @@ def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) ->
     if joints is not None and tip is not None:
         raise ArmError("both joints and a tip", file=robot.source, expected="one of the two")
     if joints is not None:
-        chain = Chain(_named(robot, joints))
+        chain = ChainChoice(_named(robot, joints))
     elif tip is not None:
-        chain = Chain(_up_to(robot, tip))
+        chain = ChainChoice(_up_to(robot, tip))
     else:
         chain = _longest(robot)
     if not chain.joints:
@@ -155,27 +155,27 @@ def _up_to(robot: Robot, tip: str) -> tuple[UrdfJoint, ...]:
     return _independent(robot.path_to(tip))
 
 
-def _longest(robot: Robot) -> Chain:
+def _longest(robot: Robot) -> ChainChoice:
     """Return the longest chain. Raises ArmError for several of equal length without an unambiguous criterion."""
     chains = _chains(robot)
     length = max(map(len, chains), default=0)
     longest = [chain for chain in chains if len(chain) == length]
     if not longest:
-        return Chain(())
+        return ChainChoice(())
     if len(longest) == 1:
-        return Chain(longest[0])
+        return ChainChoice(longest[0])
     # two jaws form two chains of equal length
     if _is_parallel_gripper(longest):
         jaws = ", ".join(repr(chain[-1].name) for chain in longest)
         message = f"{jaws} slide side by side at the end of the chain: taken as a gripper's and locked"
-        return Chain(longest[0][:-1], (_remark(longest[0][-1], "info", message),))
+        return ChainChoice(longest[0][:-1], (_remark(longest[0][-1], "info", message),))
     # an effort of 0 marks joints without a drive
     driven = [chain for chain in longest if all(joint.effort != 0 for joint in chain)]
     if len(driven) == 1:
         message = (
             f"{len(longest)} chains of {length} joints: the only one without a joint of effort 0 is taken"
         )
-        return Chain(driven[0], (_remark(driven[0][-1], "warning", message),))
+        return ChainChoice(driven[0], (_remark(driven[0][-1], "warning", message),))
     raise _ambiguous(robot, longest)
 
 

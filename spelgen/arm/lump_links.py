@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spelgen.arm.angle_rounding import AngleRounding
-from spelgen.arm.chain import Chain, Leader, leaders
+from spelgen.arm.chain import ChainChoice, Leader, leaders
 from spelgen.arm.placement import Frame, Placement, Pose, TenVector
 from spelgen.arm.rational import bounded, rotation_from_rpy
 from spelgen.arm.tuning import TUNING
@@ -37,7 +37,7 @@ class LumpedLinks:
     diagnostics: tuple[Diagnostic, ...]
 
 
-def lump_links(robot: Robot, chain: Chain, angle_tolerance: float) -> LumpedLinks:
+def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> LumpedLinks:
     """Return the robot with moving joints of the chain and their followers, and all other joints locked."""
     rounding = AngleRounding(angle_tolerance)
     placement = Placement(robot.root, rounding)

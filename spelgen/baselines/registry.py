@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.baseline import Baseline, EvaluatedArm, FittedBaselines
 from spelgen.baselines.linear_servos import DelayedCommand, LinearServos
 from spelgen.baselines.names import (
@@ -81,9 +81,7 @@ FRICTION = {
 class IdentifiedArm(Baseline):
     """Rigid bodies, friction and armature with parameters identified by least squares."""
 
-    def fit(
-        self, arm: ConfiguredArm, logs: Sequence[Trajectory], preprocessing: Preprocessing
-    ) -> dict[str, object]:
+    def fit(self, arm: Arm, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> dict[str, object]:
         """Return the identification with the parameters (K,) of each friction model; {} without accelerations."""
         methods = [LeastSquares(friction=friction) for _, friction in FRICTION.values()]
         try:
@@ -100,7 +98,7 @@ class IdentifiedArm(Baseline):
         """Return a predictor for each friction model."""
         if arm.fitted_arm is None or "parameters" not in arm.fitted:
             return []
-        chain, drives = arm.fitted_arm.arm, arm.fitted_arm.actuation.drives()
+        chain, drives = arm.fitted_arm.chain, arm.fitted_arm.actuation.drives()
         predictors = []
         for name, (key, friction) in FRICTION.items():
             dynamics = identified_dynamics(chain, friction, np.array(arm.fitted[key]), drives)
@@ -126,9 +124,7 @@ class FittedServos(Baseline):
 BASELINES: tuple[Baseline, ...] = (ConstantVelocity(), UrdfValues(), IdentifiedArm(), FittedServos())
 
 
-def fit_baselines(
-    arm: ConfiguredArm, logs: Sequence[Trajectory], preprocessing: Preprocessing
-) -> FittedBaselines:
+def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> FittedBaselines:
     """Return the baselines fitted to training logs, validation logs included, and the coverage of these logs.
 
     preprocessing: resolved by the fit of the model.

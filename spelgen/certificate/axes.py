@@ -13,12 +13,12 @@ from functools import cached_property
 
 import numpy as np
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.arm.rational import IDENTITY, ZERO, turn_about
 from spelgen.certificate.tuning import TUNING
 
 
-def is_plain(arm: Arm) -> bool:
+def is_plain(arm: Chain) -> bool:
     """Return True if the bodies form one chain and each has its own coordinate: no branches, no mimic joints."""
     for index, body in enumerate(arm.bodies):
         if body.parent != index - 1 or body.coordinate != index or body.multiplier != 1:
@@ -29,7 +29,7 @@ def is_plain(arm: Arm) -> bool:
 class Axes:
     """Tests of the axes of the joints of a plain arm at every configuration; joints are counted from 0."""
 
-    def __init__(self, arm: Arm):
+    def __init__(self, arm: Chain):
         self.arm = arm
         self.slides = [kind == "prismatic" for kind in arm.joint_types]
         generator = random.Random(0)  # reproducible reports
@@ -112,7 +112,7 @@ class Axes:
         return all(_moves_nothing(twists[joint], gravity) for _, twists in self._configurations)
 
 
-def _configuration(arm: Arm, generator: random.Random) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _configuration(arm: Chain, generator: random.Random) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return axes, n times (3,), and twists, n times (6,), of the joints in the root frame, at a random configuration.
 
     A twist is the velocity of a body for a unit rate: linear velocity (3,) at the origin of the root frame, then

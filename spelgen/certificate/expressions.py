@@ -14,7 +14,7 @@ from flint import fmpq, fmpq_mpoly, fmpq_mpoly_ctx
 from sympy import Add, Expr, Integer, Rational, Symbol, cos, sin
 from sympy.core.parameters import distribute
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.certificate.axes import Axes, is_plain
 from spelgen.structure.recursion import base_denominators
 
@@ -46,7 +46,7 @@ def weighted_sum(terms: Mapping[Expr, fmpq]) -> Expr:
 class PolynomialWriter:
     """Conversion of the polynomials of an arm, over s1, c1, q1, s2, ..., to terms."""
 
-    def __init__(self, arm: Arm, context: fmpq_mpoly_ctx):
+    def __init__(self, arm: Chain, context: fmpq_mpoly_ctx):
         generators = context.gens()
         self._circles = []
         for sine, cosine in zip(generators[::3], generators[1::3], strict=True):
@@ -82,7 +82,7 @@ class PolynomialWriter:
         return {factor: value for factor, value in result.items() if value != 0}
 
 
-def parallel_runs(arm: Arm) -> list[list[int]]:
+def parallel_runs(arm: Chain) -> list[list[int]]:
     """Return the revolute coordinates in groups of consecutive axes that are parallel at every configuration.
 
     If bodies share coordinates (mimic joints), each coordinate is its own group.

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.certificate import reasons
 from spelgen.certificate.axes import Axes, is_plain
 from spelgen.labels import axes_in_words, entry_name, joints_in_words, listed
@@ -37,7 +37,7 @@ class Fact:
         return f"{self.statement}. {self.means}."
 
 
-def facts(arm: Arm, structure: Structure) -> tuple[Fact, ...]:
+def facts(arm: Chain, structure: Structure) -> tuple[Fact, ...]:
     """Return the properties of M and V at all configurations, with simple geometric reasons if there are any."""
     # A mimic joint moves several bodies, for which the reasons about pairs of axes are not valid.
     axes = None

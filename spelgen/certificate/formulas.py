@@ -14,7 +14,7 @@ from typing import Literal
 from flint import fmpq_mpoly
 from sympy import Expr, Integer, Matrix, Rational, Symbol
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.certificate.expressions import PolynomialWriter, coordinate, grouped, parameter, weighted_sum
 from spelgen.certificate.printing import latex
 from spelgen.certificate.tuning import TUNING
@@ -67,7 +67,7 @@ class Formulas:
     With ``inertials``, terms that vanish for the values of the URDF are omitted.
     """
 
-    arm: Arm
+    arm: Chain
     assume: str
     base: tuple[BaseParameter, ...]
     rows: tuple[Formula, ...]
@@ -148,7 +148,7 @@ class Formulas:
 
 
 def formulas(
-    arm: Arm, structure: Structure, *, entry: Entry | None = None, longest: int | None = None
+    arm: Chain, structure: Structure, *, entry: Entry | None = None, longest: int | None = None
 ) -> Formulas:
     """Return closed forms of all entries of M and of V, or of one ``entry``.
 
@@ -185,7 +185,7 @@ def formulas(
 class _Writer:
     """The formulas of the entries of one arm; recursion and base parameters are computed once."""
 
-    def __init__(self, arm: Arm, structure: Structure):
+    def __init__(self, arm: Chain, structure: Structure):
         self._at_urdf_values = structure.assume == "inertials"
         self.base = base_parameters(arm)
         if self._at_urdf_values:

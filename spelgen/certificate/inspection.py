@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from spelgen.arm.actuation import Actuation, InputEntry
-from spelgen.arm.arm import Arm, Coordinate
-from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.arm.arm import Chain, Coordinate
+from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.certificate.facts import Fact, facts
 from spelgen.errors import Diagnostic
 from spelgen.labels import counted, joint_ranges, joints_in_ranges, printable, short_name
@@ -35,7 +35,7 @@ POSITION = "the springs of position servos: tau = clip(kp (u - q) - kd qd), whic
 class Inspection:
     """The facts that ``spelgen inspect`` shows of an arm."""
 
-    arm: Arm
+    arm: Chain
     structure: Structure
     actuation: Actuation
     diagnostics: tuple[Diagnostic, ...]
@@ -264,7 +264,7 @@ def range_text(coordinate: Coordinate) -> str:
 
 
 def inspect(
-    arm: ConfiguredArm | str | Path,
+    arm: Arm | str | Path,
     joints: Sequence[str] | None = None,
     tip: str | None = None,
     assume: Assume = "kinematics",
@@ -279,7 +279,7 @@ def inspect(
 
     Raises the errors of ``load_arm``, and ArmError for ``inertials`` if the URDF has none.
     """
-    if not isinstance(arm, ConfiguredArm):
+    if not isinstance(arm, Arm):
         arm = load_arm(arm, joints, tip, angle_tolerance)
-    structure = derive(arm.arm, assume)
-    return Inspection(arm.arm, structure, arm.actuation, arm.diagnostics, arm.settings.input)
+    structure = derive(arm.chain, assume)
+    return Inspection(arm.chain, structure, arm.actuation, arm.diagnostics, arm.settings.input)

@@ -43,6 +43,6 @@ def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
         reasons.append("the derived model differs from the one in the module")
     if text not in (module_text(spec, standalone=is_standalone) for is_standalone in (False, True)):
         reasons.append("the text of the module differs from that of `spelgen build`")
-    proof = verify(arm.robot, arm.arm, derive(arm.arm, stated.options.assume))
+    proof = verify(arm.robot, arm.chain, derive(arm.chain, stated.options.assume))
     reasons += [str(difference) for difference in proof.differences]
     return CheckResult(path, not reasons, tuple(reasons), proof)

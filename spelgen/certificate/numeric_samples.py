@@ -12,7 +12,7 @@ from fractions import Fraction
 import numpy as np
 import pinocchio as pin
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.settings.settings import Settings
 from spelgen.structure.pseudo_inertia import parameters_of
@@ -40,7 +40,7 @@ class NumericSamples:
         return result
 
 
-def draw(arm: Arm, count: int, rng: np.random.Generator, *, random_inertials: bool) -> NumericSamples:
+def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: bool) -> NumericSamples:
     """Return samples at ``count`` configurations, with random inertial parameters or those from the URDF."""
     n = len(arm.coordinates)
     rows, columns = np.tril_indices(n)
@@ -63,7 +63,7 @@ def draw(arm: Arm, count: int, rng: np.random.Generator, *, random_inertials: bo
     return NumericSamples(mass[:, :, rows, columns] / scale, scale, gravity / largest)
 
 
-def regressor(arm: Arm, rng: np.random.Generator) -> np.ndarray:
+def regressor(arm: Chain, rng: np.random.Generator) -> np.ndarray:
     """Return rows of the inverse-dynamics regressor at random q, qd, qdd, (m n, 10 B) for B bodies."""
     # The regressor does not depend on the inertial parameters.
     dynamics = arm_dynamics(with_random_inertias(arm, rng), Settings())
@@ -79,14 +79,14 @@ def regressor(arm: Arm, rng: np.random.Generator) -> np.ndarray:
     return np.concatenate(rows)
 
 
-def _positions(arm: Arm, rng: np.random.Generator) -> np.ndarray:
+def _positions(arm: Chain, rng: np.random.Generator) -> np.ndarray:
     """Return random positions (n,) [rad, m]."""
     # The structure holds at every configuration, also outside the limits.
     half_range = np.where(np.array(arm.joint_types) == "revolute", np.pi, 1.0)
     return rng.uniform(-half_range, half_range)
 
 
-def with_random_inertias(arm: Arm, rng: np.random.Generator) -> Arm:
+def with_random_inertias(arm: Chain, rng: np.random.Generator) -> Chain:
     """Return the arm with random, physically consistent inertial parameters of all bodies."""
     translations = np.array([body.translation for body in arm.bodies], dtype=float)
     size = float(np.linalg.norm(translations, axis=1).mean()) or 1.0

@@ -1,7 +1,7 @@
-"""Comparison of an Arm with Pinocchio's reading of the URDF: axes of joints, masses and inertias.
+"""Comparison of a chain with Pinocchio's reading of the URDF: axes of joints, masses and inertias.
 
-It detects errors of reading, which checks of the derivation cannot detect, because the derivation starts from the Arm.
-Pinocchio does not round angles: an Arm with rounded angles is also made from the file without rounding.
+It detects errors of reading. Checks of the derivation cannot detect them: the derivation starts from the chain.
+Pinocchio does not round angles: a chain with rounded angles is also made from the file without rounding.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 from lxml import etree
 
-from spelgen.arm.arm import Arm, make_arm
+from spelgen.arm.arm import Chain, make_arm
 from spelgen.certificate.tuning import TUNING
 from spelgen.certificate.verification import FactCheck, Verdict, size_text
 from spelgen.dynamics.constraint import mimic_constraint
@@ -27,11 +27,11 @@ from spelgen.urdf.robot import Robot
 TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
-def urdf_cross_check(robot: Robot, arm: Arm, seed: int) -> tuple[FactCheck, ...]:
+def urdf_cross_check(robot: Robot, arm: Chain, seed: int) -> tuple[FactCheck, ...]:
     """Compare ``arm`` with Pinocchio's reading of the same bytes at random configurations."""
     try:
         dynamics = _pinocchio_dynamics(robot, arm)
-    except Exception as problem:  # a failure of Pinocchio is no evidence about the Arm
+    except Exception as problem:  # a failure of Pinocchio is no evidence about the chain
         text = " ".join(str(problem).split())[:120]
         result = f"Pinocchio cannot read it ({type(problem).__name__}: {text})"
         return (FactCheck("reading of the file", "the moving bodies", result, "undecided"),)
@@ -60,7 +60,7 @@ def urdf_cross_check(robot: Robot, arm: Arm, seed: int) -> tuple[FactCheck, ...]
     return tuple(checks)
 
 
-def _pinocchio_dynamics(robot: Robot, arm: Arm) -> PinocchioDynamics:
+def _pinocchio_dynamics(robot: Robot, arm: Chain) -> PinocchioDynamics:
     """Return the dynamics of the URDF by Pinocchio's reader. Raises ValueError if the file has changed."""
     data = urdf_bytes(robot.path)
     if hashlib.sha256(data).hexdigest() != robot.digest:
@@ -79,7 +79,7 @@ def _pinocchio_dynamics(robot: Robot, arm: Arm) -> PinocchioDynamics:
     return PinocchioDynamics(model, mimic_constraint(robot, arm.joint_names))
 
 
-def _arm_dynamics(arm: Arm) -> PinocchioDynamics:
+def _arm_dynamics(arm: Chain) -> PinocchioDynamics:
     bodies = []
     for body in arm.bodies:
         # In Pinocchio's reading, a body without inertial has no mass.
@@ -87,7 +87,7 @@ def _arm_dynamics(arm: Arm) -> PinocchioDynamics:
     return arm_dynamics(replace(arm, bodies=tuple(bodies)), Settings())
 
 
-def _reading(dynamics: PinocchioDynamics, arm: Arm, q: np.ndarray) -> dict[str, np.ndarray]:
+def _reading(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str, np.ndarray]:
     """Return kinematic and dynamic quantities of the B moving bodies at positions q (S, n).
 
     "axes of the joints": twists of unit rates in the root frame, (S, 6, B). "masses and inertias": M with twice its

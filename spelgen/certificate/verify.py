@@ -1,8 +1,8 @@
 """Numerical verification of a structure by Pinocchio at random configurations.
 
 With ``kinematics`` every sample has its own random inertial parameters; with ``inertials`` all samples have the
-parameters of the URDF. The verification shares only the Arm with the derivation; the Arm is compared with Pinocchio's
-reading of the file (``urdf_cross_check``).
+parameters of the URDF. The verification shares only the chain with the derivation; the chain is compared with the
+reading of the file by Pinocchio (``urdf_cross_check``).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.certificate.numeric_samples import ENGINE, NumericSamples, draw, regressor
 from spelgen.certificate.tuning import TUNING
 from spelgen.certificate.urdf_cross_check import urdf_cross_check
@@ -63,7 +63,7 @@ class _DerivedFact:
         return FactCheck(self.fact, self.derived, result, "agrees")
 
 
-def verify(robot: Robot, arm: Arm, structure: Structure, *, seed: int = 0) -> Verification:
+def verify(robot: Robot, arm: Chain, structure: Structure, *, seed: int = 0) -> Verification:
     """Verify the structure of ``arm``, and the arm against the file of ``robot``, at random configurations."""
     # r samples have the rank r of a space; additional samples would reveal a larger rank
     count = len(structure.entries) + TUNING.spare_samples
@@ -172,7 +172,7 @@ def _rank(fact: str, rows: np.ndarray, rank: int) -> _DerivedFact:
     return _DerivedFact(fact, str(rank), magnitudes)
 
 
-def _is_fine(arm: Arm, structure: Structure) -> bool:
+def _is_fine(arm: Chain, structure: Structure) -> bool:
     """Return True if a nonzero number of the arm is so small that its products may vanish in rounding errors."""
     numbers = [np.array(body.rotation, dtype=float).ravel() for body in arm.bodies]
     if structure.assume == "inertials":

@@ -65,7 +65,7 @@ def inspect(
         # imported here: Pinocchio and SymPy, which take seconds
         from spelgen.certificate.verify import verify as verified
 
-        proof = verified(arm.robot, arm.arm, inspection.structure)
+        proof = verified(arm.robot, arm.chain, inspection.structure)
     closed = None
     if formulas or chosen_entry is not None or chosen in ("latex", "sympy"):
         from spelgen.certificate.formulas import WRITABLE

@@ -26,7 +26,7 @@ from spelgen.errors import SpelgenErrors
 from spelgen.files import write_text
 
 if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import ConfiguredArm
+    from spelgen.arm.configured_arm import Arm
 
 
 def excite(
@@ -111,7 +111,7 @@ def simulate(
     from spelgen.simulation.simulate import simulate as simulate_arm
 
     arm = options.load(robot, joints, tip, angle_tolerance)
-    names = arm.arm.joint_names
+    names = arm.chain.joint_names
     motions = [read_motion(file, names) for file in motion or ()]
     truth = output / "as_built.urdf"
     paths = {role: output / f"{role}.parquet" for role in ("train", "test")}
@@ -171,7 +171,7 @@ def logs(
         say(json.dumps(result.to_dict(), indent=2))
     # also for logs with errors, whose charts may show the cause
     if html is not None:
-        note(f"wrote {write_text(html, page(result, arm.arm, arm.actuation.matrix()))}")
+        note(f"wrote {write_text(html, page(result, arm.chain, arm.actuation.matrix()))}")
     if result.errors:
         note(SpelgenErrors(result.errors))
     # errors before warnings
@@ -181,7 +181,7 @@ def logs(
         raise typer.Exit(FAILED)
 
 
-def _suggested(paths: list[Path], arm: ConfiguredArm, file: Path) -> Path:
+def _suggested(paths: list[Path], arm: Arm, file: Path) -> Path:
     """Write the mapping that the first log suggests, and return its file; exit with 1 if the log lacks columns."""
     from spelgen.errors import collect
     from spelgen.logs.formats import log_files
@@ -189,7 +189,7 @@ def _suggested(paths: list[Path], arm: ConfiguredArm, file: Path) -> Path:
 
     logs, errors = log_files(paths)
     collect(errors)
-    suggestion = suggest_mapping(logs[0], arm.arm.joint_names)
+    suggestion = suggest_mapping(logs[0], arm.chain.joint_names)
     say(f"wrote {write_text(file, suggestion.text)}; check it, then pass it by --mapping")
     if suggestion.missing:
         note(f"no column was found for {', '.join(suggestion.missing)}; write their names into {file}")

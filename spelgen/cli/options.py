@@ -17,7 +17,7 @@ from spelgen.settings.log_mapping import Accepted
 from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import ConfiguredArm
+    from spelgen.arm.configured_arm import Arm
     from spelgen.logs.arm_mapping import LoggedArm
     from spelgen.settings.log_mapping import LogMapping
 
@@ -184,7 +184,7 @@ def log_mapping(arm: LoggedArm, mapping: Path | LogMapping | None, codes: Sequen
     return chosen.model_copy(update={"accept": tuple(accepted)})
 
 
-def load(robot: Path, joints: str | None, tip: str | None, angle_tolerance: float) -> ConfiguredArm:
+def load(robot: Path, joints: str | None, tip: str | None, angle_tolerance: float) -> Arm:
     """Return the arm of a URDF with the options of a command."""
     from spelgen.arm.configured_arm import load_arm
 

@@ -88,7 +88,7 @@ def simulated_figures(
     far = spread_windows(testing, steps + 1, decimation)
     # smallest eigenvalue of M: where the arm can be; error of M: where the arm has been
     joints = fit.record.joints
-    ranges = list(map(working_range, load_arm(truth, joints).arm.coordinates))
+    ranges = list(map(working_range, load_arm(truth, joints).chain.coordinates))
     low, high = torch.tensor(ranges, dtype=torch.float64).T
     visited = far.q[:, 0]
     example = predict_example(of_dynamics("", model, far), testing, steps, decimation)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from spelgen.arm.actuation import Drives
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.body_regressor import chain_regressor, pseudo_inertia
 from spelgen.dynamics.bristles import moved_bristles
 from spelgen.dynamics.equations import MotionEquations
@@ -20,7 +20,7 @@ from spelgen.runtime.parts import Row
 from spelgen.runtime.port_hamiltonian import applied
 
 
-def body_chain(arm: Arm) -> BodyChain:
+def body_chain(arm: Chain) -> BodyChain:
     """Return the kinematics of the bodies of an arm."""
     rows: list[tuple[Any, ...]] = []
     for body in arm.bodies:
@@ -30,7 +30,7 @@ def body_chain(arm: Arm) -> BodyChain:
     return BodyChain(len(arm.coordinates), _row(arm.gravity), *zip(*rows, strict=True))
 
 
-def regressor(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+def regressor(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
     """Return Y (T, n, 10 B) of the arm's B bodies at q, qd, qdd, each (T, n): tau = Y pi [Nm, N].
 
     Column 10 b + i belongs to parameter i of ``arm.bodies[b]``, in the order of ``Body.inertia``.
@@ -38,7 +38,7 @@ def regressor(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.nd
     return chain_regressor(body_chain(arm), q, qd, qdd)
 
 
-def urdf_parameters(arm: Arm) -> np.ndarray:
+def urdf_parameters(arm: Chain) -> np.ndarray:
     """Return the inertial parameters of the URDF, (10 B,); zero for a body without inertial."""
     return np.array([body.inertia or (0,) * 10 for body in arm.bodies], dtype=float).ravel()
 
@@ -57,7 +57,7 @@ class RegressorDynamics:
 
     def __init__(
         self,
-        arm: Arm,
+        arm: Chain,
         parameters: np.ndarray,
         armature: np.ndarray,
         friction: Callable[[np.ndarray, np.ndarray | None], np.ndarray],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import Arm
 from spelgen.design import Design
 from spelgen.emission.assemble import ArmModel, assemble
 from spelgen.emission.specify import make_spec
@@ -12,7 +12,7 @@ from spelgen.urdf.robot import Assume
 
 
 def build(
-    arm: ConfiguredArm | str | Path,
+    arm: Arm | str | Path,
     preset: str | Path | Design = "hybrid",
     *,
     width: int = 64,

@@ -7,14 +7,14 @@ from fractions import Fraction
 
 import numpy as np
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.arm.rational import Vector
 from spelgen.emission.tuning import TUNING
 from spelgen.spec import LinkSpec, Triple
 from spelgen.structure.pseudo_inertia import parameters_of, pseudo_inertia, reference_factor
 
 
-def link_specs(arm: Arm, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[LinkSpec, ...]:
+def link_specs(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[LinkSpec, ...]:
     """Return the links of ``arm`` with these inertial parameters, made physically consistent if necessary.
 
     Args:
@@ -50,7 +50,7 @@ def _unique(names: Sequence[str]) -> list[str]:
 
 
 def _consistent(
-    arm: Arm, index: int, ten: Sequence[Fraction | float], heaviest: float
+    arm: Chain, index: int, ten: Sequence[Fraction | float], heaviest: float
 ) -> Sequence[Fraction | float]:
     """Return physically consistent inertial parameters, (10,)."""
     if ten[0] <= 0:
@@ -102,7 +102,7 @@ def _light_ball(radius: float, mass: float) -> list[float]:
     return [mass, 0, 0, 0, moment, 0, 0, moment, 0, moment]
 
 
-def _length(arm: Arm, index: int) -> float:
+def _length(arm: Chain, index: int) -> float:
     """Return the distance to the next joint, at least 0.1 [m]."""
     distances = [
         float(np.linalg.norm(_floats(body.translation))) for body in arm.bodies if body.parent == index

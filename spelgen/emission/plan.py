@@ -10,7 +10,7 @@ import numpy as np
 
 from spelgen.arm.actuation import Actuation
 from spelgen.arm.arm import Coordinate
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import Arm
 from spelgen.design import Design, load_design
 from spelgen.emission.entry_sums import mean_mass
 from spelgen.emission.links import link_specs
@@ -33,7 +33,7 @@ from spelgen.structure.nominal import Nominal, exact_inertias, nominal, working_
 from spelgen.structure.structure import Structure, derive
 
 
-def derive_spec(arm: ConfiguredArm, options: Options) -> ModelSpec:
+def derive_spec(arm: Arm, options: Options) -> ModelSpec:
     """Return the specification of the model of ``arm`` with these options.
 
     Raises SettingsError for position servos with a design without bristle friction.
@@ -45,10 +45,10 @@ def derive_spec(arm: ConfiguredArm, options: Options) -> ModelSpec:
             f"position servos with the preset {options.preset}", element="input",
             expected="a preset with bristle friction, which position servos need", do="--preset closed-form",
         )  # fmt: skip
-    structure = derive(arm.arm, options.assume)
-    sizes = nominal(arm.arm, structure)
+    structure = derive(arm.chain, options.assume)
+    sizes = nominal(arm.chain, structure)
     joints, servos = [], []
-    for index, coordinate in enumerate(arm.arm.coordinates):
+    for index, coordinate in enumerate(arm.chain.coordinates):
         drive = arm.settings.joint(coordinate.name)
         joints.append(_joint(coordinate, sizes, index, drive))
         if has_servos:
@@ -56,11 +56,11 @@ def derive_spec(arm: ConfiguredArm, options: Options) -> ModelSpec:
     links: tuple[LinkSpec, ...] = ()
     outputs, constants = _outputs(structure, sizes, design), _constants(structure, sizes)
     if design.mass == "closed-form":
-        links = link_specs(arm.arm, exact_inertias(arm.arm, sizes.from_urdf))
+        links = link_specs(arm.chain, exact_inertias(arm.chain, sizes.from_urdf))
         joints = _with_armature(joints, np.diagonal(mean_mass(len(joints), outputs, constants)))
-    x, y, z = map(float, arm.arm.gravity)
+    x, y, z = map(float, arm.chain.gravity)
     return ModelSpec(
-        robot=arm.arm.name,
+        robot=arm.chain.name,
         urdf=arm.robot.path.name,
         urdf_sha256=arm.robot.digest,
         gravity=(x, y, z),

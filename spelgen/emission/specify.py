@@ -6,7 +6,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.design import PRESET_NAMES, Design, load_design
 from spelgen.emission.plan import derive_spec
 from spelgen.emission.text import module_text
@@ -16,7 +16,7 @@ from spelgen.urdf.robot import Assume
 
 
 def generate(
-    arm: ConfiguredArm | str | Path,
+    arm: Arm | str | Path,
     preset: str | Path | Design = "hybrid",
     *,
     width: int = 64,
@@ -36,7 +36,7 @@ def generate(
 
 
 def make_spec(
-    arm: ConfiguredArm | str | Path,
+    arm: Arm | str | Path,
     preset: str | Path | Design = "hybrid",
     *,
     width: int = 64,
@@ -45,7 +45,7 @@ def make_spec(
     module: Path | None = None,
 ) -> ModelSpec:
     """Return the specification of the model tailored to an arm; arguments and errors as for ``generate``."""
-    arm = arm if isinstance(arm, ConfiguredArm) else load_arm(arm)
+    arm = arm if isinstance(arm, Arm) else load_arm(arm)
     name, design = str(preset), None
     if preset not in PRESET_NAMES:
         name = "own" if isinstance(preset, Design) else Path(preset).stem
@@ -64,7 +64,7 @@ def make_spec(
     return spec if module is None else replace(spec, urdf=_path_of_urdf(module, arm.robot.path))
 
 
-def arm_of_spec(spec: ModelSpec, urdf: str | Path) -> ConfiguredArm:
+def arm_of_spec(spec: ModelSpec, urdf: str | Path) -> Arm:
     """Return the arm of a specification from its URDF, with the options that the specification was made with."""
     return load_arm(urdf, spec.options.joints, spec.options.tip, spec.options.angle_tolerance)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.baseline import EvaluatedArm
 from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import Predictor, accurate_solver, of_dynamics
@@ -56,12 +56,12 @@ def evaluate(
     model: ArmModel | Fit | Path | str,
     logs: Trajectory | Sequence[Trajectory],
     *,
-    arm: ConfiguredArm | Path | str | None = None,
+    arm: Arm | Path | str | None = None,
     baselines: Mapping[str, RigidDynamics] | None = None,
     preprocessing: Preprocessing | None = None,
     steps: Sequence[int] = STEPS,
     seconds: Sequence[float] = SECONDS,
-    truth: ConfiguredArm | Path | str | None = None,
+    truth: Arm | Path | str | None = None,
     progress: Progress | None = None,
 ) -> Results:
     """Predict the states and torques of test logs and measure the errors.
@@ -127,7 +127,7 @@ def _evaluate_torques(
     used: Preprocessing,
     baselines: Mapping[str, RigidDynamics],
     ahead: tuple[Sequence[int], Sequence[float]],
-    truth: ConfiguredArm | Path | str | None,
+    truth: Arm | Path | str | None,
     progress: Progress | None,
 ) -> Results:
     """Evaluate the torques, and the motion under the logged torques."""

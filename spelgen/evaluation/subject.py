@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.baseline import arm_of_model
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
 from spelgen.emission.assemble import ArmModel, spec_of
@@ -62,7 +62,7 @@ class Subject:
         return frozenset([*self.fit.record.training, *self.fit.record.validation])
 
     @property
-    def fitted_arm(self) -> ConfiguredArm | None:
+    def fitted_arm(self) -> Arm | None:
         """The arm that the baselines of its fit were fitted for. Raises UrdfError, ArmError or SettingsError."""
         if self.fit is None or self.fit.urdf is None or not self.fit.baselines:
             return None
@@ -76,7 +76,7 @@ class Subject:
         return linear
 
 
-def subject(tested: ArmModel | Fit | Path | str, arm: ConfiguredArm | Path | str | None = None) -> Subject:
+def subject(tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None = None) -> Subject:
     """Return the subject of an evaluation: a model, a fit or the folder of a run; arm: see `evaluate`."""
     if isinstance(tested, str | Path):
         tested = load_run(tested)

@@ -15,8 +15,8 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from spelgen.arm.arm import Arm
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.arm import Chain
+from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.regressor_dynamics import body_chain, urdf_parameters
@@ -32,7 +32,7 @@ FRICTION = FrictionModel()
 class Criterion:
     """Criterion to be minimized over the parameters of an `ExcitationTrajectory`."""
 
-    def __init__(self, arm: Arm, trajectory: ExcitationTrajectory) -> None:
+    def __init__(self, arm: Chain, trajectory: ExcitationTrajectory) -> None:
         self.trajectory, self.chain = trajectory, body_chain(arm)
         self.columns = torch.from_numpy(base_parameters(arm, FRICTION).columns)
         count = TUNING.samples_per_harmonic * trajectory.harmonics + 1
@@ -103,7 +103,7 @@ class Criterion:
 
 
 def excite(
-    arm: ConfiguredArm,
+    arm: Arm,
     *,
     duration: float = 30.0,
     sample_rate: float = 100.0,
@@ -142,15 +142,15 @@ def excite(
         harmonics = max(TUNING.min_harmonics, round(TUNING.harmonics_per_second * duration))
     elif harmonics < 2:
         raise SettingsError(repr(harmonics), element="excite: harmonics", expected="2 or more")
-    bounds = motion_bounds(arm.arm, reach, speed, arm.robot.joint)
+    bounds = motion_bounds(arm.chain, reach, speed, arm.robot.joint)
     trajectory = ExcitationTrajectory(duration, harmonics, bounds)
-    criterion = Criterion(arm.arm, trajectory)
+    criterion = Criterion(arm.chain, trajectory)
     starts = np.random.default_rng(seed).standard_normal((TUNING.starts, trajectory.size))
     best = _improved(criterion, min(starts, key=criterion.value), trials, progress)
     motion = trajectory.motion(best, np.linspace(0.0, duration, round(duration * sample_rate) + 1))
     first, states = criterion.states(starts[0]), torch.from_numpy(np.stack([motion.q, motion.qd, motion.qdd]))
     return Excitation(
-        arm=arm.arm,
+        arm=arm.chain,
         motion=motion,
         parameters=len(criterion.columns),
         first=criterion.condition(first),

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.excitation.trajectory import Motion
 from spelgen.listing import WIDTH, Listing
 
@@ -28,7 +28,7 @@ class Excitation:
     divided by the effort limit; NaN without limit or inertials. first_efforts: of the first random motion.
     """
 
-    arm: Arm
+    arm: Chain
     motion: Motion
     parameters: int
     first: float

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.errors import ArmError, SpelgenError, collect
 from spelgen.excitation.tuning import TUNING
 from spelgen.urdf.robot import UrdfJoint
@@ -36,7 +36,7 @@ class MotionBounds:
 
 
 def motion_bounds(
-    arm: Arm, range_fraction: float, speed_fraction: float, joints: Mapping[str, UrdfJoint] | None = None
+    arm: Chain, range_fraction: float, speed_fraction: float, joints: Mapping[str, UrdfJoint] | None = None
 ) -> MotionBounds:
     """Return the central fraction of the position ranges, and a fraction of the velocity limits.
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from spelgen.arm.arm import make_arm
 from spelgen.arm.chain import choose_chain
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import Arm
 from spelgen.arm.lump_links import lump_links
 from spelgen.dynamics.protocol import input_of, motors_of, residual_terms
 from spelgen.dynamics.tip import last_link
@@ -44,7 +44,7 @@ class Trained:
     """
 
     model: ArmModel
-    arm: ConfiguredArm
+    arm: Arm
     entries: tuple[str, ...] = ()
 
     @cached_property
@@ -60,12 +60,12 @@ class Trained:
     @property
     def robot(self) -> str:
         """The name of the robot in the URDF."""
-        return self.arm.arm.name
+        return self.arm.chain.name
 
     @property
     def joint_names(self) -> tuple[str, ...]:
         """The names of the joints in the URDF."""
-        return self.arm.arm.joint_names
+        return self.arm.chain.joint_names
 
     @property
     def memory(self) -> int:
@@ -74,7 +74,7 @@ class Trained:
         return model.n * model.elements if isinstance(model, RigidBodyDynamics) else 0
 
 
-def describe(model: ArmModel, loaded: ConfiguredArm) -> TrainedModel:
+def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
     """Return the description of a trained model. Raises RunError for a preset without rigid bodies."""
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
     if not isinstance(exact, RigidBodyDynamics):
@@ -92,8 +92,8 @@ def describe(model: ArmModel, loaded: ConfiguredArm) -> TrainedModel:
         constant_mass += array(weights.residual.constant).reshape(exact.n, exact.n)
         residuals = _residuals(exact)
     return TrainedModel(
-        name=identifier(loaded.arm.name),
-        arm=loaded.arm,
+        name=identifier(loaded.chain.name),
+        arm=loaded.chain,
         identifiers=unique_identifiers(model.joint_names),
         inertias=array(exact.inertial_parameters),
         constant_mass=constant_mass,
@@ -150,9 +150,9 @@ def servos_of(model: ArmModel) -> Servos | None:
     return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
 
 
-def tip_frame(loaded: ConfiguredArm) -> Tip:
+def tip_frame(loaded: Arm) -> Tip:
     """Return the frame of the tip link, with the unrounded angles of the URDF."""
-    names = loaded.arm.joint_names
+    names = loaded.chain.joint_names
     link = loaded.tip or last_link(loaded.robot, names)
     frame = lump_links(loaded.robot, choose_chain(loaded.robot, names, None), 0.0).frames[link]
     pose = np.eye(4)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import BSpline
 
-from spelgen.arm.arm import Arm, Body
+from spelgen.arm.arm import Body, Chain
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class TrainedModel:
     """
 
     name: str
-    arm: Arm
+    arm: Chain
     identifiers: tuple[str, ...]
     inertias: np.ndarray
     constant_mass: np.ndarray

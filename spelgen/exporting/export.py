@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import Arm
 from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import RunError, suggestion
 from spelgen.exporting.describe import Trained
@@ -24,7 +24,7 @@ def export(
     to: str = "urdf",
     path: Path | str | None = None,
     *,
-    arm: ConfiguredArm | Path | str | None = None,
+    arm: Arm | Path | str | None = None,
     force: bool = False,
     entries: Sequence[str] = (),
 ) -> Exported:
@@ -60,7 +60,7 @@ def export(
     if arm is None:
         expected = "a run of `spelgen train --robot FILE.urdf`, or an arm"
         raise RunError("no robot.urdf", element="export", expected=expected)
-    if not isinstance(arm, ConfiguredArm):
+    if not isinstance(arm, Arm):
         arm = arm_of_spec(required_spec(trained), arm)
     # imported here: the packages of a format may be extras that are not installed
     exported: Exported = pkgutil.resolve_name(exporter.function_name)(Trained(trained, arm, tuple(entries)))

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from lxml import etree
 
-from spelgen.arm.arm import Arm, Coordinate
+from spelgen.arm.arm import Chain, Coordinate
 from spelgen.dynamics.body_regressor import about_center, quaternion
 from spelgen.exporting.describe import Trained, tip_frame
 from spelgen.exporting.description import Servos
@@ -52,7 +52,7 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
 
     Inputs of the actuators are torques, or commands of position servos.
     """
-    arm, servos = projection.arm.arm, projection.servos
+    arm, servos = projection.arm.chain, projection.servos
     random = random_inputs(arm.coordinates, states)
     controls = torques = random["tau"]
     if servos is not None:
@@ -71,7 +71,7 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
     return require_parity(differences, TUNING.mujoco_tolerance, states)
 
 
-def _simulated(text: bytes, arm: Arm, q: np.ndarray, qd: np.ndarray, controls: np.ndarray) -> Values:
+def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls: np.ndarray) -> Values:
     """Return M, bias and, without mimic joints, accelerations in MuJoCo, in the coordinates of the arm.
 
     Args:
@@ -115,7 +115,7 @@ def mjcf_text(projection: RigidBodyProjection) -> bytes:
 
     Actuators are motors, one per nonzero column of G, or a position actuator per joint with a position servo.
     """
-    arm = projection.arm.arm
+    arm = projection.arm.chain
     root = etree.Element("mujoco", model=arm.name)
     # the default is degrees; autolimits: a given range is a limit
     _add(root, "compiler", angle="radian", autolimits="true")
@@ -171,13 +171,13 @@ def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> d
         "damping": friction.viscous[k],
         "frictionloss": friction.coulomb[k],
         "solimpfriction": " ".join(f"{number:g}" for number in TUNING.friction_impedance),
-        "range": projection.arm.arm.coordinates[k].limits,
+        "range": projection.arm.chain.coordinates[k].limits,
     }
 
 
 def _add_motors(actuators: etree._Element, tendons: etree._Element, projection: RigidBodyProjection) -> None:
     """Add a motor for each input: at a joint, or at a tendon if it acts on several joints."""
-    joints = projection.arm.arm.coordinates
+    joints = projection.arm.chain.coordinates
     for k, column in enumerate(projection.inputs.T):
         name, driven = joints[k].name, np.flatnonzero(column)
         if driven.size == 1:

@@ -105,7 +105,7 @@ def check_parity(
         states: number of random states.
         dtype: of the export; the inputs of both are rounded to it.
     """
-    inputs = random_inputs(trained.arm.arm.coordinates, states, trained.memory)
+    inputs = random_inputs(trained.arm.chain.coordinates, states, trained.memory)
     inputs = {key: value.astype(dtype).astype(np.float64) for key, value in inputs.items()}
     # in double precision: the rounding of a float32 model would exceed the tolerance
     exact = copy.deepcopy(trained.model).double().cpu().requires_grad_(False)

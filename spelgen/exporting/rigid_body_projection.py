@@ -11,8 +11,8 @@ import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
-from spelgen.arm.arm import Arm
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.arm import Chain
+from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.parameters import without_residuals
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.build import build
@@ -56,7 +56,7 @@ class RigidBodyProjection:
     differences of M and gravity torque to the trained model. bodies: model of the rigid bodies only, float64.
     """
 
-    arm: ConfiguredArm
+    arm: Arm
     inertias: np.ndarray
     armature: np.ndarray
     motors: np.ndarray
@@ -79,16 +79,16 @@ class RigidBodyProjection:
             errors = f"M differs by {self.mass_error:.1%}, gravity by {self.gravity_error:.1%}"
             bodies = f"bodies are {source}; {errors}"
         worst = int(np.argmax(self.friction.error))
-        joint = self.arm.arm.coordinates[worst]
+        joint = self.arm.chain.coordinates[worst]
         friction = "friction is written as viscous and Coulomb friction"
         error = f"it differs from the model's by up to {self.friction.error[worst]:.0%} ({joint.name})"
         return bodies, f"{friction}; {error}"
 
 
-def rigid_body_projection(model: ArmModel, arm: ConfiguredArm) -> RigidBodyProjection:
+def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
     """Return the projection of a trained model of ``arm``."""
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
-    q = sampled_positions(arm.arm)
+    q = sampled_positions(arm.chain)
     exact = isinstance(model, RigidBodyDynamics)
     bodies: ArmModel = without_residuals(model) if exact else _nearest_bodies(model, arm, q)
     return RigidBodyProjection(
@@ -96,7 +96,7 @@ def rigid_body_projection(model: ArmModel, arm: ConfiguredArm) -> RigidBodyProje
         inertias=bodies.inertial_parameters.numpy(),
         armature=bodies.armature.numpy(),
         motors=motors_of(bodies).numpy(),
-        friction=nearest_friction(arm.arm, model, q),
+        friction=nearest_friction(arm.chain, model, q),
         inputs=array(model.input_matrix(torch.zeros(model.n, dtype=torch.float64))),
         servos=servos_of(model),
         exact=exact,
@@ -106,12 +106,12 @@ def rigid_body_projection(model: ArmModel, arm: ConfiguredArm) -> RigidBodyProje
     )
 
 
-def sampled_positions(arm: Arm) -> Tensor:
+def sampled_positions(arm: Chain) -> Tensor:
     """Return random positions in the joints' ranges, (positions, n), the same in each call."""
     return torch.from_numpy(random_inputs(arm.coordinates, TUNING.positions)["q"])
 
 
-def _nearest_bodies(model: ArmModel, arm: ConfiguredArm, q: Tensor) -> ArmModel:
+def _nearest_bodies(model: ArmModel, arm: Arm, q: Tensor) -> ArmModel:
     """Return the physically consistent bodies with the smallest errors of M and gravity torque at q (positions, n).
 
     The cost is the mean of |W (M - M0) W^T|^2 / n + |g - g0|^2 / mean g0^2, with M0 and g0 of the model. W is the
@@ -142,7 +142,7 @@ def _relative_rms(values: Tensor, expected: Tensor) -> float:
     return float((values - expected).square().mean().sqrt() / size)
 
 
-def nearest_friction(arm: Arm, model: ArmModel, q: Tensor) -> NearestFriction:
+def nearest_friction(arm: Chain, model: ArmModel, q: Tensor) -> NearestFriction:
     """Return the viscous and Coulomb friction nearest to the friction of a model, by non-negative least squares.
 
     Args:

@@ -56,7 +56,7 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
     their <inertial>.
     """
     robot = projection.arm.robot
-    arm = projection.arm.arm
+    arm = projection.arm.chain
     # the URDF is untrusted
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
     root = etree.fromstring(urdf_bytes(robot.path), parser)
@@ -89,7 +89,7 @@ def _settings_text(projection: RigidBodyProjection) -> str:
         content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     joints = content.setdefault("joints", {})
     friction = projection.friction
-    for index, coordinate in enumerate(projection.arm.arm.coordinates):
+    for index, coordinate in enumerate(projection.arm.chain.coordinates):
         # settings have the inertia at the rotor, the model has the inertia at the joint
         gear = projection.arm.settings.joint(coordinate.name).gear
         joint = joints.setdefault(coordinate.name, {})
@@ -132,7 +132,7 @@ def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[st
     """Return the constants of the friction model by name, (n,) or (n, K) each."""
     model = trained.model
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}
-    factor = array(friction_factor(model, sampled_positions(projection.arm.arm)))
+    factor = array(friction_factor(model, sampled_positions(projection.arm.chain)))
     if (factor != 1).any():
         constants["position_factor"] = np.stack([factor.min(axis=0), factor.max(axis=0)], axis=-1)
     return constants

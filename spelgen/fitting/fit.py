@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.baseline import FittedBaselines, arm_of_model
 from spelgen.baselines.registry import fit_baselines
 from spelgen.emission.assemble import ArmModel
@@ -45,7 +45,7 @@ def fit(
     preprocessing: Preprocessing = AUTOMATIC,
     validation: float | Sequence[Trajectory] = 0.25,
     seed: int = 0,
-    arm: ConfiguredArm | Path | str | None = None,
+    arm: Arm | Path | str | None = None,
     folder: Path | str | None = None,
     options: RunOptions = QUIET,
 ) -> Fit:
@@ -165,7 +165,7 @@ class _Fitting:
             if self.run is not None:
                 write_json(self.run.config, self.record.to_dict())
 
-    def _baseline_arm(self) -> ConfiguredArm | None:
+    def _baseline_arm(self) -> Arm | None:
         """Return the arm that baselines are fitted for; None if its URDF is unknown, or if they are fitted already.
 
         A URDF that cannot be read is reported, and the model is fitted without baselines.
@@ -180,7 +180,7 @@ class _Fitting:
             self.notes.append(Diagnostic("warning", "no-baselines", "run", None, message))
             return None
 
-    def _fit_baselines(self, arm: ConfiguredArm) -> None:
+    def _fit_baselines(self, arm: Arm) -> None:
         logs = list(self.request.logs)
         if not isinstance(self.request.validation, float):
             logs += self.request.validation
@@ -194,7 +194,7 @@ def sample_rates(logs: Sequence[Trajectory]) -> list[float]:
     return [log.sample_rate for log in logs if log.duration >= SHORTEST]
 
 
-def _urdf(arm: ConfiguredArm | Path | str | None) -> Path | None:
+def _urdf(arm: Arm | Path | str | None) -> Path | None:
     """Return the file of a loaded arm, or a path."""
     if arm is None:
         return None

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.friction import BRISTLES, FrictionModel
 from spelgen.dynamics.regressor_dynamics import regressor
 from spelgen.identification.tuning import TUNING
@@ -52,7 +52,7 @@ class BaseParameters:
         return result
 
 
-def base_parameters(arm: Arm, friction: FrictionModel, motors: np.ndarray | None = None) -> BaseParameters:
+def base_parameters(arm: Chain, friction: FrictionModel, motors: np.ndarray | None = None) -> BaseParameters:
     """Return the base parameters of an arm with friction.
 
     Args:
@@ -82,7 +82,7 @@ def base_parameters(arm: Arm, friction: FrictionModel, motors: np.ndarray | None
     return BaseParameters(tuple(base_names), chosen, combination, tuple(names), len(exact))
 
 
-def _columns(arm: Arm, friction: FrictionModel, motors: np.ndarray | None, count: int) -> np.ndarray:
+def _columns(arm: Chain, friction: FrictionModel, motors: np.ndarray | None, count: int) -> np.ndarray:
     """Return the regressor of all parameters at random states, (rows, count)."""
     n = len(arm.coordinates)
     shape = (2 * count // n + 1, n)  # twice as many equations as parameters

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from spelgen.arm.actuation import Drives
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
@@ -56,7 +56,7 @@ class Identification:
     torque_delay: by which logged torques were moved.
     """
 
-    arm: Arm
+    arm: Chain
     method: LeastSquares
     base: BaseParameters
     parameters: np.ndarray
@@ -193,7 +193,7 @@ class Identification:
 
 
 def identified_dynamics(
-    arm: Arm, friction: FrictionModel, parameters: np.ndarray, drives: Drives
+    arm: Chain, friction: FrictionModel, parameters: np.ndarray, drives: Drives
 ) -> RegressorDynamics:
     """Return the dynamics of an arm with these parameters, (K,): bodies, friction, drives."""
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)

@@ -27,7 +27,7 @@ from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
 
 if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import ConfiguredArm
+    from spelgen.arm.configured_arm import Arm
     from spelgen.settings.log_mapping import LogMapping
 
 ORDER = replace(
@@ -38,9 +38,7 @@ WRONG_TORQUES = {"torque-sense": SENSE, "torque-order": ORDER}
 ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED}
 
 
-def check_logs(
-    logs: Iterable[Trajectory], arm: ConfiguredArm, mapping: LogMapping | None = None
-) -> LogReport:
+def check_logs(logs: Iterable[Trajectory], arm: Arm, mapping: LogMapping | None = None) -> LogReport:
     """Report all about the logs of an arm, read once, one trajectory after another; nothing is repaired or raised.
 
     The report's `errors` prevent training. mapping: that of the logs, by default from the arm's settings; units that
@@ -48,11 +46,11 @@ def check_logs(
     the joints. Raises LogError without any trajectory, or with one of another number of joints, and
     where an arm's settings say 'input: position', without commands.
     """
-    joints = arm.arm.joint_names
+    joints = arm.chain.joint_names
     checked: TorqueLogs | ServoLogs = TorqueLogs(arm, mapping or arm.settings.logs)
     if arm.settings.input == "position":
         checked = ServoLogs(arm)
-    log_checks = LogChecks(joints, arm.arm.joint_types)
+    log_checks = LogChecks(joints, arm.chain.joint_types)
     measured: list[Statistics] = []
     examples: list[Trajectory] = []
     # one after another: a stream of logs may be larger than memory
@@ -67,11 +65,11 @@ def check_logs(
         raise LogError("no trajectory", expected="at least one")
     summary = log_checks.findings()
     reports = []
-    for index, coordinate in enumerate(arm.arm.coordinates):
+    for index, coordinate in enumerate(arm.chain.coordinates):
         reports.append(joint_report(index, coordinate, measured, log_checks.products))
     completed, tables = checked.check(reports, summary)
     return LogReport(
-        robot=arm.arm.name,
+        robot=arm.chain.name,
         trajectories=tuple(x.clock for x in measured),
         joints=completed,
         tables=tables,
@@ -82,7 +80,7 @@ def check_logs(
 
 
 def require_sound_logs(
-    logs: Sequence[Trajectory], arm: ConfiguredArm, mapping: LogMapping | None = None
+    logs: Sequence[Trajectory], arm: Arm, mapping: LogMapping | None = None
 ) -> list[Diagnostic]:
     """Return what `check_logs` finds of logs beside their arm; raise LogError where they cannot be trained on."""
     # the same checks as the command, so that a fit refuses what `spelgen logs` refuses
@@ -95,10 +93,10 @@ def require_sound_logs(
 class TorqueLogs:
     """Check logs of torques beside their arm, from samples that are kept while the logs go by."""
 
-    def __init__(self, arm: ConfiguredArm, mapping: LogMapping) -> None:
+    def __init__(self, arm: Arm, mapping: LogMapping) -> None:
         self._arm, self._mapping, self._drives = arm, mapping, arm.actuation.drives()
         self._samples: list[np.ndarray] = []
-        self._moving = DriveLog(arm.arm.joint_types, self._drives, Preprocessing())
+        self._moving = DriveLog(arm.chain.joint_types, self._drives, Preprocessing())
         self._declared: list[set[str]] = []
 
     def add(self, trajectory: Trajectory) -> None:
@@ -116,8 +114,8 @@ class TorqueLogs:
         accepted = set(self._mapping.accept) | set.intersection(*self._declared)
         motion = joined(self._samples)
         completed = []
-        fits = fit_gravity(self._arm.arm, motion)
-        for coordinate, report, gravity in zip(self._arm.arm.coordinates, reports, fits, strict=True):
+        fits = fit_gravity(self._arm.chain, motion)
+        for coordinate, report, gravity in zip(self._arm.chain.coordinates, reports, fits, strict=True):
             completed.append(replace(report, gravity=gravity))
             passed = accepted
             # a unit that somebody wrote down is taken as right
@@ -136,7 +134,7 @@ class TorqueLogs:
 
         motion: samples (4, S, n), see `state_samples`.
         """
-        arm, joints, drives = self._arm.arm, self._arm.arm.joint_names, self._drives
+        arm, joints, drives = self._arm.chain, self._arm.chain.joint_names, self._drives
         if not summary.errors and SENSE.code not in accepted:
             opposed = find_opposed_inertia(arm, motion, drives.speeds)
             if opposed is not None:
@@ -156,9 +154,9 @@ class TorqueLogs:
             summary.notes.extend(late.notes)
 
 
-def _coupling_hint(arm: ConfiguredArm, coupling: Coupling, remaining: float) -> Diagnostic:
+def _coupling_hint(arm: Arm, coupling: Coupling, remaining: float) -> Diagnostic:
     """Return a coupling that the logs show, in the sidecar's words."""
-    names = arm.arm.joint_names
+    names = arm.chain.joint_names
     pair = [coupling.moved_by, coupling.joint]
     matrix = np.array([[1.0, coupling.ratio], [0.0, 1.0]]) * np.diag(arm.actuation.matrix())[pair]
     joints = json.dumps([names[k] for k in pair])

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import orth
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.regressor_dynamics import body_chain, regressor, urdf_parameters
 from spelgen.identification.drive_hints import drive_rows
 from spelgen.log_checks.tuning import TUNING
@@ -57,7 +57,7 @@ def joined(samples: Sequence[np.ndarray]) -> np.ndarray:
     return motion[:, :: -(-motion.shape[1] // TUNING.all_gravity_samples) or 1]
 
 
-def fit_gravity(arm: Arm, motion: np.ndarray) -> list[GravityFit]:
+def fit_gravity(arm: Chain, motion: np.ndarray) -> list[GravityFit]:
     """Return by joint what gravity explains of the torques of these samples, (4, S, n)."""
     q, qd, qdd, tau = motion
     # fewer cannot tell gravity from friction
@@ -75,7 +75,7 @@ def fit_gravity(arm: Arm, motion: np.ndarray) -> list[GravityFit]:
     return fits
 
 
-def find_opposed_inertia(arm: Arm, motion: np.ndarray, speeds: np.ndarray) -> str | None:
+def find_opposed_inertia(arm: Chain, motion: np.ndarray, speeds: np.ndarray) -> str | None:
     """Find torques that all have the opposite sign: by least squares the mass matrix then is negative.
 
     motion: samples, (4, S, n). speeds: C, (n, n), of the motors. Friction does not tell: a drive may compensate it

@@ -31,7 +31,7 @@ class DescribedArm(Protocol):
     """Hold what of a loaded arm says how its logs are named."""
 
     @property
-    def arm(self) -> JointNames: ...
+    def chain(self) -> JointNames: ...
     @property
     def robot(self) -> Robot: ...
     @property
@@ -62,7 +62,7 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
     if isinstance(arm, DescribedArm):
         mapping = arm.settings.logs if mapping is None else mapping
         log_mapping = _mapping(mapping, list(arm.robot.joint))
-        return LogSource(tuple(arm.arm.joint_names), tuple(arm.arm.joint_types), log_mapping)
+        return LogSource(tuple(arm.chain.joint_names), tuple(arm.chain.joint_types), log_mapping)
     if isinstance(arm, JointNames):
         joints = tuple(arm.joint_names)
         log_mapping = _mapping(mapping, joints)

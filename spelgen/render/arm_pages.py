@@ -13,7 +13,7 @@ from spelgen.render.parameters import DETERMINED, base_table
 from spelgen.structure.structure import derive
 
 if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import ConfiguredArm
+    from spelgen.arm.configured_arm import Arm
     from spelgen.certificate.formulas import Formulas
     from spelgen.certificate.verification import Verification
     from spelgen.identification.identification import Identification
@@ -49,7 +49,7 @@ def inspection_page(
     )
 
 
-def identification_page(identification: Identification, arm: ConfiguredArm) -> str:
+def identification_page(identification: Identification, arm: Arm) -> str:
     """Return the page: base parameters with confidence intervals, the arm, and the torque residual."""
     record: Content = identification.to_dict()
     words = [parameter["determined"] for parameter in record["base_parameters"]]
@@ -63,8 +63,8 @@ def identification_page(identification: Identification, arm: ConfiguredArm) -> s
         never=never,
         residuals=identification.listings()[0],
         parameters=base_table(None, arm, record),
-        cells=matrix(arm.arm, derive(arm.arm)),
-        arm=arm_section(arm.arm, arm.robot.path),
+        cells=matrix(arm.chain, derive(arm.chain)),
+        arm=arm_section(arm.chain, arm.robot.path),
         heading=identification.heading(),
         notes=identification.diagnostics,
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.baselines.names import MODEL
 from spelgen.certificate.facts import facts
 from spelgen.certificate.formulas import formulas
@@ -64,7 +64,7 @@ class AnimatedArm:
     has_meshes: bool
 
 
-def matrix(arm: Arm, structure: Structure) -> list[list[Cell]]:
+def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
     """Return both triangles of M, (n, n): each entry with its dependence on joints, the reason and a short formula."""
     explanations = _explanations(arm, structure)
     cells = {}
@@ -77,7 +77,7 @@ def matrix(arm: Arm, structure: Structure) -> list[list[Cell]]:
     return [[cells[row, column] for column in joints] for row in joints]
 
 
-def _explanations(arm: Arm, structure: Structure) -> dict[str, str]:
+def _explanations(arm: Chain, structure: Structure) -> dict[str, str]:
     """Return, by entry name, the dependence of the entry, the facts that mention it, and its formula."""
     every_fact = facts(arm, structure)
     closed = {formula.name: formula for formula in formulas(arm, structure).rows}
@@ -101,7 +101,7 @@ def _explanations(arm: Arm, structure: Structure) -> dict[str, str]:
     return explanations
 
 
-def arm_section(arm: Arm, urdf: Path, traces: Traces | None = None) -> AnimatedArm:
+def arm_section(arm: Chain, urdf: Path, traces: Traces | None = None) -> AnimatedArm:
     """Return the arm with the motions of an evaluation; without any, with a motion through the joint ranges."""
     shapes = scene(urdf, arm.joint_names)
     motions = [] if traces is None else _motions(traces)
@@ -128,7 +128,7 @@ def _motions(traces: Traces) -> list[AnimatedMotion]:
     return motions
 
 
-def _sweep(arm: Arm) -> AnimatedMotion:
+def _sweep(arm: Chain) -> AnimatedMotion:
     """Return sines of all joints about the middle of their ranges, with three different periods."""
     t = np.linspace(0, 12, 121)
     low, high = np.array(list(map(working_range, arm.coordinates))).T

@@ -64,7 +64,7 @@ def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -
             first.setdefault(result.preset, result.simulated)
     styles = dict(zip(first, STYLES, strict=False))
     folders = {job.preset: job.folder for job in reversed(study.jobs) if job.arm == section.name}
-    arm = inputs.load().arm
+    arm = inputs.load().chain
     examples = {name: figures.example for name, figures in first.items() if figures.example is not None}
     prediction, mass = [], []
     if examples:

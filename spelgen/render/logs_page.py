@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.labels import named_joints
 from spelgen.log_checks.report import LogReport
@@ -14,7 +14,7 @@ from spelgen.render.plots import JointRow, Panel, stacks
 from spelgen.render.tuning import TUNING
 
 
-def page(report: LogReport, arm: Arm, inputs: np.ndarray) -> str:
+def page(report: LogReport, arm: Chain, inputs: np.ndarray) -> str:
     """Return the page about the report. inputs: G, (n, n), joint torques = G times logged torques."""
     return render_page(
         "logs.html.jinja",
@@ -27,7 +27,7 @@ def page(report: LogReport, arm: Arm, inputs: np.ndarray) -> str:
     )
 
 
-def charts(log: Trajectory, arm: Arm, inputs: np.ndarray) -> list[Panel]:
+def charts(log: Trajectory, arm: Chain, inputs: np.ndarray) -> list[Panel]:
     """Return charts of each joint: position; velocity with dq/dt; torque with the URDF's gravity torque.
 
     Of position servos: position with command. inputs: G, (n, n), see `page`.

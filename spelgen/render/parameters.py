@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.body_regressor import about_center
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.parameters import parameters_of_kind
@@ -40,9 +40,7 @@ class ParameterTable(Listing):
     folded_title: str = ""
 
 
-def parameter_tables(
-    model: ArmModel | None, arm: ConfiguredArm | None, identified: Content | None
-) -> list[Listing]:
+def parameter_tables(model: ArmModel | None, arm: Arm | None, identified: Content | None) -> list[Listing]:
     """Return the tables of a run's parameters; `identified`: result of least squares on the same logs."""
     tables: list[Listing] = []
     if arm is not None and identified and "base_parameters" in identified:
@@ -63,21 +61,21 @@ def body_parameters(model: RigidBodyDynamics) -> np.ndarray:
     return values
 
 
-def base_table(model: ArmModel | None, arm: ConfiguredArm, identified: Content) -> ParameterTable:
+def base_table(model: ArmModel | None, arm: Arm, identified: Content) -> ParameterTable:
     """Return the base parameters by least squares, from the URDF and of a rigid-body model."""
     effects = identified["method"]["effects"]
     friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
-    base = base_parameters(arm.arm, friction, arm.actuation.drives().speeds)
+    base = base_parameters(arm.chain, friction, arm.actuation.drives().speeds)
     parameters = identified["base_parameters"]
     names, determined, formulas = [], [], []
     for parameter in parameters:
         names.append(parameter["name"])
         determined.append(parameter["determined"])
         formulas.append("" if parameter["formula"] == parameter["name"] else parameter["formula"])
-    nominal = base.combination[:, : 10 * len(arm.arm.bodies)] @ urdf_parameters(arm.arm)
+    nominal = base.combination[:, : 10 * len(arm.chain.bodies)] @ urdf_parameters(arm.chain)
     # no URDF has friction and drives in this form, and some have no inertials
     nominal[base.bodies :] = np.nan
-    if not arm.arm.inertials_complete:
+    if not arm.chain.inertials_complete:
         nominal[:] = np.nan
     columns = {"parameter": names, "URDF": list(map(_number, nominal))}
     note = "The intervals are those of least squares on the training logs [kg, m, s]"
@@ -125,14 +123,14 @@ def _interval(parameter: Content) -> str:
     return value
 
 
-def _body_table(values: np.ndarray, arm: ConfiguredArm | None) -> Listing:
+def _body_table(values: np.ndarray, arm: Arm | None) -> Listing:
     """Return mass, centre of mass and principal moments of each body; values: (bodies, 10)."""
     names = [f"body {k + 1}" for k in range(len(values))]
     nominal = None
     if arm is not None:
-        names = [body.name for body in arm.arm.bodies]
-        if arm.arm.inertials_complete:
-            nominal = urdf_parameters(arm.arm).reshape(-1, 10)
+        names = [body.name for body in arm.chain.bodies]
+        if arm.chain.inertials_complete:
+            nominal = urdf_parameters(arm.chain).reshape(-1, 10)
     rows = []
     # the URDF's values below the model's values of the same body, so that a column shows their difference
     for k, name in enumerate(names):
@@ -160,7 +158,7 @@ def _listed(values: np.ndarray) -> str:
     return ", ".join(f"{value:.3g}" for value in values)
 
 
-def _joint_table(model: ArmModel, arm: ConfiguredArm | None) -> Listing:
+def _joint_table(model: ArmModel, arm: Arm | None) -> Listing:
     """Return armature, friction and torque offset of each joint of a rigid-body model."""
     units = [UNITS[joint_type] for joint_type in model.joint_types]
     torques = [unit.torque for unit in units]
@@ -171,9 +169,9 @@ def _joint_table(model: ArmModel, arm: ConfiguredArm | None) -> Listing:
     }
     note = ""
     if arm is not None:
-        joints = arm.arm.coordinates
-        columns["joint"] = list(arm.arm.joint_names)
-        viscous, forward, backward, _ = nearest_friction(arm.arm, model, sampled_positions(arm.arm))
+        joints = arm.chain.coordinates
+        columns["joint"] = list(arm.chain.joint_names)
+        viscous, forward, backward, _ = nearest_friction(arm.chain, model, sampled_positions(arm.chain))
         note = "Viscous and Coulomb friction are fitted to the model's friction law, as in exports."
         # the damping of a servo's controller contains the viscous friction of its joint
         if not parameters_of_kind(model, "damping"):

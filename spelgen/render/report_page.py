@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from jinja2 import TemplateError
 
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import Arm
 from spelgen.emission.specify import arm_of_spec
 from spelgen.emission.text import header
 from spelgen.errors import RunError, SpelgenError, in_one_line
@@ -51,14 +51,14 @@ class Run:
     config: Record | None
     results: Results | None
     baselines: Content
-    arm: ConfiguredArm | None
+    arm: Arm | None
 
     @property
     def limits(self) -> Limits:
         """Position limits of the joints [rad, m]; None for a joint without limits."""
         if self.arm is None:
             return [None] * len(self.spec.joints)
-        return [joint.limits for joint in self.arm.arm.coordinates]
+        return [joint.limits for joint in self.arm.chain.coordinates]
 
     @property
     def verdict(self) -> Verdict | None:
@@ -160,8 +160,8 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
     sections = dict.fromkeys(("arm", "cells", "training", "settings", "losses"))
     sections |= evaluation_charts(traces, spec)
     if run.arm is not None:
-        sections["arm"] = arm_section(run.arm.arm, Path(robot or run.arm.robot.path), traces)
-        sections["cells"] = matrix(run.arm.arm, derive(run.arm.arm, spec.options.assume))
+        sections["arm"] = arm_section(run.arm.chain, Path(robot or run.arm.robot.path), traces)
+        sections["cells"] = matrix(run.arm.chain, derive(run.arm.chain, spec.options.assume))
     if record is not None:
         sections["training"] = training_facts(record, metrics, run.baselines, model)
         sections["settings"] = settings(record)

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 from lxml import etree
 
-from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SpelgenError
 from spelgen.excitation.trajectory import SPEEDS, motion_bounds
@@ -23,7 +23,7 @@ from spelgen.urdf.document import urdf_bytes
 ABOUT = "The arm as built, from seed {}: the ground truth of simulated logs. `spelgen simulate` on it makes more logs."
 
 
-def as_built(arm: ConfiguredArm, seed: int, path: Path | str) -> ConfiguredArm:
+def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
     """Write the URDF and the settings of an arm as it may have been built, and return that arm.
 
     The arm can be simulated, and `evaluate` compares mass matrices with it. Raises ArmError if a moving link has no
@@ -39,7 +39,7 @@ def as_built(arm: ConfiguredArm, seed: int, path: Path | str) -> ConfiguredArm:
         raise SpelgenError(
             "the URDF of the arm itself", file=path, expected="another file for the arm as built"
         )
-    arm_dynamics(arm.arm, arm.settings)  # complains of missing inertials under the name of the user's file
+    arm_dynamics(arm.chain, arm.settings)  # complains of missing inertials under the name of the user's file
     settings, sidecar = _settings(arm, seed), path.with_suffix(".yaml")
     write_bytes(path, perturbed_urdf(arm.robot.path, AS_BUILT.inertial_error, seed))
     # magnitudes of friction and armature follow from the perturbed rigid bodies, without drives
@@ -50,7 +50,7 @@ def as_built(arm: ConfiguredArm, seed: int, path: Path | str) -> ConfiguredArm:
     return load_arm(path, angle_tolerance=arm.angle_tolerance)
 
 
-def _settings(arm: ConfiguredArm, seed: int) -> dict[str, object]:
+def _settings(arm: Arm, seed: int) -> dict[str, object]:
     """Return the settings of the arm as built, without drives: how it is mounted, wired and moved."""
     nominal = arm.settings
     carried = nominal.model_dump(
@@ -58,13 +58,13 @@ def _settings(arm: ConfiguredArm, seed: int) -> dict[str, object]:
         include={"gravity", "input", "torque", "couplings", "simulation", "tracking"},
         exclude_unset=True,
     )
-    names = list(arm.arm.joint_names)
+    names = list(arm.chain.joint_names)
     settings: dict[str, object] = {"about": ABOUT.format(seed), "moving_joints": names} | carried
     # a joint without a motor cannot be moved along a path: such an arm is driven as its own settings state
-    if nominal.input == "position" or any(joint.passive for joint in arm.arm.coordinates):
+    if nominal.input == "position" or any(joint.passive for joint in arm.chain.coordinates):
         settings["simulation"] = carried.get("simulation", {}) | {"seed": seed}
         return settings
-    bounds = motion_bounds(arm.arm, 1.0, 1.0, arm.robot.joint)
+    bounds = motion_bounds(arm.chain, 1.0, 1.0, arm.robot.joint)
     ranges = np.stack([bounds.low, bounds.high], axis=1).tolist()
     settings["simulation"] = {
         "protocol": "prescribed",
@@ -82,9 +82,7 @@ def _settings(arm: ConfiguredArm, seed: int) -> dict[str, object]:
     return settings
 
 
-def _drives(
-    arm: ConfiguredArm, bodies: ConfiguredArm, rng: np.random.Generator
-) -> dict[str, dict[str, object]]:
+def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[str, object]]:
     """Return random friction and armature of each joint, as settings.
 
     Coulomb friction is a fraction of the rigid-body torque of moderate motion (at most half the effort limit), armature
@@ -95,10 +93,10 @@ def _drives(
         bodies: The arm as built, without drives.
         rng: Source of the random numbers.
     """
-    joints = bodies.arm.coordinates
-    bounds = motion_bounds(bodies.arm, AS_BUILT.range_fraction, 1.0)
+    joints = bodies.chain.coordinates
+    bounds = motion_bounds(bodies.chain, AS_BUILT.range_fraction, 1.0)
     q = rng.uniform(bounds.low, bounds.high, (AS_BUILT.positions, len(joints)))
-    dynamics = arm_dynamics(bodies.arm, bodies.settings)
+    dynamics = arm_dynamics(bodies.chain, bodies.settings)
     inertia = np.einsum("tii->i", dynamics.mass_matrix(q)) / len(q)
     speed = np.array([min(joint.velocity or np.inf, SPEEDS[joint.joint_type]) for joint in joints])
     torque = np.hypot(

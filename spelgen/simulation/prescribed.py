@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.arm.actuation import Drives
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.bristles import BristleReach, bristles_along
 from spelgen.dynamics.friction import DriveFriction
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
@@ -72,7 +72,7 @@ def read_motion(file: Path, joints: Sequence[str]) -> Motion:
 
 
 def prescribed(
-    arm: Arm,
+    arm: Chain,
     settings: Settings,
     drives: Drives | None = None,
     *,
@@ -117,7 +117,7 @@ def prescribed(
     return SimulatedLogs.split(logs, protocol.test_fraction)
 
 
-def friction_along(friction: DriveFriction, arm: Arm, motion: Motion, presliding: float) -> np.ndarray:
+def friction_along(friction: DriveFriction, arm: Chain, motion: Motion, presliding: float) -> np.ndarray:
     """Return the friction torque (T, n) [Nm; N] along a motion.
 
     Maxwell-slip model (Al-Bender, Lampaert, Swevers, IEEE TAC 50:1883, 2005): elements in parallel, each of which

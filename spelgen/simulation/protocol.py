@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.friction import DriveFriction, joint_friction
 from spelgen.errors import SettingsError, SpelgenError, collect
 from spelgen.excitation.trajectory import SPEEDS, ExcitationTrajectory, Motion, MotionBounds
@@ -42,7 +42,7 @@ def sample_times(simulation: SimulationSettings) -> np.ndarray:
     return np.arange(round(simulation.duration * simulation.sample_rate) + 1) / simulation.sample_rate
 
 
-def make_friction(arm: Arm, settings: Settings, speeds: np.ndarray | None = None) -> DriveFriction:
+def make_friction(arm: Chain, settings: Settings, speeds: np.ndarray | None = None) -> DriveFriction:
     """Return the friction of the drives: from a joint's settings if it has any, else from its URDF's <dynamics>.
 
     Args:
@@ -55,7 +55,7 @@ def make_friction(arm: Arm, settings: Settings, speeds: np.ndarray | None = None
     return joint_friction(arm.coordinates, settings.joints, width, speeds)
 
 
-def initial_range(arm: Arm, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
+def initial_range(arm: Chain, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and the highest initial position, (n,) each [rad; m]; SettingsError if a joint has no range."""
     positions = settings.simulation.positions or {}
     ranges, errors = [], []
@@ -75,7 +75,7 @@ def initial_range(arm: Arm, settings: Settings) -> tuple[np.ndarray, np.ndarray]
     return lowest, highest
 
 
-def paths(arm: Arm, settings: Settings, t: np.ndarray) -> list[Motion]:
+def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
     """Return the desired motion of each trajectory, as `settings.tracking` specifies.
 
     The first motions are the same for any number of trajectories. Raises SettingsError if sines exceed a joint's range,
@@ -124,7 +124,7 @@ def sines(
     return Motion(t, middle + swing, amplitude * omega * np.cos(angle), -(omega**2) * swing)
 
 
-def _amplitude(arm: Arm, settings: Settings, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def _amplitude(arm: Chain, settings: Settings, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return the amplitudes (n,) [rad; m] of sines within low..high, (n,) each; SettingsError if they exceed these."""
     amplitude, errors = np.full(len(low), settings.tracking.amplitude), list[SpelgenError]()
     if "amplitude" not in settings.tracking.model_fields_set:

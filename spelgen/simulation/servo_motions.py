@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from spelgen.arm.actuation import Drives
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
@@ -20,7 +20,7 @@ EFFORT, LAG = 5.0, 0.05  # [Nm], [s]: torque limit and time constant kd / kp of 
 
 
 def servo_motions(
-    arm: Arm,
+    arm: Chain,
     settings: Settings,
     drives: Drives | None = None,
     *,
@@ -56,7 +56,7 @@ def _commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:
     return np.asarray(0.5 * (sines + levels[(t / TUNING.command_interval).astype(int)]))
 
 
-def _positions(arm: Arm, settings: Settings, t: np.ndarray, u: np.ndarray) -> np.ndarray:
+def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Return positions (T, n) [rad; m] from rest at the first command.
 
     Method: semi-implicit Euler with dry friction as impulses. The impulse of a joint's dry friction stops it, within

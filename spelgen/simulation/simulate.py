@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from spelgen.arm.actuation import Drives
-from spelgen.arm.arm import Arm
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.arm import Chain
+from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SettingsError
 from spelgen.excitation.trajectory import Motion
@@ -27,7 +27,7 @@ from spelgen.simulation.tuning import TUNING
 
 
 def random_inputs(
-    arm: Arm,
+    arm: Chain,
     settings: Settings,
     drives: Drives | None = None,
     *,
@@ -77,7 +77,7 @@ PROTOCOLS = {"random-inputs": random_inputs, "tracking": track, "prescribed": pr
 
 
 def simulate(
-    arm: ConfiguredArm,
+    arm: Arm,
     *,
     trajectories: int | None = None,
     duration: float | None = None,
@@ -119,9 +119,9 @@ def simulate(
                 "motions of an arm with position servos", element="input", expected="input: torque",
                 do="simulate without motions: commands are random",
             )  # fmt: skip
-        return prescribed(arm.arm, settings, drives, motions=motions, progress=progress)
+        return prescribed(arm.chain, settings, drives, motions=motions, progress=progress)
     run = servo_motions if settings.input == "position" else PROTOCOLS[settings.simulation.protocol]
-    return run(arm.arm, settings, drives, progress=progress)
+    return run(arm.chain, settings, drives, progress=progress)
 
 
 def _controlled(settings: Settings) -> Settings:

@@ -16,7 +16,7 @@ from functools import lru_cache
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.structure import field
 from spelgen.structure.recursion import PARAMETERS, Position, coefficients
 from spelgen.structure.sampling import regressor_rows
@@ -49,7 +49,7 @@ def parameter_name(index: int) -> str:
 
 
 @lru_cache(maxsize=16)
-def base_parameter_count(arm: Arm) -> int:
+def base_parameter_count(arm: Chain) -> int:
     """Return the rank of the inverse-dynamics regressor, which is the number of base parameters."""
     points = 7  # sufficient for most arms of up to seven joints
     while True:
@@ -62,7 +62,7 @@ def base_parameter_count(arm: Arm) -> int:
 
 
 @lru_cache(maxsize=16)  # least squares, checks of logs and closed forms use the same arm
-def base_parameters(arm: Arm) -> tuple[BaseParameter, ...]:
+def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
     """Return the base parameters of ``arm``, in the order of the bodies from the root."""
     order: list[int] = []
     for body in range(len(arm.bodies)):
@@ -82,7 +82,7 @@ def base_parameters(arm: Arm) -> tuple[BaseParameter, ...]:
     return tuple(result)
 
 
-def _value(arm: Arm, weights: list[tuple[int, Fraction]]) -> Fraction | None:
+def _value(arm: Chain, weights: list[tuple[int, Fraction]]) -> Fraction | None:
     """Return the value of a base parameter from the URDF; None if a body has no inertial."""
     total = Fraction(0)
     for index, coefficient in weights:
@@ -93,7 +93,7 @@ def _value(arm: Arm, weights: list[tuple[int, Fraction]]) -> Fraction | None:
     return total
 
 
-def _reduced_rows(arm: Arm, order: list[int]) -> list[list[fmpq]]:
+def _reduced_rows(arm: Chain, order: list[int]) -> list[list[fmpq]]:
     """Return the reduced row echelon form of the regressor, with its columns in this order."""
     generator = random.Random(0)
     # A constant part of V has no effect on the motion: V is relative to its value at the first configuration.
@@ -107,7 +107,7 @@ def _reduced_rows(arm: Arm, order: list[int]) -> list[list[fmpq]]:
     return basis
 
 
-def _rows(arm: Arm, generator: random.Random) -> np.ndarray:
+def _rows(arm: Chain, generator: random.Random) -> np.ndarray:
     """Return the coefficients of the entries of M, and of V, at a random configuration, (m, 10 B) of fmpq.
 
     m = n(n+1)/2 + 1 for n joints, B bodies.

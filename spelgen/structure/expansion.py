@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 from flint import Ordering, fmpq, fmpq_mpoly, fmpq_mpoly_ctx
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.structure.base_parameters import rational
 from spelgen.structure.recursion import Position, energies
 
@@ -77,7 +77,7 @@ class Budget:
 class Expansion:
     """The recorded recursion of ``arm`` over the variables s1, c1, q1, s2, ..., three per coordinate."""
 
-    def __init__(self, arm: Arm):
+    def __init__(self, arm: Chain):
         n = len(arm.coordinates)
         names: list[str] = []
         for k in range(n):

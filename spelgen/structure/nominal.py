@@ -13,7 +13,7 @@ from math import floor, isqrt, log10, pi
 
 import numpy as np
 
-from spelgen.arm.arm import Arm, Coordinate
+from spelgen.arm.arm import Chain, Coordinate
 from spelgen.structure.basis import Term, row_of
 from spelgen.structure.sampling import float_energies
 from spelgen.structure.structure import Structure
@@ -44,7 +44,7 @@ class Nominal:
     """Whether the inertials of the URDF are usable."""
 
 
-def nominal(arm: Arm, structure: Structure) -> Nominal:
+def nominal(arm: Chain, structure: Structure) -> Nominal:
     """Return the nominal values of ``arm`` for the outputs and constants of its ``structure``."""
     # A fixed seed: these numbers are part of the emitted module, which must be reproducible.
     rng = np.random.default_rng(0)
@@ -100,7 +100,7 @@ def _functionals(terms: Sequence[Term], n: int) -> np.ndarray:
     return np.reshape(rows, (-1, n * (n + 1) // 2))
 
 
-def _gives_usable_mass(arm: Arm, q: np.ndarray) -> bool:
+def _gives_usable_mass(arm: Chain, q: np.ndarray) -> bool:
     """Test that every joint moves a mass and M is positive definite at q (S, n), for the inertials of the URDF."""
     mass, _ = float_energies(arm, q, nominal_inertias(arm, True))
     rows, columns = np.tril_indices(q.shape[1])
@@ -109,19 +109,19 @@ def _gives_usable_mass(arm: Arm, q: np.ndarray) -> bool:
     return bool(lightest > 1e-11 and _min_eigenvalue(mass) > 1e-6)
 
 
-def nominal_inertias(arm: Arm, from_urdf: bool) -> list[list[float]]:
+def nominal_inertias(arm: Chain, from_urdf: bool) -> list[list[float]]:
     """Return ``exact_inertias`` as floats."""
     return [list(map(float, ten)) for ten in exact_inertias(arm, from_urdf)]
 
 
-def exact_inertias(arm: Arm, from_urdf: bool) -> Sequence[Sequence[Fraction | float]]:
+def exact_inertias(arm: Chain, from_urdf: bool) -> Sequence[Sequence[Fraction | float]]:
     """Return the ten inertial parameters of each body: exact from the URDF, or default bodies of 1 kg."""
     if from_urdf:
         return [body.inertia or () for body in arm.bodies]
     return [_default_inertia(arm, index) for index in range(len(arm.bodies))]
 
 
-def _default_inertia(arm: Arm, index: int) -> list[float]:
+def _default_inertia(arm: Chain, index: int) -> list[float]:
     """Return a ball of 1 kg half-way to the next joint; of the last body: 0.1 m from the joint along x and z."""
     gyration = TUNING.default_gyration
     center = np.zeros(3)
@@ -154,7 +154,7 @@ def _min_eigenvalue(mass: np.ndarray) -> float:
     return float(eigenvalues.min())
 
 
-def _gravity_torque(arm: Arm, q: np.ndarray, inertias: list[list[float]]) -> np.ndarray:
+def _gravity_torque(arm: Chain, q: np.ndarray, inertias: list[list[float]]) -> np.ndarray:
     """Return the root mean square over q (S, n) of the gravity torque dV/dq, (n,) [Nm, N]."""
     step = 1e-4  # [rad, m] central differences: relative errors of 1e-8 suffice for scales
     shifts = step * np.eye(q.shape[1])[:, None]
@@ -166,7 +166,7 @@ def _gravity_torque(arm: Arm, q: np.ndarray, inertias: list[list[float]]) -> np.
 
 
 def _mass_changes(
-    arm: Arm, q: np.ndarray, inertias: list[list[float]], mass: np.ndarray, typical: np.ndarray
+    arm: Chain, q: np.ndarray, inertias: list[list[float]], mass: np.ndarray, typical: np.ndarray
 ) -> np.ndarray:
     """Return the root mean square change of the entries of M with each coordinate, (n,).
 

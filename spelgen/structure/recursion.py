@@ -15,7 +15,7 @@ from itertools import combinations_with_replacement
 from math import cos, lcm, sin, tan
 from typing import Any
 
-from spelgen.arm.arm import Arm, Body
+from spelgen.arm.arm import Body, Chain
 
 Element = Any
 """An element of the ring: an object with +, - and *, with other elements and with integers."""
@@ -87,7 +87,7 @@ def triangle(n: int) -> list[tuple[int, int]]:
 
 
 def energies(
-    arm: Arm,
+    arm: Chain,
     positions: Sequence[Position],
     inertias: Sequence[Sequence[Element]],
     number: Callable[[Fraction], Element],
@@ -122,7 +122,7 @@ def energies(
 
 
 def coefficients(
-    arm: Arm, positions: Sequence[Position], units: Sequence[Element], number: Callable[[Fraction], Element]
+    arm: Chain, positions: Sequence[Position], units: Sequence[Element], number: Callable[[Fraction], Element]
 ) -> list[Element]:
     """Return the coefficients of the inertial parameters in the entries of M, row after row, and then in V.
 
@@ -134,7 +134,7 @@ def coefficients(
 
 
 def _motions(
-    arm: Arm, positions: Sequence[Position], number: Callable[[Fraction], Element]
+    arm: Chain, positions: Sequence[Position], number: Callable[[Fraction], Element]
 ) -> list[_JointMotion]:
     """Return the motion of the joint of each body at these positions of the coordinates."""
     bases = base_denominators(arm)
@@ -167,7 +167,7 @@ def circle_point(angle: float) -> tuple[Fraction, Fraction]:
     return (1 - t * t) / (1 + t * t), 2 * t / (1 + t * t)
 
 
-def base_denominators(arm: Arm) -> list[int]:
+def base_denominators(arm: Chain) -> list[int]:
     """Return for each coordinate q the integer d for which the angle of every body is an integer multiple of q / d."""
     denominators = [1] * len(arm.coordinates)
     for body in arm.bodies:
@@ -193,7 +193,7 @@ def _multiple_angle(c: Element, s: Element, factor: int) -> tuple[Element, Eleme
 
 
 def _column(
-    arm: Arm, poses: Sequence[_Pose], motions: Sequence[_JointMotion], index: int, inertia: _Inertia
+    arm: Chain, poses: Sequence[_Pose], motions: Sequence[_JointMotion], index: int, inertia: _Inertia
 ) -> list[tuple[int, Element]]:
     """Return the entries of the mass matrix of the bodies' joints: of joint ``index`` with itself and its ancestors."""
     body = arm.bodies[index]

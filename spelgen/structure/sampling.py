@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.structure import field
 from spelgen.structure.field import (
     PRIME,
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Ten = Sequence[Element]
 
 
-def field_samples(arm: Arm, assume: Assume, samples: int) -> tuple[np.ndarray, np.ndarray]:
+def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Return lower triangles of M, (1 + n, samples, n(n+1)/2), and V, (1 + n, samples), in the prime field.
 
     ``kinematics``: every sample has its own random inertial parameters. ``inertials``: all have those from the URDF.
@@ -59,7 +59,7 @@ def field_samples(arm: Arm, assume: Assume, samples: int) -> tuple[np.ndarray, n
     return np.stack(entries, axis=-1), _residue_values(result.potential, shape)
 
 
-def regressor_rows(arm: Arm, points: int) -> np.ndarray:
+def regressor_rows(arm: Chain, points: int) -> np.ndarray:
     """Return rows of the energy regressor in the prime field, (m points, 10 B), m = n(n+1)/2 + 1.
 
     M(q) and V(q) - V(q0) are linear in the inertial parameters and determine the torque: the rank of the rows is the
@@ -81,7 +81,7 @@ def regressor_rows(arm: Arm, points: int) -> np.ndarray:
     return rows.reshape(-1, parameters)
 
 
-def float_samples(arm: Arm, assume: Assume, samples: int, seed: int = 2) -> np.ndarray:
+def float_samples(arm: Chain, assume: Assume, samples: int, seed: int = 2) -> np.ndarray:
     """Return lower triangles of M in double precision, (1 + n, samples, n(n+1)/2); arguments as ``field_samples``."""
     rng = np.random.default_rng(seed)
     n = len(arm.coordinates)
@@ -96,7 +96,7 @@ def float_samples(arm: Arm, assume: Assume, samples: int, seed: int = 2) -> np.n
     return mass
 
 
-def float_energies(arm: Arm, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[np.ndarray, np.ndarray]:
+def float_energies(arm: Chain, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[np.ndarray, np.ndarray]:
     """Return lower triangles of M and the potential energy.
 
     Args:
@@ -140,7 +140,7 @@ class Spans:
     coordinate k. U is the sum of all T_k.
     """
 
-    def __init__(self, arm: Arm, assume: Assume):
+    def __init__(self, arm: Chain, assume: Assume):
         self.n = len(arm.coordinates)
         self.keys = triangle(self.n)
         # d samples span a space of dimension d; additional samples would reveal a larger dimension.

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.structure.recursion import triangle
 from spelgen.structure.sampling import float_energies
 from spelgen.structure.tuning import TUNING
@@ -32,7 +32,7 @@ class ServoRank:
     open: tuple[tuple[str, int], ...]
 
 
-def servo_rank(arm: Arm) -> ServoRank:
+def servo_rank(arm: Chain) -> ServoRank:
     """Return the identifiable ratios for generic values: random states, inertial parameters and drive parameters."""
     random, n = np.random.default_rng(0), len(arm.coordinates)
     samples = 2 * (10 * len(arm.bodies) // n + len(PARAMETERS)) + 20
@@ -67,7 +67,7 @@ def servo_rank(arm: Arm) -> ServoRank:
     return ServoRank(tuple(map(tuple, groups)), tuple(undetermined))
 
 
-def torque_rows(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
     """Return the torque regressor Y (S, n, 10 B) of B bodies from Lagrange's equations.
 
     Args:

@@ -14,7 +14,7 @@ from functools import lru_cache
 from itertools import compress
 from typing import TYPE_CHECKING, Literal
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.errors import ArmError
 from spelgen.structure.base_parameters import base_parameter_count
 from spelgen.structure.basis import Term, smallest_form
@@ -60,7 +60,7 @@ class Structure:
 
 
 @lru_cache(maxsize=16)  # the same arm is often used with several settings or logs
-def derive(arm: Arm, assume: Assume = "kinematics") -> Structure:
+def derive(arm: Chain, assume: Assume = "kinematics") -> Structure:
     """Return the structure of ``arm``. Raises ArmError for ``inertials`` if a body has no inertial values."""
     if assume == "inertials" and not arm.inertials_complete:
         raise ArmError(
