@@ -254,7 +254,8 @@ def test_a_fit_moves_late_torques_and_its_evaluation_too(uncoupled):
     assert fitted.preprocessing.torque_delay == pytest.approx(0.004, abs=0.0005)
     assert [x.code for x in fitted.diagnostics].count("torque-delay") == 1
     misses = 1 - fitted.score(log)
-    assert misses < 1 - replace(fitted, preprocessing=Preprocessing()).score(log)
+    undelayed = fitted.record.model_copy(update={"preprocessing": Preprocessing()})
+    assert misses < 1 - replace(fitted, record=undelayed).score(log)
 
 
 def test_no_delay_is_estimated_with_an_unspecified_coupling(uncoupled):
