@@ -172,7 +172,7 @@ def states(count=40):
 class TestModule:
     def test_dynamics_both_ways(self, coupled):
         model = coupled[1]
-        model.raw_gains.data.fill_(np.log(1.25))
+        model.inputs.raw_gains.data.fill_(np.log(1.25))
         q, qd, _, tau = states()
         expected = G.clone()
         expected[0, 0] = 100
@@ -187,7 +187,7 @@ class TestModule:
     def test_the_gain_has_a_gradient(self, coupled):
         q, qd, _, tau = states()
         coupled[1].forward_dynamics(q, qd, tau).square().sum().backward()
-        assert coupled[1].raw_gains.grad.abs().min() > 0
+        assert coupled[1].inputs.raw_gains.grad.abs().min() > 0
 
     def test_a_passive_joint_gets_nothing(self, tmp_path):
         path = urdf(tmp_path, sidecar=MOTOR + "joints: {j1: {gear: 9}, roll: {actuated: false}}")
@@ -239,7 +239,7 @@ def test_the_urdfs_dynamics_have_the_same_motors(coupled):
 def test_a_gain_is_recovered(coupled):
     """From motion under a gear of 100 that is thought to be 80, all else known."""
     model = coupled[1]
-    model.raw_gains.data.fill_(np.log(1.25))
+    model.inputs.raw_gains.data.fill_(np.log(1.25))
     start, speed, tau, _ = states(200)
     still = Windows(
         q=start[:, None].expand(-1, 5, -1),
@@ -252,9 +252,9 @@ def test_a_gain_is_recovered(coupled):
     moved = replace(
         still, q=torch.cat([still.q[:, :1], q], dim=1), qd=torch.cat([still.qd[:, :1], qd], dim=1)
     )
-    model.raw_gains.data.zero_()
+    model.inputs.raw_gains.data.zero_()
     scales = loss_scales(moved, model.joint_types)
-    optimizer = torch.optim.LBFGS([model.raw_gains], line_search_fn="strong_wolfe")
+    optimizer = torch.optim.LBFGS([model.inputs.raw_gains], line_search_fn="strong_wolfe")
 
     def closure():
         optimizer.zero_grad()
@@ -263,4 +263,4 @@ def test_a_gain_is_recovered(coupled):
         return loss
 
     optimizer.step(closure)
-    assert model.raw_gains.exp().item() == pytest.approx(1.25, rel=1e-3)
+    assert model.inputs.raw_gains.exp().item() == pytest.approx(1.25, rel=1e-3)
