@@ -55,5 +55,41 @@ class DriveHintTuning:
     trajectories: int = 8  # of more, whole ones are left out
 
 
+@dataclass(frozen=True)
+class GeometryTuning:
+    """Numbers of the test of a log's geometry; costs are negative log posteriors. Chosen by benchmarks/log_geometry.py."""
+
+    # [s] residuals of recorded arms stay correlated for about 0.2 s: the likelihood counts one error in that time
+    correlation_time: float = 0.2
+    # at most so many errors per joint: what a rigid model lacks does not average out in long logs
+    max_errors: float = 150.0
+    # [1] of the torque's variance, is always left: friction models err by 2 % of the torque
+    error_floor: float = 4e-4
+    initial_error: float = 0.1  # [1] of the torque's variance, before the first iteration
+    iterations: int = 5  # of reweighting; the costs change by less than 0.1 after
+    # [1] standard deviations of masses, of centres of mass relative to the extent, and of tensors
+    relative_error: float = 0.5
+    min_extent: float = 0.03  # [m] of a body
+    min_gyration: float = 0.3  # [1] radius of gyration relative to the extent: point masses have none
+    # costs at most: recorded arms have friction that drives (shanghai's joint 6) or negative inertia (airbot), none both
+    implausible_inertia: float = 15.0
+    implausible_friction: float = 10.0
+    # cost by which another hypothesis must be better: the recorded arms' best wrong one gains 16
+    needed: float = 20.0
+    ambiguous: float = 8.0  # cost by which two hypotheses must differ for one to be named alone
+    changes: int = 3  # that a reading has at most, an order of joints as one
+    named: int = 3  # readings that a message names at most
+    rare: float = 1.0  # cost of a change that is rarer than a wrong sense or order, of two that explain as much
+    samples: int = 200  # for comparing all hypotheses
+    confirming_samples: int = 800  # for the best ones
+    refinements: int = 4  # Gauss-Newton steps of an offset, or of the direction of gravity
+    min_angle: float = 0.09  # [rad] smaller zero offsets and tilts of the base are errors of calibration
+    min_shift: float = 0.01  # [m] likewise of prismatic joints
+    right_angle: float = 3.0  # cost up to which a multiple of 90 degrees is preferred to the best angle
+    serious_angle: float = 0.17  # [rad] zero offsets and tilts of the base below are warnings
+    compensated: float = 0.5  # [1] of the URDF's gravity: with less in all joints it is compensated
+
+
 TUNING = IdentificationTuning()
+GEOMETRY = GeometryTuning()
 HINTS = DriveHintTuning()

@@ -1,0 +1,245 @@
+"""Evidence for hypotheses about the geometry of a log: senses and order of joints, zero offsets, gravity, units.
+
+A hypothesis changes the signals of a log, or the gravity of the arm, as lines of the settings would. Its cost is the
+negative log posterior of the torques, minimised over inertial parameters, friction and the noise of each joint. The
+prior at the URDF, and penalties for negative rotor inertia and for friction that drives, decide between hypotheses that
+explain the torques equally well.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from spelgen.arm.arm import Arm
+from spelgen.dynamics.body_regressor import chain_regressor
+from spelgen.dynamics.linear_friction import FrictionModel
+from spelgen.dynamics.regressor import body_chain
+from spelgen.identification.inertial_prior import InertialPrior, inertial_prior
+from spelgen.settings.tuning.identification import GEOMETRY, TUNING
+
+FRICTION = FrictionModel(coulomb_smoothing_velocity=TUNING.moving)
+ARMATURE, VISCOUS, COULOMB = range(3)  # order of the effects of `FRICTION`
+Vector3 = tuple[float, float, float]
+
+
+class MotionSamples(NamedTuple):
+    """Samples of motion and joint torques, (S, n) each: q, qd, qdd [rad, s; m, s], tau [Nm; N]."""
+
+    q: np.ndarray
+    qd: np.ndarray
+    qdd: np.ndarray
+    tau: np.ndarray
+
+    def thinned(self, count: int) -> MotionSamples:
+        """Return at most `count` samples, evenly spaced."""
+        stride = -(-len(self.q) // count) or 1
+        return MotionSamples(*(column[::stride] for column in self))
+
+
+class Columns(NamedTuple):
+    """What a mapping makes of the columns of n joints: q is motion_scale times the column plus offset; see `Hypothesis`."""
+
+    motion_scale: np.ndarray
+    torque_scale: np.ndarray
+    offset: np.ndarray
+
+    def logged(self, samples: MotionSamples) -> MotionSamples:
+        """Return the samples in the units, senses and zeros of the log."""
+        q, qd, qdd, tau = samples
+        scale = self.motion_scale
+        return MotionSamples((q - self.offset) / scale, qd / scale, qdd / scale, tau / self.torque_scale)
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A reading of the columns of n joints, and a gravity.
+
+    codes: of the changes, as findings have them; none: the log as it is. q of joint k is motion_scale[k] times the
+    column of joint motion_source[k], plus offset[k] [rad, m]; its torque is torque_scale[k] times the column of joint
+    torque_source[k]. gravity: in the frame of the root link [m/s^2].
+    """
+
+    codes: tuple[str, ...]
+    motion_source: np.ndarray
+    torque_source: np.ndarray
+    motion_scale: np.ndarray
+    torque_scale: np.ndarray
+    offset: np.ndarray
+    gravity: Vector3
+
+    @classmethod
+    def unchanged(cls, arm: Arm, columns: Columns | None = None) -> Hypothesis:
+        """Return the hypothesis that the log means what its mapping states; None: SI units and no offsets."""
+        joints = len(arm.coordinates)
+        order = np.arange(joints)
+        scales = columns or Columns(np.ones(joints), np.ones(joints), np.zeros(joints))
+        x, y, z = map(float, arm.gravity)
+        return cls((), order, order, *scales, gravity=(x, y, z))
+
+    @property
+    def motion_key(self) -> tuple[bytes, Vector3]:
+        """What the regressor depends on."""
+        arrays = (self.motion_source, self.motion_scale, self.offset)
+        return b"".join(x.tobytes() for x in arrays), self.gravity
+
+    def signals(self, samples: MotionSamples) -> MotionSamples:
+        """Return the samples as this hypothesis reads them."""
+        q, qd, qdd = (x[:, self.motion_source] * self.motion_scale for x in samples[:3])
+        return MotionSamples(q + self.offset, qd, qdd, samples.tau[:, self.torque_source] * self.torque_scale)
+
+
+class Equations(NamedTuple):
+    """Rows (S, n, K) of bodies, then of friction, and their products Y^T Y, (n, K, K)."""
+
+    rows: np.ndarray
+    normal: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Least squares with the prior under a hypothesis.
+
+    cost: negative log posterior up to a constant. parameters: (K,), those of the bodies first. errors: (n,) mean squared
+    residual of each joint, relative to the variance of its torque.
+    """
+
+    hypothesis: Hypothesis
+    cost: float
+    parameters: np.ndarray
+    errors: np.ndarray
+
+
+class GeometryProblem:
+    """Least squares of the torques of a log under hypotheses about its geometry."""
+
+    def __init__(
+        self,
+        arm: Arm,
+        samples: MotionSamples,
+        speeds: np.ndarray,
+        seconds: float,
+        columns: Columns | None = None,
+    ) -> None:
+        """Prepare the problem of an arm with n joints.
+
+        Args:
+            arm: with its gravity and the inertial parameters of its URDF.
+            samples: of its motion, with torques at the joints.
+            speeds: C (n, n) of the motors, see `Drives`.
+            seconds: duration of the logs [s], which limits the number of independent errors.
+            columns: what the mapping of the logs makes of their columns.
+        """
+        self.arm, self.speeds = arm, speeds
+        self.samples = samples if columns is None else columns.logged(samples)
+        self.unchanged = Hypothesis.unchanged(arm, columns)
+        self._prior: InertialPrior = inertial_prior(arm)
+        self._count = float(np.clip(seconds / GEOMETRY.correlation_time, 1.0, GEOMETRY.max_errors))
+        self._equations: dict[tuple[bytes, Vector3], Equations] = {}
+
+    def thinned(self, count: int) -> GeometryProblem:
+        """Return the problem on at most `count` samples."""
+        fewer = copy(self)
+        fewer.samples, fewer._equations = self.samples.thinned(count), {}
+        return fewer
+
+    def torque(self, hypothesis: Hypothesis, parameters: np.ndarray) -> np.ndarray:
+        """Return the torques (S, n) of parameters (K,) under a hypothesis."""
+        return np.asarray(self.equations(hypothesis).rows @ parameters)
+
+    def equations(self, hypothesis: Hypothesis) -> Equations:
+        """Return the regressor under a hypothesis, kept from one call to the next."""
+        key = hypothesis.motion_key
+        if key not in self._equations:
+            q, qd, qdd, _ = hypothesis.signals(self.samples)
+            chain = body_chain(replace(self.arm, gravity=hypothesis.gravity))
+            friction = FRICTION.columns(qd, qdd, None, self.speeds)
+            rows = np.concatenate([chain_regressor(chain, q, qd, qdd), friction], axis=2)
+            by_joint = rows.swapaxes(0, 1)
+            self._equations[key] = Equations(rows, by_joint.swapaxes(1, 2) @ by_joint)
+        return self._equations[key]
+
+    def fit(self, hypothesis: Hypothesis) -> Fit:
+        """Return the fit under a hypothesis: least squares, reweighted by the noise and by the scale of the prior."""
+        rows, normal = self.equations(hypothesis)
+        tau = hypothesis.signals(self.samples).tau
+        right = np.einsum("snk,sn->nk", rows, tau)
+        variance = len(tau) * np.maximum(tau.var(axis=0), 1e-12 * np.square(tau).max() + 1e-30)
+        total = np.square(tau).sum(axis=0)
+        return self._solved(hypothesis, normal, right, total, variance)
+
+    def step(self, fit: Fit, columns: np.ndarray) -> np.ndarray:
+        """Return the Gauss-Newton step (D,) of what the torques of a fit depend on by columns (S, n, D)."""
+        rows, _ = self.equations(fit.hypothesis)
+        tau = fit.hypothesis.signals(self.samples).tau
+        weights = 1.0 / ((fit.errors + GEOMETRY.error_floor) * np.maximum(tau.var(axis=0), 1e-30))
+        joined = np.concatenate([rows, columns], axis=2) * np.sqrt(weights)[:, None]
+        flat = joined.reshape(-1, joined.shape[2])
+        matrix = flat.T @ flat * (self._count / len(tau))
+        bodies = len(self._prior.mean)
+        matrix[:bodies, :bodies] += self._prior.precision
+        residual = (tau - rows @ fit.parameters) * np.sqrt(weights)
+        vector = flat.T @ residual.ravel() * (self._count / len(tau))
+        vector[:bodies] += self._prior.precision @ (self._prior.mean - fit.parameters[:bodies])
+        return (inverse(matrix) @ vector)[-columns.shape[2] :]
+
+    def _solved(
+        self, hypothesis: Hypothesis, normal: np.ndarray, right: np.ndarray, total: np.ndarray, variance: np.ndarray
+    ) -> Fit:
+        """Minimise the cost. normal, right: Y^T Y (n, K, K) and Y^T tau (n, K); total: sums of tau^2, (n,).
+
+        variance: (n,) sums of squares of tau about its mean. The noise of a joint is marginalised: its log likelihood is
+        -N / 2 log(residual sum of squares). The prior is a Student t: `scale` is its weight of iteratively reweighted
+        least squares.
+        """
+        prior, bodies = self._prior, len(self._prior.mean)
+        precision, mean = np.zeros(normal.shape[1:]), np.zeros(normal.shape[-1])
+        precision[:bodies, :bodies], mean[:bodies] = prior.precision, prior.mean
+        errors, scale = np.full(len(normal), GEOMETRY.initial_error), 1.0
+        for _ in range(GEOMETRY.iterations):
+            weights = self._count / ((errors + GEOMETRY.error_floor) * variance)
+            matrix = np.tensordot(weights, normal, 1)
+            # a joint at rest has no friction to be seen
+            ridge = 1e-9 * np.diag(matrix) + 1e-9
+            ridge[:bodies] = 0.0
+            covariance = inverse(matrix + scale * precision + np.diag(ridge))
+            x = covariance @ (weights @ right + scale * precision @ mean)
+            squares = total - 2 * right @ x + np.einsum("k,jkl,l->j", x, normal, x)
+            errors = np.maximum(squares / variance, 0.0)
+            distance = float((x - mean) @ precision @ (x - mean))
+            scale = 2 * prior.freedom / (prior.freedom + distance)
+        cost = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
+        cost += prior.freedom * float(np.log1p(distance / prior.freedom))
+        cost += self._implausible(x, covariance, normal)
+        return Fit(hypothesis, cost, x, errors)
+
+    def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
+        """Return the cost of rotor inertias below 0 and of friction that drives its joint, on average of the log.
+
+        Each costs the square of its standard score / 2, at most `implausible_inertia` and `implausible_friction`: a drive
+        may compensate friction, and the errors of a friction model may resemble inertia.
+        """
+        drives, n = np.arange(len(normal)), len(normal)
+        first = len(self._prior.mean)
+        viscous, coulomb = first + n * VISCOUS + drives, first + n * COULOMB + drives
+        functionals = np.zeros((2 * n, len(x)))
+        functionals[drives, first + n * ARMATURE + drives] = 1.0
+        # friction power: qd (viscous qd + Coulomb sign qd), summed over the samples
+        functionals[n + drives, viscous] = normal[drives, viscous, viscous]
+        functionals[n + drives, coulomb] = normal[drives, viscous, coulomb]
+        negative = np.minimum(functionals @ x, 0.0)
+        variance = np.einsum("ik,kl,il->i", functionals, covariance, functionals)
+        odds = 0.5 * np.square(negative) / np.maximum(variance, 1e-30)
+        bounds = np.repeat([GEOMETRY.implausible_inertia, GEOMETRY.implausible_friction], n)
+        return float(np.minimum(odds, bounds).sum())
+
+
+def inverse(matrix: np.ndarray) -> np.ndarray:
+    """Return the inverse of a symmetric positive matrix, scaled to a unit diagonal."""
+    length = np.sqrt(np.diag(matrix))
+    length = np.where(length > 0, length, 1.0)
+    scaled = matrix / np.outer(length, length) + 1e-12 * np.eye(len(matrix))
+    return np.asarray(np.linalg.inv(scaled)) / np.outer(length, length)
