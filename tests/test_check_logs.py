@@ -114,21 +114,22 @@ def test_a_torque_that_is_none_is_found(loaded, arm, log, code):
 
 
 IMPOSSIBLE = {
-    "sign": (-1.0, "torques that move against gravity, -"),
-    "unit": (1e-3, "torques that move with 0.000988 times the URDF's gravity torque"),
-    "drives": (1e4, "up to 1.622e+04, 811 times what the drive can give"),
+    "sign": (-1.0, "torques of the opposite sense", "{gain: -1}"),
+    "unit": (1e-3, "torques of another unit, 0.001 times as large", "{gain: 1000}"),
+    "drives": (1e4, "torques of another unit, 1e+04 times as large", "{gain: 0.0001}"),
 }
 
 
 @pytest.mark.parametrize("case", IMPOSSIBLE)
 def test_torques_of_another_sense_or_unit_are_errors_before_anything_is_fitted(loaded, arm, log, case):
-    factor, told = IMPOSSIBLE[case]
+    factor, told, line = IMPOSSIBLE[case]
     joint, tau = loaded_joint(loaded, log), log.tau.copy()
     tau[:, joint] *= factor
     wrong = [replace(log, tau=tau)]
-    where = f"joint {arm.coordinates[joint].name!r}, tau: got {told}"
+    name = arm.coordinates[joint].name
     (error,) = check_logs(wrong, loaded).errors
-    assert str(error).startswith(where)
+    assert str(error).startswith(f"joint {name!r}: got {told}")
+    assert f"write 'joints: {{{name}: {line}}}' under 'logs'" in str(error)
     with pytest.raises(LogError) as caught:
         require_sound_logs(wrong, loaded)
     assert str(caught.value) == str(error)
@@ -361,7 +362,8 @@ def test_negated_torques_of_an_arm_without_gravity_are_refused(robots, rate):
     assert "No findings" not in refused.text()
     assert check_logs([right[:1]], flat).errors == ()  # no rate at all
     (error,) = refused.errors
-    assert "act against acceleration" in str(error) and "--accept torque-sense" in str(error)
+    assert "all joints: got torques of the opposite sense" in str(error)
+    assert "--accept torque-sense" in str(error)
 
 
 def test_times_in_milliseconds_are_refused(loaded, log):
@@ -376,7 +378,7 @@ def test_times_in_milliseconds_are_refused(loaded, log):
 def test_gravity_of_another_mounting_is_refused(robots, tmp_path, log):
     (tmp_path / "arm.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
     (tmp_path / "arm.yaml").write_text("gravity: [0, 0, 9.81]\n")
-    with pytest.raises(SpelgenError, match="the gravity of this mounting"):
+    with pytest.raises(SpelgenError, match=r"'gravity: \[0, 0, -9.81\]' in the robot's YAML"):
         require_sound_logs([log], load_arm(tmp_path / "arm.urdf"))
 
 

@@ -1,17 +1,16 @@
-"""Find what logs show of drives that no file says: motors that move several joints, and wrong torques.
+"""Find couplings of motors that no file states, by least squares with rate-only friction on a subset of all samples.
 
-Both are asked of least squares with friction without memory, on samples of all logs, thinned. The products of its
-columns are formed once; a candidate has other columns of one or two joints. The best candidate counts if it explains
-the torques better in blocks of time that the parameters were not fitted to.
+The products of the regressor's columns are formed once; a candidate has other columns of two joints. The best candidate
+counts if it explains the torques better in blocks of time that the parameters were not fitted to.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
-from itertools import combinations_with_replacement, permutations
+from itertools import permutations
 from typing import Literal
 
 import numpy as np
@@ -45,15 +44,6 @@ class Coupling:
     def pair(self) -> list[int]:
         """Return both joints."""
         return [self.joint, self.moved_by]
-
-
-@dataclass(frozen=True)
-class WrongTorque:
-    """Say why the torques of a joint cannot be right: `code` of what may be accepted, `got` in an error."""
-
-    joint: int
-    code: str
-    got: str
 
 
 def drive_rows(
@@ -140,14 +130,6 @@ class DriveProblem:
         # of torques that are explained exactly rounding is left
         return np.asarray(np.maximum(errors[..., 0, 0].T, TUNING.negligible))
 
-    def exchanged(self, joint: int, other: int) -> DriveProblem:
-        """Return the problem with the torques of two joints exchanged, of a joint and itself with the opposite sign."""
-        rows = self.rows[:, [joint, other]].copy()
-        rows[..., -1] = self.rows[:, [other, joint], -1] * (-1 if joint == other else 1)
-        size = self.size.copy()
-        size[[joint, other]] = size[[other, joint]]
-        return replace(self.with_rows([joint, other], rows), size=size)
-
     def cost(self, coupling: Coupling) -> float:
         """Return what a coupling leaves of the errors of both joints."""
         errors = self.coupled(coupling).errors[:, coupling.pair].mean()
@@ -167,22 +149,6 @@ class DriveProblem:
         if coupling.logged_at == "motors":
             rows[:, 1, -1] += ratio * rows[:, 0, -1]
         return self.with_rows(coupling.pair, rows)
-
-
-def find_wrong_torques(problem: DriveProblem, joints: Sequence[str]) -> WrongTorque | None:
-    """Return what is surely wrong with the torques of joints: one of the other sign, or two exchanged."""
-    if problem.is_short:
-        return None
-    coarse = problem.in_one_block(HINTS.coarse)
-    candidates = list(combinations_with_replacement(range(len(joints)), 2))
-    k, other = min(candidates, key=lambda pair: float(coarse.exchanged(*pair).errors.mean()))
-    logged, changed = problem.errors.mean(axis=1), problem.exchanged(k, other).errors.mean(axis=1)
-    if not _is_sure(logged, changed, HINTS.wrong_gain, len(candidates)):
-        return None
-    if k == other:
-        return WrongTorque(k, "torque-sense", f"torques of the opposite sign (tau of {joints[k]!r})")
-    got = f"the torques of {joints[other]!r}, and that joint has those of {joints[k]!r}"
-    return WrongTorque(k, "torque-order", got)
 
 
 def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:

@@ -1,4 +1,4 @@
-"""Search for the reading of a log that explains its torques: one change first, then orders of joints and two changes."""
+"""Search for the reading of a log that explains its torques: single changes, orders of joints, combinations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from spelgen.settings.tuning.identification import GEOMETRY
 
 STANDARD_GRAVITY = 9.81  # m/s^2
 RIGHT_ANGLE = np.pi / 2
-RARE = ("gravity", "gravity-compensated", "joint-zero", "torque-unit")
+RARE = {"gravity": 1, "joint-zero": 2, "torque-unit": 2, "gravity-compensated": 3}
 STEP = 1e-4  # [rad, m] of finite differences
 
 
@@ -23,6 +23,11 @@ class Comparison:
 
     unchanged: Fit
     better: tuple[Fit, ...]
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """Codes of the changes of the best reading."""
+        return self.better[0].hypothesis.codes
 
 
 def compare_readings(problem: GeometryProblem, factors: Sequence[np.ndarray] = ()) -> Comparison:
@@ -41,11 +46,21 @@ def compare_readings(problem: GeometryProblem, factors: Sequence[np.ndarray] = (
         if min(tried, key=_rank).cost > best.cost - GEOMETRY.needed:
             break
         fits = [*tried, unchanged]
-    limit = min(fits, key=_rank).cost + GEOMETRY.ambiguous
-    likely = sorted((fit for fit in fits if fit.cost < limit and fit is not unchanged), key=_rank)
-    if unchanged.cost < limit + GEOMETRY.needed - GEOMETRY.ambiguous:
-        return Comparison(unchanged, ())
+    best = min(fits, key=_rank)
+    if best.cost > unchanged.cost - GEOMETRY.needed:
+        return Comparison(unchanged, _rescaled(coarse, unchanged, factors))
+    likely = sorted((fit for fit in fits if fit.cost < best.cost + GEOMETRY.ambiguous), key=_rank)
     return _confirmed(problem, likely[: GEOMETRY.named])
+
+
+def _rescaled(problem: GeometryProblem, unchanged: Fit, factors: Sequence[np.ndarray]) -> tuple[Fit, ...]:
+    """Return the fit with the best factor of the torques, if it is better at all.
+
+    Gravity has shown already that a factor is needed: light bodies, whose cost is small, explain small torques.
+    """
+    fits = [problem.fit(hypothesis) for hypothesis in _scaled(problem.unchanged, factors)]
+    best = min(fits, key=_rank, default=unchanged)
+    return (best,) if best.cost < unchanged.cost else ()
 
 
 def _confirmed(problem: GeometryProblem, likely: Sequence[Fit]) -> Comparison:
@@ -56,12 +71,14 @@ def _confirmed(problem: GeometryProblem, likely: Sequence[Fit]) -> Comparison:
     best = min(fit.cost for fit in fits)
     if best > unchanged.cost - GEOMETRY.needed:
         return Comparison(unchanged, ())
-    return Comparison(unchanged, tuple(fit for fit in fits if fit.cost < best + GEOMETRY.ambiguous))
+    return Comparison(
+        unchanged, tuple(sorted((fit for fit in fits if fit.cost < best + GEOMETRY.ambiguous), key=_rank))
+    )
 
 
 def _rank(fit: Fit) -> float:
     """Return the cost, plus a penalty by which changes that are rarer come after others that explain as much."""
-    return fit.cost + GEOMETRY.rare * sum(code in RARE for code in fit.hypothesis.codes)
+    return fit.cost + GEOMETRY.rare * sum(RARE.get(code, 0) for code in fit.hypothesis.codes)
 
 
 def single_changes(problem: GeometryProblem, base: Fit, factors: Sequence[np.ndarray]) -> list[Fit]:
@@ -154,15 +171,19 @@ def _with_offset(problem: GeometryProblem, base: Fit, joint: int, revolute: bool
         if fit.cost > best.cost:
             break
         best, offset = fit, offset + step
-    if revolute and offset:
+    if revolute:
         offset = (offset + np.pi) % (2 * np.pi) - np.pi
         right = RIGHT_ANGLE * round(offset / RIGHT_ANGLE)
         exact = problem.fit(shifted(right))
         if right and exact.cost < best.cost + GEOMETRY.right_angle:
-            return [exact]
+            best, offset = exact, right
     if abs(offset) < (GEOMETRY.min_angle if revolute else GEOMETRY.min_shift):
         return []
-    return [problem.fit(shifted(round(offset, 4)))]
+    # where the masses alone can make up for an offset, the angle would be no better than the masses of the URDF
+    if best.misfit > base.misfit - GEOMETRY.needed / 2:
+        return []
+    is_right_angle = offset in (RIGHT_ANGLE, -RIGHT_ANGLE, -np.pi)
+    return [best if is_right_angle else problem.fit(shifted(round(offset, 4)))]
 
 
 def _with_gravity(problem: GeometryProblem, base: Fit) -> list[Fit]:
@@ -175,13 +196,13 @@ def _with_gravity(problem: GeometryProblem, base: Fit) -> list[Fit]:
     axes = [*np.eye(3), *-np.eye(3)]
     starts = [_gravity(problem, base, (size or STANDARD_GRAVITY) * axis) for axis in axes]
     best = min(starts, key=lambda fit: fit.cost)
-    for start in (best, base) if size else (best,):
-        direction = _best_direction(problem, start)
-        new = np.array(direction.hypothesis.gravity)
-        if np.linalg.norm(new - present) > GEOMETRY.min_angle * size:
-            axis = _gravity(problem, base, _nearest_axis(new))
-            is_axis = axis.cost < direction.cost + GEOMETRY.right_angle
-            fits.append(axis if is_axis else _gravity(problem, base, new.round(3)))
+    directions = [_best_direction(problem, start) for start in ((best, base) if size else (best,))]
+    direction = min(directions, key=lambda fit: fit.cost)
+    new = np.array(direction.hypothesis.gravity)
+    if np.linalg.norm(new - present) > GEOMETRY.min_angle * size:
+        axis = _gravity(problem, base, _nearest_axis(new))
+        is_axis = axis.cost < direction.cost + GEOMETRY.right_angle
+        fits.append(axis if is_axis else _gravity(problem, base, new.round(3)))
     return fits
 
 
@@ -229,4 +250,3 @@ def _with_compensation(problem: GeometryProblem, base: Fit) -> list[Fit]:
     best = some if some.cost < without.cost - GEOMETRY.ambiguous else without
     codes = tuple("gravity-compensated" if code == "gravity" else code for code in best.hypothesis.codes)
     return [replace(best, hypothesis=replace(best.hypothesis, codes=codes))]
-

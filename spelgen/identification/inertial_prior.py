@@ -41,16 +41,20 @@ def inertial_prior(arm: Arm) -> InertialPrior:
 def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
     """Return a root (10, 10) of the covariance of (m, m c, I) of a body.
 
-    The columns are the derivatives with respect to the mass at a fixed shape, the centre of mass and the tensor about it,
-    times their standard deviations. own: (10,). length: to the next joint [m]. typical: mass of a body without [kg].
+    The columns are the derivatives with respect to the mass at a fixed shape, the centre of mass and the tensor about
+    it, times their standard deviations. own: (10,). length: to the next joint [m]. typical: mass of a body without [kg].
     """
-    mass = own[0] if own[0] > 0 else typical
+    if own[0] <= 0:
+        extent = max(length, GEOMETRY.unknown_extent)
+        lengths = np.repeat([1.0, extent, extent**2], (1, 3, 6))
+        return GEOMETRY.unknown_mass * typical * np.diag(lengths)
+    mass = own[0]
     center, moments = own[1:4] / mass, own[[4, 7, 9]]
     gyration = np.sqrt(max(float(moments.sum() / 2 / mass - center @ center), 0.0))
     extent = max(float(np.linalg.norm(center)), gyration, length / 2, GEOMETRY.min_extent)
     radius = max(gyration, GEOMETRY.min_gyration * extent)
     root = np.zeros((10, 10))
-    root[:, 0] = own if own[0] > 0 else np.array([mass, *[0.0] * 9])
+    root[:, 0] = own
     for axis, unit in enumerate(np.eye(3)):
         product = np.outer(center, unit) + np.outer(unit, center)
         tensor = np.trace(product) * np.eye(3) - product

@@ -41,7 +41,7 @@ class MotionSamples(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """What a mapping makes of the columns of n joints: q is motion_scale times the column plus offset; see `Hypothesis`."""
+    """What a mapping makes of the columns of n joints, (n,) each; see `Hypothesis`."""
 
     motion_scale: np.ndarray
     torque_scale: np.ndarray
@@ -103,12 +103,13 @@ class Equations(NamedTuple):
 class Fit:
     """Least squares with the prior under a hypothesis.
 
-    cost: negative log posterior up to a constant. parameters: (K,), those of the bodies first. errors: (n,) mean squared
+    cost: negative log posterior up to a constant. misfit: its part that the torques make. parameters: (K,), those of the bodies first. errors: (n,) mean squared
     residual of each joint, relative to the variance of its torque.
     """
 
     hypothesis: Hypothesis
     cost: float
+    misfit: float
     parameters: np.ndarray
     errors: np.ndarray
 
@@ -167,15 +168,17 @@ class GeometryProblem:
         rows, normal = self.equations(hypothesis)
         tau = hypothesis.signals(self.samples).tau
         right = np.einsum("snk,sn->nk", rows, tau)
-        variance = len(tau) * np.maximum(tau.var(axis=0), 1e-12 * np.square(tau).max() + 1e-30)
         total = np.square(tau).sum(axis=0)
+        # a torque that never changes states nothing about the dynamics
+        variance = np.where(varying(tau), len(tau) * tau.var(axis=0), np.inf)
         return self._solved(hypothesis, normal, right, total, variance)
 
     def step(self, fit: Fit, columns: np.ndarray) -> np.ndarray:
         """Return the Gauss-Newton step (D,) of what the torques of a fit depend on by columns (S, n, D)."""
         rows, _ = self.equations(fit.hypothesis)
         tau = fit.hypothesis.signals(self.samples).tau
-        weights = 1.0 / ((fit.errors + GEOMETRY.error_floor) * np.maximum(tau.var(axis=0), 1e-30))
+        variance = np.where(varying(tau), tau.var(axis=0), np.inf)
+        weights = 1.0 / ((fit.errors + GEOMETRY.error_floor) * variance)
         joined = np.concatenate([rows, columns], axis=2) * np.sqrt(weights)[:, None]
         flat = joined.reshape(-1, joined.shape[2])
         matrix = flat.T @ flat * (self._count / len(tau))
@@ -187,7 +190,12 @@ class GeometryProblem:
         return (inverse(matrix) @ vector)[-columns.shape[2] :]
 
     def _solved(
-        self, hypothesis: Hypothesis, normal: np.ndarray, right: np.ndarray, total: np.ndarray, variance: np.ndarray
+        self,
+        hypothesis: Hypothesis,
+        normal: np.ndarray,
+        right: np.ndarray,
+        total: np.ndarray,
+        variance: np.ndarray,
     ) -> Fit:
         """Minimise the cost. normal, right: Y^T Y (n, K, K) and Y^T tau (n, K); total: sums of tau^2, (n,).
 
@@ -198,7 +206,7 @@ class GeometryProblem:
         prior, bodies = self._prior, len(self._prior.mean)
         precision, mean = np.zeros(normal.shape[1:]), np.zeros(normal.shape[-1])
         precision[:bodies, :bodies], mean[:bodies] = prior.precision, prior.mean
-        errors, scale = np.full(len(normal), GEOMETRY.initial_error), 1.0
+        errors, scale = np.full(len(normal), GEOMETRY.initial_error), GEOMETRY.initial_scale
         for _ in range(GEOMETRY.iterations):
             weights = self._count / ((errors + GEOMETRY.error_floor) * variance)
             matrix = np.tensordot(weights, normal, 1)
@@ -211,10 +219,10 @@ class GeometryProblem:
             errors = np.maximum(squares / variance, 0.0)
             distance = float((x - mean) @ precision @ (x - mean))
             scale = 2 * prior.freedom / (prior.freedom + distance)
-        cost = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
-        cost += prior.freedom * float(np.log1p(distance / prior.freedom))
+        misfit = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
+        cost = misfit + prior.freedom * float(np.log1p(distance / prior.freedom))
         cost += self._implausible(x, covariance, normal)
-        return Fit(hypothesis, cost, x, errors)
+        return Fit(hypothesis, cost, misfit, x, errors)
 
     def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
         """Return the cost of rotor inertias below 0 and of friction that drives its joint, on average of the log.
@@ -235,6 +243,11 @@ class GeometryProblem:
         odds = 0.5 * np.square(negative) / np.maximum(variance, 1e-30)
         bounds = np.repeat([GEOMETRY.implausible_inertia, GEOMETRY.implausible_friction], n)
         return float(np.minimum(odds, bounds).sum())
+
+
+def varying(tau: np.ndarray) -> np.ndarray:
+    """Return which torques (S, n) vary by more than the rounding of a constant, (n,)."""
+    return np.asarray(tau.std(axis=0) > TUNING.negligible * np.abs(tau).max(axis=0))
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:

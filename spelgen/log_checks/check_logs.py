@@ -11,31 +11,31 @@ import numpy as np
 
 from spelgen.dynamics.regressor import body_chain
 from spelgen.errors import Diagnostic, LogError, collect
-from spelgen.identification.drive_hints import Coupling, drive_problem, find_wrong_torques
-from spelgen.identification.drive_samples import DriveLog
+from spelgen.identification.drive_hints import Coupling, drive_problem
+from spelgen.identification.drive_samples import DriveLog, DriveSamples
+from spelgen.identification.geometry_search import compare_readings
+from spelgen.identification.log_geometry import GeometryProblem, MotionSamples, varying
 from spelgen.identification.torque_delay import delay_of
 from spelgen.listing import Listing, number
 from spelgen.log_checks.check_servo_logs import ServoLogs
-from spelgen.log_checks.gravity import find_opposed_inertia, fit_gravity, joined, state_samples
+from spelgen.log_checks.gravity import fit_gravity, joined, state_samples
+from spelgen.log_checks.remedies import GEOMETRY_CODES, geometry_finding, mapped_columns
 from spelgen.log_checks.report import JointReport, LogReport, joint_report, percent, signal_tables
-from spelgen.log_checks.robot_checks import CHECKS, SENSE, JointEvidence
+from spelgen.log_checks.robot_checks import CHECKS, WITHOUT_GRAVITY, JointEvidence, torque_factors
 from spelgen.log_checks.statistics import Statistics, statistics
 from spelgen.logs.checks import Findings, LogChecks, run_checks
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
+from spelgen.settings.tuning.identification import HINTS
 from spelgen.settings.tuning.log_checks import TUNING
 
 if TYPE_CHECKING:
     from spelgen.pipeline.loaded_arm import LoadedArm
     from spelgen.settings.log_mapping import LogMapping
 
-ORDER = replace(
-    SENSE, code="torque-order", expected="its own", do="change the names of the columns under 'logs'"
-)
-COUPLED = "coupled-motors"
-WRONG_TORQUES = {"torque-sense": SENSE, "torque-order": ORDER}
-ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED}
+COUPLED, WRONG_VELOCITY = "coupled-motors", "velocity-is-no-derivative"
+ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED, *GEOMETRY_CODES}
 
 
 def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None) -> LogReport:
@@ -98,6 +98,7 @@ class TorqueLogs:
         self._samples: list[np.ndarray] = []
         self._moving = DriveLog(arm.arm.joint_types, self._drives, Preprocessing())
         self._declared: list[set[str]] = []
+        self._seconds = 0.0
 
     def add(self, trajectory: Trajectory) -> None:
         """Take in a trajectory. Raises LogError without torques."""
@@ -105,49 +106,74 @@ class TorqueLogs:
         self._samples.append(state_samples(trajectory, self._drives.inputs))
         self._moving.add(trajectory)
         self._declared.append(set(trajectory.accepted))
+        self._seconds += trajectory.duration
 
     def check(
         self, reports: Sequence[JointReport], summary: Findings
     ) -> tuple[list[JointReport], tuple[Listing, ...]]:
-        """Return the reports with what gravity explains, and tables; add what is odd to the summary."""
-        # what files declare by themselves holds where all of them do
+        """Return the reports with gravity's part in the torques, and tables; add the findings to the summary."""
+        # a code that files declare holds if all of them declare it
         accepted = set(self._mapping.accept) | set.intersection(*self._declared)
         motion = joined(self._samples)
         completed = []
         fits = fit_gravity(self._arm.arm, motion)
-        for coordinate, report, gravity in zip(self._arm.arm.coordinates, reports, fits, strict=True):
+        for report, gravity in zip(reports, fits, strict=True):
             completed.append(replace(report, gravity=gravity))
-            passed = accepted
-            # a unit that somebody wrote down is taken as right
-            if self._mapping.unit("tau", coordinate.name) is not None:
-                passed = accepted.union(UNIT_CODES)
-            where = f"joint {coordinate.name!r}"
-            for check, message in run_checks(CHECKS, JointEvidence(coordinate, completed[-1]), passed):
+        evidence = list(map(JointEvidence, self._arm.arm.coordinates, completed))
+        # with wrong velocities friction is wrong too, and hints about drives would be wrong with wrong torques
+        is_sound = not summary.errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
+        moving = self._moving.samples()
+        is_right = not is_sound or self._is_read_right(moving, motion, evidence, accepted, summary)
+        if is_sound and is_right and moving is not None:
+            self._check_drives(moving, summary)
+        for joint in evidence:
+            passed = accepted | {code for code in UNIT_CODES if self._is_declared(joint.coordinate.name)}
+            if not is_right:  # one cause, one message
+                passed |= {"torque-beyond-drive", WITHOUT_GRAVITY}
+            where = f"joint {joint.coordinate.name!r}"
+            for check, message in run_checks(CHECKS, joint, passed):
                 summary.add(check, message, f"{where}, tau" if check.severity == "error" else where)
-        # beside wrong velocities friction is wrong too, and of wrong torques hints about drives would be wrong
-        if not any(note.code == "velocity-is-no-derivative" for note in summary.notes):
-            self._check_together(motion, accepted, summary)
         return completed, (*signal_tables(completed, QUANTITIES), _physics_table(completed))
 
-    def _check_together(self, motion: np.ndarray, accepted: set[str], summary: Findings) -> None:
-        """Add what is wrong with the torques of all joints together, or else a coupling of motors, or else a delay.
+    def _is_declared(self, joint: str) -> bool:
+        """Whether the mapping states the unit of a joint's torque."""
+        return self._mapping.unit("tau", joint) is not None
 
-        motion: samples (4, S, n), see `state_samples`.
+    def _is_read_right(
+        self,
+        moving: DriveSamples | None,
+        motion: np.ndarray,
+        joints: Sequence[JointEvidence],
+        accepted: set[str],
+        summary: Findings,
+    ) -> bool:
+        """Whether no other reading of the columns explains the torques better; add the finding if one does.
+
+        moving: filtered samples; None: the logs are too slow for accelerations, and motion (4, S, n) is used.
         """
-        arm, joints, drives = self._arm.arm, self._arm.arm.joint_names, self._drives
-        if not summary.errors and SENSE.code not in accepted:
-            opposed = find_opposed_inertia(arm, motion, drives.speeds)
-            if opposed is not None:
-                summary.add(SENSE, opposed, "tau")
-        moving = self._moving.samples()
-        if moving is None or summary.errors:
-            return
-        problem = drive_problem(body_chain(arm), drives, moving)
-        wrong = find_wrong_torques(problem, joints)
-        if wrong is not None and wrong.code not in accepted:
-            summary.add(WRONG_TORQUES[wrong.code], wrong.got, f"joint {joints[wrong.joint]!r}, tau")
-            return
-        late = delay_of(problem)
+        arm = self._arm.arm
+        q, qd, qdd, tau = motion
+        samples = MotionSamples(q, qd, qdd, tau)
+        if moving is not None:
+            samples = MotionSamples(moving.q, moving.qd, moving.qdd, moving.tau)
+        if len(samples.q) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
+            return True
+        columns = mapped_columns(arm, self._mapping, self._drives)
+        problem = GeometryProblem(arm, samples, self._drives.speeds, self._seconds, columns)
+        undeclared = [not self._is_declared(name) for name in arm.joint_names]
+        comparison = compare_readings(problem, torque_factors(joints, undeclared))
+        if not comparison.better or set(comparison.codes) <= accepted:
+            return True
+        finding = geometry_finding(comparison, arm, self._mapping)
+        if isinstance(finding, Diagnostic):
+            summary.notes.append(finding)
+        else:
+            summary.errors.append(finding)
+        return False
+
+    def _check_drives(self, moving: DriveSamples, summary: Findings) -> None:
+        """Add a coupling of motors that the logs show, or else a delay of the torques."""
+        late = delay_of(drive_problem(body_chain(self._arm.arm), self._drives, moving))
         if late.coupling is not None:
             summary.notes.append(_coupling_hint(self._arm, *late.coupling))
         else:

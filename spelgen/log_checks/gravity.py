@@ -1,4 +1,4 @@
-"""Tell whether logged torques move with gravity, joint by joint, and whether all together act against inertia."""
+"""Fit the gravity of the URDF to logged torques, joint by joint."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 from scipy.linalg import orth
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.regressor import body_chain, regressor, urdf_parameters
-from spelgen.identification.drive_hints import drive_rows
+from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.settings.tuning.identification import IdentificationTuning
 from spelgen.settings.tuning.log_checks import TUNING
@@ -73,30 +72,6 @@ def fit_gravity(arm: Arm, motion: np.ndarray) -> list[GravityFit]:
         signals = np.column_stack([tau[:, joint], load[:, joint], rows[:, joint]])
         fits.append(_fit(signals, friction[:, joint]))
     return fits
-
-
-def find_opposed_inertia(arm: Arm, motion: np.ndarray, speeds: np.ndarray) -> str | None:
-    """Find torques that all have the opposite sign: by least squares the mass matrix then is negative.
-
-    motion: samples, (4, S, n). speeds: C, (n, n), of the motors. Friction does not tell: a drive may compensate it
-    after its torque was measured.
-    """
-    q, qd, qdd, tau = motion
-    if len(q) < TUNING.gravity_samples / 4 or not np.ptp(tau, axis=0).all():
-        return None
-    unit = tau.std(axis=0)
-    chain = body_chain(arm)
-    moving = drive_rows(chain, q, qd, qdd, speeds)
-    steady = drive_rows(chain, q, qd, np.zeros_like(qdd), speeds)
-    flat = (moving / unit[:, None]).reshape(tau.size, -1)
-    parameters = np.linalg.lstsq(flat, (tau / unit).ravel(), rcond=TUNING.dependent)[0]
-    inertia = (moving - steady) @ parameters
-    if not (inertia.std(axis=0) > TUNING.loaded * unit).any():
-        return None
-    product = (inertia * qdd).sum(axis=1)  # qdd^T M qdd
-    if product.sum() >= -TUNING.opposed * np.abs(product).sum():
-        return None
-    return "torques of all joints that act against acceleration"
 
 
 def _fit(signals: np.ndarray, friction: np.ndarray) -> GravityFit:

@@ -41,6 +41,11 @@ Accepted = Literal[
     "torque-unit",
     "torque-beyond-drive",
     "torque-order",
+    "joint-sense",
+    "joint-order",
+    "joint-zero",
+    "gravity",
+    "gravity-compensated",
 ]
 """Errors of `spelgen logs` that someone who knows better can accept, by their codes."""
 

@@ -39,8 +39,6 @@ class DriveHintTuning:
     # of the squared error, and in each block of the torque's squares, what a coupling leaves at most; the TX40's wrist
     # leaves 0.05 and 0.03
     coupling_gain: float = 0.5
-    # likewise of a swapped or negated torque; recorded arms lose a factor of 4 by either
-    wrong_gain: float = 0.25
     chance: float = 1 / 400  # that any candidate is taken by luck, as of what enters a fit
     simple_ratio: float = 0.02  # of the squared error, what a ratio of small numbers may cost
     # that begin the search for couplings: each covers half of it to twice
@@ -57,7 +55,7 @@ class DriveHintTuning:
 
 @dataclass(frozen=True)
 class GeometryTuning:
-    """Numbers of the test of a log's geometry; costs are negative log posteriors. Chosen by benchmarks/log_geometry.py."""
+    """Numbers of the test of a log's geometry, chosen by benchmarks/log_geometry.py. Costs: negative log posteriors."""
 
     # [s] residuals of recorded arms stay correlated for about 0.2 s: the likelihood counts one error in that time
     correlation_time: float = 0.2
@@ -66,12 +64,16 @@ class GeometryTuning:
     # [1] of the torque's variance, is always left: friction models err by 2 % of the torque
     error_floor: float = 4e-4
     initial_error: float = 0.1  # [1] of the torque's variance, before the first iteration
-    iterations: int = 5  # of reweighting; the costs change by less than 0.1 after
+    initial_scale: float = 0.1  # of the prior's weight, before the first iteration
+    iterations: int = 6  # of reweighting; the costs change by less than 0.1 after
     # [1] standard deviations of masses, of centres of mass relative to the extent, and of tensors
     relative_error: float = 0.5
+    # [1] of the other bodies' mass or 1 kg, and [m]: standard deviation and extent of a body without an inertial
+    unknown_mass: float = 20.0
+    unknown_extent: float = 0.5
     min_extent: float = 0.03  # [m] of a body
     min_gyration: float = 0.3  # [1] radius of gyration relative to the extent: point masses have none
-    # costs at most: recorded arms have friction that drives (shanghai's joint 6) or negative inertia (airbot), none both
+    # costs at most: recorded arms have friction that drives (shanghai's joint 6) or negative inertia (airbot), not both
     implausible_inertia: float = 15.0
     implausible_friction: float = 10.0
     # cost by which another hypothesis must be better: the recorded arms' best wrong one gains 16
@@ -79,7 +81,9 @@ class GeometryTuning:
     ambiguous: float = 8.0  # cost by which two hypotheses must differ for one to be named alone
     changes: int = 3  # that a reading has at most, an order of joints as one
     named: int = 3  # readings that a message names at most
-    rare: float = 1.0  # cost of a change that is rarer than a wrong sense or order, of two that explain as much
+    rare: float = (
+        1.0  # cost of a change that is rarer than a wrong sense or order, of two that explain as much
+    )
     samples: int = 200  # for comparing all hypotheses
     confirming_samples: int = 800  # for the best ones
     refinements: int = 4  # Gauss-Newton steps of an offset, or of the direction of gravity

@@ -17,8 +17,6 @@ class LogCheckTuning:
     one_way: float = 0.1  # of a joint's fastest velocity: that of a joint that never moves back is less
     limit_noise: float = 0.01  # of a velocity or effort limit: overrun by less is noise of the signal
     loaded: float = 0.2  # deviation of gravity's torque, of the torque's: from here it must be seen (UR10e)
-    # of inertial power that is negative beyond what is positive; +0.3 to +1 on recorded arms
-    opposed: float = 0.25
     seen: float = 0.7  # correlation from which on gravity is in the torque; below what lacks to 1 it is not
     unusual_factor: float = 5.0  # times the URDF's gravity torque: inertials are wrong, but not like this
     impossible_factor: float = 10.0  # times the URDF's gravity torque, which only another unit has
