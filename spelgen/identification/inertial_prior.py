@@ -42,7 +42,8 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
     """Return a root (10, 10) of the covariance of (m, m c, I) of a body.
 
     The columns are the derivatives with respect to the mass at a fixed shape, the centre of mass and the tensor about
-    it, times their standard deviations. own: (10,). length: to the next joint [m]. typical: mass of a body without [kg].
+    the centre, times their standard deviations. own: (10,). length: to the next joint [m]. typical: mass of a body
+    without an inertial [kg].
     """
     if own[0] <= 0:
         extent = max(length, GEOMETRY.unknown_extent)

@@ -103,8 +103,8 @@ class Equations(NamedTuple):
 class Fit:
     """Least squares with the prior under a hypothesis.
 
-    cost: negative log posterior up to a constant. misfit: its part that the torques make. parameters: (K,), those of the bodies first. errors: (n,) mean squared
-    residual of each joint, relative to the variance of its torque.
+    cost: negative log posterior up to a constant. misfit: the part of the cost that the torques make. parameters: (K,),
+    those of the bodies first. errors: (n,) mean squared residual of each joint, relative to the variance of its torque.
     """
 
     hypothesis: Hypothesis
@@ -199,9 +199,9 @@ class GeometryProblem:
     ) -> Fit:
         """Minimise the cost. normal, right: Y^T Y (n, K, K) and Y^T tau (n, K); total: sums of tau^2, (n,).
 
-        variance: (n,) sums of squares of tau about its mean. The noise of a joint is marginalised: its log likelihood is
-        -N / 2 log(residual sum of squares). The prior is a Student t: `scale` is its weight of iteratively reweighted
-        least squares.
+        variance: (n,) sums of squares of tau about its mean. The noise of a joint is marginalised: its log likelihood
+        is -N / 2 log(residual sum of squares). The prior is a Student t: `scale` is its weight of iteratively
+        reweighted least squares.
         """
         prior, bodies = self._prior, len(self._prior.mean)
         precision, mean = np.zeros(normal.shape[1:]), np.zeros(normal.shape[-1])
@@ -227,8 +227,8 @@ class GeometryProblem:
     def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
         """Return the cost of rotor inertias below 0 and of friction that drives its joint, on average of the log.
 
-        Each costs the square of its standard score / 2, at most `implausible_inertia` and `implausible_friction`: a drive
-        may compensate friction, and the errors of a friction model may resemble inertia.
+        Each costs the square of its standard score / 2, at most `implausible_inertia` and `implausible_friction`: a
+        drive may compensate friction, and the errors of a friction model may resemble inertia.
         """
         drives, n = np.arange(len(normal)), len(normal)
         first = len(self._prior.mean)

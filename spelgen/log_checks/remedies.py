@@ -46,9 +46,8 @@ def settings_lines(reading: Hypothesis, unchanged: Hypothesis, arm: Arm, mapping
     if joints:
         texts.append(f"'joints: {_flow(joints)}' under 'logs' in the robot's YAML")
     if reading.gravity != unchanged.gravity:
-        texts.append(
-            f"'gravity: {_flow([float(f'{x:.5g}') for x in reading.gravity])}' in the robot's YAML (then build the model again)"
-        )
+        vector = _flow([float(f"{x:.5g}") for x in reading.gravity])
+        texts.append(f"'gravity: {vector}' in the robot's YAML (then build the model again)")
     return " and ".join(texts)
 
 
@@ -147,9 +146,11 @@ def _gravity_text(code: str, reading: Hypothesis, unchanged: Hypothesis) -> str:
     present, new = np.array(unchanged.gravity), np.array(reading.gravity)
     if code == "gravity-compensated":
         part = float(new @ present / (present @ present))
-        return f"torques in which gravity is compensated: {part:.2g} times the URDF's gravity is left in all joints"
+        text = f"torques in which gravity is compensated: {part:.2g} times the URDF's gravity is left"
+        return text + " in all joints"
     cosine = float(new @ present / max(np.linalg.norm(new) * np.linalg.norm(present), 1e-9))
-    return f"torques of a gravity that is {np.rad2deg(np.arccos(np.clip(cosine, -1, 1))):.3g} degrees from its direction in the settings"
+    angle = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
+    return f"torques of a gravity that is {angle:.3g} degrees from its direction in the settings"
 
 
 def evidence(best: Fit, unchanged: Fit) -> str:

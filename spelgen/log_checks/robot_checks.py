@@ -67,7 +67,7 @@ def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
 
 
 def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) -> list[np.ndarray]:
-    """Return factors (n,) by which torques become as large as the URDF's gravity makes them, as another unit would.
+    """Return factors (n,) with which the torques have the size of the URDF's gravity: candidates for another unit.
 
     One for each joint with torques at least `TUNING.unusual_factor` times too large or too small, and one for all joints
     together. undeclared: joints whose unit no mapping states.
