@@ -12,14 +12,14 @@ from spelgen.runtime.body_chain import BodyChain
 from spelgen.runtime.parts import Row
 
 
-def body_chain(arm: Arm) -> BodyChain:
-    """Return how the arm's bodies may move, for q (..., n) [rad; m]."""
+def body_chain(arm: Arm, gravity: Row | None = None) -> BodyChain:
+    """Return the kinematics of the arm's bodies, for q (..., n) [rad; m]; gravity [m/s^2]: by default the arm's."""
     rows: list[tuple[Any, ...]] = []
     for body in arm.bodies:
         placement = [(*_row(row), float(x)) for row, x in zip(body.rotation, body.translation, strict=True)]
         is_revolute, ratio = body.kind == "revolute", float(body.multiplier)
         rows.append((body.parent, body.coordinate, is_revolute, ratio, body.offset, placement))
-    return BodyChain(len(arm.coordinates), _row(arm.gravity), *zip(*rows, strict=True))
+    return BodyChain(len(arm.coordinates), gravity or _row(arm.gravity), *zip(*rows, strict=True))
 
 
 def regressor(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:

@@ -218,7 +218,7 @@ def _nearest_axis(gravity: np.ndarray) -> np.ndarray:
 def _gravity_columns(problem: GeometryProblem, fit: Fit) -> np.ndarray:
     """Return the derivative of the torques with respect to the vector of gravity, (S, n, 3)."""
     bodies = [problem.torque(replace(fit.hypothesis, gravity=x), fit.parameters) for x in UNIT_GRAVITIES]
-    return np.stack(bodies[1:], axis=2) - bodies[0][..., None]
+    return np.asarray(np.stack(bodies[1:], axis=2) - bodies[0][..., None])
 
 
 UNIT_GRAVITIES: tuple[Vector3, ...] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))

@@ -9,7 +9,7 @@ explain the torques equally well.
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -152,14 +152,16 @@ class GeometryProblem:
         return np.asarray(self.equations(hypothesis).rows @ parameters)
 
     def equations(self, hypothesis: Hypothesis) -> Equations:
-        """Return the regressor under a hypothesis, kept from one call to the next."""
+        """Return the regressor under a hypothesis; the last ones are kept."""
         key = hypothesis.motion_key
         if key not in self._equations:
             q, qd, qdd, _ = hypothesis.signals(self.samples)
-            chain = body_chain(replace(self.arm, gravity=hypothesis.gravity))
+            chain = body_chain(self.arm, hypothesis.gravity)
             friction = FRICTION.columns(qd, qdd, None, self.speeds)
             rows = np.concatenate([chain_regressor(chain, q, qd, qdd), friction], axis=2)
             by_joint = rows.swapaxes(0, 1)
+            if len(self._equations) >= GEOMETRY.kept:
+                self._equations.pop(next(iter(self._equations)))
             self._equations[key] = Equations(rows, by_joint.swapaxes(1, 2) @ by_joint)
         return self._equations[key]
 
@@ -187,7 +189,7 @@ class GeometryProblem:
         residual = (tau - rows @ fit.parameters) * np.sqrt(weights)
         vector = flat.T @ residual.ravel() * (self._count / len(tau))
         vector[:bodies] += self._prior.precision @ (self._prior.mean - fit.parameters[:bodies])
-        return (inverse(matrix) @ vector)[-columns.shape[2] :]
+        return np.asarray((inverse(matrix) @ vector)[-columns.shape[2] :])
 
     def _solved(
         self,
@@ -255,4 +257,4 @@ def inverse(matrix: np.ndarray) -> np.ndarray:
     length = np.sqrt(np.diag(matrix))
     length = np.where(length > 0, length, 1.0)
     scaled = matrix / np.outer(length, length) + 1e-12 * np.eye(len(matrix))
-    return np.asarray(np.linalg.inv(scaled)) / np.outer(length, length)
+    return np.asarray(np.linalg.inv(scaled) / np.outer(length, length))

@@ -23,6 +23,7 @@ from spelgen.log_checks.remedies import GEOMETRY_CODES, geometry_finding, mapped
 from spelgen.log_checks.report import JointReport, LogReport, joint_report, percent, signal_tables
 from spelgen.log_checks.robot_checks import CHECKS, WITHOUT_GRAVITY, JointEvidence, torque_factors
 from spelgen.log_checks.statistics import Statistics, statistics
+from spelgen.logs.bags import BAG
 from spelgen.logs.checks import Findings, LogChecks, run_checks
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
@@ -98,7 +99,7 @@ class TorqueLogs:
         self._samples: list[np.ndarray] = []
         self._moving = DriveLog(arm.arm.joint_types, self._drives, Preprocessing())
         self._declared: list[set[str]] = []
-        self._seconds = 0.0
+        self._seconds, self._is_bag = 0.0, False
 
     def add(self, trajectory: Trajectory) -> None:
         """Take in a trajectory. Raises LogError without torques."""
@@ -107,6 +108,8 @@ class TorqueLogs:
         self._moving.add(trajectory)
         self._declared.append(set(trajectory.accepted))
         self._seconds += trajectory.duration
+        if trajectory.file is not None:
+            self._is_bag |= trajectory.file.suffix in BAG.suffixes or (trajectory.file / BAG.marker).exists()
 
     def check(
         self, reports: Sequence[JointReport], summary: Findings
@@ -164,7 +167,7 @@ class TorqueLogs:
         comparison = compare_readings(problem, torque_factors(joints, undeclared))
         if not comparison.better or set(comparison.codes) <= accepted:
             return True
-        finding = geometry_finding(comparison, arm, self._mapping)
+        finding = geometry_finding(comparison, arm, self._mapping, by_name=self._is_bag)
         if isinstance(finding, Diagnostic):
             summary.notes.append(finding)
         else:

@@ -35,12 +35,17 @@ def mapped_columns(arm: Arm, mapping: LogMapping, drives: Drives) -> Columns:
     )
 
 
-def settings_lines(reading: Hypothesis, unchanged: Hypothesis, arm: Arm, mapping: LogMapping) -> str:
-    """Return the lines to write so that the columns of a log are read so, and where they belong."""
+def settings_lines(
+    reading: Hypothesis, unchanged: Hypothesis, arm: Arm, mapping: LogMapping, by_name: bool
+) -> str:
+    """Return the lines to write so that the columns of a log are read so, and where they belong.
+
+    by_name: messages of joints by their names, as bags have them, and no columns.
+    """
     texts = []
     joints = {}
     for k, name in enumerate(arm.joint_names):
-        keys = _joint_keys(k, reading, unchanged, arm.joint_names, mapping)
+        keys = _joint_keys(k, reading, unchanged, arm.joint_names, mapping, by_name)
         if keys:
             joints[name] = keys
     if joints:
@@ -52,18 +57,25 @@ def settings_lines(reading: Hypothesis, unchanged: Hypothesis, arm: Arm, mapping
 
 
 def _joint_keys(
-    k: int, reading: Hypothesis, unchanged: Hypothesis, joints: Sequence[str], mapping: LogMapping
+    k: int,
+    reading: Hypothesis,
+    unchanged: Hypothesis,
+    joints: Sequence[str],
+    mapping: LogMapping,
+    by_name: bool,
 ) -> dict[str, object]:
     """Return the keys of joint k in a mapping that differ from its present ones."""
     present = mapping.joint(joints[k])
     keys: dict[str, object] = {}
-    columns = {}
+    columns: dict[str, str] = {}
     motion, torque = joints[reading.motion_source[k]], joints[reading.torque_source[k]]
     for quantity in mapping.quantities:
         source = torque if quantity == "tau" else motion
         if source != joints[k]:
             columns[quantity] = mapping.column(quantity, source)
-    if columns:
+    if by_name and motion == torque != joints[k]:
+        keys["name"] = mapping.log_name(motion)
+    elif columns:
         keys["columns"] = columns
     sign = float(reading.motion_scale[k] / unchanged.motion_scale[k])
     if sign < 0:
@@ -163,12 +175,16 @@ def evidence(best: Fit, unchanged: Fit) -> str:
     return "the torque error of least squares remains the same, with plausible masses, rotor inertias and friction"
 
 
-def geometry_finding(comparison: Comparison, arm: Arm, mapping: LogMapping) -> LogError | Diagnostic:
+def geometry_finding(
+    comparison: Comparison, arm: Arm, mapping: LogMapping, *, by_name: bool
+) -> LogError | Diagnostic:
     """Return the finding of a better reading: an error, or a warning about small angles and moderate factors."""
     best, unchanged = comparison.better[0], comparison.unchanged
     where, got = described(best.hypothesis, unchanged.hypothesis, arm)
     got = f"{got} ({evidence(best, unchanged)})"
-    lines = [settings_lines(x.hypothesis, unchanged.hypothesis, arm, mapping) for x in comparison.better]
+    lines = [
+        settings_lines(x.hypothesis, unchanged.hypothesis, arm, mapping, by_name) for x in comparison.better
+    ]
     do = f"write {'; or '.join(dict.fromkeys(lines))}"
     codes = comparison.codes
     if _is_minor(best.hypothesis, unchanged.hypothesis):

@@ -67,10 +67,10 @@ def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
 
 
 def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) -> list[np.ndarray]:
-    """Return factors (n,) with which the torques have the size of the URDF's gravity: candidates for another unit.
+    """Return factors (n,) that give the torques the size of the URDF's gravity: candidates for another unit.
 
-    One for each joint with torques at least `TUNING.unusual_factor` times too large or too small, and one for all joints
-    together. undeclared: joints whose unit no mapping states.
+    One for each joint with torques at least `TUNING.unusual_factor` times too large or too small, and one for all
+    joints together. undeclared: joints whose unit no mapping states.
     """
     seen: list[float] = []
     factors = []

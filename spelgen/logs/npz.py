@@ -100,9 +100,15 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
         # a joint's column may be that of a matrix `q` (T, n)
         matrix = getattr(mapping.columns, quantity).replace("{joint}", "").rstrip("_")
         if matrix in arrays.names and arrays[matrix].ndim == 2:
-            indices = _matrix_columns(arrays, matrix, [mapping.log_name(joint) for joint in joints])
-            for joint, index in zip(joints, indices, strict=True):
-                mapping = mapping.with_joint_columns({joint: {quantity: f"{matrix}[{index}]"}})
+            names = [mapping.log_name(joint) for joint in joints]
+            elements = {}
+            for name, index in zip(names, _matrix_columns(arrays, matrix, names), strict=True):
+                elements[getattr(mapping.columns, quantity).replace("{joint}", name)] = f"{matrix}[{index}]"
+            # a joint may have the column of another one
+            named = {joint: mapping.column(quantity, joint) for joint in joints}
+            mapping = mapping.with_joint_columns(
+                {joint: {quantity: elements.get(column, column)} for joint, column in named.items()}
+            )
     # names alone: to learn an array's type is to read it
     schema = pa.schema([(name, pa.null()) for name in arrays.names])
     layout = table_layout(schema, joints, mapping, arrays.file)

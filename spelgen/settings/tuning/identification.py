@@ -85,6 +85,7 @@ class GeometryTuning:
         1.0  # cost of a change that is rarer than a wrong sense or order, of two that explain as much
     )
     samples: int = 200  # for comparing all hypotheses
+    kept: int = 30  # regressors in memory, of about 1 MB
     confirming_samples: int = 800  # for the best ones
     refinements: int = 4  # Gauss-Newton steps of an offset, or of the direction of gravity
     min_angle: float = 0.09  # [rad] smaller zero offsets and tilts of the base are errors of calibration
