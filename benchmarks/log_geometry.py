@@ -29,12 +29,12 @@ sys.path.insert(0, str(Path(__file__).parent))
 from truth import Case, Truth, record_log, wrong_urdf
 
 from spelgen.arm.arm import Arm
+from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.identification.drive_samples import DriveLog
 from spelgen.identification.geometry_search import compare_readings
 from spelgen.identification.log_geometry import GeometryProblem, Hypothesis, MotionSamples
+from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
-from spelgen.settings.tuning.identification import GEOMETRY
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 OWN = ("rpr", "two_link", "scara", "six_dof", "panda", "ur10e")
@@ -51,7 +51,9 @@ NEAR = 0.2  # rad, and of the size of gravity: angles that are found within it a
 RESULTS = ("named", "with others", "invisible", "missed", "wrong")
 
 
-def draw_log(urdf: Path, number: int, folder: Path) -> tuple[Case, LoadedArm, LoadedArm, MotionSamples]:
+def draw_log(
+    urdf: Path, number: int, folder: Path
+) -> tuple[Case, ConfiguredArm, ConfiguredArm, MotionSamples]:
     """Return a case, the arm of its wrong URDF, the true arm, and samples of its log."""
     rng = np.random.default_rng([number, *urdf.stem.encode()])
     case = Case(
@@ -135,7 +137,9 @@ def is_same(one: Hypothesis, other: Hypothesis) -> bool:
     )
 
 
-def result_of(arm: LoadedArm, true: LoadedArm, samples: MotionSamples, kind: str, right: Hypothesis) -> str:
+def result_of(
+    arm: ConfiguredArm, true: ConfiguredArm, samples: MotionSamples, kind: str, right: Hypothesis
+) -> str:
     """Return how a fault is told, one of `RESULTS`."""
     drives, chain, ideal = arm.actuation.drives(), arm.arm, true.arm
     if kind == "gravity":  # the log is right, and the settings state another gravity

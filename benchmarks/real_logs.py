@@ -1,11 +1,12 @@
 """Real logs beside published baselines: every figure of docs/real_logs.md in one command.
 
-    python benchmarks/real_logs.py [LOGS]
+    python benchmarks/real_logs.py [FOLDER]
 
-LOGS is ../shared/logs beside the checkout by default. Torque errors are nMSE (mean squared error by the torque's
-variance, mean of the joints), once over the samples that move and once with the pauses between motions; the second is
-how the baselines' published figures were made. Nothing is chosen here: the settings are the defaults of spelgen, and
-fits are those of `spelgen train`, with the delay of torques that it finds; least squares has the same samples.
+FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. Torque errors are nMSE (mean
+squared error by the torque's variance, mean of the joints), once over the samples that move and once with the pauses
+between motions; the second is how the baselines' published figures were made. Nothing is chosen here: the settings are
+the defaults of spelgen, and fits are those of `spelgen train`, with the delay of torques that it finds; least squares
+has the same samples.
 """
 
 from __future__ import annotations
@@ -22,17 +23,21 @@ from typing import Any
 import numpy as np
 import torch
 
+sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from characters import TESTS as CHARACTERS
-from characters import read_characters, write_arm
+from delan_characters import TESTS as CHARACTERS
+from delan_characters import read_characters, write_arm
+from recordings import folder_of, panda_urdf
 
 import spelgen
 from spelgen.arm.arm import Arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.predictor import Solver
 from spelgen.dynamics.bristles import bristle_reach, reach_of
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.regressor import regressor
+from spelgen.emission.build import build
 from spelgen.errors import LogError
 from spelgen.evaluation.horizons import end_errors
 from spelgen.evaluation.torque import mean_nmse, predicted_torques
@@ -45,8 +50,6 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows, joined
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 
 Torque = Callable[[DynamicsSamples], np.ndarray]
 
@@ -66,10 +69,10 @@ SUBSTEPS = 4
 
 def main() -> None:
     torch.set_num_threads(1)
-    logs = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[2] / "shared" / "logs"
+    logs = folder_of(sys.argv[1] if len(sys.argv) > 1 else None)
     with tempfile.TemporaryDirectory() as scratch:
         ur10e(logs / "ur10e")
-        panda(logs / "panda", logs.parent / "arms" / "panda_erd.urdf")
+        panda(logs / "panda", panda_urdf(logs))
         characters(logs / "delan_characters", Path(scratch))
 
 

@@ -1,4 +1,4 @@
-"""Arms of one or two bodies, small enough to do their mechanics by hand."""
+"""Arms of one or two bodies whose mechanics can be derived by hand."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -19,6 +19,7 @@ def body(name="a", kind="revolute", **changes):
     """A point of mass 1 in the origin of its joint, on the root."""
     known = {
         "parent": -1,
+        "link": name,
         "coordinate": 0,
         "multiplier": Fraction(1),
         "offset": 0.0,
@@ -26,7 +27,7 @@ def body(name="a", kind="revolute", **changes):
         "translation": (0, 0, 0),
         "inertia": point(1),
     }
-    return Body(name=name, kind=kind, **(known | changes))
+    return Body(name=name, link=f"link of {name}", kind=kind, **(known | changes))
 
 
 def point(mass, x=0.0):

@@ -1,22 +1,24 @@
-"""Options of a fit: each objective has its own, and one that does not apply is told with what it belongs to."""
+"""Each objective accepts its own options; any other option is refused with the objective that it belongs to."""
 
 from pathlib import Path
 
 import pytest
+from planar_model import JOINTS, write_module
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
+from spelgen.emission.build import build
+from spelgen.emission.specify import generate
 from spelgen.errors import OptionError, SettingsError
 from spelgen.fitting.fit import fit
+from spelgen.fitting.objectives import FitOptions, choose_config
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import write_logs
-from spelgen.pipeline.build import build
-from spelgen.pipeline.generate import generate
 from spelgen.settings.fits import CONFIGS, OWNERS, MomentumFit, Rollout, TorqueFit, fit_config
 from spelgen.settings.settings import load_settings
 from spelgen.settings.training import TrainingSettings
-from tests.test_training import JOINTS, STAND_IN, motions
+from tests.test_training import motions
 
 VALUES = {
     "prior": {"bodies": 1.0}, "adapt": "friction", "evaluations": 40, "weight_decay": 0.1, "urdf_weight": 0.5,
@@ -143,11 +145,12 @@ def test_the_command_line_names_the_flag(robots, tmp_path):
         told
         == "Error: --objective: momentum belongs to models of networks alone, this is one of rigid bodies"
     )
-    told = refused(STAND_IN, *data, "--set", "evaluations=40")
+    networks = write_module(tmp_path, "networks.py")
+    told = refused(networks, *data, "--set", "evaluations=40")
     assert told == "Error: --set evaluations: belongs to the objective torque, this fits rollout"
-    told = refused(STAND_IN, *data, "--set", "torque_first=false")
+    told = refused(networks, *data, "--set", "torque_first=false")
     assert told == "Error: --set torque_first: with the objective rollout belongs to models of rigid bodies"
-    told = refused(STAND_IN, *data, "--set", "optimizer=lbfgs", "--set", "batch=4")
+    told = refused(networks, *data, "--set", "optimizer=lbfgs", "--set", "batch=4")
     assert told == "Error: --set batch: belongs to the optimizer adamw, this is lbfgs"
     assert not (tmp_path / "run").exists()
 
@@ -155,7 +158,16 @@ def test_the_command_line_names_the_flag(robots, tmp_path):
 def test_a_run_goes_on_with_its_own_options(tmp_path):
     logs, run = tmp_path / "train.parquet", tmp_path / "run"
     write_logs(logs, motions(), JOINTS)
-    train = ["train", str(STAND_IN), "--data", str(logs), "-o", str(run), "--set", "progress=false"]
+    train = [
+        "train",
+        str(write_module(tmp_path)),
+        "--data",
+        str(logs),
+        "-o",
+        str(run),
+        "--set",
+        "progress=false",
+    ]
     first = ["--set", "momentum_steps=20", "--set", "epochs=1", "--set", "window=6"]
     assert CliRunner().invoke(app, [*train, *first]).exit_code == 0
     again = [*train, "--resume"]
@@ -175,3 +187,23 @@ def test_a_name_in_place_of_a_configuration_is_told(robots):
         SettingsError, match=r"got 'torque' as the configuration of a fit, expected spelgen\.Torq"
     ):
         fit(model, [], "torque")
+
+
+def test_logs_are_read_for_the_choice_of_an_objective_only_if_it_depends_on_them(robots):
+    """An option that does not apply is reported before logs are read, which may take long."""
+
+    def unread():
+        raise AssertionError("the logs were read")
+
+    bodies, networks = (
+        build(robots / "two_link.urdf", preset, width=4) for preset in ("closed-form", "spel")
+    )
+    assert choose_config(networks, None, unread).objective == "rollout"
+    assert choose_config(bodies, FitOptions("torque"), unread).objective == "torque"
+    with pytest.raises(OptionError, match="belongs to the objective rollout, this fits torque"):
+        choose_config(bodies, FitOptions("torque", {"epochs": 3}), unread)
+    assert choose_config(bodies, None, lambda: [10.0, 100.0]).objective == "torque"
+    slow = choose_config(bodies, None, lambda: [10.0])
+    assert (slow.objective, slow.urdf_weight) == ("rollout", 0.0)
+    regularized = FitOptions(defaults={"urdf_weight": 2.0, "substeps": 3})
+    assert choose_config(bodies, regularized, lambda: [10.0]).urdf_weight == 2.0

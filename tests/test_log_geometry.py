@@ -10,12 +10,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.errors import SpelgenError
 from spelgen.log_checks.check_logs import check_logs, require_sound_logs
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.log_mapping import LogMapping
 
 ROBOTS = ("rpr", "six_dof", "ur10e")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,7 +26,7 @@ from spelgen.errors import SpelgenErrors
 from spelgen.files import write_text
 
 if TYPE_CHECKING:
-    from spelgen.pipeline.loaded_arm import LoadedArm
+    from spelgen.arm.configured_arm import ConfiguredArm
 
 
 def excite(
@@ -82,22 +83,46 @@ def simulate(
     tip: Tip = None,
     angle_tolerance: AngleTolerance = 2e-3,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Random seed; default: that of the robot's settings.")
+        int | None, typer.Option(min=0, help="Random seed; default: the seed in the robot's settings.")
+    ] = None,
+    as_built: Annotated[
+        int | None,
+        typer.Option(
+            min=0, metavar="SEED", help="Simulate an arm that differs from its URDF, drawn from this seed."
+        ),
+    ] = None,
+    motion: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE.csv",
+            help="A motion of `spelgen excite` to perform; repeatable. The last half is for testing.",
+        ),
     ] = None,
     force: Force = False,
 ) -> None:
-    """Simulate training and test logs with Pinocchio."""
+    """Simulate training and test logs with Pinocchio.
+
+    With --as-built, masses, centres of mass, friction and armature differ from the URDF as those of a real arm do;
+    LOGS/as_built.urdf and .yaml are the truth, for `spelgen evaluate --truth`.
+    """
     from spelgen.logs.read import write_logs
+    from spelgen.simulation.as_built import as_built as make_as_built
+    from spelgen.simulation.motion_file import read_motion
     from spelgen.simulation.simulate import simulate as simulate_arm
 
     arm = options.load(robot, joints, tip, angle_tolerance)
-    paths = {role: output / f"{role}.parquet" for role in ("train", "test")}
-    for path in paths.values():
-        options.require_free(path, force=force)
-    with progress_bar("simulating") as progress:
-        logs = simulate_arm(arm, seed=seed, progress=progress)
-    # logs are written in SI units under the URDF names: no mapping is needed to read them
     names = arm.arm.joint_names
+    motions = [read_motion(file, names) for file in motion or ()]
+    truth = output / "as_built.urdf"
+    paths = {role: output / f"{role}.parquet" for role in ("train", "test")}
+    for path in [*paths.values(), *([] if as_built is None else [truth, truth.with_suffix(".yaml")])]:
+        options.require_free(path, force=force)
+    if as_built is not None:
+        arm = make_as_built(arm, as_built, truth)
+        say(f"wrote {truth} and as_built.yaml, the true arm")
+    with progress_bar("simulating") as progress:
+        logs = simulate_arm(arm, seed=seed, motions=motions, progress=progress)
+    # logs are written in SI units with the URDF's joint names: no mapping is needed to read them
     for path, trajectories in zip(paths.values(), (logs.train, logs.test), strict=True):
         if trajectories:
             write_logs(path, trajectories, names)
@@ -128,7 +153,7 @@ def logs(
     The logs are not changed. The exit code is 1 if they cannot be used for training.
     """
     from spelgen.log_checks.check_logs import check_logs
-    from spelgen.logs.chunks import stream_logs
+    from spelgen.logs.read import read_bounded_logs
     from spelgen.render.logs_page import page
 
     # the URDF says which joints a mapping must name
@@ -137,7 +162,9 @@ def logs(
         options.require_free(suggest, force=force)
         mapping = _suggested(paths, arm, suggest)
     log_mapping = options.log_mapping(arm, mapping, accept)
-    result = check_logs(stream_logs(paths, arm, log_mapping), arm, log_mapping)
+    logs, notes = read_bounded_logs(paths, arm, log_mapping)
+    result = check_logs(logs, arm, log_mapping)
+    result = replace(result, findings=(*notes, *result.findings))
     if format == "text":
         say(result.text())
     else:
@@ -154,7 +181,7 @@ def logs(
         raise typer.Exit(FAILED)
 
 
-def _suggested(paths: list[Path], arm: LoadedArm, file: Path) -> Path:
+def _suggested(paths: list[Path], arm: ConfiguredArm, file: Path) -> Path:
     """Write the mapping that the first log suggests, and return its file; exit with 1 if the log lacks columns."""
     from spelgen.errors import collect
     from spelgen.logs.formats import log_files

@@ -1,12 +1,15 @@
-"""What everything has that moves like an arm: emitted modules, Pinocchio's models, models of least squares."""
+"""The interface of all dynamics of an arm: assembled models, models of Pinocchio, models of least squares."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeGuard
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeGuard, runtime_checkable
 
 import torch
 
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
+from spelgen.runtime.residual_dynamics import ResidualDynamics
+from spelgen.runtime.residual_terms import ResidualTerms
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -20,97 +23,80 @@ class RigidDynamics(Protocol):
 
     @property
     def n(self) -> int:
-        """How many joints."""
+        """Number of joints."""
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """M, (..., n, n), armature included."""
+        """Return M, (..., n, n), with armature."""
 
     def gravity(self, q: Tensor) -> Tensor:
-        """dV/dq, (..., n)."""
+        """Return dV/dq, (..., n)."""
 
     def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
-        """h: Coriolis, centrifugal and gravity torques without friction, (..., n)."""
+        """Return h, (..., n): Coriolis, centrifugal and gravity torques without friction."""
 
     def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
-        """What friction takes, (..., n)."""
+        """Return the friction torque, (..., n)."""
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
-        """qdd, (..., n), under the inputs tau."""
+        """Return qdd, (..., n), under the inputs tau."""
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
+        """Return the inputs, (..., n), that give qdd; of a passive joint, the torque that it lacks."""
 
 
-class ResidualModel(PortHamiltonian):
-    """A model with functions of joints and networks beside its rigid bodies; None where they were taken off."""
-
-    residuals: Any  # see `runtime.residual_terms`
-
-
+@runtime_checkable
 class FrictionState(Protocol):
     """Friction that depends on the state z of bristles, (..., n, elements) [rad, m]."""
 
-    elements: int
-    friction: Any  # the laws, see `runtime.friction_laws`
+    @property
+    def elements(self) -> int:
+        """Bristles per joint."""
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return z of joints that have long gone the way of qd."""
+        """Return z, (..., n, elements), of joints that have moved at qd for a long time."""
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """Return z after joints went one way by (..., n)."""
+        """Return z after a monotonic displacement of the joints, (..., n)."""
 
 
-def has_rigid_bodies(model: object) -> bool:
-    """Return whether a model is made of rigid bodies, with inertial parameters and friction by laws."""
-    return hasattr(model, "inertial_parameters")
+def residual_terms(model: object) -> ResidualTerms | None:
+    """Return the residual terms of a model; None of a model without any, or of one that they were removed from."""
+    return model.residuals if isinstance(model, ResidualDynamics) else None
 
 
-def has_residuals(model: object) -> TypeGuard[ResidualModel]:
-    """Return whether a model has functions of joints and networks beside its rigid bodies."""
-    return getattr(model, "residuals", None) is not None
-
-
-def has_friction_state(model: object) -> TypeGuard[FrictionState]:
-    """Return whether the model's friction depends on the state z of bristles, which all calls then take last."""
-    return getattr(model, "elements", 0) > 0
+def is_stateful(dynamics: object) -> TypeGuard[FrictionState]:
+    """Return whether friction depends on the state z of bristles, the last argument of all calls."""
+    return isinstance(dynamics, FrictionState) and dynamics.elements > 0
 
 
 def motors_of(model: Any) -> Tensor:
-    """Return C, (n, n): the drives' speeds are C qd; the identity where each drive moves its own joint alone."""
-    if hasattr(model, "motors"):
-        motors: Tensor = model.motors
-        return motors
-    return torch.eye(model.n).to(model.friction.nominal)
+    """Return C, (n, n): the motors rotate at C qd; the identity if each motor drives its own joint."""
+    return torch.eye(model.n).to(model.friction.nominal) if model.motors is None else model.motors
 
 
 def input_of(model: object) -> Literal["torque", "position"]:
-    """Return what a model's inputs are: torques, or commands of position servos."""
-    return "position" if hasattr(model, "servo") else "torque"
-
-
-def has_momentum(dynamics: object) -> TypeGuard[PortHamiltonian]:
-    """Return whether momenta can be its state (see ``PortHamiltonian``)."""
-    return hasattr(dynamics, "momentum")
+    """Return the quantity of the inputs of a model: torques, or commands of position servos."""
+    return "position" if isinstance(model, RigidBodyDynamics) and model.servo is not None else "torque"
 
 
 def sliding_memory(dynamics: object, qd: Tensor) -> Tensor:
-    """z, (..., n, K), of joints that have long gone the way of qd."""
-    if not has_friction_state(dynamics):
+    """Return z, (..., n, K), of joints that have moved at qd for a long time; K = 0 for friction without a state."""
+    if not is_stateful(dynamics):
         return qd.unsqueeze(-1)[..., :0]
     return dynamics.memory(qd)
 
 
 def memory_after(dynamics: object, z: Tensor, displacement: Tensor) -> Tensor:
-    """z after joints went one way by (..., n)."""
-    if not z.shape[-1] or not has_friction_state(dynamics):
+    """Return z after a monotonic displacement of the joints, (..., n)."""
+    if not z.shape[-1] or not is_stateful(dynamics):
         return z
     return dynamics.memory_after(z, displacement)
 
 
 def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
-    """z, (W, K, n, elements), along the samples q and qd, (W, K, n), each straight to the next.
+    """Return z, (W, K, n, elements), along the samples q and qd, (W, K, n), which are connected by straight lines.
 
-    It starts at z, (W, n, elements), by default as of joints that have long gone the way of the first qd.
+    z: initial state, (W, n, elements); None: of joints that have moved at the first qd for a long time.
     """
     states = [sliding_memory(dynamics, qd[:, 0]) if z is None else z]
     for moved in q.diff(dim=1).unbind(1):
@@ -119,49 +105,50 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
 
 
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
-    """z as what to give to these dynamics last, where they have a use for it.
+    """Return the last arguments of calls of these dynamics: z, if friction has a state, and the direction.
 
-    direction: (..., n) of dry friction without memory, where tau was filtered: its steps must be, too.
+    direction: of dry friction without bristles, (..., n); it is given for a filtered tau, as it must be filtered, too.
     """
-    if z is None or not has_friction_state(dynamics):
+    if z is None or not is_stateful(dynamics):
         return ()
-    if direction is None or not has_rigid_bodies(dynamics):
+    if direction is None or not isinstance(dynamics, RigidBodyDynamics):
         return (z,)
     return z, direction
 
 
 class VelocityState:
-    """Any dynamics where momenta are asked for: velocities take their place."""
+    """Any dynamics with velocities in place of momenta, for rollouts."""
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
-        self.elements = getattr(dynamics, "elements", 0)
-        if has_friction_state(dynamics):
+        self.elements = 0
+        if is_stateful(dynamics):
+            self.elements = dynamics.elements
             self.memory, self.memory_after = dynamics.memory, dynamics.memory_after
 
     def prepare(self) -> None:
-        """Nothing."""
+        """Return None: there is no parameter cache."""
 
     def at(self, q: Tensor, prepared: None = None) -> Tensor:
-        """Return q."""
+        """Return q: there is no configuration cache."""
         return q
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
-        """qd."""
+        """Return qd."""
         return qd
 
     def velocity(self, q: Tensor, p: Tensor) -> Tensor:
-        """qd."""
+        """Return qd."""
         return p
 
     def port_hamiltonian_rhs(
         self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: None, z: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """qd and qdd."""
+        """Return qd and qdd, (..., n) each."""
         past = known_past(self.dynamics, z)
         return p, self.dynamics.forward_dynamics(q, p, torch.zeros_like(q) if tau is None else tau, *past)
 
 
 def integrable(dynamics: RigidDynamics) -> Any:
-    """What a rollout integrates: the dynamics in momenta where they have these, else in velocities."""
-    return dynamics if has_momentum(dynamics) else VelocityState(dynamics)
+    """Return the dynamics that a rollout integrates: in momenta if they have them, else in velocities."""
+    return dynamics if isinstance(dynamics, PortHamiltonian) else VelocityState(dynamics)

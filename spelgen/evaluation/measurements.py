@@ -1,4 +1,4 @@
-"""The figures and curves of an evaluation, as evaluation.json has them."""
+"""The figures and curves of an evaluation: the content of evaluation.json."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from spelgen.evaluation.replay import Replay
 from spelgen.evaluation.torque import TorqueErrors
 from spelgen.evaluation.traces import Traces
 
-SCHEMA = 9
+SCHEMA = 10
 
 
 @dataclass(frozen=True, repr=False)
 class Measurements:
-    """Gather what `evaluate` measures; `to_dict` is evaluation.json.
+    """All measurements of `evaluate`; `to_dict` is evaluation.json.
 
-    cutoff: of the filter on the test logs [Hz], None without. substeps: of the integrator between samples, for the
-    model. parameters: its trained numbers. torque: by predictor, empty where the logs are too sparse. traces: the
-    curves behind the figures; those of predictions are the longest horizon's. replays: of commands, of an arm under
-    position servos. torque_steps: of joints whose torque is logged in steps of its own size, by name [Nm, N].
+    parameters: number of trained parameters. traces: curves behind the figures, of predictions over the longest
+    horizon. cutoff: of the filter of the test logs [Hz], None without one. substeps: integrator steps of the model per
+    sample interval. torque: errors by predictor, empty if the logs are too sparse for accelerations. torque_steps: see
+    `coarse_torques`. replays: of the commands of an arm under position servos. mass_errors: relative errors of M by
+    predictor, if the truth is known.
     """
 
     robot: str
@@ -41,6 +42,7 @@ class Measurements:
     torque: dict[str, TorqueErrors] = field(default_factory=dict)
     torque_steps: dict[str, float] = field(default_factory=dict)
     replays: tuple[Replay, ...] = ()
+    mass_errors: dict[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON form, versioned by `schema`."""
@@ -48,5 +50,5 @@ class Measurements:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, object]) -> Self:
-        """Return what `to_dict` gave. Raises ValueError where it is something else."""
+        """Return the measurements of a `to_dict`. Raises ValueError for other content."""
         return TypeAdapter(cls).validate_python(content)

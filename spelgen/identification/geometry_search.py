@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from spelgen.identification.log_geometry import Fit, GeometryProblem, Hypothesis, Vector3
-from spelgen.settings.tuning.identification import GEOMETRY
+from spelgen.identification.tuning import GEOMETRY
 
 STANDARD_GRAVITY = 9.81  # m/s^2
 RIGHT_ANGLE = np.pi / 2

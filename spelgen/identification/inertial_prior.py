@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spelgen.arm.arm import Arm
-from spelgen.settings.tuning.identification import GEOMETRY
+from spelgen.identification.tuning import GEOMETRY
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,9 +19,10 @@ from spelgen.dynamics.body_regressor import chain_regressor
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.regressor import body_chain
 from spelgen.identification.inertial_prior import InertialPrior, inertial_prior
-from spelgen.settings.tuning.identification import GEOMETRY, TUNING
+from spelgen.identification.tuning import GEOMETRY, TUNING
+from spelgen.logs.tuning import SAMPLES
 
-FRICTION = FrictionModel(coulomb_smoothing_velocity=TUNING.moving)
+FRICTION = FrictionModel(coulomb_smoothing_velocity=SAMPLES.moving)
 ARMATURE, VISCOUS, COULOMB = range(3)  # order of the effects of `FRICTION`
 Vector3 = tuple[float, float, float]
 

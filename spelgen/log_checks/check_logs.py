@@ -16,6 +16,7 @@ from spelgen.identification.drive_samples import DriveLog, DriveSamples
 from spelgen.identification.geometry_search import compare_readings
 from spelgen.identification.log_geometry import GeometryProblem, MotionSamples, varying
 from spelgen.identification.torque_delay import delay_of
+from spelgen.identification.tuning import HINTS
 from spelgen.listing import Listing, number
 from spelgen.log_checks.check_servo_logs import ServoLogs
 from spelgen.log_checks.gravity import fit_gravity, joined, state_samples
@@ -23,23 +24,24 @@ from spelgen.log_checks.remedies import GEOMETRY_CODES, geometry_finding, mapped
 from spelgen.log_checks.report import JointReport, LogReport, joint_report, percent, signal_tables
 from spelgen.log_checks.robot_checks import CHECKS, WITHOUT_GRAVITY, JointEvidence, torque_factors
 from spelgen.log_checks.statistics import Statistics, statistics
+from spelgen.log_checks.tuning import TUNING
 from spelgen.logs.bags import BAG
 from spelgen.logs.checks import Findings, LogChecks, run_checks
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
-from spelgen.settings.tuning.identification import HINTS
-from spelgen.settings.tuning.log_checks import TUNING
 
 if TYPE_CHECKING:
-    from spelgen.pipeline.loaded_arm import LoadedArm
+    from spelgen.arm.configured_arm import ConfiguredArm
     from spelgen.settings.log_mapping import LogMapping
 
 COUPLED, WRONG_VELOCITY = "coupled-motors", "velocity-is-no-derivative"
 ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED, *GEOMETRY_CODES}
 
 
-def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None) -> LogReport:
+def check_logs(
+    logs: Iterable[Trajectory], arm: ConfiguredArm, mapping: LogMapping | None = None
+) -> LogReport:
     """Report all about the logs of an arm, read once, one trajectory after another; nothing is repaired or raised.
 
     The report's `errors` prevent training. mapping: that of the logs, by default from the arm's settings; units that
@@ -81,7 +83,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
 
 
 def require_sound_logs(
-    logs: Sequence[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None
+    logs: Sequence[Trajectory], arm: ConfiguredArm, mapping: LogMapping | None = None
 ) -> list[Diagnostic]:
     """Return what `check_logs` finds of logs beside their arm; raise LogError where they cannot be trained on."""
     # the same checks as the command, so that a fit refuses what `spelgen logs` refuses
@@ -94,7 +96,7 @@ def require_sound_logs(
 class TorqueLogs:
     """Check logs of torques beside their arm, from samples that are kept while the logs go by."""
 
-    def __init__(self, arm: LoadedArm, mapping: LogMapping) -> None:
+    def __init__(self, arm: ConfiguredArm, mapping: LogMapping) -> None:
         self._arm, self._mapping, self._drives = arm, mapping, arm.actuation.drives()
         self._samples: list[np.ndarray] = []
         self._moving = DriveLog(arm.arm.joint_types, self._drives, Preprocessing())
@@ -183,7 +185,7 @@ class TorqueLogs:
             summary.notes.extend(late.notes)
 
 
-def _coupling_hint(arm: LoadedArm, coupling: Coupling, remaining: float) -> Diagnostic:
+def _coupling_hint(arm: ConfiguredArm, coupling: Coupling, remaining: float) -> Diagnostic:
     """Return a coupling that the logs show, in the sidecar's words."""
     names = arm.arm.joint_names
     pair = [coupling.moved_by, coupling.joint]

@@ -13,9 +13,9 @@ from spelgen.arm.arm import Arm
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.geometry_search import Comparison
 from spelgen.identification.log_geometry import Columns, Fit, Hypothesis
+from spelgen.identification.tuning import GEOMETRY
+from spelgen.log_checks.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.tuning.identification import GEOMETRY
-from spelgen.settings.tuning.log_checks import TUNING
 
 GRAVITY = ("gravity", "gravity-compensated")
 GEOMETRY_CODES = (

@@ -12,9 +12,10 @@ import numpy as np
 from spelgen.arm.arm import Coordinate
 from spelgen.labels import UNITS
 from spelgen.log_checks.report import MEASURES, JointReport
+from spelgen.log_checks.tuning import TUNING
 from spelgen.logs.checks import Check
 from spelgen.logs.trajectory import QUANTITIES
-from spelgen.settings.tuning.log_checks import TUNING
+from spelgen.logs.tuning import SIGNALS
 
 WITHOUT_GRAVITY = "torque-without-gravity"
 SAY_UNIT = "write 'units: {tau: ...}' or a 'gain' under 'logs' in the robot's YAML; 'Nm' confirms the unit"
@@ -81,7 +82,7 @@ def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) 
         if (
             not undeclared[k]
             or fit.factor is None
-            or not (is_loaded or (fit.correlation or 0.0) > TUNING.agreement)
+            or not (is_loaded or (fit.correlation or 0.0) > SIGNALS.agreement)
         ):
             continue
         factor = fit.factor

@@ -11,16 +11,17 @@ import copy
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 import torch
 
 from spelgen.dynamics.bristles import encoder_step
-from spelgen.errors import Diagnostic, LogError
+from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import digest
 from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
-from spelgen.fitting.levenberg_marquardt import levenberg_marquardt, start
+from spelgen.fitting.levenberg_marquardt import SolverState, initial_state, levenberg_marquardt
 from spelgen.fitting.objective import FitRequest, Objective, PreparedLogs, Status
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.laws import select_dead_zones, without_faint
@@ -29,11 +30,10 @@ from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
 from spelgen.fitting.servo.report import servo_record, solution
 from spelgen.fitting.servo.start import start_servos
+from spelgen.fitting.servo.tuning import ServoSolverTuning
 from spelgen.fitting.servo.windows import servo_windows
-from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.checks import check
 from spelgen.logs.trajectory import require_commands, require_joints
-from spelgen.settings.tuning.servo import ServoSolverTuning
 
 if TYPE_CHECKING:
     from spelgen.fitting.progress import TrainingProgress
@@ -60,25 +60,20 @@ class ServoObjective(Objective):
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
         request, model = self.request, self.model
-        if isinstance(request.logs, LargeLogs):
-            expected = "fewer logs, for example every tenth file"
-            raise LogError("logs of positions larger than memory", expected=expected)
         self._logs = request.logs
         for log in self._logs:
-            require_joints(log, model.facts.joints)
+            require_joints(log, model.joint_names)
             require_commands(log)
-        notes = check(self._logs, model.facts.joints, model.joint_types)
+        notes = check(self._logs, model.joint_names, model.joint_types)
         self._windows = servo_windows(self._logs, request.preprocessing)
         return PreparedLogs(
             config=request.config,
             preprocessing=request.preprocessing,
-            record={
-                "data_digest": digest(self._logs),
-                "training": [log.name for log in self._logs],
-                "validation": [],
-                "training_windows": len(self._windows.q),
-                "validation_windows": 0,
-            },
+            digest=digest(self._logs),
+            training=[log.name for log in self._logs],
+            validation=[],
+            training_windows=len(self._windows.q),
+            validation_windows=0,
             notes=notes,
         )
 
@@ -105,19 +100,20 @@ class ServoObjective(Objective):
         problem = self._problem
         while True:
             number = len(self._rounds)
-            x, damping = self._rounds[-1], DAMPING.first
+            show = partial(_show_progress, progress, number)
+            x, damping = self._rounds[-1], DAMPING.initial
             if number > 1:  # near the minimum from where the round before ended
                 damping = TUNING.later_damping
-            for state in levenberg_marquardt(
+            result = levenberg_marquardt(
                 problem,
-                start(problem, x, damping, self._steps),
+                initial_state(problem, x, damping, self._steps),
                 max_steps=TUNING.steps if number < ROUNDS else TUNING.last_steps,
-                least_gain=TUNING.gain,
-                relative_gain=TUNING.relative_gain,
-            ):
-                rms = float(state.residuals.square().mean().sqrt())
-                progress.round(number, ROUNDS, state.steps, rms)
-            x, self._steps = state.x, state.steps
+                min_decrease=TUNING.gain,
+                min_relative_decrease=TUNING.relative_gain,
+                callback=show,
+            )
+            show(result.state)
+            x, self._steps = result.state.x, result.state.steps
             if number == ROUNDS:
                 break
             # dead zones are chosen when gains are right: before, errors are those of the gains
@@ -158,7 +154,7 @@ class ServoObjective(Objective):
             problem.windows = replace(problem.windows, steps=self._windows.steps)
         if self._rounds:
             problem.linearise(x, problem.predicted_path(x))
-        errors = problem.residuals(x)
+        errors = problem.residual(x)
         problem.weigh(errors)
         problem.write(x)  # for the checkpoint: an interrupted fit is usable
         self._rounds.append(x)
@@ -180,3 +176,8 @@ class ServoObjective(Objective):
                 "steps": self._first_steps,
             },
         }
+
+
+def _show_progress(progress: TrainingProgress, number: int, state: SolverState[ServoParameters]) -> None:
+    rms = float(state.residual.square().mean().sqrt())
+    progress.round(number, ROUNDS, state.steps, rms)

@@ -15,14 +15,14 @@ import torch
 
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.errors import LogError
+from spelgen.fitting.servo.tuning import ServoWindowTuning
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 from spelgen.logs.filtering import derivative, velocities
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
-from spelgen.settings.tuning.servo import ServoWindowTuning
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = ServoWindowTuning()
 SHORTEST = 8  # samples, of which half are judged
@@ -145,7 +145,7 @@ class BodyLoad(NamedTuple):
     slopes: torch.Tensor
 
 
-def body_load(model: EmittedModel, path: Path) -> BodyLoad:
+def body_load(model: ArmModel, path: Path) -> BodyLoad:
     """Return that of the model as it is."""
     blocks: list[BodyLoad] = []
     with torch.no_grad():

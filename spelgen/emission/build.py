@@ -1,0 +1,34 @@
+"""From a URDF to a model in memory: the function ``build``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.design import Design
+from spelgen.emission.assemble import ArmModel, assemble
+from spelgen.emission.specify import make_spec
+from spelgen.urdf.robot import Assume
+
+
+def build(
+    arm: ConfiguredArm | str | Path,
+    preset: str | Path | Design = "hybrid",
+    *,
+    width: int = 64,
+    depth: int = 2,
+    assume: Assume = "kinematics",
+    seed: int = 0,
+) -> ArmModel:
+    """Return the model tailored to an arm, untrained; ``model.spec`` is its specification.
+
+    Args:
+        arm: the result of ``load_arm``, or the path of a URDF.
+        preset: name of a preset, path of a YAML file with a design, or a ``Design``.
+        width, depth: units of the hidden layers of networks, and their number.
+        assume: ``kinematics``: the structure for any inertial parameters; ``inertials``: for those of the URDF.
+        seed: of the initial weights of networks.
+
+    Raises what ``load_arm`` raises, and SettingsError for a design of no model.
+    """
+    return assemble(make_spec(arm, preset, width=width, depth=depth, assume=assume), seed)

@@ -1,0 +1,112 @@
+"""Constants of fits of position servos."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ServoWindowTuning:
+    """Windows that a servo fit predicts."""
+
+    # [s] Length of a window: gravity and friction need as long to become visible, and longer windows diverge with the
+    # delay.
+    length: float = 4.0
+    # [s] Burn-in at the beginning of a window, during which the friction state forms; its errors do not count.
+    settling: float = 1.0
+    # [1] Largest number of windows, evenly spread: ten minutes of motion.
+    count: int = 200
+
+
+@dataclass(frozen=True)
+class ServoPriorTuning:
+    """Standard deviations of the Gaussian prior of a servo fit, about the initial parameters."""
+
+    # [1] Logarithms of a joint's gains, armature and friction: a factor of seven.
+    logarithm: float = 2.0
+    # [1] Logarithm of the Stribeck velocity: with a wider prior friction that decreases at any speed absorbs offsets.
+    stribeck_velocity: float = 1.0
+    # [rad, m] Half of a dead zone: gears of hobby servos have a few mrad.
+    dead_zone: float = 0.02
+    # [s] Delay of the commands.
+    delay: float = 0.1
+    # [1] Log-Cholesky parameters of the bodies: 30 % in mass.
+    bodies: float = 0.3
+    # [1] Directions of the body parameters that are fitted, those with the largest effect on gravity; further ones
+    # stay within their prior.
+    body_directions: int = 6
+
+
+@dataclass(frozen=True)
+class ServoCostTuning:
+    """Cost of a servo fit and its derivatives."""
+
+    # [s] Largest correlation time of the errors; most measured ones are above 0.2 s.
+    correlation_time: float = 0.5
+    # [1] Finite-difference step of the parameters: rollouts in double precision lose half of their digits.
+    nudge: float = 1e-4
+
+
+@dataclass(frozen=True)
+class ServoSolverTuning:
+    """Convergence of a servo fit."""
+
+    # [1] Largest number of windows in all outer iterations but the last.
+    sparse_windows: int = 32
+    # [1] Largest number of steps of an outer iteration.
+    steps: int = 12
+    # [1] Steps of the last outer iteration, on all windows: it starts near the minimum of few windows.
+    last_steps: int = 2
+    # [1] Decrease of the cost below which an outer iteration, or the fit of a joint with and without dead zone, ends.
+    gain: float = 0.01
+    # [1] The same, relative to the cost: costs are high if the form of the model is wrong.
+    relative_gain: float = 1e-4
+    # [1] Damping of the first step of all outer iterations but the first; with 1e-3 kd ends 0.3 % off.
+    later_damping: float = 1e-5
+    # [1] Finite-difference step of the last derivatives: with shorter steps a joint that is about to slip seems
+    # determined.
+    last_nudge: float = 1e-3
+
+
+@dataclass(frozen=True)
+class ServoLawTuning:
+    """Selection of the joints that have a dead zone."""
+
+    # [1] Initial dead zone, as a fraction of the static error.
+    dead_zone_fraction: float = 0.25
+    # [1] Steps of the fit of a single joint.
+    steps: int = 6
+    # [1] Standard deviations by which a dead zone must be more probable; other forms of friction gain 3.
+    significance: float = 4.0
+    # [rad, m] Smallest dead zone: the step of a 12-bit encoder is 1.5e-3 rad.
+    least_dead_zone: float = 1e-3
+
+
+@dataclass(frozen=True)
+class ServoIntervalTuning:
+    """Intervals and identifiability of the fitted parameters."""
+
+    # [1] Smallest number of logs of which each is one block of the covariance: halves of one motion are not
+    # independent.
+    logs: int = 3
+    # [1] Smallest number of blocks into which fewer logs are divided.
+    stretches: int = 6
+    # [1] Variance inflation above which two effects are indistinguishable; on SO-101s it is below 30 or above 90.
+    variance_inflation: float = 50.0
+    # [1] Standard deviation of ratios due to the form of the friction model: `benchmarks/servo_recovery.py`.
+    law_deviation: float = 0.015
+    # [1] A value whose interval reaches beyond this factor is not determined.
+    open_factor: float = 1.25
+
+
+@dataclass(frozen=True)
+class ServoStartTuning:
+    """Initial parameters of a servo fit."""
+
+    # [1] Standard deviations of kp from gravity: samples of neighbouring windows are correlated.
+    significance: float = 8.0
+    # [1] Largest factor on the kp of the settings, or on 2 efforts per radian.
+    kp_range: float = 20.0
+    # [1] Smallest dry friction as a fraction of the nominal one; squared the smallest kd/kp, cubed the smallest
+    # armature/kp, so that their logarithms exist.
+    least: float = 0.05

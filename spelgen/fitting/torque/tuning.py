@@ -1,0 +1,147 @@
+"""Constants of fits to torques."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from spelgen.settings.fits import Adaptation, GaussianPrior
+
+# [1] Standard deviations of the friction parameters (logarithms, fractions) of one arm from day to day.
+DAY_TO_DAY = {
+    "sizes": 0.1,
+    "velocities": 0.1,
+    "fractions": 0.1,
+    "shared_sizes": 0.1,
+    "shared_velocities": 0.1,
+    "shared_fractions": 0.1,
+    "shared_friction": 0.3,
+}
+
+
+@dataclass(frozen=True)
+class TorqueTuning:
+    """Fits of rigid bodies to torques (`fitting.torque`)."""
+
+    # [1] Stride of the samples at 100 Hz: after the filter at 8 Hz every second one contains all information.
+    decimation: int = 2
+    # [1] Residual correlation length after the filter, in samples of 20 ms (0.06 s): so many consecutive errors count
+    # as one. White noise has this length after the filter. With 5, M(q) of the arms of `benchmarks/truth.py` is 5 %
+    # worse, and three seconds of the UR10e of `benchmarks/ablation.py` are better (torque nMSE 0.0080 -> 0.0062).
+    # Lengths estimated from the residual are unstable: a joint with a large residual gets a small weight, and its
+    # residual grows (Panda: 0.0015 -> 0.0030).
+    correlation_length: float = 3.1
+    # [1] The same for comparisons of friction models and for the selection of residual terms, in samples of 20 ms
+    # (0.1 s).
+    selection_correlation_length: float = 5.0
+    # [1] Outer iterations of noise and prior after the initial fit.
+    iterations: int = 5
+    # [1] Twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773,
+    # 1995).
+    strong_evidence: float = 6.0
+    # [1] The same for the Stribeck effect, saturation and load dependence of a joint (2 per parameter: Akaike, IEEE
+    # Trans. Autom. Control 19:716, 1974).
+    effects_evidence: float = 2.0
+    # [1] Largest number of steps before noise and prior are estimated.
+    initial_steps: int = 60
+    # [1] Largest number of iterations in which the noise is lowered to that of least squares.
+    annealing_iterations: int = 12
+    # [1] Noise of these iterations, as a fraction of the torque residual (a low_cost_robot with placeholder
+    # inertials: error of M(q) 0.44 -> 0.005).
+    annealing_fraction: float = 0.03
+    # [1] Outer iterations of a final fit, and of unconstrained least squares.
+    final_iterations: int = 2
+    # [1] Factor on the number of outer iterations while the noise of a joint decreases.
+    max_extension: int = 4
+    # [1] Noise divided by the noise of the previous iteration, above which the noise has converged.
+    noise_converged: float = 0.98
+    # [1] Largest number of steps in an outer iteration.
+    iteration_steps: int = 5
+    # [1] Relative decrease of the cost below which an outer iteration ends.
+    min_relative_decrease: float = 1e-4
+    # [1] Alternations of rigid bodies and residual terms.
+    alternations: int = 3
+    # [1] Evenly spread samples of the first outer iterations; the last ones use all samples.
+    initial_samples: int = 2**10
+    # [1] Largest number of windows of 5 samples from which the scales of the motion are computed.
+    max_windows: int = 2**12
+    # [1] Largest number of validation windows on which the fitted model is measured.
+    validation_windows: int = 2**8
+    # [1] Samples for the selection of residual terms.
+    residual_samples: int = 2**14
+    # [1] Directions with less than this fraction of the largest curvature are not determined by the samples.
+    min_relative_curvature: float = 1e-10
+    # [1] Smallest noise, as a fraction of a torque's range: noise-free samples are fitted to four digits.
+    min_noise: float = 1e-4
+    # [1] Smallest fraction of independent errors that remains, however many parameters are determined.
+    min_error_fraction: float = 0.1
+    # [1] Fraction of the squared residual that friction compensation by a drive (torque that increases with velocity)
+    # must explain.
+    min_explained: float = 0.1
+    # [1] Standard deviations by which the coefficient of friction compensation must differ from zero.
+    min_significance: float = 4.0
+    # [1] Smallest standard deviation of friction compensation, as a fraction of that of the torque: delays of
+    # milliseconds have a similar but smaller effect.
+    min_compensation: float = 0.05
+    # [1] Samples of one block: some 100 MB for seven joints with their derivatives.
+    block: int = 2**13
+    # [B] Largest size of the regressors: 70,000 samples of six joints; of more samples a subset is used.
+    regressor_bytes: float = 4e8
+    # [1] Largest step of a body, as a fraction of the distance to physically inconsistent parameters.
+    body_step: float = 0.3
+    # [1] Priors about the run that is adapted, by what is adapted. load: mass known to a factor of twenty (with 10 in
+    # place of 3 half a second of motion has an error of 27 times the variance of the torque, UR10e). friction: warmth
+    # changes the friction of all joints by tens of per cent, of a single joint less (Bittencourt and Gunnarsson, J.
+    # Dyn. Sys. Meas. Control 134:051013, 2012). unit: units of one make also differ by a few per cent in mass.
+    priors: Mapping[Adaptation, GaussianPrior] = field(
+        default_factory=lambda: {
+            "load": GaussianPrior(bodies=3.0),
+            "friction": GaussianPrior(**DAY_TO_DAY),
+            "unit": GaussianPrior(**DAY_TO_DAY, bodies=0.1, gains=0.1, armature=0.1, shared_armature=0.1),
+        }
+    )
+
+
+@dataclass(frozen=True)
+class ResidualTuning:
+    """Selection of residual terms (`fitting.torque.selection`)."""
+
+    # [1] Contiguous blocks of samples, each held out once.
+    folds: int = 10
+    # [1] Correlation lengths that are left out between fitted and held-out samples: 0.5 s with
+    # `TorqueTuning.selection_correlation_length`.
+    gap: float = 5.0
+    # [1] Standard errors that the mean error reduction over the blocks must exceed: p = 0.01 of Student's t with nine
+    # degrees of freedom.
+    standard_errors: float = 2.82
+    # [1] Smallest error reduction of a residual term.
+    min_reduction: float = 1e-3
+    # [1] A later term is preferred to the best one so far only if its residual is below this fraction of the residual
+    # of the best one.
+    preference_ratio: float = 0.9
+    # [1] Largest number of fixed-point iterations of the marginal likelihood.
+    max_iter: int = 30
+    # [1] Relative change of the noise at which these iterations end.
+    tolerance: float = 1e-3
+    # [1] Samples to which networks are fitted.
+    network_samples: int = 2**12
+    # [1] Evaluations of the loss after which a network without error reduction is discarded.
+    network_probe_evaluations: int = 20
+    # [1] Evaluations of the loss of a network.
+    network_evaluations: int = 100
+
+
+@dataclass(frozen=True)
+class TorqueReportTuning:
+    """Warnings of a torque fit (`fitting.torque.report`)."""
+
+    # [1] Relative standard deviation above which logs do not determine an inertia.
+    undetermined: float = 0.5
+    # [1] Torque residual divided by the inertial torque of a joint, above which the predicted motion is unreliable.
+    weak_acceleration: float = 2.0
+    # [1] Positions at which inertias are evaluated.
+    positions: int = 50
+
+
+TUNING = TorqueTuning()
+SELECTION = ResidualTuning()

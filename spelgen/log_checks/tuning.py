@@ -1,0 +1,65 @@
+"""Constants of the checks of logs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class LogCheckTuning:
+    """Thresholds of notes and errors about logs beside their robot."""
+
+    # [rad, m] A position limit may be exceeded by this much: rounding.
+    limit_rounding: float = 1e-3
+    # [1] A joint moves one way only if its speed in the other direction stays below this fraction of its largest.
+    one_way: float = 0.1
+    # [1] A velocity or effort limit may be exceeded by this fraction: noise.
+    limit_noise: float = 0.01
+    # [1] Standard deviation of the gravity torque, as a fraction of the measured torque's, from which on gravity must
+    # be visible (UR10e).
+    loaded: float = 0.2
+    # [1] Correlation from which on gravity is part of the torque; with a correlation below 1 - seen it is not.
+    seen: float = 0.7
+    # [1] Multiple of the URDF's gravity torque that wrong inertials do not explain.
+    unusual_factor: float = 5.0
+    # [1] Multiple of the URDF's gravity torque that only another unit explains.
+    impossible_factor: float = 10.0
+    # [1] Multiple of a drive's effort limit that no drive produces in any unit.
+    beyond_drives: float = 20.0
+    # [1] Samples per trajectory for gravity; gravity and friction change slowly.
+    gravity_samples: int = 400
+    # [1] A quantised signal with fewer levels gives no reliable magnitude.
+    levels: float = 10.0
+    # [1] Fraction of a step, and of the levels of a signal, that may be off a quantisation grid.
+    step_tolerance: float = 0.05
+    # [1] Samples of all trajectories together for gravity.
+    all_gravity_samples: int = 6000
+    # [1] A column is dependent if the part that other columns do not span is below this fraction of its length.
+    dependent: float = 1e-8
+    # [1] Trajectories that a page draws.
+    examples: int = 2
+    # [1] Trajectories that a terminal and a notebook list.
+    shown: int = 20
+
+
+@dataclass(frozen=True)
+class ServoLogTuning:
+    """Thresholds of notes about logs of commanded positions."""
+
+    # [s] Smallest delay of positions after commands that is searched; a negative one means shifted rows.
+    earliest_delay: float = -0.1
+    # [s] Largest delay that is searched; measured delays of cheap servos are below 0.2 s.
+    latest_delay: float = 0.4
+    # [s] Step of the searched delays: half a sample at 50 Hz.
+    delay_step: float = 0.01
+    # [s] Time of constant command before a joint can be at rest; measured on an SO-101.
+    rest_time: float = 0.25
+    # [rad, m] Standard deviation below which a command is constant.
+    idle_command: float = 1e-2
+    # [1] Correlation below which a position does not track its command.
+    ignores: float = 0.5
+    # [Hz] Sample rate below which delays and friction are not visible.
+    sparse_rate: float = 20.0
+
+
+TUNING, SERVO_LOGS = LogCheckTuning(), ServoLogTuning()

@@ -1,0 +1,97 @@
+"""Constants of reading, checking and preparing logs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class LogTuning:
+    """Reading, cutting, filtering and differentiation of logs."""
+
+    # [B] Numbers that a fit keeps of all logs together: 25 minutes of seven joints at 1 kHz, or 76,000 samples of a
+    # torque fit, about as many as its last iterations use. Windows of five samples take five times the memory.
+    kept_bytes: int = 2**28
+    # [1] Largest number of samples of a segment of logs that exceed `kept_bytes`: 16 s at 1 kHz, long compared with
+    # filter transients.
+    segment_samples: int = 2**14
+    # [1] Rows of a row group of the Parquet files that are written.
+    row_group: int = 2**16
+    # [B] Largest unpacked size of an NPZ archive: zeros are packed a thousandfold.
+    npz_bytes: int = 2**30
+    # [rad, rad/s, Nm; m, m/s, N] Largest magnitude of a signal; larger ones have a wrong unit.
+    largest_value: float = 1e9
+    # [1] A 0 between samples whose magnitude exceeds this multiple of the typical step is a dropout: continuous
+    # signals approach 0 gradually.
+    dropout: float = 20.0
+    # [1] A step longer than this multiple of the median step is a gap; jitter of USB loggers stays below 3.
+    gap: float = 4.0
+    # [Hz] Cutoff of the low-pass filter by default: rigid-body motion lies below, ripple and quantisation above
+    # (UR10e).
+    automatic_cutoff: float = 8.0
+    # [Hz] Logs of a lower rate are interpolated by cubics, and their windows are not filtered.
+    dense_rate: float = 50.0
+    # [1] Relative error of a sample rate: nominal 50 Hz are 49.95 Hz with one logger and 50.1 Hz with another.
+    clock_error: float = 0.002
+    # [1] Order of the Butterworth low-pass, run forward and backward as in the logs' published protocols.
+    filter_order: int = 4
+    # [1] Samples of a window per period of the cutoff; two is Nyquist's bound.
+    samples_per_period: int = 3
+    # [s] Span of the cubic that differentiates encoder positions: a trade-off of noise and lag (SO-101).
+    derivative_span: float = 0.18
+    # [1] Largest first time of a clock that starts with the recording, in any unit of time; a larger one is a date.
+    longest_clock: float = 1e8
+    # [1] Bars of a chart of the coverage of logs.
+    bins: int = 24
+    # [B] Beginning of a CSV file from which encoding, delimiter and decimal point are detected.
+    csv_head: int = 2**16
+    # [1] Columns that a message lists: enough to see how they are named.
+    listed: int = 5
+    # [s] Shortest time between samples: its fourth power is a floating-point number.
+    shortest_step: float = 1e-15
+    # [s] Largest time, for the same reason.
+    latest: float = 1e24
+
+
+@dataclass(frozen=True)
+class SignalCheckTuning:
+    """Thresholds of the checks of the signals of a log."""
+
+    # [1] Samples over which q and the integral of qd are compared: quantisation is averaged out.
+    increments: int = 10
+    # [rad, m] Motion according to qd from which on a constant q is called frozen.
+    drift: float = 0.05
+    # [1] Correlation from which on two signals are equal up to a factor; the factor may differ from 1 by the
+    # remainder.
+    agreement: float = 0.9
+    # [1] A factor within this ratio of the factor of a unit is the factor of the unit.
+    unit_factor: float = 1.25
+    # [s] Largest median time between samples: no arm is sampled at less than 2 Hz.
+    slowest_step: float = 0.5
+
+
+@dataclass(frozen=True)
+class SampleTuning:
+    """Samples of the dynamics: filtered, and on a common grid of time."""
+
+    # [Hz] Rate of the common grid: twelve times the cutoff of the low-pass filter.
+    sample_rate: float = 100.0
+    # [rad/s, m/s] A joint is at rest below this speed; samples of an arm at rest determine no dynamics.
+    moving: float = 0.02
+    # [s] Shortest gap-free piece: shorter ones consist of filter transients.
+    shortest_piece: float = 1.0
+    # [1] Periods of the filter's cutoff at both ends of a piece that are left out: the filter's error there is 20
+    # times the noise.
+    unsettled: float = 0.75
+
+
+@dataclass(frozen=True)
+class ServoRolloutTuning:
+    """Integration of motion under position servos."""
+
+    # [s] Largest step; longer ones bias armatures by a few per cent (measured).
+    step: float = 3.4e-3
+
+
+TUNING, SIGNALS, SAMPLES = LogTuning(), SignalCheckTuning(), SampleTuning()
+SERVO_ROLLOUT = ServoRolloutTuning()
