@@ -3,12 +3,12 @@
     python benchmarks/log_geometry.py [--arms rpr,ur10e] [--folder ../shared/arms] [--draws 3] [--faults 12] [--first 0]
 
 Every draw is an arm with inertials 30 % wrong in the URDF, friction of one of five kinds, noise of 0.5 to 5 % of the
-torques, and 20 s of excitation or pick-and-place. The log is compared as it is, and with single faults drawn at random:
+torques, and 20 s of excitation or pick-and-place. The log is compared unchanged, and with single random faults:
 the sense of a joint's position, torque or both, an order of all columns or of the torques, a zero offset (a multiple of
 90 degrees, or any), and another gravity than the settings state.
 
 A fault is named if the first reading is the right one, named with others if it is among the readings that the
-message lists, and missed if nothing is said. It is invisible if the evidence for the right reading is below the
+message lists, and not found without a finding. It is invisible if the evidence for the right reading is below the
 threshold even with the inertials of the true arm: a vertical first axis, a wrist that is symmetric.
 """
 
@@ -140,7 +140,7 @@ def is_same(one: Hypothesis, other: Hypothesis) -> bool:
 def result_of(
     arm: ConfiguredArm, true: ConfiguredArm, samples: MotionSamples, kind: str, right: Hypothesis
 ) -> str:
-    """Return how a fault is told, one of `RESULTS`."""
+    """Return the result for a fault, one of `RESULTS`."""
     drives, chain, ideal = arm.actuation.drives(), arm.arm, true.arm
     if kind == "gravity":  # the log is right, and the settings state another gravity
         chain, ideal = replace(chain, gravity=right.gravity), replace(ideal, gravity=right.gravity)

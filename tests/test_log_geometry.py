@@ -1,6 +1,6 @@
 """`spelgen logs` names the lines for a log whose columns, zeros or gravity are others than the settings state.
 
-Faults are drawn: joint, order, angle and direction. Every line is written beside the URDF, the log is read again, and
+Faults are drawn: joint, order, angle and direction. Every line is written into the settings, the log is read again, and
 it is then the log without the fault. Inertials of the URDF are 30 % wrong, torques have noise, and friction.
 """
 
@@ -144,7 +144,7 @@ def test_a_zero_offset_is_named_to_a_tenth_of_a_radian(arm, angle, tmp_path):
     turning = [k for k, x in enumerate(arm.arm.coordinates) if x.kind == "revolute"]
     k = turning[1] if len(turning) > 2 else 2
     log = recorded(arm, int(rng.integers(1000)))
-    if arm.arm.name == "rpr":  # its last link is rigidly turned: the masses alone could make up for it
+    if arm.arm.name == "rpr":  # its last link is rigidly turned: other masses could make up for it
         assert check_logs([turned(log, k, np.deg2rad(angle))], arm).errors == ()
         return
     wrong = turned(log, k, np.deg2rad(angle))
@@ -163,7 +163,7 @@ def turned(log, k, angle):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_direction_of_gravity_is_found(arm, seed, tmp_path):
-    """On a wall, on a ceiling, and anyhow: the torques are those of a base that is mounted so."""
+    """On a wall, on a ceiling, and anyhow: torques of a base with this mounting."""
     rng = np.random.default_rng(seed)
     direction = [np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), rng.standard_normal(3)][seed]
     gravity = 9.81 * direction / np.linalg.norm(direction)

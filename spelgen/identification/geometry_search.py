@@ -19,7 +19,7 @@ STEP = 1e-4  # [rad, m] of finite differences
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Readings of a log that are better than the log as it is, the best first; they explain it equally well."""
+    """Readings of a log that are better than the unchanged log, the best first; they explain it equally well."""
 
     unchanged: Fit
     better: tuple[Fit, ...]
@@ -31,7 +31,7 @@ class Comparison:
 
 
 def compare_readings(problem: GeometryProblem, factors: Sequence[np.ndarray] = ()) -> Comparison:
-    """Return the readings of a log that are significantly better than the log as it is.
+    """Return the readings of a log that are significantly better than the unchanged log.
 
     factors: (n,) each, of the torques, as another unit or motor constant has them.
     """
@@ -179,7 +179,7 @@ def _with_offset(problem: GeometryProblem, base: Fit, joint: int, revolute: bool
             best, offset = exact, right
     if abs(offset) < (GEOMETRY.min_angle if revolute else GEOMETRY.min_shift):
         return []
-    # where the masses alone can make up for an offset, the angle would be no better than the masses of the URDF
+    # if other masses can make up for an offset, the angle would be no better than the masses of the URDF
     if best.misfit > base.misfit - GEOMETRY.needed / 2:
         return []
     is_right_angle = offset in (RIGHT_ANGLE, -RIGHT_ANGLE, -np.pi)
@@ -187,7 +187,7 @@ def _with_offset(problem: GeometryProblem, base: Fit, joint: int, revolute: bool
 
 
 def _with_gravity(problem: GeometryProblem, base: Fit) -> list[Fit]:
-    """Return the fits with the best direction of gravity, and with the part of gravity that is left in the torques."""
+    """Return the fits with the best direction of gravity, and with the part of gravity in compensated torques."""
     present = np.array(base.hypothesis.gravity)
     size = float(np.linalg.norm(present))
     fits = []
@@ -225,7 +225,7 @@ UNIT_GRAVITIES: tuple[Vector3, ...] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1
 
 
 def _best_direction(problem: GeometryProblem, fit: Fit) -> Fit:
-    """Return the fit with the best direction of gravity near that of a fit."""
+    """Return the fit with the best direction of gravity near the direction of a fit."""
     size = float(np.linalg.norm(fit.hypothesis.gravity))
     for _ in range(GEOMETRY.refinements):
         gravity = np.array(fit.hypothesis.gravity)
@@ -241,7 +241,7 @@ def _best_direction(problem: GeometryProblem, fit: Fit) -> Fit:
 
 
 def _with_compensation(problem: GeometryProblem, base: Fit) -> list[Fit]:
-    """Return the fit with the part of gravity that is left in torques from which a controller has taken it."""
+    """Return the fit with the part of gravity that a compensating controller has not taken out of the torques."""
     present = np.array(base.hypothesis.gravity)
     without = _gravity(problem, base, np.zeros(3))
     column = (_gravity_columns(problem, without) @ present)[..., None]

@@ -42,7 +42,7 @@ class MotionSamples(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """What a mapping makes of the columns of n joints, (n,) each; see `Hypothesis`."""
+    """Scales and offsets from the columns of a log to n joints, (n,) each; see `Hypothesis`."""
 
     motion_scale: np.ndarray
     torque_scale: np.ndarray
@@ -59,7 +59,7 @@ class Columns(NamedTuple):
 class Hypothesis:
     """A reading of the columns of n joints, and a gravity.
 
-    codes: of the changes, as findings have them; none: the log as it is. q of joint k is motion_scale[k] times the
+    codes: of the changes, as findings have them; none: the unchanged log. q of joint k is motion_scale[k] times the
     column of joint motion_source[k], plus offset[k] [rad, m]; its torque is torque_scale[k] times the column of joint
     torque_source[k]. gravity: in the frame of the root link [m/s^2].
     """
@@ -74,7 +74,7 @@ class Hypothesis:
 
     @classmethod
     def unchanged(cls, arm: Arm, columns: Columns | None = None) -> Hypothesis:
-        """Return the hypothesis that the log means what its mapping states; None: SI units and no offsets."""
+        """Return the hypothesis of the unchanged log. columns: of its mapping; None: SI units and no offsets."""
         joints = len(arm.coordinates)
         order = np.arange(joints)
         scales = columns or Columns(np.ones(joints), np.ones(joints), np.zeros(joints))
@@ -83,7 +83,7 @@ class Hypothesis:
 
     @property
     def motion_key(self) -> tuple[bytes, Vector3]:
-        """What the regressor depends on."""
+        """Key of the regressor: motion and gravity."""
         arrays = (self.motion_source, self.motion_scale, self.offset)
         return b"".join(x.tobytes() for x in arrays), self.gravity
 
@@ -104,8 +104,8 @@ class Equations(NamedTuple):
 class Fit:
     """Least squares with the prior under a hypothesis.
 
-    cost: negative log posterior up to a constant. misfit: the part of the cost that the torques make. parameters: (K,),
-    those of the bodies first. errors: (n,) mean squared residual of each joint, relative to the variance of its torque.
+    cost: negative log posterior up to a constant. misfit: its part from the torque residual. parameters: (K,), inertial
+    parameters first. errors: (n,) mean squared residual of each joint, relative to the variance of its torque.
     """
 
     hypothesis: Hypothesis
@@ -133,7 +133,7 @@ class GeometryProblem:
             samples: of its motion, with torques at the joints.
             speeds: C (n, n) of the motors, see `Drives`.
             seconds: duration of the logs [s], which limits the number of independent errors.
-            columns: what the mapping of the logs makes of their columns.
+            columns: scales and offsets of the mapping of the logs.
         """
         self.arm, self.speeds = arm, speeds
         self.samples = samples if columns is None else columns.logged(samples)
@@ -177,7 +177,7 @@ class GeometryProblem:
         return self._solved(hypothesis, normal, right, total, variance)
 
     def step(self, fit: Fit, columns: np.ndarray) -> np.ndarray:
-        """Return the Gauss-Newton step (D,) of what the torques of a fit depend on by columns (S, n, D)."""
+        """Return the Gauss-Newton step (D,) of parameters with the torque Jacobian `columns` (S, n, D)."""
         rows, _ = self.equations(fit.hypothesis)
         tau = fit.hypothesis.signals(self.samples).tau
         variance = np.where(varying(tau), tau.var(axis=0), np.inf)
@@ -249,7 +249,7 @@ class GeometryProblem:
 
 
 def varying(tau: np.ndarray) -> np.ndarray:
-    """Return which torques (S, n) vary by more than the rounding of a constant, (n,)."""
+    """Whether torques (S, n) vary by more than the rounding of a constant, (n,)."""
     return np.asarray(tau.std(axis=0) > TUNING.negligible * np.abs(tau).max(axis=0))
 
 

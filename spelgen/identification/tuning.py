@@ -76,7 +76,7 @@ class GeometryTuning:
 
     # [s] residuals of recorded arms stay correlated for about 0.2 s: the likelihood counts one error in that time
     correlation_time: float = 0.2
-    # at most so many errors per joint: what a rigid model lacks does not average out in long logs
+    # at most this number of errors per joint: the errors of a rigid model do not average out in long logs
     max_errors: float = 150.0
     # [1] of the torque's variance, is always left: friction models err by 2 % of the torque
     error_floor: float = 4e-4
@@ -100,7 +100,7 @@ class GeometryTuning:
     implausible_friction: float = 10.0
     # cost by which another hypothesis must be better: the recorded arms' best wrong one gains 16
     needed: float = 20.0
-    # Cost by which two hypotheses must differ for one to be named alone.
+    # Cost by which two hypotheses must differ for only one to be named.
     ambiguous: float = 8.0
     # That a reading has at most, an order of joints as one.
     changes: int = 3

@@ -1,4 +1,4 @@
-"""Report all that logs show beside a robot, and what is odd about it."""
+"""Report the content of the logs of a robot, and findings about it."""
 
 from __future__ import annotations
 
@@ -85,16 +85,16 @@ def check_logs(
 def require_sound_logs(
     logs: Sequence[Trajectory], arm: ConfiguredArm, mapping: LogMapping | None = None
 ) -> list[Diagnostic]:
-    """Return what `check_logs` finds of logs beside their arm; raise LogError where they cannot be trained on."""
-    # the same checks as the command, so that a fit refuses what `spelgen logs` refuses
+    """Return the findings of `check_logs` about an arm and its logs; raise LogError where they cannot be trained on."""
+    # the same checks as the command: a fit and `spelgen logs` refuse the same logs
     report = check_logs(logs, arm, mapping)
     collect(report.errors)
-    # a fit itself tells what logs show without the arm, and finds the delay of torques
+    # a fit itself reports checks that need no arm, and finds the delay of torques
     return [note for note in report.findings if note.code in ABOUT_ARM]
 
 
 class TorqueLogs:
-    """Check logs of torques beside their arm, from samples that are kept while the logs go by."""
+    """Check logs of torques with the model of their arm, from samples that are kept while the logs go by."""
 
     def __init__(self, arm: ConfiguredArm, mapping: LogMapping) -> None:
         self._arm, self._mapping, self._drives = arm, mapping, arm.actuation.drives()
@@ -209,7 +209,7 @@ def _physics_table(joints: Sequence[JointReport]) -> Listing:
     rows = []
     for joint in joints:
         fit = joint.gravity
-        # beside a low correlation the factor means nothing
+        # with a low correlation the factor means nothing
         is_seen = abs(fit.correlation or 0) > TUNING.seen
         velocity = number(joint.velocity_factor), number(joint.velocity_correlation)
         rows.append((joint.name, *velocity, percent(fit.explained), number(fit.factor if is_seen else None)))

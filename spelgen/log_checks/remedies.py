@@ -1,4 +1,4 @@
-"""Lines of the settings that make a log mean what a better reading of it found, and the finding in words."""
+"""Lines of the settings for a better reading of a log, and the finding in words."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ RIGHT = "joints, zeros, units and gravity as the URDF and the settings state the
 
 
 def mapped_columns(arm: Arm, mapping: LogMapping, drives: Drives) -> Columns:
-    """Return what a mapping, and gears of single joints, make of the columns of an arm."""
+    """Return scales and offsets of the columns of an arm, by its mapping and the gears of single joints."""
     joints = arm.joint_names
     gears = np.diag(drives.inputs) if np.count_nonzero(drives.inputs) == len(joints) else np.ones(len(joints))
     return Columns(
@@ -106,7 +106,7 @@ def _flow(value: object) -> str:
 
 
 def described(reading: Hypothesis, unchanged: Hypothesis, arm: Arm) -> tuple[str, str]:
-    """Return the joints that a reading changes, as an error names its place, and what the log contains instead."""
+    """Return the joints that a reading changes, as an error names its place, and the content of the log instead."""
     senses = np.sign(reading.motion_scale / unchanged.motion_scale)
     factors = reading.torque_scale / unchanged.torque_scale
     angles = np.where(senses == 1, reading.offset - unchanged.offset, 0.0)
@@ -166,7 +166,7 @@ def _gravity_text(code: str, reading: Hypothesis, unchanged: Hypothesis) -> str:
 
 
 def evidence(best: Fit, unchanged: Fit) -> str:
-    """Return how much better a reading explains the torques: mean over joints of the squared error."""
+    """Return the error reduction of a reading: mean over joints of the squared error."""
     if best.hypothesis.codes == ("torque-unit",):
         return "by the URDF's gravity"
     before, after = unchanged.errors.mean(), best.errors.mean()

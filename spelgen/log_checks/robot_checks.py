@@ -22,7 +22,7 @@ SAY_UNIT = "write 'units: {tau: ...}' or a 'gain' under 'logs' in the robot's YA
 
 
 class JointEvidence(NamedTuple):
-    """Hold a joint, and what all trajectories show of it: the subject of the checks against the robot."""
+    """A joint and its report over all trajectories: the subject of the checks against the robot."""
 
     coordinate: Coordinate
     report: JointReport
@@ -39,7 +39,7 @@ class JointEvidence(NamedTuple):
         fit = self.report.gravity
         # of a joint that gravity hardly loads the factor is chance
         if fit.factor is None or fit.correlation is None or (fit.relative_deviation or 0.0) < TUNING.loaded:
-            return nan, nan  # which no comparison takes for odd
+            return nan, nan  # every comparison with NaN is false
         return fit.factor, fit.correlation
 
 
@@ -114,7 +114,7 @@ def find_beyond_drive(joint: JointEvidence) -> str | None:
 def find_coarse(joint: JointEvidence) -> str | None:
     """Find signals that are quantised to steps of their own size."""
     for name in QUANTITIES:
-        # a step alone says little: 0.01 Nm is fine for a shoulder and all there is for a wrist
+        # a step has to be compared with the range: 0.01 Nm is fine for a shoulder and all there is for a wrist
         step, width = joint.report.steps[name], joint.report.high[name] - joint.report.low[name]
         if step is not None and width < TUNING.levels * step:
             return (
@@ -133,7 +133,7 @@ def find_stop(joint: JointEvidence) -> str | None:
 
 
 def find_one_way(joint: JointEvidence) -> str | None:
-    """Find joints that move one way only: by it dry friction is one number with what loads the joint."""
+    """Find joints that move one way only: dry friction is then one number with the load of the joint."""
     slower, faster = sorted((-joint.report.low["qd"], joint.report.high["qd"]))
     if slower >= TUNING.one_way * faster:
         return None
