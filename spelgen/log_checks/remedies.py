@@ -126,7 +126,7 @@ def described(reading: Hypothesis, unchanged: Hypothesis, arm: Arm) -> tuple[str
             "torque-sense": ((factors < 0) & (senses > 0), "torques of the opposite sense"),
             "torque-unit": (
                 np.abs(factors) != 1,
-                f"torques of another unit, {1 / factors.max():.3g} times as large",
+                f"torques of another unit, {1 / _extreme(factors):.3g} times as large",
             ),
             "joint-zero": (angles != 0, f"positions with another zero, by {_angle_text(arm, angles)}"),
         }[code]
