@@ -255,7 +255,7 @@ def delan_characters(read: Read, folder: Path) -> None:
 class Link:
     """A link and the joint that moves it: origin (xyz [m], roll [rad]), centre of mass [m], mass [kg], effort [Nm].
 
-    Kinematics are the authors', masses are made up, inertias those of spheres of 6 cm.
+    Kinematics are the authors', masses are made up, inertias of spheres of 6 cm.
     """
 
     xyz: str

@@ -257,7 +257,7 @@ def main() -> None:
     fit = spelgen.load_run(asked.run)
     if fit.record.servo is None or fit.urdf is None:
         parser.error(f"{asked.run} has to be the finished run of an arm under position servos, with its URDF")
-    options = fit.model.facts.options
+    options = fit.model.spec.options
     arm = spelgen.load_arm(fit.urdf, options.joints, options.tip, options.angle_tolerance)
     logs = spelgen.read_logs(asked.train, arm, fit.record.mapping)
     windows = servo_windows(logs, fit.preprocessing, WINDOWS)

@@ -461,7 +461,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def by_better_least_squares(row: dict[str, Any], key: str) -> float:
-    """Return an error of the default model, by that of the better of both least squares."""
+    """Return an error of the default model, by the error of the better of both least squares."""
     errors = {name: row["results"][name][key] for name in OURS}
     return float(errors["hybrid"] / min(errors["identify"], errors["identify --memory"]))
 

@@ -412,7 +412,7 @@ def test_bare_command_shows_the_help(spelgen):
 
 def test_help_shows_whole_sentences(spelgen):
     commands = spelgen("--help").stdout.partition("Commands:\n")[2].splitlines()
-    assert len(commands) == 14
+    assert len(commands) == 13
     assert all(line.endswith(".") and not line.endswith("...") for line in commands)
 
 

@@ -131,7 +131,7 @@ HOSTILE = [
 
 @FORMS
 def test_no_text_of_the_urdf_becomes_code(tmp_path, standalone):
-    """With hostile names the syntax tree is that of plain names, except for string constants."""
+    """With hostile names the syntax tree equals the tree for plain names, except for string constants."""
     from xml.sax.saxutils import quoteattr
 
     def written(robot, names, file):

@@ -238,8 +238,9 @@ def test_a_model_that_runs_away_has_no_error_but_null(run, tmp_path):
     copy.mkdir()
     for path in run.iterdir():
         (copy / path.name).write_bytes(path.read_bytes())
-    # a gravity of 1e9 Nm; damping of any size is integrated
-    torch.save(weights | {"weight": torch.tensor([1e9, 1e9], dtype=torch.float64)}, copy / "model.pt")
+    # a gravity of 1e12 Nm; damping of any size is integrated
+    name = "potential.weights.1"
+    torch.save(weights | {name: torch.full_like(weights[name], 1e12)}, copy / "model.pt")
     result = evaluated(copy, run.parent / "logs")
     last = result.horizons[-1]
     assert last.errors["model"].mean_relative_rms is None

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import spelgen
+from spelgen.certificate.verify import verify
 
 ROOT = Path(__file__).parents[1]
 
@@ -78,12 +79,14 @@ def test_importing_it_imports_nothing_heavy():
 
 def test_objects_are_short_to_read(robots):
     arm = spelgen.load_arm(robots / "rpr.urdf")
-    assert repr(arm) == "<ConfiguredArm 'rpr': 3 joints of rpr.urdf>"
+    assert repr(arm) == "<Arm 'rpr': 3 joints of rpr.urdf>"
     told = "3 outputs, 2 constants, 11 base parameters"
-    assert repr(arm.structure) == f"<Structure of 3 joints (kinematics used): {told}>"
+    inspection = spelgen.inspect(arm)
+    assert repr(inspection.structure) == f"<Structure of 3 joints (kinematics used): {told}>"
     told = "3 outputs and 2 constants, 11 base inertial parameters"
-    assert repr(arm.inspect()) == f"<Inspection of 'rpr': {told}>"
-    for each in (arm, arm.inspect(), arm.verify(), arm.formulas((2, 2))):
+    assert repr(inspection) == f"<Inspection of 'rpr': {told}>"
+    proof = verify(arm.robot, arm.arm, inspection.structure)
+    for each in (inspection, proof, inspection.closed_forms((2, 2))):
         assert len(repr(each)) < 100
         assert each._repr_html_().count("<tr>") >= 2
 

@@ -14,7 +14,6 @@ from spelgen.design import PRESETS
 from spelgen.emission.build import build
 from spelgen.emission.specify import make_spec
 from spelgen.errors import RunError
-from spelgen.fitting.fitted import load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.render.report_page import render_report, write_report
 from spelgen.render.run_facts import commands
@@ -178,7 +177,7 @@ def test_learned_constants_are_those_of_the_weights(run):
     state["raw_armature"] += math.log(3.0)
     torch.save(state, run / "model.pt")
     page = render_report(run)
-    for start in load_run(run).model.armature.tolist():
+    for start in RunFolder(run).untrained_model().armature.tolist():
         assert f"{3 * start:.3g} " in page
 
 

@@ -278,9 +278,9 @@ def inspect(
 
     Args:
         arm: the result of ``load_arm``, or the path of a URDF; the other arguments of ``load_arm`` go with a path.
-        assume: ``kinematics``: the structure for any inertial parameters; ``inertials``: for those of the URDF.
+        assume: ``kinematics``: the structure for any inertial parameters; ``inertials``: for the inertials of the URDF.
 
-    Raises what ``load_arm`` raises, and ArmError if the URDF has no inertials to assume.
+    Raises the errors of ``load_arm``, and ArmError if the URDF has no inertials to assume.
     """
     if not isinstance(arm, ConfiguredArm):
         arm = load_arm(arm, joints, tip, angle_tolerance)

@@ -41,12 +41,15 @@ def inspect(
     chosen_entry = options.entry(entry)
     chosen = options.choose_format(format, output, get_args(Format))
     from spelgen.certificate.inspection import inspect as inspect_arm
-    from spelgen.certificate.verify import verify as verified
 
     arm = options.load(robot, joints, tip, angle_tolerance)
     inspection = inspect_arm(arm, assume=assume)
-    # other programs, which take seconds
-    proof = verified(arm.robot, arm.arm, inspection.structure) if verify else None
+    proof = None
+    if verify:
+        # imported here: other programs, which take seconds
+        from spelgen.certificate.verify import verify as verified
+
+        proof = verified(arm.robot, arm.arm, inspection.structure)
     closed = None
     if formulas or chosen_entry is not None or chosen in ("latex", "sympy"):
         from spelgen.certificate.formulas import WRITABLE

@@ -102,7 +102,7 @@ def simulate(
 ) -> None:
     """Simulate training and test logs with Pinocchio.
 
-    With --as-built, masses, centres of mass, friction and armature differ from the URDF as those of a real arm do;
+    With --as-built, masses, centres of mass, friction and armature differ from the URDF, as in a real arm;
     LOGS/as_built.urdf and .yaml are the truth, for `spelgen evaluate --truth`.
     """
     from spelgen.logs.read import write_logs

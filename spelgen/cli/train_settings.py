@@ -1,4 +1,4 @@
-"""The settings of the command `train`: the command line, then the robot's settings or those of the resumed run."""
+"""The settings of the command `train`: the command line, then the settings of the robot or of the resumed run."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Request:
         return {name: self.values[name] for name in keys if name in self.values}
 
     def settings(self, defaults: TrainingSettings) -> TrainingSettings:
-        """Return the settings with those of the command line for preprocessing and split."""
+        """Return the settings, with options of the command line for preprocessing and split."""
         return defaults.model_copy(update=self.values_of(OF_LOGS))
 
 

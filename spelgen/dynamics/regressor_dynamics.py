@@ -1,4 +1,4 @@
-"""Dynamics of inertial parameters that need not be physically consistent, such as those of least squares."""
+"""Dynamics of inertial parameters that need not be physically consistent, such as the result of least squares."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def idle_residuals(model: object) -> list[str]:
 
 
 def used_parameter_count(model: nn.Module) -> int:
-    """Return the number of parameters of a model, without those of residual terms that are zero."""
+    """Return the number of parameters of a model, without residual terms that are zero."""
     idle = idle_residuals(model)
     return sum(weights.numel() for name, weights in model.named_parameters() if name not in idle)
 

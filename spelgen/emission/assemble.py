@@ -86,7 +86,7 @@ class MassEntries:
 
 
 def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
-    """Return the linear combination in the order in which a module writes it, so that both round alike."""
+    """Return the linear combination, added in the order of a written module: equal to the last bit."""
     total: Tensor | float = 0
     for position, (factor, index) in enumerate(sums):
         size = terms[index] if abs(factor) == 1 else abs(factor) * terms[index]

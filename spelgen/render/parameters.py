@@ -20,6 +20,7 @@ from spelgen.labels import UNITS, entry_name
 from spelgen.listing import Listing
 from spelgen.render.plots import Record
 from spelgen.render.tuning import TUNING
+from spelgen.runtime.derived_mass import DerivedMass
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
@@ -197,12 +198,12 @@ def _constant_table(model: Any) -> Listing:
     mass = model.mass
     count = len(mass.raw_constants)
     # what each constant adds to M, (constants, n, n)
-    functions = torch.zeros(len(getattr(mass, "function_mean", ())), count, dtype=torch.float64)
+    functions = len(mass.function_mean) if isinstance(mass, DerivedMass) else 0
+    zeros = torch.zeros(functions, count, dtype=torch.float64)
     units = torch.eye(count, dtype=torch.float64)
     rows = []
-    for basis, value in zip(
-        mass.entries(functions.unbind(), units.unbind()), mass.constants().tolist(), strict=True
-    ):
+    bases = mass.entries(*zeros.unbind(), *units.unbind())
+    for basis, value in zip(bases, mass.constants().tolist(), strict=True):
         indices = basis.tril().nonzero().tolist()
         terms = [f"{basis[row, column].item():+.4g} {entry_name(row, column)}" for row, column in indices]
         first, second = (UNITS[model.joint_types[k]].inertia for k in indices[0])

@@ -28,7 +28,7 @@ class BodyChain(nn.Module):
     """Bodies that rotate about or translate along axes, each carried by another body or by the base.
 
     Twists are (angular, linear) in the base frame (Featherstone, Rigid Body Dynamics Algorithms, 2008);
-    frames are 4 x 4 matrices (Uicker, J. Appl. Mech. 34:418, 1967). The inertia of a body is that of four
+    frames are 4 x 4 matrices (Uicker, J. Appl. Mech. 34:418, 1967). A body has the inertia of four
     points: the columns (position, 1) * sqrt(mass) of a root of its pseudo-inertia. Only the frames are
     computed one body after the other; sums over carrying or carried bodies are products with a mask, which
     takes the fewest operations.
@@ -104,7 +104,7 @@ class BodyChain(nn.Module):
         return velocity, twists, torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
 
     def accelerations(self, at: ChainConfiguration, qd: Tensor) -> Tensor:
-        """Return accelerations of the points at constant qd, that of gravity included, (..., 12 bodies)."""
+        """Return accelerations of the points at constant qd, gravity included, (..., 12 bodies)."""
         velocity, twists, turning = self.motion(at, qd)
         steady = (turning * (qd @ self.ratios.mT).unsqueeze(-2)) @ self.carriers
         w, (a, u) = twists[..., :3, :, None], steady.unsqueeze(-1).chunk(2, dim=-3)

@@ -18,7 +18,8 @@ class DerivedMass(nn.Module):
     M is positive definite for all q and all parameters: if M - margin C is not, with C the nominal mean of
     M, it is replaced by M' = C + t (M - C). t = 2^-k is the first such power with t |M - C| <= 1 - margin,
     where |.| is an upper bound of the norm relative to C. t is piecewise constant, so that the derivatives
-    of M' are t times those of M. C has the zeros and linear relations of M, which therefore hold in M'.
+    of M' are t times the derivatives of M. C has the zeros and linear relations of M, which therefore
+    hold in M'.
     """
 
     parameter_groups = (
@@ -73,7 +74,7 @@ class DerivedMass(nn.Module):
         return self.network.prepare(rows[:-1].flatten(1).mT, offset.flatten())
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
-        """Return M'(q), and the intermediates of its derivatives: those of the network, and t."""
+        """Return M'(q), and the intermediates of its derivatives: of the network, and t."""
         rows, intermediates = self.network.forward(encoded, layers)
         mass = rows.reshape(*rows.shape[:-1], *self.center.shape)
         fraction = self.fraction(mass.detach())

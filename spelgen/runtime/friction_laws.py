@@ -60,7 +60,7 @@ class FrictionConstants(NamedTuple):
             qd: velocities, (..., n) [rad/s, m/s].
             gravity: gravity torques, (..., n) [Nm, N].
             z: bristle displacements, (..., n, K) [rad, m]; None: unknown, dry friction depends on velocity.
-            direction: direction of dry friction at joints without bristles, (..., n); None: that of qd.
+            direction: direction of dry friction at joints without bristles, (..., n); None: of qd.
         """
         if direction is None:
             direction = qd * turning(qd, self.coulomb_smoothing_velocity)

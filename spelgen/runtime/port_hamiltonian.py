@@ -59,7 +59,7 @@ class PortHamiltonian(nn.Module):
         """Return the configuration at q. Raises TypeError or ValueError for a wrong dtype or shape.
 
         Args:
-            q: (..., n), or a configuration, which is returned as it is.
+            q: (..., n), or a configuration, which is returned unchanged.
             others: further vectors (..., n), which are only checked.
             prepared: result of ``prepare``; None: computed here.
         """
@@ -109,14 +109,14 @@ class PortHamiltonian(nn.Module):
         return 0.5 * (p * self.velocity(at, p)).sum(dim=-1) + self.potential_energy(at, *state)
 
     def forward_dynamics(self, q: Position, qd: Tensor, tau: Tensor, *state: Tensor | None) -> Tensor:
-        """Return qdd, (..., n), under the input tau; state: that of friction, if the model has one."""
+        """Return qdd, (..., n), under the input tau; state: of friction, if the model has one."""
         at = self.at(q, qd, tau)
         force = self.input_force(at, qd, tau) - self.nonlinear_effects(at, qd)
         force = force - self.friction_torque(at, qd, *state)
         return self.velocity(at, force)  # M^-1 times the force
 
     def inverse_dynamics(self, q: Position, qd: Tensor, qdd: Tensor, *state: Tensor | None) -> Tensor:
-        """Return the input tau, (..., n), that gives qdd; state: that of friction, if the model has one."""
+        """Return the input tau, (..., n), that gives qdd; state: of friction, if the model has one."""
         at = self.at(q, qd, qdd)
         force = applied(at.mass, qdd) + self.nonlinear_effects(at, qd)
         force = force + self.friction_torque(at, qd, *state)

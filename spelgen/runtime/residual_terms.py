@@ -17,7 +17,7 @@ from spelgen.runtime.rows import Joint, vector
 
 # Number of B-splines over the range of a joint.
 SPLINES = 34
-# Harmonics of a revolution of the joint; two more are those of a revolution of the motor (teeth and poles).
+# Harmonics of a revolution of the joint; two more belong to a revolution of the motor (teeth and poles).
 HARMONICS = 64
 # Bound of the logarithm of the friction factor: the factor stays between 0.1 and 10.
 LARGEST = math.log(10.0)
@@ -167,7 +167,7 @@ class ResidualTerms(nn.Module):
         return ResidualConfiguration(q, encoded, torque, friction, mass, slope, intermediates, parameters)
 
     def energy(self, at: ResidualConfiguration) -> Tensor:
-        """Return the residual of V, (...) [J]; that of a spline is zero in its middle."""
+        """Return the residual of V, (...) [J]; each spline is zero in its middle."""
         distance = self._distances(at.q)
         size = distance.abs()
         # integral of the B-spline from its middle

@@ -1,4 +1,4 @@
-"""A port-Hamiltonian model of rigid bodies, whose inertia is that of four points per body."""
+"""A port-Hamiltonian model of rigid bodies, with the inertia of four points per body."""
 
 from __future__ import annotations
 
@@ -202,7 +202,7 @@ class RigidBodyDynamics(PortHamiltonian):
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
         """Return the rate of (q, p, z), (..., 2 n + n K), or of (q, p, z, tau) with a constant tau.
 
-        A state without z, (..., 2 n), is that of friction without bristles.
+        A state without z, (..., 2 n), is for friction without bristles.
         """
         n, size = self.n, self.n * self.elements
         if state.shape[-1] < 2 * n + size:

@@ -29,7 +29,7 @@ class Joint(NamedTuple):
     friction: float  # typical friction torque [Nm, N]
     armature: float  # nominal rotor inertia times gear ratio squared [kg m^2, kg]
     gear: float = 1.0  # motor revolutions per revolution of the joint
-    typical_range: tuple[float, float] | None = None  # center and half range; None: those of the limits
+    typical_range: tuple[float, float] | None = None  # center and half range; None: from the limits
 
     @property
     def center(self) -> float:
@@ -61,7 +61,7 @@ class Link(NamedTuple):
     rotation: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     ratio: float = 1.0
     offset: float = 0.0  # [rad, m]
-    joint_type: Literal["revolute", "prismatic"] | None = None  # None: that of the joint
+    joint_type: Literal["revolute", "prismatic"] | None = None  # None: as the joint
 
 
 class Function(NamedTuple):

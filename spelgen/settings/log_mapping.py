@@ -80,7 +80,7 @@ class JointColumns(Group):
 
 
 class JointUnits(Group):
-    """Units of one joint's columns; None: those of all joints."""
+    """Units of one joint's columns; None: as for all joints."""
 
     q: Position | None = None
     qd: Velocity | None = None

@@ -153,7 +153,7 @@ def _least_eigenvalue(mass: np.ndarray) -> float:
 
 def _gravity_torque(arm: Arm, q: np.ndarray, inertias: list[list[float]]) -> np.ndarray:
     """Return the root mean square of dV/dq by coordinate."""
-    step = 1e-4  # [rad, m] central differences: errors of 1e-8 do, these are sizes
+    step = 1e-4  # [rad, m] central differences: errors of 1e-8 do, the results are magnitudes
     shifts = step * np.eye(q.shape[1])[:, None]
     _, forward = float_energies(arm, q + shifts, inertias)
     _, backward = float_energies(arm, q - shifts, inertias)
