@@ -79,7 +79,7 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     metadata = schema.metadata or {}
     # simulated logs of an arm whose settings describe its real logger
     if metadata.get(UNITS_KEY) == UNITS:
-        mapping = LogMapping(input=mapping.input)
+        mapping = mapping.in_si()
     columns = [mapping.columns.t, *starmap(mapping.column, mapping.signals(joints))]
     missing = []
     for name in columns:

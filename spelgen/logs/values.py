@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.compute
 
 from spelgen.errors import LogError
+from spelgen.logs.jumps import signed
 from spelgen.logs.tables import Layout, list_element
 from spelgen.settings.log_mapping import TIMES
 from spelgen.settings.tuning.logs import TUNING
@@ -31,6 +32,10 @@ def values_in_si(table: Table, layout: Layout, start: pa.Scalar | None, row: int
     for name in layout.columns[1:]:
         logged.append(_floats(_column(table, name), name, layout, row))
     mapping, signals = layout.mapping, layout.mapping.signals(layout.joints)
+    for k, (quantity, joint) in enumerate(signals, start=1):
+        sign_bit = mapping.word("sign_bit", quantity, joint)
+        if sign_bit:
+            logged[k] = signed(logged[k], sign_bit)
     factors = np.array([unit, *starmap(mapping.scale, signals)])
     offsets = np.array([0.0, *starmap(mapping.offset, signals)])
     # what overflows is told below, with its row

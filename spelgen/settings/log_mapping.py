@@ -1,7 +1,7 @@
 """Describe how a user's logs are named and measured: the group `logs` of a sidecar file, or a mapping file of its own.
 
 q = sign * unit * value + offset, and so is u, a commanded position; qd = sign * unit * value,
-tau = sign * gain * unit * value + torque_offset.
+tau = sign * gain * unit * value + torque_offset. Before that, `sign_bit` and `period` turn words of a register into values.
 """
 
 from __future__ import annotations
@@ -36,6 +36,9 @@ Accepted = Literal[
     "frozen",
     "time-unit",
     "dropouts",
+    "jumps",
+    "held-samples",
+    "velocity-without-sign",
     "no-torques",
     "torque-sense",
     "torque-unit",
@@ -89,6 +92,15 @@ class LogUnits(JointUnits):
     t: Time = "s"
 
 
+class JointWords(Group):
+    """Sizes of one joint's words, in logged units; None: its values are no words."""
+
+    q: Positive | None = None
+    qd: Positive | None = None
+    tau: Positive | None = None
+    u: Positive | None = None
+
+
 class JointLog(Group):
     """How one joint is logged.
 
@@ -96,6 +108,8 @@ class JointLog(Group):
     sign: -1 where the log's sense is the opposite of the URDF's, of position, velocity and torque.
     offset: the joint's position where the log says 0 [rad, m]. gain: torque per logged unit, e.g. gear x
     motor constant [Nm/A]; negative where current and velocity have opposite senses. torque_offset [Nm, N].
+    period: at which values start again, e.g. 65536 counts of a 16-bit register, 360 degrees of an angle; joints without
+    position limits have one turn. sign_bit: from it on, a value is minus its excess, as 32768 + x of a servo is -x.
     """
 
     name: str | None = None
@@ -107,6 +121,8 @@ class JointLog(Group):
     offset: Number = 0.0
     gain: Number | None = None
     torque_offset: Number = 0.0
+    period: JointWords = JointWords()
+    sign_bit: JointWords = JointWords()
 
     @model_validator(mode="after")
     def _moves(self) -> JointLog:
@@ -122,7 +138,8 @@ class LogMapping(Group):
     topic: of the ROS 2 bag, where it holds several with joint states. velocity: "differentiated" where the
     log has none. torque_delay: how much later than positions a log shows torques [s], see what `spelgen logs` suggests.
     accept: codes of errors in logs that are right as they are. dropouts: "dropped" leaves out rows in which a signal
-    fell to 0 for a moment.
+    falls to 0 or leaves its neighbours for a moment, and rows that repeat the row before. sample_rate [Hz]: rows of a
+    recording are evenly spaced by it, whatever their times are.
     Files that spelgen wrote itself are read as they are, whatever stands here.
     """
 
@@ -135,6 +152,7 @@ class LogMapping(Group):
     joints: dict[str, JointLog] = Field(default={})
     accept: tuple[Accepted, ...] = ()
     dropouts: Literal["kept", "dropped"] = "kept"
+    sample_rate: Positive | None = None
 
     @property
     def quantities(self) -> tuple[str, ...]:
@@ -175,6 +193,26 @@ class LogMapping(Group):
             logged = self.joint(joint)
             joints[joint] = logged.model_copy(update={"columns": logged.columns.model_copy(update=names)})
         return self.model_copy(update={"joints": joints})
+
+    def with_turns(self, joints: Sequence[str]) -> LogMapping:
+        """Return the mapping with a period of one turn for positions of these joints, unless they have one."""
+        changed = dict(self.joints)
+        for joint in joints:
+            logged = self.joint(joint)
+            turns = {x: 2 * pi / abs(self.scale(x, joint)) for x in ("q", "u") if not self.word("period", x, joint)}
+            period = logged.period.model_copy(update=turns)
+            changed[joint] = logged.model_copy(update={"period": period})
+        return self.model_copy(update={"joints": changed})
+
+    def in_si(self) -> LogMapping:
+        """Return the mapping of a file in SI units with plain names: of this one only input and turns remain."""
+        turning = [name for name in self.joints if self.word("period", "q", name)]
+        return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
+
+    def word(self, key: Literal["period", "sign_bit"], quantity: str, joint: str) -> float | None:
+        """Return the period or the sign bit of a joint's quantity in logged units, None if it has none."""
+        size: float | None = getattr(getattr(self.joint(joint), key), quantity)
+        return size
 
     def unit(self, quantity: str, joint: str) -> str | None:
         """Return the unit of "q", "qd", "tau" or "u" of a joint, None where none was said; u is measured as q is."""

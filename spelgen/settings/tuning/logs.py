@@ -13,8 +13,15 @@ class LogTuning:
     chunk_samples: int = 2**16  # of a streamed log held at once: of 7 joints 12 MB, as windows 53 MB
     npz_bytes: int = 2**30  # unpacked at most from one NPZ archive, which zeros pack a thousandfold
     largest_value: float = 1e9  # [rad, rad/s, Nm; m, m/s, N] no arm has more: what is beyond is a wrong unit
-    # [usual steps] next to which a signal's 0 is no value: smooth signals come nearer first
-    dropout: float = 20.0
+    # [usual steps] A larger step is a jump, and a 0 with neighbours farther away is a missing value.
+    jump: float = 20.0
+    # [steps of the neighbours] An outlier's two steps are larger: a fast motion has large steps before and after, too.
+    local_jump: float = 4.0
+    jump_window: int = 8  # [samples] of the neighbours on each side
+    excursion: int = 5  # [samples] A signal that leaves and returns within these has outliers, later it has jumped.
+    most_jumps: float = 0.05  # of all steps: a signal with more is noise
+    most_words: float = 0.5  # of all steps: a signal around 0 changes its sign, and a sign bit, no more often
+    fastest: float = 40.0  # [rad/s, m/s] No arm moves faster, so a faster step is a jump.
     gap: float = 4.0  # [median steps] a longer step is a hole; jitter of USB loggers stays below 3
     automatic_cutoff: float = 8.0  # [Hz] rigid-body motion lies below, ripple and quantisation above (UR10e)
     # [Hz] slower logs are interpolated by cubics, and windows of them are not filtered
