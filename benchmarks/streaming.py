@@ -23,9 +23,9 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.logs.tuning import LogTuning
 from spelgen.pipeline.generate import generate
 from spelgen.pipeline.loaded_arm import load_arm
-from spelgen.settings.tuning.logs import LogTuning
 
 ROOT = Path(__file__).parents[1]
 URDF = ROOT / "robots" / "panda.urdf"

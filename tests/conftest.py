@@ -38,7 +38,7 @@ def shared() -> Path:
 @pytest.fixture
 def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Epochs of few windows take four steps: for tests of what stands around a fit."""
-    from spelgen.settings.tuning.fitting import WindowTuning
+    from spelgen.fitting.tuning import WindowTuning
 
     monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", WindowTuning(epoch_steps=4))
 
@@ -46,7 +46,7 @@ def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def short_torque_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fits to torques take two steps a round and few rounds: for tests of what stands around a fit."""
-    from spelgen.settings.tuning.fitting import TorqueTuning
+    from spelgen.fitting.torque.tuning import TorqueTuning
 
     tuning = TorqueTuning(rounds=1, first_steps=2, last_rounds=1, longer=1, steps=2)
     monkeypatch.setattr("spelgen.fitting.torque.problem.TUNING", tuning)

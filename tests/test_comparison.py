@@ -24,11 +24,11 @@ from spelgen.design import load_design
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
 from spelgen.evaluation import invariants
+from spelgen.evaluation.tuning import EvaluationTuning
 from spelgen.fitting.rollout import roll_out
 from spelgen.logs.read import Trajectory, read_logs
 from spelgen.logs.windows import cut_windows, joined
 from spelgen.render.comparison_page import write_comparison
-from spelgen.settings.tuning.evaluation import EvaluationTuning
 from spelgen.tasks import run_here
 from spelgen.urdf.read import read_urdf
 

@@ -14,10 +14,10 @@ from spelgen.evaluation import momentum_observer
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.momentum_observer import observe, past_steps, without_past
 from spelgen.evaluation.rollout import rollout
+from spelgen.evaluation.tuning import EvaluationTuning
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows
-from spelgen.settings.tuning.evaluation import EvaluationTuning
 
 STAND_IN = Path(__file__).with_name("stand_in.py")
 RATE = 100.0

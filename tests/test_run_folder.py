@@ -28,6 +28,7 @@ from spelgen.fitting.fitted import load_run
 from spelgen.fitting.process import locked
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.train import train
+from spelgen.fitting.tuning import WindowTuning
 from spelgen.fitting.window import momentum
 from spelgen.logs import chunks
 from spelgen.logs.read import write_logs
@@ -35,7 +36,6 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.pipeline.generate import generate, require_own_module
 from spelgen.render.report_page import render_report
 from spelgen.settings.fits import Rollout
-from spelgen.settings.tuning.fitting import WindowTuning
 
 JOINTS = ("joint1", "joint2")
 QUICK = Rollout(epochs=3, momentum_steps=0, optimizer="adamw", batch=32, urdf_weight=0.0, stride=3)

@@ -29,6 +29,7 @@ from spelgen.fitting.torque.problem import TorqueProblem
 from spelgen.fitting.torque.report import terms_in_use, torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.selection import select_functions
+from spelgen.fitting.torque.tuning import TorqueTuning
 from spelgen.fitting.torque.weights import NONE, RIGID, RigidWeights, moved_bodies
 from spelgen.fitting.train import train
 from spelgen.logs import chunks
@@ -39,7 +40,6 @@ from spelgen.pipeline.build import build
 from spelgen.pipeline.generate import generate
 from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.fits import GaussianPrior, Rollout, TorqueFit
-from spelgen.settings.tuning.fitting import TorqueTuning
 from tests.test_closed_form import FOLLOWED, drawn
 
 ROBOTS = ("two_link", "rpr", "six_dof")

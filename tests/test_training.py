@@ -38,13 +38,13 @@ from spelgen.fitting.rollout import (
     rollout_loss,
 )
 from spelgen.fitting.train import train
+from spelgen.fitting.tuning import WindowTuning
 from spelgen.fitting.window.rollout import RolloutObjective
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.settings.fits import MomentumFit, Rollout
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.tuning.fitting import WindowTuning
 
 STAND_IN = Path(__file__).with_name("stand_in.py")
 JOINTS = ("shoulder", "elbow")

@@ -20,7 +20,7 @@ FRAGMENT = re.compile(r"^(What|Of|By|Whoever|Whether) ")
 ALLOWED = re.compile(r"\b(at|from|to) rest\b|--trust|trust=True|`trust`|hold(s|ing)? the arm|zero-order hold")
 CODE = re.compile(r"^```.*?^```$|^(?: {4}|\t).*$|`[^`\n]*`|\]\([^)]*\)", re.MULTILINE | re.DOTALL)
 # texts for developers: what each number of a table means
-INTERNAL = ("settings/tuning", "runtime")
+INTERNAL = ("runtime",)
 
 
 def wrong(text: str) -> list[str]:

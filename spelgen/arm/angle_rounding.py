@@ -10,11 +10,9 @@ from math import pi
 import numpy as np
 
 from spelgen.arm.rational import bounded, exact, rotation_from_rpy, rounded_angle
+from spelgen.arm.tuning import TUNING
 from spelgen.errors import Diagnostic
-from spelgen.settings.tuning.structure import GeometryTuning
 from spelgen.urdf.robot import Inertial, Joint, Link
-
-TUNING = GeometryTuning()
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,9 @@ from spelgen.arm.angle_rounding import AngleRounding
 from spelgen.arm.chain import Chain, Follow, follows
 from spelgen.arm.placement import Frame, Placement, Pose, TenVector
 from spelgen.arm.rational import bounded, rotation_from_rpy
+from spelgen.arm.tuning import TUNING
 from spelgen.errors import Diagnostic
-from spelgen.settings.tuning.structure import GeometryTuning
 from spelgen.urdf.robot import Joint, Link, Robot
-
-TUNING = GeometryTuning()
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,11 @@ from math import atan2, cos, lcm, pi, sin, tan
 
 import numpy as np
 
-from spelgen.settings.tuning.structure import GeometryTuning
+from spelgen.arm.tuning import TUNING
 
 Vector = tuple[Fraction, Fraction, Fraction]
 Matrix = tuple[Vector, Vector, Vector]
 
-TUNING = GeometryTuning()
 
 IDENTITY: np.ndarray = np.eye(3, dtype=object) * Fraction(1)
 ZERO = np.array([Fraction(0)] * 3)

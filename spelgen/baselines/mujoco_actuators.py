@@ -91,10 +91,11 @@ def fitted_actuators(run: RunFolder, logs: Sequence[Trajectory]) -> dict[str, ob
     """Return actuators fitted to these logs; none where MuJoCo is not installed or cannot have the arm's servos."""
     if not _has_mujoco():
         return {}
-    from spelgen.baselines.position_actuators import TUNING, fit_position_actuators
+    from spelgen.baselines.position_actuators import fit_position_actuators
+    from spelgen.baselines.tuning import ACTUATORS
 
     preprocessing = Preprocessing(**run.read_config()["preprocessing"])
-    windows = servo_windows(logs, preprocessing, TUNING.windows)
+    windows = servo_windows(logs, preprocessing, ACTUATORS.windows)
     actuators = fit_position_actuators(run_arm(run), windows, trained_model(run))
     return {} if actuators is None else {KEPT: actuators.to_dict()}
 

@@ -19,19 +19,18 @@ import numpy as np
 from mujoco import minimize, rollout
 
 from spelgen.arm.arm import Arm
+from spelgen.baselines.tuning import ACTUATORS as TUNING
 from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.rigid_bodies import about_center, quaternion
+from spelgen.exporting.tuning import TUNING as EXPORT_TUNING
 from spelgen.fitting.servo.windows import ServoWindows
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 from spelgen.pipeline.build import build
 from spelgen.pipeline.loaded_arm import LoadedArm
-from spelgen.settings.tuning.exporting import TUNING as EXPORT_TUNING
-from spelgen.settings.tuning.servo import PositionActuatorTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
 
-TUNING = PositionActuatorTuning()
 FARTHEST, OFFSET, LATEST = 4.0, 0.3, 0.4  # bounds: of logarithms from their start; rad, m; s
 
 

@@ -10,11 +10,10 @@ import torch
 from torch import Tensor
 
 from spelgen.baselines.rosenbrock import roll_out_stiff
+from spelgen.baselines.tuning import TUNING
 from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.logs.windows import Windows, thinned
-from spelgen.settings.tuning.evaluation import EvaluationTuning
 
-TUNING = EvaluationTuning()
 States = tuple[Tensor, Tensor]
 
 

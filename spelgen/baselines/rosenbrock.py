@@ -16,12 +16,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from spelgen.baselines.tuning import TUNING
 from spelgen.dynamics.equations import Pose, poses
 from spelgen.dynamics.protocol import has_friction_state, has_momentum, memory_after, sliding_memory
 from spelgen.logs.windows import Windows
-from spelgen.settings.tuning.evaluation import EvaluationTuning
 
-TUNING = EvaluationTuning()
 GAMMA = 1 - 0.5**0.5  # makes the method L-stable
 
 

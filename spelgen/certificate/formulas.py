@@ -23,16 +23,15 @@ from spelgen.certificate.expressions import (
     weighted_sum,
 )
 from spelgen.certificate.printing import latex
+from spelgen.certificate.tuning import TUNING
 from spelgen.errors import SpelgenError
 from spelgen.labels import entry_name
 from spelgen.listing import Listing
-from spelgen.settings.tuning.structure import CertificateTuning
 from spelgen.structure.base_parameters import BaseParameter, base_parameters, parameter_name, rational
 from spelgen.structure.expansion import Budget, Expansion, TooLarge
 from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure
 
-TUNING = CertificateTuning()
 READABLE = TUNING.readable_terms
 WRITABLE = TUNING.writable_terms
 

@@ -15,16 +15,15 @@ import pinocchio as pin
 from lxml import etree
 
 from spelgen.arm.arm import Arm, make_arm
+from spelgen.certificate.tuning import TUNING
 from spelgen.certificate.verification import Check, Verdict, size_text
 from spelgen.dynamics.constraint import mimic_constraint
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.settings.settings import Settings
-from spelgen.settings.tuning.structure import CertificateTuning
 from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.robot import Robot
 
-TUNING = CertificateTuning()
 TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 

@@ -14,16 +14,15 @@ import numpy as np
 
 from spelgen.arm.arm import Arm
 from spelgen.certificate.numeric_samples import ENGINE, NumericSamples, draw, regressor
+from spelgen.certificate.tuning import TUNING
 from spelgen.certificate.urdf_cross_check import urdf_cross_check
 from spelgen.certificate.verification import Check, Verdict, Verification, size_text
 from spelgen.errors import shortened
 from spelgen.labels import entry_name, joints_in_ranges
-from spelgen.settings.tuning.structure import CertificateTuning
 from spelgen.structure.basis import row_of
 from spelgen.structure.structure import Structure
 from spelgen.urdf.robot import Robot
 
-TUNING = CertificateTuning()
 _SPARE = 6  # samples more than a rank can be: they would show a larger one
 
 

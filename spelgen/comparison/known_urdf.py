@@ -7,9 +7,7 @@ from pathlib import Path
 import numpy as np
 from lxml import etree
 
-from spelgen.settings.tuning.comparison import ComparisonTuning
-
-TUNING = ComparisonTuning()
+from spelgen.comparison.tuning import TUNING
 
 
 def known_urdf(robot: Path, error: float | None) -> bytes:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from pydantic import TypeAdapter, ValidationError
 
+from spelgen.comparison.tuning import TUNING
 from spelgen.dynamics.parameters import parameter_count
 from spelgen.dynamics.protocol import has_residuals
 from spelgen.errors import RunError
@@ -21,12 +22,9 @@ from spelgen.fitting.rollout import position_difference, roll_out
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.pipeline.loaded_arm import load_arm
-from spelgen.settings.tuning.comparison import ComparisonTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
-
-TUNING = ComparisonTuning()
 
 
 @dataclass(frozen=True)

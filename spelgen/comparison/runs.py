@@ -20,6 +20,7 @@ from spelgen.comparison.metrics import (
     true_mass,
 )
 from spelgen.comparison.study import Study, Variant
+from spelgen.comparison.tuning import TUNING
 from spelgen.emission.loading import load_module
 from spelgen.evaluation.drawn_motions import PredictedMotion, predicted_motion
 from spelgen.evaluation.invariants import invariants
@@ -32,11 +33,8 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows
 from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.fits import DEFAULTS, Rollout
-from spelgen.settings.tuning.comparison import ComparisonTuning
 from spelgen.structure.nominal import working_range
 from spelgen.tasks import RunTasks
-
-TUNING = ComparisonTuning()
 
 
 def run_study(study: Study, run_tasks: RunTasks, *, note: Callable[[str], None]) -> None:

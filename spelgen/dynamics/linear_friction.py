@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from spelgen.design import BRISTLE_REACH
-from spelgen.settings.tuning.identification import TUNING
 
 BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BRISTLE_REACH["revolute"])))
+
+# [rad/s, m/s] Velocity at which the additional dry friction of slow motion has fallen to 1/e.
+STRIBECK_VELOCITY = 0.1
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ class FrictionModel:
             dry = [sign] * len(BRISTLES) if bent is None else list(np.moveaxis(bent, -1, 0))
         effects = [rise, speed, *dry, np.ones_like(speed)]
         if self.stribeck:
-            effects.append(sign * np.exp(-((speed / TUNING.stribeck_velocity) ** 2)))
+            effects.append(sign * np.exp(-((speed / STRIBECK_VELOCITY) ** 2)))
         if self.polynomial:
             effects += [speed * np.abs(speed), speed**3]
         return np.stack(effects, axis=-2)

@@ -13,9 +13,9 @@ from spelgen.arm.actuation import Actuation
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.design import Design, load_design
 from spelgen.emission.bodies import body_specs
+from spelgen.emission.tuning import TUNING
 from spelgen.errors import SettingsError
 from spelgen.settings.joint import JointSettings
-from spelgen.settings.tuning.emission import TUNING
 from spelgen.spec import BodySpec, ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec, ServoSpec
 from spelgen.structure.basis import Weights
 from spelgen.structure.nominal import Nominal, nominal, nominal_inertias, working_range

@@ -12,9 +12,9 @@ import numpy as np
 
 from spelgen.design import BRISTLE_REACH, SERVO_STRIBECK_ROUNDING
 from spelgen.emission.source import WIDTH, Call, Code, assignment, call, laid_out
+from spelgen.emission.tuning import TUNING
 from spelgen.emission.unit_joints import hidden_units
 from spelgen.labels import entry_name, joint_ranges
-from spelgen.settings.tuning.emission import TUNING
 from spelgen.spec import BodySpec, ConstantSpec, JointSpec, ModelSpec, OutputSpec
 
 _FRICTION_AXES = {"dense-n": 1, "dense-3n": 3}

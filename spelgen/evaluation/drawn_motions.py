@@ -17,16 +17,14 @@ from spelgen.dynamics.bristles import bristles_along
 from spelgen.evaluation.horizons import JudgedLogs
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.torque import friction_past, mean_nmse, predicted_torques
+from spelgen.evaluation.tuning import TRACES as TUNING
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
-from spelgen.settings.tuning.evaluation import TraceTuning
 
 if TYPE_CHECKING:
     from spelgen.dynamics.protocol import RigidDynamics
-
-TUNING = TraceTuning()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

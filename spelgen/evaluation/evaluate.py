@@ -28,12 +28,12 @@ from spelgen.evaluation.results import Results
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import TorqueErrors, coarse_torques, torque_errors
 from spelgen.evaluation.traces import Traces, motion_traces, replay_traces
+from spelgen.evaluation.tuning import TUNING
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import SHORTEST, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import Trajectory, require_commands, require_joints, require_torques
-from spelgen.settings.tuning.evaluation import EvaluationTuning
 
 if TYPE_CHECKING:
     from spelgen.dynamics.protocol import RigidDynamics
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from spelgen.fitting.fitted import Fit
     from spelgen.pipeline.loaded_arm import LoadedArm
 
-TUNING = EvaluationTuning()
 STEPS: Sequence[int] = (1, 10)
 SECONDS: Sequence[float] = (1.0,)
 Progress = Callable[[int, int, str], None]

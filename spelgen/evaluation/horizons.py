@@ -15,14 +15,13 @@ from spelgen.dynamics.protocol import integrable
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.momentum_observer import observe, past_steps, without_past
 from spelgen.evaluation.plain import finite
+from spelgen.evaluation.tuning import TUNING
 from spelgen.fitting.rollout import position_difference
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows, joined
-from spelgen.settings.tuning.evaluation import EvaluationTuning
 
-TUNING = EvaluationTuning()
 TipPosition = Callable[[Tensor], Tensor]
 """q (..., n) -> the tip's position (..., 3) [m]."""
 

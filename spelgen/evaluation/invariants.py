@@ -10,13 +10,11 @@ import torch
 from torch import Tensor
 
 from spelgen.evaluation.rollout import rollout
+from spelgen.evaluation.tuning import TUNING
 from spelgen.logs.windows import Windows
-from spelgen.settings.tuning.evaluation import EvaluationTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
-
-TUNING = EvaluationTuning()
 
 
 @dataclass(frozen=True)

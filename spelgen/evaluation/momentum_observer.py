@@ -19,10 +19,8 @@ import torch
 from torch import Tensor
 
 from spelgen.dynamics.protocol import known_past, memory_along
+from spelgen.evaluation.tuning import TUNING
 from spelgen.logs.windows import Windows
-from spelgen.settings.tuning.evaluation import EvaluationTuning
-
-TUNING = EvaluationTuning()
 
 
 def past_steps(rate: float) -> int:

@@ -14,15 +14,13 @@ from spelgen.baselines.names import MODEL
 from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import Diagnostic
+from spelgen.evaluation.tuning import TUNING
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 from spelgen.logs.filtering import velocities
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
-from spelgen.settings.tuning.evaluation import EvaluationTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
-
-TUNING = EvaluationTuning()
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
+from spelgen.evaluation.tuning import TUNING
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.arm_mapping import GivenMapping
@@ -18,16 +19,12 @@ from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.settings import load_mapping
-from spelgen.settings.tuning.evaluation import EvaluationTuning
 from spelgen.spec import Facts, logged_joints, read_facts
 from spelgen.urdf.read import read_urdf
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
     from spelgen.pipeline.loaded_arm import LoadedArm
-
-
-TUNING = EvaluationTuning()
 
 
 @dataclass(frozen=True)

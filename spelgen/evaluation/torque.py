@@ -13,14 +13,14 @@ from torch import Tensor
 from spelgen.dynamics.protocol import known_past
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.plain import finite
+from spelgen.identification.tuning import TUNING as LEAST_SQUARES
 from spelgen.log_checks.statistics import quantisation_step
+from spelgen.log_checks.tuning import TUNING as LOG_CHECKS
 from spelgen.logs.dynamics_samples import DynamicsSamples, is_moving
 from spelgen.logs.trajectory import Trajectory, joined_column
-from spelgen.settings.tuning.identification import IdentificationTuning
-from spelgen.settings.tuning.log_checks import LogCheckTuning
 
-LEVELS = LogCheckTuning().levels
-NEGLIGIBLE = IdentificationTuning().negligible
+LEVELS = LOG_CHECKS.levels
+NEGLIGIBLE = LEAST_SQUARES.negligible
 
 
 @dataclass(frozen=True)

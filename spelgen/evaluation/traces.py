@@ -28,14 +28,12 @@ from spelgen.evaluation.drawn_motions import (
 from spelgen.evaluation.horizons import JudgedLogs, Predictions, TipPosition
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.replay import Missed
+from spelgen.evaluation.tuning import TRACES as TUNING
 from spelgen.fitting.rollout import AT_REST, loss_scales, position_difference
 from spelgen.logs.trajectory import Trajectory, coverage, joined_column
-from spelgen.settings.tuning.evaluation import TraceTuning
 
 if TYPE_CHECKING:
     from spelgen.dynamics.protocol import RigidDynamics
-
-TUNING = TraceTuning()
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,11 +14,10 @@ from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.errors import shortened
 from spelgen.evaluation.horizons import StateErrors
 from spelgen.evaluation.measurements import Measurements
+from spelgen.evaluation.tuning import TUNING
 from spelgen.labels import listed, share, thousandths
 from spelgen.listing import number
-from spelgen.settings.tuning.evaluation import EvaluationTuning
 
-TUNING = EvaluationTuning()
 SEEN = "tested-on-training-data"
 STANDSTILL = " near standstill"
 TORQUE_USES: tuple[tuple[float, Sequence[str], Sequence[str]], ...] = (

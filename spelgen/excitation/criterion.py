@@ -16,8 +16,8 @@ from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.regressor import body_chain, urdf_parameters
 from spelgen.excitation.trajectory import ExcitationTrajectory
+from spelgen.excitation.tuning import TUNING
 from spelgen.identification.base_parameters import base_parameters
-from spelgen.settings.tuning.simulation import EXCITATION
 
 FRICTION = FrictionModel()
 
@@ -28,7 +28,7 @@ class Criterion:
     def __init__(self, arm: Arm, trajectory: ExcitationTrajectory) -> None:
         self.trajectory, self.chain = trajectory, body_chain(arm)
         self.columns = torch.from_numpy(base_parameters(arm, FRICTION).columns)
-        count = EXCITATION.samples_per_harmonic * trajectory.harmonics + 1
+        count = TUNING.samples_per_harmonic * trajectory.harmonics + 1
         self.times = torch.linspace(0.0, trajectory.duration, count, dtype=torch.float64)
         self.inertial = torch.from_numpy(urdf_parameters(arm))
         # without inertials the torque is not known, and no limit can be kept
@@ -62,8 +62,8 @@ class Criterion:
 
     def _value(self, parameters: Tensor) -> Tensor:
         rows = self._rows(self.trajectory.states(parameters, self.times))
-        overrun = (self._efforts(rows).abs() - EXCITATION.effort).clamp(min=0.0)
-        penalties = EXCITATION.penalty * overrun.square().sum() + self.trajectory.given_away(parameters).sum()
+        overrun = (self._efforts(rows).abs() - TUNING.effort).clamp(min=0.0)
+        penalties = TUNING.penalty * overrun.square().sum() + self.trajectory.given_away(parameters).sum()
         return self._log_condition(rows) + penalties
 
     def _rows(self, states: Tensor) -> Tensor:

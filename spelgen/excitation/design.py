@@ -14,7 +14,7 @@ from spelgen.errors import SettingsError
 from spelgen.excitation.criterion import Criterion
 from spelgen.excitation.excitation import Excitation
 from spelgen.excitation.trajectory import ExcitationTrajectory, motion_bounds
-from spelgen.settings.tuning.simulation import EXCITATION
+from spelgen.excitation.tuning import TUNING
 
 
 def excite(
@@ -45,13 +45,13 @@ def excite(
             expected = "more than 0, at most 1" if is_fraction else "a positive number"
             raise SettingsError(repr(value), element=f"excite: {name}", expected=expected)
     if harmonics is None:
-        harmonics = max(EXCITATION.fewest_harmonics, round(EXCITATION.harmonics_per_second * duration))
+        harmonics = max(TUNING.fewest_harmonics, round(TUNING.harmonics_per_second * duration))
     elif harmonics < 2:
         raise SettingsError(repr(harmonics), element="excite: harmonics", expected="2 or more")
     bounds = motion_bounds(arm.arm, reach, speed, arm.robot.joint)
     trajectory = ExcitationTrajectory(duration, harmonics, bounds)
     criterion = Criterion(arm.arm, trajectory)
-    starts = np.random.default_rng(seed).standard_normal((EXCITATION.starts, trajectory.size))
+    starts = np.random.default_rng(seed).standard_normal((TUNING.starts, trajectory.size))
     best = _improved(criterion, min(starts, key=criterion.value), trials, progress)
     motion = trajectory.motion(best, np.linspace(0.0, duration, round(duration * sample_rate) + 1))
     first, states = criterion.states(starts[0]), torch.from_numpy(np.stack([motion.q, motion.qd, motion.qdd]))
@@ -87,6 +87,6 @@ def _improved(
         progress(min(done, trials), trials)
         return value, gradient
 
-    options = {"maxfun": trials, "maxiter": trials, "maxcor": EXCITATION.memory, "ftol": 0.0}
+    options = {"maxfun": trials, "maxiter": trials, "maxcor": TUNING.memory, "ftol": 0.0}
     minimize(evaluate, start, jac=True, method="L-BFGS-B", options=options)
     return best

@@ -15,13 +15,13 @@ from torch import Tensor
 
 from spelgen.arm.arm import Arm
 from spelgen.errors import ArmError, SpelgenError, collect
-from spelgen.settings.tuning.simulation import EXCITATION
+from spelgen.excitation.tuning import TUNING
 from spelgen.urdf.robot import Joint
 
-BETWEEN = cos(pi / EXCITATION.grid)  # of a series' largest value, what a grid shows at least
+BETWEEN = cos(pi / TUNING.grid)  # of a series' largest value, what a grid shows at least
 # where the URDF names no limit, and for endless joints: [rad/s, m/s], and [rad, m] to both sides of 0
-SPEEDS = {"revolute": EXCITATION.usual_speed, "prismatic": EXCITATION.sliding_speed}
-REACHES = {"revolute": pi, "prismatic": EXCITATION.sliding_reach}
+SPEEDS = {"revolute": TUNING.usual_speed, "prismatic": TUNING.sliding_speed}
+REACHES = {"revolute": pi, "prismatic": TUNING.sliding_reach}
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ class ExcitationTrajectory:
         exceeds them by less than 1 / cos(pi / density) (Ehlich and Zeller, Math. Z. 86:41, 1964).
         """
         coefficients, offsets = self._coefficients(parameters)
-        points = torch.linspace(0.0, self.duration, EXCITATION.grid * self.harmonics + 1, dtype=torch.float64)
+        points = torch.linspace(0.0, self.duration, TUNING.grid * self.harmonics + 1, dtype=torch.float64)
         positions, velocities, _ = self._signals(coefficients, points)
         highest, lowest = positions.amax(dim=0), positions.amin(dim=0)
         middle, half = (highest + lowest) / 2, (highest - lowest) / 2 / BETWEEN

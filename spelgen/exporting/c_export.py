@@ -16,7 +16,7 @@ from spelgen.exporting.c_source import MEMORIES, CFunction, c_functions, write_c
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.exported import Exported, folder_export
 from spelgen.exporting.parity import Called, Values, check_parity
-from spelgen.settings.tuning.exporting import TUNING
+from spelgen.exporting.tuning import TUNING
 
 _FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared")
 

@@ -16,7 +16,7 @@ from spelgen.exporting.exported import Exported, folder_export
 from spelgen.exporting.model_expressions import expression_functions, residuals_needed
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.residual_expressions import residual_values
-from spelgen.settings.tuning.exporting import TUNING
+from spelgen.exporting.tuning import TUNING
 
 
 def export_casadi(trained: Trained) -> Exported:

@@ -12,7 +12,7 @@ from spelgen.exporting.exported import UNITS, Exported, readme
 from spelgen.exporting.mjcf_file import mjcf_text
 from spelgen.exporting.parity import Parity, Values, random_inputs, relative, require_parity
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection, rigid_body_projection
-from spelgen.settings.tuning.exporting import TUNING
+from spelgen.exporting.tuning import TUNING
 
 
 def export_mjcf(trained: Trained) -> Exported:

@@ -12,7 +12,7 @@ from spelgen.dynamics.rigid_bodies import about_center, quaternion
 from spelgen.exporting.describe import tip_frame
 from spelgen.exporting.description import Servos
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection
-from spelgen.settings.tuning.exporting import TUNING
+from spelgen.exporting.tuning import TUNING
 
 SECTIONS = ("worldbody", "equality", "tendon", "actuator")
 

@@ -22,7 +22,7 @@ from spelgen.exporting.entry_points import chosen
 from spelgen.exporting.exported import Exported, folder_export
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.torch_export import PROGRAMS, export_program, program_inputs, program_output
-from spelgen.settings.tuning.exporting import TUNING
+from spelgen.exporting.tuning import TUNING
 
 
 def export_onnx(trained: Trained) -> Exported:

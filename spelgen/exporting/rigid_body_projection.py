@@ -17,10 +17,10 @@ from spelgen.dynamics.residuals import without_residuals
 from spelgen.exporting.describe import array, servos_of
 from spelgen.exporting.description import Servos
 from spelgen.exporting.parity import random_inputs, usual_speeds
+from spelgen.exporting.tuning import TUNING
 from spelgen.fitting.optimizers import minimise
 from spelgen.pipeline.build import build
 from spelgen.pipeline.loaded_arm import LoadedArm
-from spelgen.settings.tuning.exporting import TUNING
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

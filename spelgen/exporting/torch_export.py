@@ -15,7 +15,7 @@ from spelgen.exporting.describe import Trained
 from spelgen.exporting.entry_points import ENTRY_POINTS, chosen
 from spelgen.exporting.exported import Exported, folder_export
 from spelgen.exporting.parity import Called, Values, check_parity
-from spelgen.settings.tuning.exporting import TUNING
+from spelgen.exporting.tuning import TUNING
 
 PROGRAMS: dict[str, Callable[..., Tensor]] = {
     "inverse_dynamics": PreparedModel.inverse_dynamics,

@@ -16,13 +16,13 @@ from spelgen.dynamics.bristles import BristleReach
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.rollout import LossScales, choose_substeps, loss_scales, rollout_loss
 from spelgen.fitting.run_record import Content
+from spelgen.fitting.tuning import ValidationTuning
 from spelgen.logs.checks import check
 from spelgen.logs.chunks import Chunk
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 from spelgen.logs.windows import Split, Windows, cut_windows, split_validation, thinned
 from spelgen.settings.fits import DEFAULTS, Solver
-from spelgen.settings.tuning.fitting import ValidationTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

@@ -13,7 +13,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import torch
 
-from spelgen.settings.tuning.fitting import DampingTuning
+from spelgen.fitting.tuning import DampingTuning
 
 TUNING = DampingTuning()
 

@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterable
 import torch
 
 from spelgen.fitting.run_record import Content
+from spelgen.fitting.tuning import OptimizerTuning
 from spelgen.logs.windows import Windows
-from spelgen.settings.tuning.fitting import OptimizerTuning
 
 TUNING = OptimizerTuning()
 

@@ -11,10 +11,10 @@ import torch
 from spelgen.dynamics.equations import mass_as_learned, runge_kutta
 from spelgen.dynamics.protocol import known_past, memory_after, memory_along, sliding_memory
 from spelgen.errors import LogError
+from spelgen.fitting.tuning import AdaptiveTuning, IntegrationTuning
 from spelgen.logs.windows import Windows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import Solver
-from spelgen.settings.tuning.fitting import AdaptiveTuning, IntegrationTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

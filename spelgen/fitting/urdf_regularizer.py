@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 
 from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
+from spelgen.fitting.tuning import RegularizerTuning
 from spelgen.logs.windows import Windows
-from spelgen.settings.tuning.fitting import RegularizerTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

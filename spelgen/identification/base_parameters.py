@@ -14,7 +14,7 @@ import numpy as np
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.linear_friction import BRISTLES, FrictionModel
 from spelgen.dynamics.regressor import regressor
-from spelgen.settings.tuning.identification import TUNING
+from spelgen.identification.tuning import TUNING
 from spelgen.structure.base_parameters import base_parameters as body_base_parameters
 from spelgen.structure.base_parameters import parameter_name
 

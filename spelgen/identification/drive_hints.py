@@ -23,10 +23,11 @@ from spelgen.dynamics.body_regressor import chain_regressor
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.identification.drive_samples import DriveSamples
 from spelgen.identification.least_squares import block_products, normal_solution
+from spelgen.identification.tuning import HINTS, TUNING
+from spelgen.logs.tuning import SAMPLES
 from spelgen.runtime.body_chain import BodyChain
-from spelgen.settings.tuning.identification import HINTS, TUNING
 
-FRICTION = FrictionModel(coulomb_smoothing_velocity=TUNING.moving)
+FRICTION = FrictionModel(coulomb_smoothing_velocity=SAMPLES.moving)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.linear_friction import FrictionModel
+from spelgen.identification.tuning import HINTS
 from spelgen.logs.dynamics_samples import (
     FREQUENCY,
-    TUNING,
+    SHORTEST,
     DynamicsSamples,
     dynamics_samples,
     is_moving,
@@ -22,7 +23,6 @@ from spelgen.logs.dynamics_samples import (
 )
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
-from spelgen.settings.tuning.identification import HINTS
 
 STEPS = max(HINTS.shifts)
 SHIFTS = np.array(HINTS.shifts) / FREQUENCY  # [s]
@@ -69,7 +69,7 @@ class DriveLog:
 
     def add(self, trajectory: Trajectory) -> None:
         """Take in a trajectory, if it is dense and long enough for accelerations."""
-        if trajectory.duration < TUNING.shortest_piece:  # most of ten thousand short motions, at no cost
+        if trajectory.duration < SHORTEST:  # most of ten thousand short motions, at no cost
             return
         self._number += 1
         if self._number % self._step:

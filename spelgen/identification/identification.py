@@ -19,9 +19,9 @@ from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.errors import Diagnostic
 from spelgen.identification.base_parameters import BaseParameters
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay
+from spelgen.identification.tuning import TUNING
 from spelgen.labels import UNITS, counted
 from spelgen.listing import WIDTH, Listing
-from spelgen.settings.tuning.identification import TUNING
 
 SCHEMA = 3
 DETERMINED = ("firm", "fair", "weak", "may be zero")

@@ -19,12 +19,12 @@ from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.identification import Identification, LeastSquares
 from spelgen.identification.least_squares import Columns, Solution, deviations, reduce, solve
 from spelgen.identification.torque_delay import TorqueDelay, find_torque_delay
+from spelgen.identification.tuning import TUNING
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import SHORTEST, DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
-from spelgen.settings.tuning.identification import TUNING
 
 
 def identify(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import pinv
 
-from spelgen.settings.tuning.identification import TUNING
+from spelgen.identification.tuning import TUNING
 
 Columns = tuple[np.ndarray, np.ndarray]
 """Of some samples: the regressor (T, n, K) and the torque (T, n)."""

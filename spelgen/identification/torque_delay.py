@@ -16,10 +16,10 @@ from spelgen.errors import Diagnostic
 from spelgen.identification.drive_hints import Coupling, DriveProblem, drive_problem, find_coupling
 from spelgen.identification.drive_samples import SHIFTS, DriveLog
 from spelgen.identification.least_squares import block_products, normal_solution
+from spelgen.identification.tuning import HINTS, TUNING
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.runtime.body_chain import BodyChain
-from spelgen.settings.tuning.identification import HINTS, TUNING
 
 FRICTION = FrictionModel(memory=True)
 

@@ -20,11 +20,11 @@ from spelgen.log_checks.gravity import find_opposed_inertia, fit_gravity, joined
 from spelgen.log_checks.report import JointReport, LogReport, joint_report, percent, signal_tables
 from spelgen.log_checks.robot_checks import CHECKS, SENSE, JointEvidence
 from spelgen.log_checks.statistics import Statistics, statistics
+from spelgen.log_checks.tuning import TUNING
 from spelgen.logs.checks import Findings, LogChecks, run_checks
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
-from spelgen.settings.tuning.log_checks import TUNING
 
 if TYPE_CHECKING:
     from spelgen.pipeline.loaded_arm import LoadedArm

@@ -12,23 +12,21 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.listing import Listing, number
 from spelgen.log_checks.report import JointFollowing, JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
+from spelgen.log_checks.tuning import SERVO_LOGS as TUNING
 from spelgen.logs.checks import DEGREES, Findings, is_factor, run_checks
 from spelgen.logs.commands import delayed_commands
 from spelgen.logs.filtering import derivative
 from spelgen.logs.trajectory import Trajectory, require_commands, split_at_gaps
-from spelgen.settings.tuning.identification import IdentificationTuning
-from spelgen.settings.tuning.log_checks import TUNING as CHECK_TUNING
-from spelgen.settings.tuning.servo import ServoLogTuning
+from spelgen.logs.tuning import SAMPLES, SIGNALS
 
 if TYPE_CHECKING:
     from spelgen.pipeline.loaded_arm import LoadedArm
 
-TUNING = ServoLogTuning()
-MOVING = IdentificationTuning().moving
+MOVING = SAMPLES.moving
 DELAYS = np.arange(TUNING.earliest_delay, TUNING.latest_delay + 1e-9, TUNING.delay_step).round(9)
 NO_DELAY = int(np.argmin(np.abs(DELAYS)))
 FILTER_SAMPLES = 12  # the shortest piece that the derivative's polynomial has room in
-FOLLOWS = CHECK_TUNING.agreement
+FOLLOWS = SIGNALS.agreement
 
 
 class Following(NamedTuple):

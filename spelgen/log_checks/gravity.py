@@ -11,11 +11,11 @@ from scipy.linalg import orth
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.regressor import body_chain, regressor, urdf_parameters
 from spelgen.identification.drive_hints import drive_rows
+from spelgen.log_checks.tuning import TUNING
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
-from spelgen.settings.tuning.identification import IdentificationTuning
-from spelgen.settings.tuning.log_checks import TUNING
+from spelgen.logs.tuning import SAMPLES
 
-MOVING = IdentificationTuning().moving
+MOVING = SAMPLES.moving
 
 
 @dataclass(frozen=True)

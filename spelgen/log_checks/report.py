@@ -15,9 +15,9 @@ from spelgen.labels import UNITS, counted
 from spelgen.listing import WIDTH, Listing, number
 from spelgen.log_checks.gravity import GravityFit
 from spelgen.log_checks.statistics import Clock, Statistics
+from spelgen.log_checks.tuning import TUNING
 from spelgen.logs.checks import velocity_agreement
 from spelgen.logs.trajectory import Trajectory
-from spelgen.settings.tuning.log_checks import TUNING
 
 UNFITTED = GravityFit()
 MEASURES = {"q": "position", "qd": "velocity", "tau": "torque", "u": "position"}

@@ -9,9 +9,10 @@ from typing import NamedTuple
 from spelgen.arm.arm import Coordinate
 from spelgen.labels import UNITS
 from spelgen.log_checks.report import MEASURES, JointReport
+from spelgen.log_checks.tuning import TUNING
 from spelgen.logs.checks import Check
 from spelgen.logs.trajectory import QUANTITIES
-from spelgen.settings.tuning.log_checks import TUNING
+from spelgen.logs.tuning import SIGNALS
 
 SAY_UNIT = "write 'units: {tau: ...}' or a 'gain' under 'logs' in the robot's YAML; 'Nm' confirms the unit"
 TORQUE_ERRORS = ("torque-sense", "torque-unit", "torque-beyond-drive")
@@ -137,7 +138,7 @@ def find_no_gravity(joint: JointEvidence) -> str | None:
 POSITION_CHECKS = [Check("beyond-position-limit", "warning", find_beyond_limits)]
 SENSE = Check(
     "torque-sense", "error",
-    partial(find_opposed, TUNING.agreement, "torques that move against gravity, {:.3g} times the URDF's"),
+    partial(find_opposed, SIGNALS.agreement, "torques that move against gravity, {:.3g} times the URDF's"),
     expected="the URDF's sense",
     do="write 'sign: -1' or a negative 'gain' of the joint under 'logs', or the gravity of this mounting",
 )  # fmt: skip
@@ -147,7 +148,7 @@ CHECKS: list[Check[JointEvidence]] = [
     Check(
         "torque-unit", "error",
         partial(
-            find_scaled, TUNING.agreement, TUNING.impossible_factor,
+            find_scaled, SIGNALS.agreement, TUNING.impossible_factor,
             "torques that move with {:.3g} times the URDF's gravity torque",
         ),
         expected="Nm or N at the joint", do=SAY_UNIT,

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from spelgen.log_checks.tuning import TUNING
 from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import Trajectory
-from spelgen.settings.tuning.log_checks import TUNING
 
 
 @dataclass(frozen=True)

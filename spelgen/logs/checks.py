@@ -18,8 +18,8 @@ from spelgen.labels import counted
 from spelgen.logs.rates import SLOWEST, is_dense, shows_accelerations
 from spelgen.logs.recording import is_dropout
 from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
+from spelgen.logs.tuning import SIGNALS
 from spelgen.settings.log_mapping import TIMES
-from spelgen.settings.tuning.log_checks import TUNING
 
 DEGREES = 180.0 / np.pi
 TURNS = 4 * np.pi  # [rad] no revolute joint turns further, so what does is in degrees
@@ -85,7 +85,7 @@ def velocity_products(trajectory: Trajectory) -> np.ndarray:
     products = np.zeros((2 * trajectory.q.shape[1],) * 2)
     for piece in split_at_gaps(trajectory, shortest=2):
         # over several steps: from one sample to the next quantisation of q is larger than its change
-        span = min(TUNING.increments, len(piece) - 1)
+        span = min(SIGNALS.increments, len(piece) - 1)
         integral = cumulative_trapezoid(piece.qd, piece.t, axis=0, initial=0)
         positions = np.concatenate([integral, piece.q], axis=1)
         increments = positions[span:] - positions[:-span]
@@ -129,12 +129,12 @@ class JointSignals(NamedTuple):
 
     def changes_by(self, unit: float) -> bool:
         """Whether q changes that many times as fast as qd says, as beside a wrong unit."""
-        return self.correlation > TUNING.agreement and is_factor(self.factor, unit)
+        return self.correlation > SIGNALS.agreement and is_factor(self.factor, unit)
 
 
 def is_factor(value: float, unit: float) -> bool:
     """Whether a factor is near enough to that of a unit to be it."""
-    return 1 / TUNING.unit_factor < value / unit < TUNING.unit_factor
+    return 1 / SIGNALS.unit_factor < value / unit < SIGNALS.unit_factor
 
 
 def find_degrees(signals: JointSignals) -> str | None:
@@ -155,11 +155,11 @@ def find_frozen(signals: JointSignals) -> str | None:
     from scipy.integrate import cumulative_trapezoid
 
     q, qd = signals.q, signals.qd
-    if np.ptp(qd) == 0 and np.ptp(q) > TUNING.drift:
+    if np.ptp(qd) == 0 and np.ptp(q) > SIGNALS.drift:
         return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
     # the trapezoidal rule: a constant q with a noisy qd around zero stays where it is
     drift = np.abs(cumulative_trapezoid(qd, signals.trajectory.t)).max(initial=0.0)
-    if np.ptp(q) == 0 and drift > TUNING.drift:
+    if np.ptp(q) == 0 and drift > SIGNALS.drift:
         return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
     return None
 
@@ -167,7 +167,7 @@ def find_frozen(signals: JointSignals) -> str | None:
 def find_time_unit(signals: JointSignals) -> str | None:
     """Find times that are not in seconds: no arm is sampled more slowly than at 2 Hz, and q changes as fast as qd."""
     steps = np.diff(signals.trajectory.t)
-    if steps.size and np.median(steps) > TUNING.slowest_step:
+    if steps.size and np.median(steps) > SIGNALS.slowest_step:
         # told once, and not of each joint
         return None if signals.number else f"a sample every {np.median(steps):.3g} s"
     for unit in ("ms", "us", "ns"):
@@ -199,14 +199,14 @@ def find_no_torques(signals: JointSignals) -> str | None:
 
 def find_wrong_velocity(signals: JointSignals) -> str | None:
     """Find velocities that are not the positions' derivative, and say what else they may be."""
-    factor, correlation, tolerance = signals.factor, signals.correlation, 1 - TUNING.agreement
-    if np.isnan(correlation) or (correlation >= TUNING.agreement and abs(factor - 1) <= tolerance):
+    factor, correlation, tolerance = signals.factor, signals.correlation, 1 - SIGNALS.agreement
+    if np.isnan(correlation) or (correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance):
         return None
     advice = "check units, signs and the order of the joints"
     if abs(factor + 1) <= tolerance:
         advice = "its sign is the opposite of that of q"
     for joint, fit in zip(signals.joints, signals.correlations, strict=True):
-        if fit > max(TUNING.agreement, correlation):
+        if fit > max(SIGNALS.agreement, correlation):
             advice = f"it fits q of joint {joint!r}"
             break
     return f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}; {advice}"

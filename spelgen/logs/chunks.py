@@ -21,9 +21,9 @@ from spelgen.logs.read import read_logs
 from spelgen.logs.recording import make_trajectory, require_increasing_times
 from spelgen.logs.tables import Layout, reading, stored_columns, table_layout
 from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.tuning import TUNING
 from spelgen.logs.values import clock_start, values_in_si
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.tuning.logs import TUNING
 
 
 @dataclass(frozen=True)

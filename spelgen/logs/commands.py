@@ -7,14 +7,14 @@ import math
 import numpy as np
 
 from spelgen.logs.trajectory import Trajectory, require_commands
-from spelgen.settings.tuning.servo import ServoRolloutTuning
+from spelgen.logs.tuning import SERVO_ROLLOUT
 
 LogRows = tuple[Trajectory, slice]
 """A part of a log: rows from start to stop."""
 LEAD_IN = 1e3  # s before a recording, over which its first command is taken to have stood
 
 
-def steps_between(trajectory: Trajectory, longest: float = ServoRolloutTuning().step) -> int:
+def steps_between(trajectory: Trajectory, longest: float = SERVO_ROLLOUT.step) -> int:
     """Return into how many steps of at most ``longest`` [s] the time between samples is to be cut."""
     return max(1, math.ceil(1 / (trajectory.sample_rate * longest) - 1e-6))
 

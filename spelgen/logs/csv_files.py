@@ -13,9 +13,9 @@ import pyarrow.csv
 from spelgen.errors import LogError
 from spelgen.logs.bags import FIELDS
 from spelgen.logs.tables import LogFormat, LogTable, table_layout
+from spelgen.logs.tuning import TUNING
 from spelgen.logs.values import is_number
 from spelgen.settings.log_mapping import PLAIN, LogMapping
-from spelgen.settings.tuning.logs import TUNING
 
 STAMP = ("sec", "nanosec", "frame_id")  # of a message's header
 

@@ -12,13 +12,11 @@ from spelgen.logs.filtering import interpolated, low_passed, regular_times, requ
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
-from spelgen.settings.tuning.identification import IdentificationTuning
-from spelgen.settings.tuning.logs import TUNING as LOG_TUNING
+from spelgen.logs.tuning import SAMPLES, TUNING
 
-TUNING = IdentificationTuning()
-FREQUENCY = TUNING.sample_rate
-SHORTEST = TUNING.shortest_piece
-HOLE = 0.25 / LOG_TUNING.automatic_cutoff  # [s] a shorter one loses nothing that the filter lets through
+FREQUENCY = SAMPLES.sample_rate
+SHORTEST = SAMPLES.shortest_piece
+HOLE = 0.25 / TUNING.automatic_cutoff  # [s] a shorter one loses nothing that the filter lets through
 AUTOMATIC = Preprocessing()
 
 
@@ -102,7 +100,7 @@ def _columns(
     q, qd, tau = sampled(piece.q), sampled(piece.qd), sampled(piece.tau)
     selected = is_moving(qd)
     if cutoff is not None:  # a filter that begins or ends within a motion makes up what it does not see
-        unsettled = round(TUNING.unsettled * FREQUENCY / cutoff)
+        unsettled = round(SAMPLES.unsettled * FREQUENCY / cutoff)
         selected[:unsettled] = selected[len(selected) - unsettled :] = False
     if pauses and selected.any():
         moving = np.flatnonzero(selected)
@@ -124,4 +122,4 @@ def _columns(
 
 def is_moving(qd: np.ndarray) -> np.ndarray:
     """Return in which samples some joint moves, (T,)."""
-    return np.asarray((np.abs(qd) > TUNING.moving).any(axis=1))
+    return np.asarray((np.abs(qd) > SAMPLES.moving).any(axis=1))

@@ -9,7 +9,7 @@ import numpy as np
 
 from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import Trajectory
-from spelgen.settings.tuning.logs import TUNING
+from spelgen.logs.tuning import TUNING
 
 # SciPy is imported where it is called: that takes the better part of a second, which most commands can do without
 

@@ -12,8 +12,8 @@ import pyarrow as pa
 
 from spelgen.errors import LogError
 from spelgen.logs.tables import LogFormat, LogTable, missing_columns, stored_columns, table_layout
+from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.tuning.logs import TUNING
 
 JOINT_NAMES = "joints"  # the array of joint names, by the columns of the matrices
 TRAJECTORY = "{trajectory}"

@@ -11,7 +11,7 @@ from spelgen.logs.filtering import low_pass
 from spelgen.logs.rates import FAST
 from spelgen.logs.recording import earlier
 from spelgen.logs.trajectory import GAP, Trajectory, split_at_gaps
-from spelgen.settings.tuning.logs import TUNING
+from spelgen.logs.tuning import TUNING
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from spelgen.settings.tuning.logs import TUNING
+from spelgen.logs.tuning import TUNING
 
 SLOWEST = TUNING.samples_per_period * TUNING.automatic_cutoff  # [Hz] of logs that show accelerations at all
 FAST = 1 + TUNING.clock_error

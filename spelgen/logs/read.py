@@ -18,8 +18,8 @@ from spelgen.logs.formats import log_files, read_tables
 from spelgen.logs.recording import in_time_order, make_trajectory
 from spelgen.logs.tables import UNITS, UNITS_KEY, Layout
 from spelgen.logs.trajectory import Trajectory, joined_column, require_joints
+from spelgen.logs.tuning import TUNING
 from spelgen.logs.values import clock_start, values_in_si
-from spelgen.settings.tuning.logs import TUNING
 
 
 def read_logs(

@@ -10,7 +10,7 @@ import numpy as np
 from spelgen.errors import LogError
 from spelgen.logs.tables import Layout
 from spelgen.logs.trajectory import Trajectory, gap_ends
-from spelgen.settings.tuning.logs import TUNING
+from spelgen.logs.tuning import TUNING
 
 
 def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[str, ...] = ()) -> Trajectory:

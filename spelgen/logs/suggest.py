@@ -16,7 +16,7 @@ import pyarrow as pa
 from spelgen.errors import LogError, shortened
 from spelgen.logs.formats import FORMATS, format_of
 from spelgen.logs.tables import names_joint, reading
-from spelgen.settings.tuning.logs import TUNING
+from spelgen.logs.tuning import TUNING
 
 WORDS = {
     "t": {"t", "time", "times", "timestamp", "stamp", "clock", "ms", "us", "ns", "sec", "secs", "seconds", "millis"},

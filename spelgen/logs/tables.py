@@ -15,8 +15,8 @@ from pathlib import Path
 import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
+from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.tuning.logs import TUNING
 
 UNITS_KEY = b"units"  # in a Parquet file's metadata: the file declares its units
 UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")  # that a declared unit answers

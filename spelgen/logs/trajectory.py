@@ -13,7 +13,7 @@ import numpy as np
 from spelgen.errors import LogError
 from spelgen.labels import counted
 from spelgen.listing import Listing
-from spelgen.settings.tuning.logs import TUNING
+from spelgen.logs.tuning import TUNING
 
 T = TypeVar("T")
 

@@ -12,8 +12,8 @@ import pyarrow.compute
 from spelgen.errors import LogError
 from spelgen.logs.jumps import signed
 from spelgen.logs.tables import Layout, list_element
+from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import TIMES
-from spelgen.settings.tuning.logs import TUNING
 
 Table: TypeAlias = "pa.Table | pa.RecordBatch"
 Column: TypeAlias = "pa.ChunkedArray | pa.Array"

@@ -21,7 +21,7 @@ from spelgen.evaluation.traces import Traces
 from spelgen.labels import entry_name, joint_ranges, joints_in_ranges
 from spelgen.render.page import json_data
 from spelgen.render.scene import scene
-from spelgen.settings.tuning.render import TUNING
+from spelgen.render.tuning import TUNING
 from spelgen.structure.nominal import working_range
 from spelgen.structure.structure import Structure
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.settings.tuning.render import TUNING
+from spelgen.render.tuning import TUNING
 from spelgen.templates import render
 
 Values = Sequence[float] | np.ndarray

@@ -11,7 +11,7 @@ from spelgen.log_checks.report import LogReport
 from spelgen.logs.trajectory import Trajectory, joined_column, split_at_gaps
 from spelgen.render.page import render_page
 from spelgen.render.plots import JointRow, Panel, stacks
-from spelgen.settings.tuning.render import TUNING
+from spelgen.render.tuning import TUNING
 
 
 def page(report: LogReport, arm: Arm, inputs: np.ndarray) -> str:

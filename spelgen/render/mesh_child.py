@@ -16,7 +16,7 @@ import numpy as np
 
 from spelgen.errors import SpelgenError
 from spelgen.files import read_bytes
-from spelgen.settings.tuning.render import TUNING
+from spelgen.render.tuning import TUNING
 
 MEMORY = 1_073_741_824  # bytes
 SECONDS = 30  # of processor time: imports and simplification of fine meshes take most of it

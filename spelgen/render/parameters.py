@@ -20,7 +20,7 @@ from spelgen.labels import UNITS, entry_name
 from spelgen.listing import Listing
 from spelgen.pipeline.loaded_arm import LoadedArm
 from spelgen.render.plots import Record
-from spelgen.settings.tuning.render import TUNING
+from spelgen.render.tuning import TUNING
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

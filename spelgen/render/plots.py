@@ -24,7 +24,7 @@ from spelgen.evaluation.traces import FrictionTrace, Growth, Quantiles, Traces
 from spelgen.evaluation.verdict import Limits
 from spelgen.labels import UNITS, NamedJoint, entry_name
 from spelgen.render.charts import MARGINS, Band, Chart, Dots, Line, Mark, Values, line_chart
-from spelgen.settings.tuning.render import TUNING
+from spelgen.render.tuning import TUNING
 
 Record = Mapping[str, Any]
 """A record of JSON."""

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from spelgen.dynamics.constraint import Constraint, mimic_constraint
 from spelgen.evaluation.plain import Curve
 from spelgen.render.shapes import Shape, joined, tube, visual_shapes
-from spelgen.settings.tuning.render import TUNING
+from spelgen.render.tuning import TUNING
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Joint, Robot
 

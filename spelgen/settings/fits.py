@@ -6,13 +6,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
 from spelgen.errors import OptionError, SettingsError, suggestion
 from spelgen.settings.messages import validated
-from spelgen.settings.tuning.fit_defaults import FitDefaults
 from spelgen.settings.values import Count, Group, NonNegative, Positive, Whole
 
 Objective = Literal["torque", "momentum", "rollout", "servo"]
@@ -22,7 +22,24 @@ Solver = Literal["rk4", "dopri5"]
 Window = Annotated[Count, Field(ge=2)]
 Substeps = Annotated[Count, Field(le=1000)]  # more never end
 
-DEFAULTS = FitDefaults()
+
+@dataclass(frozen=True)
+class WindowFitDefaults:
+    """Defaults of the optimizers of fits to windows; chosen on the arms of `benchmarks/arms.py`."""
+
+    # [1] Up to this number of windows L-BFGS takes all of them in every step; AdamW is the default for more.
+    few_windows: int = 1024
+    # [1] Weight decay of L-BFGS: factor of half the sum of squared weights, in units of the loss.
+    lbfgs_decay: float = 2e-5
+    # [1] Weight decay of AdamW (Loshchilov and Hutter, ICLR 2019).
+    adamw_decay: float = 0.2
+    # [1] Windows per step of AdamW.
+    batch: int = 256
+    # [1] Largest learning rate of AdamW: the default of its authors.
+    learning_rate: float = 1e-3
+
+
+DEFAULTS = WindowFitDefaults()
 UNLESS = {  # options that belong to one value of another option
     "batch": ("optimizer", "adamw", "lbfgs"),
     "learning_rate": ("optimizer", "adamw", "lbfgs"),

@@ -15,7 +15,7 @@ from scipy.integrate import ODEintWarning, odeint
 
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import RunError
-from spelgen.settings.tuning.simulation import SIMULATION
+from spelgen.simulation.tuning import TUNING
 
 
 def rollout(
@@ -32,7 +32,7 @@ def rollout(
     on.
     """
     n = tau.shape[1]
-    tolerances = {"rtol": SIMULATION.rtol * looser, "atol": SIMULATION.atol * looser}
+    tolerances = {"rtol": TUNING.rtol * looser, "atol": TUNING.atol * looser}
     states = np.empty((t.size, 2 * n))
     states[0] = start
     changes = np.flatnonzero((tau[1:-1] != tau[:-2]).any(axis=1)) + 1
@@ -54,7 +54,7 @@ def rollout(
                     states[first],
                     t[span],
                     tfirst=True,
-                    mxstep=SIMULATION.most_steps,
+                    mxstep=TUNING.most_steps,
                     **tolerances,
                 )
             except ODEintWarning as warning:

@@ -7,9 +7,10 @@ import numpy as np
 from spelgen.arm.arm import Arm
 from spelgen.errors import SettingsError, SpelgenError, collect
 from spelgen.excitation.trajectory import SPEEDS, ExcitationTrajectory, Motion, MotionBounds
+from spelgen.excitation.tuning import TUNING as EXCITATION
 from spelgen.settings.settings import Settings
-from spelgen.settings.tuning.simulation import EXCITATION, SIMULATION
 from spelgen.simulation.protocol import initial_range
+from spelgen.simulation.tuning import TUNING as SIMULATION
 
 
 def paths(arm: Arm, settings: Settings, t: np.ndarray) -> list[Motion]:

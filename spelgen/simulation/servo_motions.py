@@ -11,10 +11,9 @@ from spelgen.arm.arm import Arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
-from spelgen.settings.tuning.servo import ServoSimulationTuning
 from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction
+from spelgen.simulation.tuning import SERVOS as TUNING
 
-TUNING = ServoSimulationTuning()
 SWEEPS = 4  # over the joints, of dry friction
 ENCODER = 2 * np.pi / 4096  # rad: a turn in twelve bits; of a sliding joint [m] a tenth of that
 EFFORT, LAG = 5.0, 0.05  # Nm, s: of a servo of which nothing is said

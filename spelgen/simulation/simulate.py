@@ -9,12 +9,12 @@ from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.settings.messages import validated
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import ControlledSimulation, ServoSimulation, SimulationSettings
-from spelgen.settings.tuning.simulation import SIMULATION
 from spelgen.settings.yaml_document import Document
 from spelgen.simulation.protocol import SimulatedLogs
 from spelgen.simulation.random_inputs import random_inputs
 from spelgen.simulation.servo_motions import servo_motions
 from spelgen.simulation.tracking import track
+from spelgen.simulation.tuning import TUNING
 
 PROTOCOLS = {"random-inputs": random_inputs, "tracking": track}
 
@@ -63,7 +63,7 @@ def _controlled(settings: Settings) -> Settings:
     usual_tracking: dict[str, object] = {
         "control": "computed-torque",
         "paths": "own" if {"amplitude", "frequency"} & tracking.model_fields_set else "excitation",
-        "control_rate": rate / max(1, round(rate / SIMULATION.control_rate)),
+        "control_rate": rate / max(1, round(rate / TUNING.control_rate)),
         "cutoff": min(tracking.cutoff, rate / 4),
     }
     tracking = tracking.model_copy(update=usual_tracking | tracking.model_dump(exclude_unset=True))

@@ -22,10 +22,10 @@ from spelgen.logs.filtering import low_pass_regular
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
-from spelgen.settings.tuning.simulation import SIMULATION
 from spelgen.simulation.integration import rollout
 from spelgen.simulation.paths import paths
 from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction
+from spelgen.simulation.tuning import TUNING
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ def track(
 def tuned_gains(inertia: np.ndarray, bandwidth: float) -> Gains:
     """Return gains for joints of inertia (n,) [kg m^2; kg]; both poles of the position loop are at the bandwidth."""
     omega = 2 * np.pi * bandwidth
-    return Gains(inertia * omega**2, SIMULATION.integral_gain * inertia * omega**3, 2 * inertia * omega)
+    return Gains(inertia * omega**2, TUNING.integral_gain * inertia * omega**3, 2 * inertia * omega)
 
 
 def computed_torque(
@@ -149,7 +149,7 @@ def record(
             effort = computed_torque(dynamics, friction, (seen, qd, qdd), error, lag, omega)
         torques.append(to_motors @ effort)
         torque = np.tile(inputs @ torques[-1], (samples + 1, 1))
-        passed = rollout(dynamics, state, k * tick + within, torque, SIMULATION.seen_loosening)
+        passed = rollout(dynamics, state, k * tick + within, torque, TUNING.seen_loosening)
         states.append(passed[:-1])
         state = passed[-1]
     true = np.concatenate(states)

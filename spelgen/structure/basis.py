@@ -16,11 +16,9 @@ from math import gcd
 
 import numpy as np
 
-from spelgen.settings.tuning.structure import StructureTuning
 from spelgen.structure import field
 from spelgen.structure.sampling import Spans
-
-TUNING = StructureTuning()
+from spelgen.structure.tuning import TUNING
 
 Weights = tuple[tuple[int, int, Fraction], ...]
 """A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""

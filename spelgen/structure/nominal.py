@@ -13,12 +13,11 @@ from math import floor, isqrt, log10, pi
 import numpy as np
 
 from spelgen.arm.arm import Arm, Coordinate
-from spelgen.settings.tuning.structure import StructureTuning
 from spelgen.structure.basis import Term, row_of
 from spelgen.structure.sampling import float_energies
 from spelgen.structure.structure import Structure
+from spelgen.structure.tuning import TUNING
 
-TUNING = StructureTuning()
 _DIGITS = 6
 
 

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spelgen.settings.tuning.structure import StructureTuning
-
-TUNING = StructureTuning()
+from spelgen.structure.tuning import TUNING
 
 
 def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:

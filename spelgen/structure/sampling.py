@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spelgen.arm.arm import Arm
-from spelgen.settings.tuning.structure import StructureTuning
 from spelgen.structure import field
 from spelgen.structure.field import (
     PRIME,
@@ -27,12 +26,12 @@ from spelgen.structure.field import (
     residue,
 )
 from spelgen.structure.recursion import Element, Position, base_denominators, coefficients, energies, triangle
+from spelgen.structure.tuning import TUNING
 
 if TYPE_CHECKING:
     from spelgen.urdf.robot import Assume
 
 Ten = Sequence[Element]
-TUNING = StructureTuning()
 
 
 def field_samples(arm: Arm, assume: Assume, samples: int) -> tuple[np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo.parameters import COULOMB, DEAD_ZONE, ServoParameters
 from spelgen.fitting.servo.problem import LONGEST_STEP, ServoProblem
-from spelgen.settings.tuning.servo import ServoLawTuning, ServoSolverTuning
+from spelgen.fitting.servo.tuning import ServoLawTuning, ServoSolverTuning
 
 TUNING, SOLVER = ServoLawTuning(), ServoSolverTuning()
 

@@ -29,11 +29,11 @@ from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
 from spelgen.fitting.servo.report import servo_record, solution
 from spelgen.fitting.servo.start import start_servos
+from spelgen.fitting.servo.tuning import ServoSolverTuning
 from spelgen.fitting.servo.windows import servo_windows
 from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.checks import check
 from spelgen.logs.trajectory import require_commands, require_joints
-from spelgen.settings.tuning.servo import ServoSolverTuning
 
 if TYPE_CHECKING:
     from spelgen.fitting.progress import TrainingProgress

@@ -14,7 +14,7 @@ from torch.autograd.functional import jacobian
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.parameters import parameters_of_kind
 from spelgen.fitting.functional_model import under_weights
-from spelgen.settings.tuning.servo import ServoPriorTuning
+from spelgen.fitting.servo.tuning import ServoPriorTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

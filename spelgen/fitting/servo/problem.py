@@ -28,8 +28,8 @@ from spelgen.fitting.servo.parameters import (
     body_parameters,
     inertial_parameters,
 )
+from spelgen.fitting.servo.tuning import ServoCostTuning
 from spelgen.fitting.servo.windows import Path, ServoWindows, body_load
-from spelgen.settings.tuning.servo import ServoCostTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

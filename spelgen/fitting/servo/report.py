@@ -20,8 +20,8 @@ from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo.laws import sliding_friction
 from spelgen.fitting.servo.parameters import DEAD_ZONE, ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
+from spelgen.fitting.servo.tuning import ServoIntervalTuning
 from spelgen.listing import Listing, number
-from spelgen.settings.tuning.servo import ServoIntervalTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
+from spelgen.fitting.servo.tuning import ServoStartTuning
 from spelgen.fitting.servo.windows import ServoWindows, body_load
-from spelgen.settings.tuning.servo import ServoStartTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

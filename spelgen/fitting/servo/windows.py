@@ -15,11 +15,11 @@ import torch
 
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.errors import LogError
+from spelgen.fitting.servo.tuning import ServoWindowTuning
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 from spelgen.logs.filtering import derivative, velocities
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
-from spelgen.settings.tuning.servo import ServoWindowTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

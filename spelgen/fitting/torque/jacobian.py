@@ -15,8 +15,8 @@ from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.residuals import friction_factor, residual_torque
 from spelgen.fitting.functional_model import Weights, under_weights
 from spelgen.fitting.torque.samples import Block, TorqueSamples
+from spelgen.fitting.torque.tuning import TorqueTuning
 from spelgen.fitting.torque.weights import RigidWeights, joint_torque, moved_bodies
-from spelgen.settings.tuning.fitting import TorqueTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

@@ -17,8 +17,8 @@ import torch.nn.functional as F
 
 from spelgen.dynamics.protocol import motors_of
 from spelgen.fitting.torque.jacobian import FollowingFunctions, ResidualSamples, RigidResponse
+from spelgen.fitting.torque.tuning import ResidualTuning
 from spelgen.runtime.residual_terms import LARGEST, SPLINES
-from spelgen.settings.tuning.fitting import ResidualTuning
 
 TUNING = ResidualTuning()
 

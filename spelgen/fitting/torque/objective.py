@@ -26,12 +26,12 @@ from spelgen.fitting.torque.report import torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay, find_torque_delay
+from spelgen.identification.tuning import HINTS
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.windows import thinned
 from spelgen.settings.fits import TorqueFit
-from spelgen.settings.tuning.identification import HINTS
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

@@ -16,8 +16,8 @@ from spelgen.errors import Diagnostic
 from spelgen.fitting.functional_model import under_weights
 from spelgen.fitting.torque.fit import TorqueSolution
 from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.fitting.torque.tuning import TorqueReportTuning
 from spelgen.fitting.torque.weights import RigidWeights
-from spelgen.settings.tuning.fitting import TorqueReportTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel

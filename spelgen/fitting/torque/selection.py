@@ -30,7 +30,7 @@ from spelgen.fitting.torque.joint_functions import (
     joint_functions,
     most_probable,
 )
-from spelgen.settings.tuning.fitting import ResidualTuning
+from spelgen.fitting.torque.tuning import ResidualTuning
 
 TUNING = ResidualTuning()
 

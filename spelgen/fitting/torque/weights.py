@@ -10,10 +10,10 @@ from spelgen.dynamics.parameters import parameter_table
 from spelgen.dynamics.protocol import motors_of
 from spelgen.fitting.functional_model import Weights
 from spelgen.fitting.torque.samples import Block
+from spelgen.fitting.torque.tuning import TorqueTuning
+from spelgen.logs.tuning import SAMPLES
 from spelgen.runtime.rigid_body import body_factor
 from spelgen.settings.fits import Adaptation
-from spelgen.settings.tuning.fitting import TorqueTuning
-from spelgen.settings.tuning.identification import IdentificationTuning
 
 if TYPE_CHECKING:
     from spelgen.emission.loading import EmittedModel
@@ -24,7 +24,7 @@ RIGID = (
 )  # fmt: skip
 """Kinds of parameters of bodies, drives and friction laws: all but what stands beside them."""
 TUNING = TorqueTuning()
-MOVING = IdentificationTuning().moving
+MOVING = SAMPLES.moving
 DAILY = ("sizes", "effects", "velocities", "load_dependence", "fractions", "offset")
 """Kinds that change from day to day."""
 NONE = -30.0  # of a size that is none, the logarithm

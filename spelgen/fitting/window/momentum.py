@@ -16,9 +16,9 @@ from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
 from spelgen.fitting.rollout import momentum_loss
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.streaming import LargeLogs
+from spelgen.fitting.tuning import WindowTuning
 from spelgen.logs.windows import Windows
 from spelgen.settings.fits import DEFAULTS, Solver, WindowConfig
-from spelgen.settings.tuning.fitting import WindowTuning
 
 if TYPE_CHECKING:
     from spelgen.fitting.progress import TrainingProgress

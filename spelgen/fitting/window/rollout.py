@@ -16,11 +16,11 @@ from spelgen.fitting.optimizers import WindowOptimizer
 from spelgen.fitting.rollout import rollout_loss
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.objective import fit_torques, torque_samples
+from spelgen.fitting.tuning import LoopTuning
 from spelgen.fitting.window.momentum import MomentumObjective
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.windows import Windows
 from spelgen.settings.fits import Rollout, TorqueFit
-from spelgen.settings.tuning.fitting import LoopTuning
 
 if TYPE_CHECKING:
     from spelgen.fitting.objective import Status

@@ -1,4 +1,4 @@
-"""Hold the tuned numbers of simulated logs and of motions that are designed."""
+"""Constants of the design of exciting motions."""
 
 from __future__ import annotations
 
@@ -22,18 +22,4 @@ class ExcitationTuning:
     sliding_reach: float = 0.5  # [m] to both sides of 0, of sliding joints without limits
 
 
-@dataclass(frozen=True)
-class SimulationTuning:
-    """Numbers that decide how exactly motion is simulated, and how arms are controlled."""
-
-    rtol: float = 1e-13  # of integration: as exact as floating-point numbers allow
-    atol: float = 1e-14  # [rad, rad/s] likewise
-    most_steps: int = 100_000  # while a torque is held: what takes more will not end
-    seen_loosening: float = 100.0  # of tolerances where encoders see the motion: 1e-11 is enough
-    used_range: float = 0.7  # of a joint's range and of its speed limit, where nothing is said
-    integral_gain: float = 0.2  # of the PID: a tenth of what makes a joint without friction unstable
-    control_rate: float = 125.0  # [Hz] about, where nothing is said of the controllers
-
-
-EXCITATION = ExcitationTuning()
-SIMULATION = SimulationTuning()
+TUNING = ExcitationTuning()

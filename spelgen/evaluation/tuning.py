@@ -1,4 +1,4 @@
-"""The numbers that decide how models are judged."""
+"""Constants of the evaluation and of its report."""
 
 from __future__ import annotations
 
@@ -7,21 +7,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class EvaluationTuning:
-    """The numbers that evaluation, baselines and the verdict go by."""
+    """Constants of the evaluation and of the verdict."""
 
     # [s] that the momentum observer runs before a prediction (measured: 0.2 and 0.3 s are no better, UR10e)
     observed_past: float = 0.1
     # [s] 1 / K of the momentum observer (measured: 0.02 to 0.1 s differ by 3 %, UR10e)
     observer_time_constant: float = 0.05
-
-    most_substeps: int = 16  # of dynamics between samples; a power of two
-    shortest_step: float = 1e-3  # [s] of dynamics: shorter ones are for those that leave all bounds
-    # of the error of dynamics, what twice as many steps may change: figures move by a thousandth
-    tolerance: float = 5e-2
-    least_error: float = 2e-5  # of the motion: dynamics are not expected to be better
-    bounds: float = 100.0  # times the largest velocity that was measured: what is faster has left all bounds
-    probed_windows: int = 16  # that say in which steps dynamics are integrated
-
     most_windows: int = 1000  # that a horizon is judged on, evenly spread
     # of a predictor over a horizon: fewer windows where they are long, but not fewer than the next
     most_predicted_steps: int = 10_000
@@ -36,15 +27,10 @@ class EvaluationTuning:
     slow: float = 0.1  # of a joint's largest velocity: below is called near standstill
     uneven: float = 1.4  # ratio of slow and fast errors that is worth a word
     narrow_range: float = 0.5  # of a joint's range: logs that cover less are called narrow
-
     sampled_positions: int = 100_000  # at which M must be positive definite
     free_steps: int = 10_000  # of 1 ms without input
     started_states: int = 8  # that motion without input starts from
-
     headline: int = 20  # [words] of a verdict's sentence: it is read at a glance
-    # of a joint's largest velocity: differences that friction is differentiated by
-    velocity_step: float = 1e-5
-    displacement_step: float = 1e-7  # [rad, m] likewise, of bristles
     # [samples] of the windows that say in which steps a model is integrated, where its fit had none
     model_window: int = 5
     replay_window: float = 1.0  # [s] of replays that start anew again and again
@@ -58,3 +44,6 @@ class TraceTuning:
     samples: int = 240  # of a curve along a log or a prediction
     log_samples: int = 600  # of a whole log that is replayed
     times: int = 24  # at which the growth of errors is shown
+
+
+TUNING, TRACES = EvaluationTuning(), TraceTuning()

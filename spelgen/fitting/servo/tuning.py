@@ -1,28 +1,8 @@
-"""Tuned numbers of arms under position servos: checks of their logs, fits, baselines and simulation."""
+"""Constants of fits of position servos."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-
-@dataclass(frozen=True)
-class ServoRolloutTuning:
-    """Decide how finely motion under servos is integrated."""
-
-    step: float = 3.4e-3  # [s] at most; measured: longer steps bias armatures by a few percent
-
-
-@dataclass(frozen=True)
-class ServoLogTuning:
-    """Decide what the checks of logs of commanded positions report."""
-
-    earliest_delay: float = -0.1  # [s] positions before commands: such rows are shifted
-    latest_delay: float = 0.4  # [s] of every delay that is searched; measured: cheap servos stay below 0.2
-    delay_step: float = 0.01  # [s] half a sample at 50 Hz
-    rest_time: float = 0.25  # [s] a command rests so long before its joint can rest; measured on an SO-101
-    idle_command: float = 1e-2  # [rad, m] standard deviation below which a command does not move
-    ignores: float = 0.5  # correlation below which a position does not follow its command
-    sparse_rate: float = 20.0  # [Hz] below it delays and friction are not seen
 
 
 @dataclass(frozen=True)
@@ -105,24 +85,3 @@ class ServoStartTuning:
     kp_range: float = 20.0
     # [1] of usual dry friction; squared of kd/kp, cubed of armature/kp: so that these have a log
     least: float = 0.05
-
-
-@dataclass(frozen=True)
-class PositionActuatorTuning:
-    """Decide how MuJoCo's position actuators are fitted, the baseline of servo fits."""
-
-    step: float = 5e-3  # [s] at most; frictionloss is as hard as twice this allows
-    windows: int = 60  # half a minute of fitting
-    iterations: int = 8  # of mujoco.minimize
-    nudge: float = 1e-4  # of unknowns, for slopes
-
-
-@dataclass(frozen=True)
-class ServoSimulationTuning:
-    """Decide how `spelgen simulate` moves an arm under position servos."""
-
-    step: float = 1e-3  # [s] at most
-    widest: float = 0.6  # [rad, m] of commands, from the middle of a joint's range
-    held_level: float = 2.0  # [s] between jumps of the commands
-    lowest_frequency: float = 0.05  # [Hz] of the commands' sines
-    highest_frequency: float = 1.2  # [Hz] above it servos of hobby arms hardly follow

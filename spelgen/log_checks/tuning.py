@@ -1,4 +1,4 @@
-"""Hold the tuned numbers of the checks of logs."""
+"""Constants of the checks of logs."""
 
 from __future__ import annotations
 
@@ -7,12 +7,8 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class LogCheckTuning:
-    """Numbers from which on something about a log is odd, or so odd that nothing may be fitted to it."""
+    """Thresholds of notes and errors about logs."""
 
-    increments: int = 10  # [samples] over which q and the integral of qd are compared: hides quantisation
-    drift: float = 0.05  # [rad, m] that qd must say a joint moved, before a constant q is called frozen
-    agreement: float = 0.9  # correlation from which two signals are one; their factor may differ by the rest
-    unit_factor: float = 1.25  # a factor this near to that of a unit is that of the unit
     limit_rounding: float = 1e-3  # [rad, m] a position limit overrun by less is rounding
     one_way: float = 0.1  # of a joint's fastest velocity: that of a joint that never moves back is less
     limit_noise: float = 0.01  # of a velocity or effort limit: overrun by less is noise of the signal
@@ -30,7 +26,19 @@ class LogCheckTuning:
     dependent: float = 1e-8  # of its own size: what is left of a column that others span
     examples: int = 2  # trajectories that a page draws
     shown: int = 20  # trajectories that a terminal and a notebook show
-    slowest_step: float = 0.5  # [s] no arm is sampled more slowly than at 2 Hz
 
 
-TUNING = LogCheckTuning()
+@dataclass(frozen=True)
+class ServoLogTuning:
+    """Decide what the checks of logs of commanded positions report."""
+
+    earliest_delay: float = -0.1  # [s] positions before commands: such rows are shifted
+    latest_delay: float = 0.4  # [s] of every delay that is searched; measured: cheap servos stay below 0.2
+    delay_step: float = 0.01  # [s] half a sample at 50 Hz
+    rest_time: float = 0.25  # [s] a command rests so long before its joint can rest; measured on an SO-101
+    idle_command: float = 1e-2  # [rad, m] standard deviation below which a command does not move
+    ignores: float = 0.5  # correlation below which a position does not follow its command
+    sparse_rate: float = 20.0  # [Hz] below it delays and friction are not seen
+
+
+TUNING, SERVO_LOGS = LogCheckTuning(), ServoLogTuning()

@@ -1,4 +1,4 @@
-"""Hold the tuned numbers of least squares on logs."""
+"""Constants of least squares on logs."""
 
 from __future__ import annotations
 
@@ -7,13 +7,8 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class IdentificationTuning:
-    """Numbers that decide which samples least squares gets, and how it judges what it found."""
+    """Numbers that decide how least squares judges what it found."""
 
-    sample_rate: float = 100.0  # [Hz] of the common grid: twelve times the low-pass, as is usual
-    moving: float = 0.02  # [rad/s, m/s] joints that are slower rest, and say nothing of dynamics
-    shortest_piece: float = 1.0  # [s] shorter pieces are all filter transient
-    # [periods of the filter's cutoff] at both ends of a piece, where the filter is off by 20 times what noise is
-    unsettled: float = 0.75
     rounds: int = 4  # of weighing joints by what is left of their torque; later ones change no digit (UR10e)
     least_noise: float = 0.02  # of a joint's torque range: few samples may be fitted better than deserved
     largest_lag: int = 500  # [samples] over which residuals are followed in time: 5 s
@@ -23,8 +18,6 @@ class IdentificationTuning:
     acceptable: float = 300.0  # condition number up to which parameters can be told apart
     firm: float = 0.05  # of a value, the deviation up to which it is firm
     fair: float = 0.2  # likewise fair; above, up to the value itself, weak
-    # [rad/s, m/s] at which the extra dry friction of slow motion has fallen to 1/e
-    stribeck_velocity: float = 0.1
     block: int = 2000  # samples in memory at a time
     dependent: float = 1e-9  # of its own length: what is left of a column that others span
     rounding: float = 1e-8  # of the largest coefficient of a base parameter: smaller ones are none
@@ -55,5 +48,4 @@ class DriveHintTuning:
     trajectories: int = 8  # of more, whole ones are left out
 
 
-TUNING = IdentificationTuning()
-HINTS = DriveHintTuning()
+TUNING, HINTS = IdentificationTuning(), DriveHintTuning()

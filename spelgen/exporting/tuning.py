@@ -1,4 +1,4 @@
-"""Tuned numbers of the exports."""
+"""Constants of the exports."""
 
 from __future__ import annotations
 

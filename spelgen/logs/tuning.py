@@ -1,4 +1,4 @@
-"""Hold the tuned numbers of reading and preparing logs."""
+"""Constants of reading, checking and preparing logs."""
 
 from __future__ import annotations
 
@@ -38,4 +38,34 @@ class LogTuning:
     latest: float = 1e24  # [s] likewise, of a time
 
 
-TUNING = LogTuning()
+@dataclass(frozen=True)
+class SignalCheckTuning:
+    """Thresholds of the checks of the signals of a log."""
+
+    increments: int = 10  # [samples] over which q and the integral of qd are compared: hides quantisation
+    drift: float = 0.05  # [rad, m] that qd must say a joint moved, before a constant q is called frozen
+    agreement: float = 0.9  # correlation from which two signals are one; their factor may differ by the rest
+    unit_factor: float = 1.25  # a factor this near to that of a unit is that of the unit
+    slowest_step: float = 0.5  # [s] no arm is sampled more slowly than at 2 Hz
+
+
+@dataclass(frozen=True)
+class SampleTuning:
+    """Constants of the samples of dynamics."""
+
+    sample_rate: float = 100.0  # [Hz] of the common grid: twelve times the low-pass, as is usual
+    moving: float = 0.02  # [rad/s, m/s] joints that are slower rest, and say nothing of dynamics
+    shortest_piece: float = 1.0  # [s] shorter pieces are all filter transient
+    # [periods of the filter's cutoff] at both ends of a piece, where the filter is off by 20 times what noise is
+    unsettled: float = 0.75
+
+
+@dataclass(frozen=True)
+class ServoRolloutTuning:
+    """Decide how finely motion under servos is integrated."""
+
+    step: float = 3.4e-3  # [s] at most; measured: longer steps bias armatures by a few percent
+
+
+TUNING, SIGNALS, SAMPLES = LogTuning(), SignalCheckTuning(), SampleTuning()
+SERVO_ROLLOUT = ServoRolloutTuning()

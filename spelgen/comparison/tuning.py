@@ -1,4 +1,4 @@
-"""Hold the tuned numbers of comparisons."""
+"""Constants of comparisons."""
 
 from __future__ import annotations
 
@@ -14,3 +14,6 @@ class ComparisonTuning:
     horizon: float = 1.0  # [s] over which trajectories are predicted, as in the paper
     massless: float = 1e-9  # [kg] links of no more than this keep their inertials
     seed: int = 0  # of the wrong inertials, the same in every call
+
+
+TUNING = ComparisonTuning()

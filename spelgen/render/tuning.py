@@ -1,4 +1,4 @@
-"""Numbers that decide what pages draw."""
+"""Constants of pages."""
 
 from __future__ import annotations
 

@@ -1,1 +1,0 @@
-"""Tuned numbers of each room: frozen dataclasses whose fields have a unit, a meaning and a source."""
