@@ -27,12 +27,30 @@ class JointNames(Protocol):
     def joint_types(self) -> Sequence[str]: ...
 
 
-@runtime_checkable
-class DescribedArm(Protocol):
-    """Hold what of a loaded arm says how its logs are named."""
+class LimitedJoint(Protocol):
+    """Joint of an arm with its position limits, None if it has none."""
 
     @property
-    def arm(self) -> JointNames: ...
+    def name(self) -> str: ...
+    @property
+    def kind(self) -> str: ...
+    @property
+    def limits(self) -> tuple[float, float] | None: ...
+
+
+class LimitedJoints(JointNames, Protocol):
+    """Joints of an arm."""
+
+    @property
+    def coordinates(self) -> Sequence[LimitedJoint]: ...
+
+
+@runtime_checkable
+class DescribedArm(Protocol):
+    """Loaded arm with the settings that describe its logs."""
+
+    @property
+    def arm(self) -> LimitedJoints: ...
     @property
     def robot(self) -> Robot: ...
     @property
@@ -53,8 +71,13 @@ class LogSource(NamedTuple):
 def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
     """Return what `read_logs` was given. Raises LogError for what is no arm, SettingsError for a wrong mapping."""
     if isinstance(arm, DescribedArm):
-        mapping = arm.settings.logs if mapping is None else mapping
-        log_mapping = _mapping(mapping, list(arm.robot.joint))
+        stated = arm.settings.logs
+        log_mapping = stated if mapping is None else _mapping(mapping, list(arm.robot.joint), stated)
+        if arm.settings.input == "position":
+            log_mapping = log_mapping.model_copy(update={"input": "position"})
+        turning = [x.name for x in arm.arm.coordinates if x.kind == "revolute" and x.limits is None]
+        # an angle without limits may be logged in any interval of one turn
+        log_mapping = log_mapping.with_turns(turning)
         return LogSource(tuple(arm.arm.joint_names), tuple(arm.arm.joint_types), log_mapping)
     if isinstance(arm, JointNames):
         joints = logged_joints(arm)
@@ -68,9 +91,25 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
     raise LogError(repr(arm), element="read_logs", expected=expected)
 
 
-def _mapping(mapping: GivenMapping, joints: Sequence[str]) -> LogMapping:
+def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | None = None) -> LogMapping:
+    """Return a mapping as an object; keys that a file or a dict lacks are those of the settings, `stated`."""
     if isinstance(mapping, LogMapping):
         return mapping
     if isinstance(mapping, str | Path):
-        return load_mapping(mapping, joints)
-    return validated(LogMapping, dict(mapping or {}), Document(Path("mapping"), None))
+        given = load_mapping(mapping, joints)
+    else:
+        given = validated(LogMapping, dict(mapping or {}), Document(Path("mapping"), None))
+    if stated is None:
+        return given
+    keys = _merged(stated.model_dump(exclude_unset=True), given.model_dump(exclude_unset=True))
+    return LogMapping.model_validate(keys)
+
+
+def _merged(stated: Mapping[str, object], given: Mapping[str, object]) -> dict[str, object]:
+    """Return the keys of two groups, and of the groups in them; a key of both has the value of the second."""
+    result = dict(stated)
+    for key, value in given.items():
+        below = result.get(key)
+        both_groups = isinstance(value, Mapping) and isinstance(below, Mapping)
+        result[key] = _merged(below, value) if both_groups else value
+    return result

@@ -7,7 +7,7 @@ so that logs need not lie in memory together. `log_checks` has the checks that t
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
@@ -15,8 +15,9 @@ import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.labels import counted
+from spelgen.logs.jumps import held_samples, is_outlier, jumps, read_as_words, repeated_rows
 from spelgen.logs.rates import SLOWEST, is_dense, shows_accelerations
-from spelgen.logs.recording import is_dropout
+from spelgen.logs.recording import listed_times
 from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
 from spelgen.logs.tuning import SIGNALS
 from spelgen.settings.log_mapping import TIMES
@@ -25,6 +26,13 @@ DEGREES = 180.0 / np.pi
 TURNS = 4 * np.pi  # [rad] no revolute joint turns further, so what does is in degrees
 
 Subject = TypeVar("Subject")
+
+
+class Advice(NamedTuple):
+    """What a check found, and the exact remedy, which the check has tried."""
+
+    message: str
+    do: str
 
 
 @dataclass(frozen=True)
@@ -38,7 +46,7 @@ class Check(Generic[Subject]):
 
     code: str
     severity: Literal["info", "warning", "error"]
-    find: Callable[[Subject], str | None]
+    find: Callable[[Subject], str | Advice | None]
     unless: tuple[str, ...] = ()
     everywhere: bool = False
     expected: str | None = None
@@ -71,9 +79,11 @@ def run_checks(
         # one cause, one message: degrees are no derivatives either
         if check.code in accepted or not results.keys().isdisjoint(check.unless):
             continue
-        message = check.find(subject)
-        if message is not None:
-            results[check.code] = check, message
+        found = check.find(subject)
+        if isinstance(found, Advice):
+            results[check.code] = replace(check, do=found.do), found.message
+        elif found is not None:
+            results[check.code] = check, found
     return list(results.values())
 
 
@@ -123,6 +133,21 @@ class JointSignals(NamedTuple):
     correlations: Sequence[float]
 
     @property
+    def turns(self) -> bool:
+        """Whether the joint may turn on and on."""
+        return self.kind == "continuous" or bool(self.trajectory.mapping.word("period", "q", self.joint))
+
+    @property
+    def joint(self) -> str:
+        """Name of the joint."""
+        return self.joints[self.number]
+
+    def signal(self, quantity: str) -> np.ndarray:
+        """Return "q", "qd", "tau" or "u" of the joint, (T,); (0,) if it was not logged."""
+        values: np.ndarray | None = getattr(self.trajectory, quantity)
+        return np.zeros(0) if values is None or not values.size else values[:, self.number]
+
+    @property
     def correlation(self) -> float:
         """Of qd and dq/dt."""
         return self.correlations[self.number]
@@ -139,13 +164,13 @@ def is_factor(value: float, unit: float) -> bool:
 
 def find_degrees(signals: JointSignals) -> str | None:
     """Find revolute joints that look recorded in degrees."""
-    if signals.kind != "revolute":
+    if signals.kind == "prismatic":
         return None
     if signals.changes_by(DEGREES):
         return f"q that changes {signals.factor:.3g} times as fast as qd says (180/pi is 57.3)"
     if signals.changes_by(1 / DEGREES):
         return f"qd that is {1 / signals.factor:.3g} times as large as q changes (180/pi is 57.3)"
-    if np.ptp(signals.q) > TURNS:
+    if np.ptp(signals.q) > TURNS and not signals.turns:
         return f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
     return None
 
@@ -177,15 +202,97 @@ def find_time_unit(signals: JointSignals) -> str | None:
 
 
 def find_dropouts(signals: JointSignals) -> str | None:
-    """Find moments at which the position or the torque falls to 0 and comes back."""
-    trajectory = signals.trajectory
-    for name, values in (("q", trajectory.q), ("tau", trajectory.tau)):
-        if values.size:
-            rows = np.flatnonzero(is_dropout(values[:, signals.number]))
-            if rows.size:
-                t = trajectory.t[rows[0]]
-                return f"{name} that falls to 0 for a moment at t = {t:.4g} s ({rows.size} such samples)"
+    """Find samples that are lost, or that leave their neighbours for a moment and return."""
+    differentiated = signals.trajectory.mapping.velocity == "differentiated"
+    for name in ("q", "tau") if differentiated else ("q", "qd", "tau"):
+        values = signals.signal(name)
+        rows = np.flatnonzero(is_outlier(values, smooth=name == "q"))
+        if rows.size:
+            first = rows[0]
+            size = values[first] - values[max(first - 1, 0)]
+            what = "falls to 0" if values[first] == 0 else f"leaves its neighbours by {size:.4g}"
+            times = listed_times(signals.trajectory.t[rows])
+            return f"{name} that {what} for a moment, in {counted(len(rows), 'sample')}, at t = {times}"
     return None
+
+
+def find_jumps(signals: JointSignals) -> str | Advice | None:
+    """Find signals that jump: words of a register read as plain numbers, wrapped angles, joined recordings."""
+    for name in signals.trajectory.quantities:
+        found = _find_words(signals, name)
+        if found is not None:
+            return found
+    t = signals.trajectory.t
+    rows = jumps(t, signals.q)
+    rows = rows[~is_outlier(signals.q, smooth=True)[rows]]
+    if not rows.size:
+        return None
+    size = signals.q[rows[0] + 1] - signals.q[rows[0]]
+    count = counted(len(rows), "time")
+    return f"q that jumps by {size:.4g} between two samples, {count}, at t = {listed_times(t[rows])}"
+
+
+def _find_words(signals: JointSignals, name: str) -> Advice | None:
+    """Find words of a register, or wrapped angles, in "q", "qd", "tau" or "u" of the joint."""
+    mapping, values = signals.trajectory.mapping, signals.signal(name)
+    scale, offset = mapping.scale(name, signals.joint), mapping.offset(name, signals.joint)
+    turn = None if signals.kind == "prismatic" or name not in ("q", "u") else 2 * np.pi / abs(scale)
+    if name == "q":
+        values = values[~is_outlier(values, smooth=True)]
+    word = read_as_words(np.round((values - offset) / scale, SIGNALS.digits), turn)
+    if word is None:
+        return None
+    # commands may jump: only if they come near the positions by it are they words
+    left = np.std(word.values * scale + offset - signals.q) if name == "u" else 0.0
+    if left > SIGNALS.near_position * np.std(values - signals.q[: len(values)]):
+        return None
+    unit = mapping.unit(name, signals.joint) or ("as logged" if turn is None else "rad")
+    size, count = float(f"{word.value:.9g}"), counted(word.jumps, "time")
+    what = "words with a sign bit" if word.key == "sign_bit" else "a register or an angle that starts again"
+    line = f"joints: {{{signals.joint}: {{{word.key}: {{{name}: {size!r}}}}}}}"
+    return Advice(
+        f"{name} that jumps by {size:.6g} ({unit}), {count}: {what}",
+        f"write '{line}' under 'logs' in the robot's YAML",
+    )
+
+
+def find_held(signals: JointSignals) -> str | None:
+    """Find signals that change too rarely for fits, whatever the rate of the rows is."""
+    rate = signals.trajectory.sample_rate
+    for name in [x for x in signals.trajectory.quantities if x != "u"]:
+        often = held_samples(signals.signal(name))
+        if often > 1:
+            return (
+                f"{name} that changes {rate / often:.3g} times a second in rows at {rate:.3g} Hz: "
+                f"each value lasts {often} samples"
+            )
+    return None
+
+
+def find_too_rare(signals: JointSignals) -> str | None:
+    """Find held signals from which no acceleration can be computed; arms under servos need none."""
+    rate = signals.trajectory.sample_rate
+    if signals.trajectory.u is not None or not shows_accelerations(rate):
+        return None
+    held = [held_samples(signals.signal(name)) for name in signals.trajectory.quantities]
+    return None if shows_accelerations(rate / max(held)) else find_held(signals)
+
+
+def find_unsigned_velocity(signals: JointSignals) -> str | None:
+    """Find velocities that are the magnitude of dq/dt."""
+    trajectory, qd = signals.trajectory, signals.qd
+    lowest, highest = sorted((abs(qd.min()), abs(qd.max())))
+    # noise of a joint at rest has both signs
+    if trajectory.mapping.velocity == "differentiated" or lowest > SIGNALS.unsigned * highest or len(qd) < 3:
+        return None
+    speed = np.gradient(signals.q, trajectory.t)
+    backward, forward = sorted((-np.quantile(speed, 0.02), np.quantile(speed, 0.98)))
+    if backward < SIGNALS.unsigned * forward or abs(qd).std() == 0:
+        return None
+    agreement = np.corrcoef(np.abs(speed), np.abs(qd))[0, 1]
+    if not agreement > SIGNALS.unsigned_agreement:
+        return None
+    return f"qd that is the magnitude of dq/dt: from {qd.min():.3g} to {qd.max():.3g} while q goes both ways"
 
 
 def find_no_torques(signals: JointSignals) -> str | None:
@@ -235,6 +342,20 @@ def find_gaps(trajectory: Trajectory) -> str | None:
     return f"{counted(gaps, 'gap')} in time, up to {np.diff(trajectory.t).max():.3g} s long; no window crosses one"
 
 
+def find_repeated_rows(trajectory: Trajectory) -> str | None:
+    """Find rows that repeat the row before while the arm moves."""
+    signals = np.concatenate([getattr(trajectory, name) for name in trajectory.quantities], axis=1)
+    repeats, _ = repeated_rows(signals, trajectory.q.shape[1])
+    count = int(np.count_nonzero(repeats))
+    if count <= SIGNALS.repeats * len(trajectory):
+        return None
+    rate = trajectory.sample_rate * (1 - count / len(trajectory))
+    return (
+        f"{count} of {len(trajectory)} rows repeat the row before while the arm moves: {rate:.3g} Hz remain; "
+        "'dropouts: dropped' under 'logs' leaves them out"
+    )
+
+
 def find_low_rate(trajectory: Trajectory) -> str | None:
     """Find a sample rate at which accelerations are hardly seen; arms under servos do without."""
     rate = trajectory.sample_rate
@@ -249,12 +370,25 @@ def find_low_rate(trajectory: Trajectory) -> str | None:
     )
 
 
-CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", find_low_rate)]
-# said when a log is read: each repair is a message of its own
+CLOCK_CHECKS = [
+    Check("gap", "info", find_gaps),
+    Check("low-rate", "warning", find_low_rate),
+    Check("repeated-rows", "warning", find_repeated_rows),
+]
+# reported when a log is read: each repair is a message of its own
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
+REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
     Check(
-        "degrees", "error", find_degrees, expected="radians and rad/s",
+        "dropouts", "error", find_dropouts, expected="signals without holes and outliers",
+        do="write 'dropouts: dropped' under 'logs' in the robot's YAML to drop those rows",
+    ),
+    Check(
+        "jumps", "error", find_jumps, unless=("dropouts",), expected="signals without jumps",
+        do="split recordings that were joined by a column 'trajectory', or check the encoder",
+    ),
+    Check(
+        "degrees", "error", find_degrees, unless=("jumps",), expected="radians and rad/s",
         do="convert degrees, by 'units' under 'logs' in the robot's YAML; if the units are right, declare them there, "
         "or in the Parquet schema's metadata 'units'",
     ),
@@ -267,15 +401,23 @@ CHECKS: list[Check[JointSignals]] = [
         do="write 'units: {t: ms}' (us, ns) under 'logs' in the robot's YAML",
     ),
     Check(
-        "dropouts", "error", find_dropouts, expected="signals without holes",
-        do="write 'dropouts: dropped' under 'logs' in the robot's YAML to drop those rows",
+        "held-samples", "error", find_too_rare, unless=("time-unit",),
+        expected=f"values that change {SLOWEST:g} times a second",
+        do="log the measurements when they are new, and not the last ones again",
+    ),
+    Check("held-values", "warning", find_held, unless=("held-samples", "time-unit")),
+    Check(
+        "velocity-without-sign", "error", find_unsigned_velocity, unless=("degrees", "time-unit", "frozen"),
+        expected="dq/dt", do="write 'velocity: differentiated' under 'logs' in the robot's YAML: velocities are then "
+        "those of q",
     ),
     Check(
         "no-torques", "error", find_no_torques, everywhere=True, expected="the torques that moved it",
         do="check the names of the columns and the logger",
     ),
     Check(
-        "velocity-is-no-derivative", "warning", find_wrong_velocity, unless=("degrees", "time-unit", "dropouts"),
+        "velocity-is-no-derivative", "warning", find_wrong_velocity,
+        unless=("degrees", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign"),
     ),
     Check("constant-torque", "warning", find_constant_torque, unless=("no-torques",), everywhere=True),
     Check("joint-at-rest", "info", find_rest, unless=("frozen",), everywhere=True),
@@ -302,8 +444,9 @@ class LogChecks:
             message = clock_check.find(trajectory)
             if message is not None:
                 self._add(message, clock_check, message, where, trajectory)
-        for repair in trajectory.repairs:
-            self._add(repair, REPAIRED, repair, where, trajectory)
+        for result, messages in ((REPAIRED, trajectory.repairs), (REMARKED, trajectory.remarks)):
+            for message in messages:
+                self._add(message, result, message, where, trajectory)
         products = velocity_products(trajectory)
         self.products += products
         factors, correlations = map(np.ndarray.tolist, velocity_agreement(products))

@@ -6,17 +6,22 @@ the robot. A step is the difference between neighbouring samples, the usual step
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from spelgen.settings.tuning.logs import TUNING
+from spelgen.logs.tuning import TUNING
+
+
+def jump_count(values: np.ndarray, period: float) -> int:
+    """Return how many steps of a signal (T,) are longer than half a period."""
+    return int(np.count_nonzero(np.abs(np.diff(values)) > period / 2))
 
 
 def unwrapped(values: np.ndarray, period: float) -> np.ndarray:
     """Return the signal (T,) without jumps of whole periods; samples that are exactly 0 by loss remain 0."""
-    steps = np.diff(values)
-    if not (np.abs(steps) > period / 2).any():
+    if not jump_count(values, period):
         return values
     known = ~is_lost(values)
     result = values.copy()
@@ -47,7 +52,7 @@ def is_lost(values: np.ndarray) -> np.ndarray:
     return np.asarray(lost & (values == 0))
 
 
-def is_outlier(t: np.ndarray, values: np.ndarray, *, smooth: bool) -> np.ndarray:
+def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     """Return which samples (T,) are lost, or leave their neighbours for a moment and return.
 
     smooth: True for positions, whose steps are alike from sample to sample; torques and velocities may step, so that
@@ -63,7 +68,7 @@ def is_outlier(t: np.ndarray, values: np.ndarray, *, smooth: bool) -> np.ndarray
     if not is_jump.any() or is_jump.mean() > TUNING.most_jumps:
         return outliers
     jumps = np.flatnonzero(is_jump)
-    for first, second in zip(jumps[:-1], jumps[1:], strict=True):
+    for first, second in pairwise(jumps):
         out, back = steps[first], steps[second]
         is_excursion = out * back < 0 and 0.5 < abs(out / back) < 2 and second - first <= TUNING.excursion
         if not is_excursion:
@@ -136,10 +141,14 @@ def held_samples(values: np.ndarray) -> int:
 
 
 class Word(NamedTuple):
-    """A reading of a signal as words of a register: mapping key, its value in logged units, and the decoded signal."""
+    """A reading of a signal as words of a register.
+
+    mapping key, its value in logged units, the number of jumps, the decoded signal.
+    """
 
     key: str
     value: float
+    jumps: int
     values: np.ndarray
 
 
@@ -155,16 +164,17 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     rows = np.flatnonzero(np.abs(steps) > limit)
     if not len(rows) or len(rows) > TUNING.most_words * len(values):
         return None
-    if limit < TUNING.jump * _usual(np.abs(steps)) and not values.min() >= 0:
-        return None
     jump = float(np.median(np.abs(steps[rows])))
+    # torques reverse, too: if values below 0 occur, only an overflow of the whole range is one
+    if values.min() < 0 and jump < max(0.9 * np.ptp(values), TUNING.jump * _usual(np.abs(steps))):
+        return None
     sizes = [x for x in _word_sizes(values, turn) if 0.75 < x / jump < 1.35]
     around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
     best, best_score = None, (len(rows) / 2, np.inf)
     for size in sizes:
-        readings = [Word("period", size, centred(unwrapped(values, size), size))]
+        readings = [Word("period", size, len(rows), centred(unwrapped(values, size), size))]
         if values.min() >= 0:
-            readings.append(Word("sign_bit", size, signed(values, size)))
+            readings.append(Word("sign_bit", size, len(rows), signed(values, size)))
         for reading in readings:
             left = np.abs(np.diff(reading.values))
             bends = np.abs(np.diff(reading.values, 2))

@@ -1,26 +1,36 @@
-"""Make trajectories of rows in SI units: put in order, holes left out, velocities differentiated, torques moved."""
+"""Make trajectories of rows in SI units: in order, without wraps and lost rows, with velocities, torques in time."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
+from math import pi
 
 import numpy as np
 
 from spelgen.errors import LogError
+from spelgen.labels import counted
+from spelgen.logs.jumps import centred, is_outlier, jump_count, repeated_rows, unwrapped
 from spelgen.logs.tables import Layout
 from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.logs.tuning import TUNING
+from spelgen.settings.log_mapping import LogMapping
 
 
 def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[str, ...] = ()) -> Trajectory:
-    """Return a trajectory of these rows (T, C) in SI units, velocities differentiated where there are none."""
-    mapping = layout.mapping
+    """Return a trajectory of these rows (T, C) in SI units, velocities differentiated if none were logged.
+
+    Wrapped angles and overflowed registers are unwrapped, and rows that are written several times are read once,
+    before anything is differentiated; with 'dropouts: dropped' lost rows and outliers are left out, too.
+    """
+    mapping, remarks = layout.mapping, layout.remarks
+    data, wraps = _without_wraps(data, mapping.signals(layout.joints), mapping)
+    data, dropped = _without_repeats(data, len(layout.joints), mapping)
+    repairs += dropped
     if mapping.dropouts == "dropped":
-        holes = np.any([is_dropout(column) for column in data[:, 1:].T], axis=0)
-        if holes.any():
-            data = data[~holes]
-            repairs += (f"{holes.sum()} rows in which a signal fell to 0 were left out",)
+        data, dropped = _without_outliers(data, mapping.signals(layout.joints))
+        repairs += dropped
     t, columns = data[:, 0], np.split(data[:, 1:], len(mapping.quantities), axis=1)
     signals = dict(zip(mapping.quantities, columns, strict=True))
     q, tau = signals["q"], signals.get("tau", np.zeros((len(t), 0)))
@@ -29,7 +39,74 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
         for rows in _pieces(t):
             qd[rows] = np.gradient(q[rows], t[rows], axis=0)  # central differences
     tau = earlier(t, tau, mapping.torque_delay)
-    return Trajectory(t, q, qd, tau, name, layout.file, layout.accepted, signals.get("u"), repairs)
+    trajectory = Trajectory(t, q, qd, tau, name, layout.file, layout.accepted, signals.get("u"), repairs)
+    return replace(trajectory, remarks=remarks + wraps, mapping=mapping)
+
+
+def _without_wraps(
+    data: np.ndarray, signals: Sequence[tuple[str, str]], mapping: LogMapping
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return rows (T, C) in which signals with a period do not jump by it, and remarks on them."""
+    remarks: list[str] = []
+    values = dict(zip(signals, data[:, 1:].T, strict=True))
+    for (quantity, joint), logged in values.items():
+        period = abs(mapping.scale(quantity, joint)) * (mapping.word("period", quantity, joint) or 0.0)
+        if not period:
+            continue
+        count = jump_count(logged, period)
+        result = unwrapped(logged, period)
+        if quantity == "u":
+            # a command is near the position, whatever revolution the two registers count from
+            result = result - period * np.round(np.median(result - values["q", joint]) / period)
+        # without a jump, an angle beyond half a turn is as good as one within it
+        elif count or abs(period - 2 * pi) > TUNING.limit_of_turn:
+            offset = mapping.offset(quantity, joint)
+            result = centred(result - offset, period) + offset
+        if count:
+            remarks.append(f"{quantity} of {joint!r} wraps at {period:.4g}: {counted(count, 'jump')} removed")
+        if result is not logged:
+            values[quantity, joint] = result
+    if all(column is logged for column, logged in zip(values.values(), data[:, 1:].T, strict=True)):
+        return data, ()
+    return np.column_stack([data[:, 0], *values.values()]), tuple(remarks)
+
+
+def _without_repeats(
+    data: np.ndarray, positions: int, mapping: LogMapping
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return rows (T, C) without repeats, if every row is written several times or repeats are to be dropped."""
+    repeats, often = repeated_rows(data[:, 1:], positions)
+    count = np.count_nonzero(repeats)
+    if not count or (often == 1 and mapping.dropouts == "kept"):
+        return data, ()
+    rate = (len(data) - 1 - count) / (data[-1, 0] - data[0, 0])
+    which = f"every row is written {often} times" if often > 1 else f"{count} rows repeat the row before"
+    return data[~repeats], (f"{which}: repeats were left out, {rate:.3g} Hz remain",)
+
+
+def _without_outliers(
+    data: np.ndarray, signals: Sequence[tuple[str, str]]
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return rows (T, C) without samples that are lost or leave their neighbours, and which these were."""
+    outliers = np.zeros(len(data), bool)
+    found = []
+    for (quantity, joint), values in zip(signals, data[:, 1:].T, strict=True):
+        if quantity != "u":
+            rows = is_outlier(values, smooth=quantity == "q")
+            outliers |= rows
+            if rows.any():
+                found.append(f"{quantity} of {joint!r} at t = {listed_times(data[rows, 0])}")
+    if not found:
+        return data, ()
+    message = f"{counted(int(outliers.sum()), 'row')} left out as dropouts: {'; '.join(found)}"
+    return data[~outliers], (message,)
+
+
+def listed_times(t: np.ndarray) -> str:
+    """Return the first times [s] of a list as text, and the number of the others."""
+    shown = ", ".join(f"{x:.4g}" for x in t[: TUNING.listed].tolist())
+    more = len(t) - TUNING.listed
+    return f"{shown} s" + (f" and {more} more" if more > 0 else "")
 
 
 def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -79,20 +156,6 @@ def require_increasing_times(t: np.ndarray, rows: Sequence[int] | np.ndarray, la
         got = f"t = {t[k + 1]:g} s after {t[k]:g} s ({backward.size} such steps, this is the first)"
         do = "sort the rows, drop repeats, or split recordings by a column 'trajectory'"
         raise layout.row_error(got, rows[k + 1], layout.columns[0], "increasing times", do)
-
-
-def is_dropout(values: np.ndarray) -> np.ndarray:
-    """Whether each sample (T,) is exactly 0 between samples that are far from 0: what loggers write for no value."""
-    is_lost = np.zeros(len(values), bool)
-    logged = np.flatnonzero(values)
-    if not logged.size or logged[-1] - logged[0] == len(logged) - 1:
-        return is_lost  # zeros at either end have nothing beside them
-    steps = np.abs(np.diff(values[logged]))
-    usual = np.median(steps[steps > 0]) if steps.any() else np.inf
-    # a signal that passes through 0 comes near it first
-    nearest = np.minimum(np.abs(values[logged[:-1]]), np.abs(values[logged[1:]]))
-    is_lost[logged[0] : logged[-1]] = np.repeat(nearest > TUNING.dropout * usual, np.diff(logged))
-    return np.asarray(is_lost & (values == 0))
 
 
 def _pieces(t: np.ndarray) -> Iterator[slice]:

@@ -34,7 +34,7 @@ class Layout:
 
     file: what errors and trajectories name. columns: of t, then of q, qd and tau by joint; without qd where velocities
     are to be differentiated. labels: the column that splits the log into recordings, None without. accepted: see
-    `Trajectory`. recording: its name, where the format keeps recordings apart.
+    `Trajectory`. recording: its name, where the format keeps recordings apart. remarks: facts about the file.
     """
 
     file: Path
@@ -44,6 +44,7 @@ class Layout:
     mapping: LogMapping
     accepted: tuple[str, ...]
     recording: str | None = None
+    remarks: tuple[str, ...] = ()
 
     def row_error(self, got: str, row: int, column: str, expected: str, do: str | None = None) -> LogError:
         """Return an error about a column in a 0-based data row, with the line of a CSV, whose first is its header."""

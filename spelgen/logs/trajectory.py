@@ -14,11 +14,13 @@ from spelgen.errors import LogError
 from spelgen.labels import counted
 from spelgen.listing import Listing
 from spelgen.logs.tuning import TUNING
+from spelgen.settings.log_mapping import LogMapping
 
 T = TypeVar("T")
 
 QUANTITIES = ("q", "qd", "tau")
 GAP = TUNING.gap
+IN_SI = LogMapping()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -33,7 +35,7 @@ class Trajectory:
     name: unique among the trajectories that are used together.
     file: where it was read from, None if it was not.
     accepted: codes of checks (see `spelgen.logs.checks`) that are not made of it: what they would find is right.
-    repairs: what was mended when it was read.
+    repairs: changes of its rows when it was read; remarks: facts about them. mapping: how it was logged.
     Raises LogError where shapes do not fit, a number is not finite or larger than any arm has, or times do not
     increase.
     """
@@ -47,6 +49,8 @@ class Trajectory:
     accepted: tuple[str, ...] = ()
     u: np.ndarray | None = None
     repairs: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    mapping: LogMapping = IN_SI
 
     def __post_init__(self) -> None:
         for column in ("t", *self.quantities):

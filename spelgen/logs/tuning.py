@@ -18,10 +18,13 @@ class LogTuning:
     # [steps of the neighbours] An outlier's two steps are larger: a fast motion has large steps before and after, too.
     local_jump: float = 4.0
     jump_window: int = 8  # [samples] of the neighbours on each side
-    excursion: int = 5  # [samples] A signal that leaves and returns within these has outliers, later it has jumped.
+    excursion: int = (
+        5  # [samples] A signal that leaves and returns within these has outliers, later it has jumped.
+    )
     most_jumps: float = 0.05  # of all steps: a signal with more is noise
     most_words: float = 0.5  # of all steps: a signal around 0 changes its sign, and a sign bit, no more often
     fastest: float = 40.0  # [rad/s, m/s] No arm moves faster, so a faster step is a jump.
+    limit_of_turn: float = 1e-6  # [rad] A period as close to a turn is one.
     gap: float = 4.0  # [median steps] a longer step is a hole; jitter of USB loggers stays below 3
     automatic_cutoff: float = 8.0  # [Hz] rigid-body motion lies below, ripple and quantisation above (UR10e)
     # [Hz] slower logs are interpolated by cubics, and windows of them are not filtered
@@ -47,6 +50,15 @@ class SignalCheckTuning:
     agreement: float = 0.9  # correlation from which two signals are one; their factor may differ by the rest
     unit_factor: float = 1.25  # a factor this near to that of a unit is that of the unit
     slowest_step: float = 0.5  # [s] no arm is sampled more slowly than at 2 Hz
+    digits: int = 9  # of logged units, to which a value in SI units is converted back
+    unsigned: float = 0.05  # of the fastest velocity: one that is the magnitude of another is hardly below 0
+    unsigned_agreement: float = 0.9  # correlation of a magnitude with |dq/dt|
+    repeats: float = (
+        0.01  # of all rows: fewer repeats are an oversight of the logger, without effect on a fit
+    )
+    near_position: float = (
+        0.3  # of the distance of commands from positions, that remains when words are read rightly
+    )
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """Describe how a user's logs are named and measured: the group `logs` of a sidecar file, or a mapping file of its own.
 
 q = sign * unit * value + offset, and so is u, a commanded position; qd = sign * unit * value,
-tau = sign * gain * unit * value + torque_offset. Before that, `sign_bit` and `period` turn words of a register into values.
+tau = sign * gain * unit * value + torque_offset. Before that, words of a register become values by `sign_bit` and
+`period`.
 """
 
 from __future__ import annotations
