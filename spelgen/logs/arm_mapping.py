@@ -110,6 +110,7 @@ def _merged(stated: Mapping[str, object], given: Mapping[str, object]) -> dict[s
     result = dict(stated)
     for key, value in given.items():
         below = result.get(key)
-        both_groups = isinstance(value, Mapping) and isinstance(below, Mapping)
-        result[key] = _merged(below, value) if both_groups else value
+        if isinstance(value, Mapping) and isinstance(below, Mapping):
+            value = _merged(below, value)
+        result[key] = value
     return result

@@ -15,7 +15,7 @@ import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.labels import counted
-from spelgen.logs.jumps import held_samples, is_outlier, jumps, read_as_words, repeated_rows
+from spelgen.logs.jumps import held_samples, is_lost, is_outlier, jumps, read_as_words, repeated_rows
 from spelgen.logs.rates import SLOWEST, is_dense, shows_accelerations
 from spelgen.logs.recording import listed_times
 from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
@@ -222,12 +222,12 @@ def find_jumps(signals: JointSignals) -> str | Advice | None:
         found = _find_words(signals, name)
         if found is not None:
             return found
-    t = signals.trajectory.t
-    rows = jumps(t, signals.q)
-    rows = rows[~is_outlier(signals.q, smooth=True)[rows]]
+    sound = ~is_outlier(signals.q, smooth=True)
+    t, q = signals.trajectory.t[sound], signals.q[sound]
+    rows = jumps(t, q)
     if not rows.size:
         return None
-    size = signals.q[rows[0] + 1] - signals.q[rows[0]]
+    size = q[rows[0] + 1] - q[rows[0]]
     count = counted(len(rows), "time")
     return f"q that jumps by {size:.4g} between two samples, {count}, at t = {listed_times(t[rows])}"
 
@@ -237,15 +237,16 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
     mapping, values = signals.trajectory.mapping, signals.signal(name)
     scale, offset = mapping.scale(name, signals.joint), mapping.offset(name, signals.joint)
     turn = None if signals.kind == "prismatic" or name not in ("q", "u") else 2 * np.pi / abs(scale)
-    if name == "q":
-        values = values[~is_outlier(values, smooth=True)]
-    word = read_as_words(np.round((values - offset) / scale, SIGNALS.digits), turn)
+    # one lost sample or outlier makes two jumps, which no register explains
+    values = values[~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))]
+    word = read_as_words((values - offset) / scale, turn)
     if word is None:
         return None
     # commands may jump: only if they come near the positions by it are they words
-    left = np.std(word.values * scale + offset - signals.q) if name == "u" else 0.0
-    if left > SIGNALS.near_position * np.std(values - signals.q[: len(values)]):
-        return None
+    if name == "u":
+        q = signals.q[~is_lost(signals.signal("u"))]
+        if np.std(word.values * scale + offset - q) > SIGNALS.near_position * np.std(values - q):
+            return None
     unit = mapping.unit(name, signals.joint) or ("as logged" if turn is None else "rad")
     size, count = float(f"{word.value:.9g}"), counted(word.jumps, "time")
     what = "words with a sign bit" if word.key == "sign_bit" else "a register or an angle that starts again"
@@ -380,12 +381,13 @@ REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: No
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
     Check(
-        "dropouts", "error", find_dropouts, expected="signals without holes and outliers",
-        do="write 'dropouts: dropped' under 'logs' in the robot's YAML to drop those rows",
+        "jumps", "error", find_jumps, expected="signals without jumps",
+        do="split recordings that were joined by a column 'trajectory', or check the encoder",
     ),
     Check(
-        "jumps", "error", find_jumps, unless=("dropouts",), expected="signals without jumps",
-        do="split recordings that were joined by a column 'trajectory', or check the encoder",
+        "dropouts", "error", find_dropouts,
+        unless=("jumps",), expected="signals without holes and outliers",
+        do="write 'dropouts: dropped' under 'logs' in the robot's YAML to drop those rows",
     ),
     Check(
         "degrees", "error", find_degrees, unless=("jumps",), expected="radians and rad/s",
@@ -440,10 +442,8 @@ class LogChecks:
         """Take in a trajectory."""
         self._count += 1
         where = f"trajectory {trajectory.name}"
-        for clock_check in CLOCK_CHECKS:
-            message = clock_check.find(trajectory)
-            if message is not None:
-                self._add(message, clock_check, message, where, trajectory)
+        for clock_check, message in run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted):
+            self._add(message, clock_check, message, where, trajectory)
         for result, messages in ((REPAIRED, trajectory.repairs), (REMARKED, trajectory.remarks)):
             for message in messages:
                 self._add(message, result, message, where, trajectory)

@@ -20,13 +20,11 @@ def jump_count(values: np.ndarray, period: float) -> int:
 
 
 def unwrapped(values: np.ndarray, period: float) -> np.ndarray:
-    """Return the signal (T,) without jumps of whole periods; samples that are exactly 0 by loss remain 0."""
+    """Return the signal (T,) without jumps of whole periods."""
     if not jump_count(values, period):
         return values
-    known = ~is_lost(values)
-    result = values.copy()
-    result[known] -= period * np.cumsum(np.round(np.diff(values[known], prepend=values[known][:1]) / period))
-    return result
+    steps = np.diff(values, prepend=values[:1])
+    return np.asarray(values - period * np.cumsum(np.round(steps / period)))
 
 
 def centred(values: np.ndarray, period: float) -> np.ndarray:
@@ -67,8 +65,7 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     # a signal of which many steps are large has no outliers, but noise
     if not is_jump.any() or is_jump.mean() > TUNING.most_jumps:
         return outliers
-    jumps = np.flatnonzero(is_jump)
-    for first, second in pairwise(jumps):
+    for first, second in pairwise(np.flatnonzero(is_jump)):
         out, back = steps[first], steps[second]
         is_excursion = out * back < 0 and 0.5 < abs(out / back) < 2 and second - first <= TUNING.excursion
         if not is_excursion:
@@ -82,7 +79,8 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
         return outliers
     others = values[~outliers]
     margin = np.ptp(others) / 2
-    return outliers & ((values > others.max() + margin) | (values < others.min() - margin) | (values == 0))
+    is_beyond = (values > others.max() + margin) | (values < others.min() - margin) | (values == 0)
+    return np.asarray(outliers & is_beyond)
 
 
 def jumps(t: np.ndarray, q: np.ndarray, limit: float = TUNING.fastest) -> np.ndarray:
@@ -166,19 +164,26 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
         return None
     jump = float(np.median(np.abs(steps[rows])))
     # torques reverse, too: if values below 0 occur, only an overflow of the whole range is one
-    if values.min() < 0 and jump < max(0.9 * np.ptp(values), TUNING.jump * _usual(np.abs(steps))):
+    is_signed = values.min() < -TUNING.finest_word * np.ptp(values)
+    if is_signed and jump < max(0.9 * np.ptp(values), TUNING.jump * _usual(np.abs(steps))):
         return None
     sizes = [x for x in _word_sizes(values, turn) if 0.75 < x / jump < 1.35]
     around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
     best, best_score = None, (len(rows) / 2, np.inf)
     for size in sizes:
-        readings = [Word("period", size, len(rows), centred(unwrapped(values, size), size))]
-        if values.min() >= 0:
+        # words of a register lie within its period, words with a sign bit on both sides of the bit
+        readings = []
+        if np.ptp(values) < size * (1 + TUNING.word_margin):
+            readings.append(Word("period", size, len(rows), centred(unwrapped(values, size), size)))
+        if not is_signed and values.max() >= size:
             readings.append(Word("sign_bit", size, len(rows), signed(values, size)))
         for reading in readings:
             left = np.abs(np.diff(reading.values))
             bends = np.abs(np.diff(reading.values, 2))
-            score = np.count_nonzero(left > limit), bends[np.clip(around, 0, len(bends) - 1)].sum()
+            score = (
+                float(np.count_nonzero(left > limit)),
+                float(bends[np.clip(around, 0, len(bends) - 1)].sum()),
+            )
             if score < best_score:
                 best, best_score = reading, score
     return best
@@ -189,11 +194,13 @@ def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
     sizes = [] if turn is None else [turn * 2.0**k for k in range(9)]
     levels = np.unique(values)
     differences = np.diff(levels)
+    # values in SI units were converted back: equal ones differ by rounding
+    differences = differences[differences > TUNING.finest_word * np.ptp(values)]
     if differences.size:
         step = float(differences.min())
         numbers = values / step
-        if np.abs(numbers - np.round(numbers)).max() < 1e-3 and np.abs(numbers).max() < 2.0**33:
-            sizes += [step * 2.0**k for k in range(6, 33)]
+        if np.abs(numbers - np.round(numbers)).max() < TUNING.word_rounding:
+            sizes += [step * 2.0**k for k in range(10, 18)]
     return sizes
 
 

@@ -23,6 +23,9 @@ class LogTuning:
     )
     most_jumps: float = 0.05  # of all steps: a signal with more is noise
     most_words: float = 0.5  # of all steps: a signal around 0 changes its sign, and a sign bit, no more often
+    finest_word: float = 4e-6  # of the range of a signal: steps of words of 18 bits
+    word_rounding: float = 0.02  # [steps] by which values on a grid may be rounded
+    word_margin: float = 0.01  # of a period, by which the noise of an angle exceeds it
     fastest: float = 40.0  # [rad/s, m/s] No arm moves faster, so a faster step is a jump.
     limit_of_turn: float = 1e-6  # [rad] A period as close to a turn is one.
     gap: float = 4.0  # [median steps] a longer step is a hole; jitter of USB loggers stays below 3
@@ -50,7 +53,6 @@ class SignalCheckTuning:
     agreement: float = 0.9  # correlation from which two signals are one; their factor may differ by the rest
     unit_factor: float = 1.25  # a factor this near to that of a unit is that of the unit
     slowest_step: float = 0.5  # [s] no arm is sampled more slowly than at 2 Hz
-    digits: int = 9  # of logged units, to which a value in SI units is converted back
     unsigned: float = 0.05  # of the fastest velocity: one that is the magnitude of another is hardly below 0
     unsigned_agreement: float = 0.9  # correlation of a magnitude with |dq/dt|
     repeats: float = (
