@@ -19,7 +19,6 @@ class ExcitationTuning:
     usual_speed: float = 1.0  # [rad/s] where the URDF names no limit
     grid: int = 40  # points for each harmonic, between which a motion keeps its limits
     sliding_speed: float = 0.25  # [m/s] likewise, of sliding joints
-    sliding_reach: float = 0.5  # [m] to both sides of 0, of sliding joints without limits
 
 
 TUNING = ExcitationTuning()

@@ -50,7 +50,9 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
     checked: TorqueLogs | ServoLogs = TorqueLogs(arm, mapping or arm.settings.logs)
     if arm.settings.input == "position":
         checked = ServoLogs(arm)
-    types = ["continuous" if x.kind == "revolute" and x.limits is None else x.kind for x in arm.arm.coordinates]
+    types = [
+        "continuous" if x.kind == "revolute" and x.limits is None else x.kind for x in arm.arm.coordinates
+    ]
     log_checks = LogChecks(joints, types)
     measured: list[Statistics] = []
     examples: list[Trajectory] = []

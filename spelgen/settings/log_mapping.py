@@ -200,7 +200,9 @@ class LogMapping(Group):
         changed = dict(self.joints)
         for joint in joints:
             logged = self.joint(joint)
-            turns = {x: 2 * pi / abs(self.scale(x, joint)) for x in ("q", "u") if not self.word("period", x, joint)}
+            turns = {
+                x: 2 * pi / abs(self.scale(x, joint)) for x in ("q", "u") if not self.word("period", x, joint)
+            }
             period = logged.period.model_copy(update=turns)
             changed[joint] = logged.model_copy(update={"period": period})
         return self.model_copy(update={"joints": changed})
