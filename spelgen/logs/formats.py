@@ -18,6 +18,14 @@ from spelgen.logs.parquet_files import LEROBOT, PARQUET
 from spelgen.logs.tables import LogFormat, LogTable, reading
 from spelgen.settings.log_mapping import LogMapping
 
+PACKED = {
+    ".zstd": "zstd -d",
+    ".zst": "zstd -d",
+    ".gz": "gunzip",
+    ".xz": "unxz",
+    ".bz2": "bunzip2",
+    ".zip": "unzip",
+}
 FORMATS: list[LogFormat] = [PARQUET, CSV, NPZ, BAG, LEROBOT]
 
 
@@ -58,6 +66,12 @@ def log_files(
     return list(files), errors
 
 
+def _unpacking(path: Path) -> str | None:
+    """Return what to do with a packed file, None for other files."""
+    command = PACKED.get(path.suffix)
+    return None if command is None else f"unpack it: {command} {path.name}"
+
+
 def _logs_at(path: Path, role: str | None) -> list[Path]:
     if format_of(path) is not None:
         return [path]
@@ -66,11 +80,12 @@ def _logs_at(path: Path, role: str | None) -> list[Path]:
     formats = f"{suffixes}, the folder of {folders}"
     if not path.is_dir():
         require_regular_file(path, LogError, f"a file: {formats}")
-        raise LogError(f"a file of kind {path.suffix!r}", file=path, expected=formats)
+        raise LogError(f"a file of kind {path.suffix!r}", file=path, expected=formats, do=_unpacking(path))
     # hidden files are not recordings: macOS puts "._log.csv" beside log.csv on other file systems
     logs = sorted(x for x in path.iterdir() if format_of(x) is not None and not x.name.startswith("."))
     if not logs:
-        raise LogError("a folder without logs", file=path, expected=formats)
+        packed = [unpacking for unpacking in map(_unpacking, sorted(path.iterdir())) if unpacking]
+        raise LogError("a folder without logs", file=path, expected=formats, do="; ".join(packed[:1]) or None)
     if role is None or not any(log.stem in ("train", "test") for log in logs):
         return logs
     selected = [log for log in logs if log.stem == role]

@@ -15,6 +15,7 @@ from spelgen.logs.jumps import centred, is_outlier, jump_count, repeated_rows, u
 from spelgen.logs.tables import Layout
 from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.logs.tuning import TUNING
+from spelgen.logs.values import foreign_rows
 from spelgen.settings.log_mapping import LogMapping
 
 
@@ -115,8 +116,13 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[n
     Rows are sorted where positions become smoother by it, and of rows of one time the first is taken. Raises LogError
     for a clock that begins anew, or that is too coarse.
     """
-    t = data[:, 0]
     repairs: tuple[str, ...] = ()
+    foreign = foreign_rows(data, len(layout.joints))
+    if foreign.any():
+        data, rows = data[~foreign], np.asarray(rows)[~foreign]
+        count, message = counted(int(foreign.sum()), "row"), "of another topic or publisher left out"
+        repairs += (f"{count} {message}: without a value of one quantity of any joint",)
+    t = data[:, 0]
     late = np.count_nonzero(np.diff(t) < 0)
     if late:
         ordered = data[np.argsort(t, kind="stable")]

@@ -22,7 +22,8 @@ Column: TypeAlias = "pa.ChunkedArray | pa.Array"
 def values_in_si(table: Table, layout: Layout, start: pa.Scalar | None, row: int = 0) -> np.ndarray:
     """Return the columns of a layout (T, C) in SI units, times from `start` on. row: of the table in its file.
 
-    Raises LogError naming row and column where a value is no number, or none that an arm can have.
+    Rows of another topic or publisher (see `foreign_rows`) contain NaN. Raises LogError naming row and column if a
+    value is no number, or none that an arm can have.
     """
     times, unit = _clock(table, layout)
     if start is not None:
@@ -44,6 +45,9 @@ def values_in_si(table: Table, layout: Layout, start: pa.Scalar | None, row: int
     largest = np.full(data.shape[1], TUNING.largest_value)
     largest[0] = TUNING.latest
     bad = ~(np.abs(data) < largest)  # NaN included
+    foreign = foreign_rows(data, len(layout.joints))
+    if not foreign.all():
+        bad &= ~foreign[:, None]
     if bad.any():
         first, k = np.argwhere(bad)[0]
         value, rows = data[first, k], f"{bad.any(axis=1).sum()} of {len(data)} rows have such a"
@@ -52,9 +56,17 @@ def values_in_si(table: Table, layout: Layout, start: pa.Scalar | None, row: int
         if not np.isfinite(value):
             got, expected = f"no finite number ({rows} gap", "a number"
             do = "remove those rows; a gap in t is understood"
+            if foreign.all():
+                do = "no row has all quantities: log them together, or resample them to the same times"
         got += ", this is the first)"
         raise layout.row_error(got, row + first, layout.columns[k], expected, do)
     return data
+
+
+def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
+    """Return which rows (T, C) lack a quantity of all joints: those of another topic or publisher, NaN there."""
+    empty = np.isnan(data[:, 1:]).reshape(len(data), -1, joints)
+    return np.asarray(empty.all(axis=2).any(axis=1))
 
 
 def clock_start(table: Table, layout: Layout) -> pa.Scalar | None:
