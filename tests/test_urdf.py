@@ -121,8 +121,12 @@ class TestValues:
                 assert (mine.name, mine.type, mine.parent) == (their.name, their.type, their.parent)
                 assert mine.axis == tuple(their.axis)
                 if their.limit is not None and mine.type != "continuous":
-                    assert (mine.lower, mine.upper) == (their.limit.lower, their.limit.upper)
-                    assert (mine.effort, mine.velocity) == (their.limit.effort, their.limit.velocity)
+                    theirs_bounded = (their.limit.effort or None, their.limit.velocity or None)  # 0 states none
+                    assert (mine.effort, mine.velocity) == theirs_bounded
+                    if mine.lower is not None:
+                        assert (mine.lower, mine.upper) == (their.limit.lower, their.limit.upper)
+                    else:
+                        assert not their.limit.lower and not their.limit.upper
                 if mine.mimic is not None:
                     assert mine.mimic.joint == their.mimic.joint
                     assert mine.mimic.multiplier == their.mimic.multiplier

@@ -17,7 +17,7 @@ from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.labels import counted
 from spelgen.logs.jumps import held_samples, is_lost, is_outlier, jumps, read_as_words, repeated_rows
 from spelgen.logs.rates import SLOWEST, is_dense, shows_accelerations
-from spelgen.logs.recording import listed_times
+from spelgen.logs.recording import listed_times, outlier_rows
 from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
 from spelgen.logs.tuning import SIGNALS
 from spelgen.settings.log_mapping import TIMES
@@ -138,6 +138,19 @@ class JointSignals(NamedTuple):
         return self.kind == "continuous" or bool(self.trajectory.mapping.word("period", "q", self.joint))
 
     @property
+    def measured(self) -> tuple[str, ...]:
+        """The quantities that were measured: neither commands nor differences."""
+        if self.trajectory.u is not None:
+            return ("q",)
+        return self.trajectory.mapping.quantities if self.trajectory.tau.size else ("q",)
+
+    @property
+    def step(self) -> float:
+        """Median of the times between samples [s], 0 of a single sample."""
+        steps = np.diff(self.trajectory.t)
+        return float(np.median(steps)) if steps.size else 0.0
+
+    @property
     def joint(self) -> str:
         """Name of the joint."""
         return self.joints[self.number]
@@ -189,24 +202,39 @@ def find_frozen(signals: JointSignals) -> str | None:
     return None
 
 
-def find_time_unit(signals: JointSignals) -> str | None:
+def find_time_unit(signals: JointSignals) -> str | Advice | None:
     """Find times that are not in seconds: no arm is sampled more slowly than at 2 Hz, and q changes as fast as qd."""
-    steps = np.diff(signals.trajectory.t)
-    if steps.size and np.median(steps) > SIGNALS.slowest_step:
-        # told once, and not of each joint
-        return None if signals.number else f"a sample every {np.median(steps):.3g} s"
+    step = signals.step
+    if step > SIGNALS.slowest_step:
+        # reported once, and not for each joint
+        if signals.number:
+            return None
+        unit = time_unit(step)
+        message = f"a sample every {step:.3g} s"
+        if unit is None or signals.trajectory.mapping.units.t != "s":
+            return message
+        message += f", {1 / (step * TIMES[unit]):.4g} Hz if times are in {unit}"
+        return Advice(message, f"write 'units: {{t: {unit}}}' under 'logs' in the robot's YAML")
     for unit in ("ms", "us", "ns"):
         if signals.changes_by(TIMES[unit]):
-            return f"q that changes {signals.factor:.3g} times as fast as qd says: times in {unit}"
+            message = f"q that changes {signals.factor:.3g} times as fast as qd says: times in {unit}"
+            return Advice(message, f"write 'units: {{t: {unit}}}' under 'logs' in the robot's YAML")
+    return None
+
+
+def time_unit(step: float) -> str | None:
+    """Return the unit in which the step between two samples is one of a robot's log; None if it is none."""
+    for unit, size in TIMES.items():
+        if SIGNALS.fastest_step <= step * size <= SIGNALS.slowest_step:
+            return unit
     return None
 
 
 def find_dropouts(signals: JointSignals) -> str | None:
     """Find samples that are lost, or that leave their neighbours for a moment and return."""
-    differentiated = signals.trajectory.mapping.velocity == "differentiated"
-    for name in ("q", "tau") if differentiated else ("q", "qd", "tau"):
+    for name in signals.measured:
         values = signals.signal(name)
-        rows = np.flatnonzero(is_outlier(values, smooth=name == "q"))
+        rows = np.flatnonzero(outlier_rows(name, values))
         if rows.size:
             first = rows[0]
             size = values[first] - values[max(first - 1, 0)]
@@ -260,7 +288,7 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
 def find_held(signals: JointSignals) -> str | None:
     """Find signals that change too rarely for fits, whatever the rate of the rows is."""
     rate = signals.trajectory.sample_rate
-    for name in [x for x in signals.trajectory.quantities if x != "u"]:
+    for name in signals.measured:
         often = held_samples(signals.signal(name))
         if often > 1:
             return (
@@ -275,7 +303,7 @@ def find_too_rare(signals: JointSignals) -> str | None:
     rate = signals.trajectory.sample_rate
     if signals.trajectory.u is not None or not shows_accelerations(rate):
         return None
-    held = [held_samples(signals.signal(name)) for name in signals.trajectory.quantities]
+    held = [held_samples(signals.signal(name)) for name in signals.measured]
     return None if shows_accelerations(rate / max(held)) else find_held(signals)
 
 
@@ -308,6 +336,9 @@ def find_no_torques(signals: JointSignals) -> str | None:
 def find_wrong_velocity(signals: JointSignals) -> str | None:
     """Find velocities that are not the positions' derivative, and say what else they may be."""
     factor, correlation, tolerance = signals.factor, signals.correlation, 1 - SIGNALS.agreement
+    # times in another unit have been found at the first joint
+    if signals.step > SIGNALS.slowest_step:
+        return None
     if np.isnan(correlation) or (correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance):
         return None
     advice = "check units, signs and the order of the joints"

@@ -29,7 +29,7 @@ def unwrapped(values: np.ndarray, period: float) -> np.ndarray:
 
 def centred(values: np.ndarray, period: float) -> np.ndarray:
     """Return the signal (T,) shifted by whole periods, so that its median is at most half a period from 0."""
-    return values - period * np.round(np.median(values) / period)
+    return np.asarray(values - period * np.round(np.median(values) / period))
 
 
 def signed(words: np.ndarray, sign_bit: float) -> np.ndarray:
@@ -79,7 +79,7 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
         return outliers
     others = values[~outliers]
     margin = np.ptp(others) / 2
-    is_beyond = (values > others.max() + margin) | (values < others.min() - margin) | (values == 0)
+    is_beyond = (values > others.max() + margin) | (values < others.min() - margin) | is_lost(values)
     return np.asarray(outliers & is_beyond)
 
 

@@ -56,7 +56,7 @@ def _unpacked(chunk: bytes) -> bytes:
         from backports.zstd import ZstdDecompressor
 
         return ZstdDecompressor().decompress(packed, size)
-    from lz4.frame import LZ4FrameDecompressor
+    from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 
     return bytes(LZ4FrameDecompressor().decompress(packed, size))
 

@@ -93,7 +93,7 @@ def _without_outliers(
     found = []
     for (quantity, joint), values in zip(signals, data[:, 1:].T, strict=True):
         if quantity != "u":
-            rows = is_outlier(values, smooth=quantity == "q")
+            rows = outlier_rows(quantity, values)
             outliers |= rows
             if rows.any():
                 found.append(f"{quantity} of {joint!r} at t = {listed_times(data[rows, 0])}")
@@ -101,6 +101,12 @@ def _without_outliers(
         return data, ()
     message = f"{counted(int(outliers.sum()), 'row')} left out as dropouts: {'; '.join(found)}"
     return data[~outliers], (message,)
+
+
+def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
+    """Return which samples (T,) of "q", "qd" or "tau" are lost or outliers; a velocity may be 0 for a moment."""
+    rows = is_outlier(values, smooth=quantity == "q")
+    return np.asarray(rows & (values != 0)) if quantity == "qd" else rows
 
 
 def listed_times(t: np.ndarray) -> str:
@@ -113,8 +119,8 @@ def listed_times(t: np.ndarray) -> str:
 def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return values (T, C) of these rows of a file with increasing times, and what was mended for that.
 
-    Rows are sorted where positions become smoother by it, and of rows of one time the first is taken. Raises LogError
-    for a clock that begins anew, or that is too coarse.
+    Rows are sorted if positions become smoother by it, and of equal rows of one time the first is kept. Times of a
+    coarse clock are reconstructed. Raises LogError for a clock that starts again, or that is too coarse.
     """
     repairs: tuple[str, ...] = ()
     foreign = foreign_rows(data, len(layout.joints))
@@ -122,6 +128,9 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[n
         data, rows = data[~foreign], np.asarray(rows)[~foreign]
         count, message = counted(int(foreign.sum()), "row"), "of another topic or publisher left out"
         repairs += (f"{count} {message}: without a value of one quantity of any joint",)
+    if layout.mapping.sample_rate:
+        data = np.column_stack([np.arange(len(data)) / layout.mapping.sample_rate, data[:, 1:]])
+        return data, repairs
     t = data[:, 0]
     late = np.count_nonzero(np.diff(t) < 0)
     if late:
@@ -133,18 +142,44 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[n
         data = ordered
         repairs += (f"{late} times before that of the row above: the rows were sorted",)
     is_repeat = np.diff(data[:, 0], prepend=-np.inf) == 0
+    differs = is_repeat & np.append(False, (np.diff(data[:, 1:], axis=0) != 0).any(axis=1))
+    # different states of one time: the clock is too coarse for the rows
+    if np.count_nonzero(differs) > max(TUNING.few_repeats, TUNING.coarse_clock * len(data)):
+        t, message = _reconstructed(data[:, 0], layout)
+        return np.column_stack([t, data[:, 1:]]), (*repairs, message)
     repeats = np.count_nonzero(is_repeat)
-    if 2 * repeats > len(data):
-        raise LogError(
-            f"{repeats} of {len(data)} rows with the time of another row", file=layout.file,
-            element=f"column {layout.columns[0]}",
-            expected="a time for each row",
-            do="log times with more digits, or split recordings by a column 'trajectory'",
-        )  # fmt: skip
     if repeats:
         data = data[~is_repeat]
         repairs += (f"{repeats} rows with the time of the row before were left out",)
     return data, repairs
+
+
+def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:
+    """Return evenly spaced times (T,) of a clock with few digits, and a message on them.
+
+    Raises LogError unless every time is its own evenly spaced one, rounded to a tick of the clock.
+    """
+    steps = np.diff(t)
+    tick = float(steps[steps > 0].min(initial=np.inf))
+    # a step that is longer than the clock's rounding allows is a hole in the recording
+    holes = np.flatnonzero(steps > TUNING.gap * max(tick, float(steps.mean()))) + 1
+    times, rates = t.copy(), []
+    for start, stop in pairwise([0, *holes.tolist(), len(t)]):
+        numbers = np.arange(stop - start)
+        slope, first = np.polyfit(numbers, t[start:stop], 1) if len(numbers) > 2 else (0.0, t[start])
+        times[start:stop] = first + slope * numbers
+        rates.append(slope)
+    if np.abs(times - t).max() > tick or not min(rates) > 0:
+        count = np.count_nonzero(steps == 0)
+        raise LogError(
+            f"{count} of {len(t)} rows with the time of another row, but another state", file=layout.file,
+            element=f"column {layout.columns[0]}", expected="a time for each row",
+            do="log times with more digits, split recordings by a column 'trajectory', or write "
+            "'sample_rate: HZ' under 'logs' if the rows are evenly spaced",
+        )  # fmt: skip
+    rate = 1 / float(np.median(rates))
+    message = f"the clock has ticks of {tick:.3g} s, too coarse for the rows: times were reconstructed, {rate:.4g} Hz"
+    return times, message
 
 
 def _roughness(positions: np.ndarray) -> float:

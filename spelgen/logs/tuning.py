@@ -28,6 +28,8 @@ class LogTuning:
     word_margin: float = 0.01  # of a period, by which the noise of an angle exceeds it
     fastest: float = 40.0  # [rad/s, m/s] No arm moves faster, so a faster step is a jump.
     limit_of_turn: float = 1e-6  # [rad] A period as close to a turn is one.
+    few_repeats: int = 10  # rows of one time, but different states, that are an accident
+    coarse_clock: float = 0.02  # of all rows: from here on the clock is too coarse
     gap: float = 4.0  # [median steps] a longer step is a hole; jitter of USB loggers stays below 3
     automatic_cutoff: float = 8.0  # [Hz] rigid-body motion lies below, ripple and quantisation above (UR10e)
     # [Hz] slower logs are interpolated by cubics, and windows of them are not filtered
@@ -52,6 +54,7 @@ class SignalCheckTuning:
     drift: float = 0.05  # [rad, m] that qd must say a joint moved, before a constant q is called frozen
     agreement: float = 0.9  # correlation from which two signals are one; their factor may differ by the rest
     unit_factor: float = 1.25  # a factor this near to that of a unit is that of the unit
+    fastest_step: float = 1e-4  # [s] nor faster than at 10 kHz
     slowest_step: float = 0.5  # [s] no arm is sampled more slowly than at 2 Hz
     unsigned: float = 0.05  # of the fastest velocity: one that is the magnitude of another is hardly below 0
     unsigned_agreement: float = 0.9  # correlation of a magnitude with |dq/dt|

@@ -25,9 +25,13 @@ SPEEDS = {f"{name}/s": scale for name, scale in LENGTHS.items()} | {"rpm": 2 * p
 SCALES = {**LENGTHS, **SPEEDS, "mNm": _MILLI, "mA": _MILLI}
 CURRENTS = ("A", "mA")
 COUNTS = ("counts", "counts/s")
+NORMALISED = (
+    "normalised"  # -100..100 of the calibrated range of a motor, as LeRobot stores positions by default
+)
+SERVO_TURN = 4096  # counts in a revolution of the servos that LeRobot calibrates
 ONLY = {  # units that a joint of this kind cannot have
     "revolute": ("m", "mm", "m/s", "mm/s", "N"),
-    "prismatic": ("rad", "deg", "turns", "rad/s", "deg/s", "turns/s", "rpm", "Nm", "mNm"),
+    "prismatic": ("normalised", "rad", "deg", "turns", "rad/s", "deg/s", "turns/s", "rpm", "Nm", "mNm"),
 }
 
 LONGEST_DELAY = 1.0  # s
@@ -49,7 +53,7 @@ Accepted = Literal[
 """Errors of `spelgen logs` that someone who knows better can accept, by their codes."""
 
 Time = Literal["s", "ms", "us", "ns"]
-Position = Literal["rad", "deg", "turns", "counts", "m", "mm"]
+Position = Literal["rad", "deg", "turns", "counts", "normalised", "m", "mm"]
 Velocity = Literal["rad/s", "deg/s", "turns/s", "rpm", "counts/s", "m/s", "mm/s"]
 Effort = Literal["Nm", "mNm", "N", "A", "mA"]
 
@@ -102,6 +106,22 @@ class JointWords(Group):
     u: Positive | None = None
 
 
+class MotorCalibration(Group):
+    """Calibration of one motor, as LeRobot writes it: the range of motion [counts], and whether it is mirrored."""
+
+    range_min: Number
+    range_max: Number
+    drive_mode: Literal[0, 1] = 0
+    homing_offset: Number = 0.0
+    id: int = 0
+
+    @model_validator(mode="after")
+    def _has_range(self) -> MotorCalibration:
+        if not self.range_min < self.range_max:
+            raise ValueError("a range_max above range_min")
+        return self
+
+
 class JointLog(Group):
     """How one joint is logged.
 
@@ -140,7 +160,8 @@ class LogMapping(Group):
     log has none. torque_delay: how much later than positions a log shows torques [s], see what `spelgen logs` suggests.
     accept: codes of errors in logs that are right as they are. dropouts: "dropped" leaves out rows in which a signal
     falls to 0 or leaves its neighbours for a moment, and rows that repeat the row before. sample_rate [Hz]: rows of a
-    recording are evenly spaced by it, whatever their times are.
+    recording are evenly spaced by it, whatever their times are. calibration: of motors by their names in the log, the
+    content of LeRobot's calibration file, for the unit "normalised".
     Files that spelgen wrote itself are read as they are, whatever stands here.
     """
 
@@ -154,6 +175,7 @@ class LogMapping(Group):
     accept: tuple[Accepted, ...] = ()
     dropouts: Literal["kept", "dropped"] = "kept"
     sample_rate: Positive | None = None
+    calibration: dict[str, MotorCalibration] = Field(default={})
 
     @property
     def quantities(self) -> tuple[str, ...]:
@@ -230,6 +252,10 @@ class LogMapping(Group):
         factor = SCALES.get(unit or "", 1.0)
         if quantity == "tau" and logged.gain is not None:
             factor *= logged.gain
+        elif unit == NORMALISED:
+            motor = self.calibration[self.log_name(joint)]
+            counts = (motor.range_max - motor.range_min) / 200
+            factor = (1 - 2 * motor.drive_mode) * counts * 2 * pi / (logged.counts_per_turn or SERVO_TURN)
         elif unit in COUNTS:
             turn = logged.counts_per_turn
             factor = 2 * pi / turn if turn else 1.0 / (logged.counts_per_metre or 1.0)
@@ -249,15 +275,17 @@ class LogMapping(Group):
         for joint, kind in zip(joints, kinds, strict=True):
             for quantity in self.quantities:
                 unit = self.unit(quantity, joint)
-                expected = self._missing(unit, self.joint(joint), kind)
+                expected = self._missing(unit, self.log_name(joint), self.joint(joint), kind)
                 if expected:
                     where = f"logs: joint {joint!r}, {quantity}"
                     errors.append(SettingsError(f"the unit {unit}", element=where, expected=expected))
         return errors
 
-    def _missing(self, unit: str | None, logged: JointLog, kind: str | None) -> str | None:
+    def _missing(self, unit: str | None, joint: str, logged: JointLog, kind: str | None) -> str | None:
         if unit in CURRENTS and logged.gain is None:
             return "a gain beside it"
+        if unit == NORMALISED and joint not in self.calibration:
+            return f"the content of LeRobot's calibration file as 'calibration', with {joint!r} in it"
         if unit in COUNTS:
             # of a joint whose kind is not known either will do
             in_turns = logged.counts_per_turn if kind != "prismatic" else None
