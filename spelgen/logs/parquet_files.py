@@ -122,6 +122,11 @@ def _calibration(folder: Path) -> dict[str, MotorCalibration]:
     return {}
 
 
+def dataset_motors(folder: Path) -> list[str]:
+    """Return the names of the motors of a data set."""
+    return _motor_names(folder, read_json(folder / INFO, LogError), STATE)
+
+
 def _motor_names(folder: Path, info: Any, feature: str) -> list[str]:
     """Return the motors' names of a feature, without LeRobot's ending."""
     try:

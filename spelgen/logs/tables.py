@@ -88,7 +88,11 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
             got, expected = "one column for several joints", "'{joint}' in its name under 'logs'"
             raise LogError(got, file=file, element=f"column {name}", expected=expected)
         if schema.names.count(name) > 1:
-            raise LogError("the same column twice", file=file, element=f"column {name}", expected="it once")
+            places = ", ".join(str(k) for k, other in enumerate(schema.names, start=1) if other == name)
+            got = f"the same name for the columns {places}"
+            raise LogError(
+                got, file=file, element=f"column {name}", expected="it once", do="rename one of them"
+            )
         if name not in schema.names and not list_element(name, schema.names):
             missing.append(name)
     if missing:
