@@ -14,7 +14,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test fuzz check docs format bench golden lock clean
+.PHONY: help demo test fuzz check lint docs format bench golden lock clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -29,17 +29,19 @@ demo: $(STAMP) ## the whole way on robots/rpr.urdf: inspect, build, simulate, tr
 	$(BIN)/spelgen evaluate $(DEMO)/run --data $(DEMO)/logs
 	$(BIN)/spelgen report $(DEMO)/run
 
-test: check ## run the checks, then the tests
-	$(BIN)/python -m pytest
+test: lint ## format and lint, then all tests on all cores, among them types and import direction
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 
-fuzz: $(TOOLS) ## URDFs, logs, settings, meshes and run folders drawn at random, new ones for MINUTES=20
-	FUZZ_MINUTES=$(MINUTES) $(BIN)/python -m pytest -q -s tests/test_fuzz.py tests/test_fuzz_files.py
+fuzz: $(TOOLS) ## random URDFs, logs, settings, meshes and run folders, new ones for MINUTES=20
+	FUZZ_MINUTES=$(MINUTES) $(BIN)/python -m pytest -q -s tests/test_fuzz_urdf.py tests/test_fuzz_files.py \
+	    tests/test_emitted_module.py::test_mass_matrix_is_positive_definite_for_any_weights
 
-check: $(TOOLS) ## format, lint, types, import direction
+check: lint ## format, lint, types, import direction
+	$(BIN)/python -m pytest -q tests/test_types.py tests/test_imports.py
+
+lint: $(TOOLS) ## format and lint
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/mypy
-	$(BIN)/python -m pytest -q tests/test_imports.py
 
 docs: $(TOOLS) ## write the docs as a site into site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet

@@ -47,15 +47,15 @@ from torch.func import grad, jvp
 
 import spelgen
 from spelgen.arm.arm import Arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.pinocchio_urdf import has_drives, urdf_dynamics
+from spelgen.emission.build import build
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 
 Split = tuple[str, Path, list[Trajectory], list[Trajectory]]
 

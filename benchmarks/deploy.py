@@ -22,7 +22,9 @@ import numpy as np
 import pinocchio as pin
 import torch
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.pinocchio_arm import pinocchio_model
+from spelgen.emission.build import build
 from spelgen.exporting.c_export import called_by_c, compile_library, compiler
 from spelgen.exporting.c_source import c_functions, write_c
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
@@ -36,8 +38,6 @@ from spelgen.exporting.onnx_export import called_by_onnx, onnx_model, onnx_sessi
 from spelgen.exporting.parity import Called, Parity, check_parity
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
 from spelgen.exporting.torch_export import PROGRAMS
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 ARMS = ("two_link", "rpr", "scara", "six_dof", "ur10e", "panda")

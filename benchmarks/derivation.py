@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from arms import planar, random_arm
 
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.structure.structure import derive
 
 ROBOTS = Path(__file__).parents[1] / "robots"

@@ -22,10 +22,10 @@ from pathlib import Path
 
 import torch
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.emission.build import generate
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.read import write_logs
-from spelgen.pipeline.generate import generate
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.simulation.simulate import simulate
 
 URDF = Path(__file__).parents[1] / "robots" / "rpr.urdf"
@@ -73,9 +73,11 @@ def main() -> None:
                 subprocess.run(command(run, resume=ready), check=True)
                 break
         whole, broken = (RunFolder(x).load_checkpoint() for x in (folder / "whole", run))
-        same = all(torch.equal(x, broken["best_weights"][key]) for key, x in whole["best_weights"].items())
+        same = all(torch.equal(x, broken.best_weights[key]) for key, x in whole.best_weights.items())
         if not asked.servos:
-            same &= all(torch.equal(x, broken["model"][key]) for key, x in whole["model"].items())
+            same &= all(
+                torch.equal(x, broken.content["model"][key]) for key, x in whole.content["model"].items()
+            )
         epochs = [len(RunFolder(x).read_metrics()) for x in (folder / "whole", run)]
         print(f"{done} kills, {done} resumes, epochs {epochs}: weights {'identical' if same else 'DIFFER'}")
     if not same or done < kills or len(set(epochs)) > 1:

@@ -24,15 +24,17 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from characters import TESTS as CHARACTERS
-from characters import read_characters, write_arm
+from delan_characters import TESTS as CHARACTERS
+from delan_characters import read_characters, write_arm
 
 import spelgen
 from spelgen.arm.arm import Arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.predictor import Solver
 from spelgen.dynamics.bristles import bristle_reach, reach_of
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.regressor import regressor
+from spelgen.emission.build import build
 from spelgen.errors import LogError
 from spelgen.evaluation.horizons import end_errors
 from spelgen.evaluation.torque import mean_nmse, predicted_torques
@@ -45,8 +47,6 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows, joined
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 
 Torque = Callable[[DynamicsSamples], np.ndarray]
 

@@ -27,14 +27,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from spelgen.emission.build import build
 from spelgen.fitting.fit import fit
 from spelgen.fitting.rollout import loss_scales, rollout_loss
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows
-from spelgen.pipeline.build import build
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 JOINTS, BATCHES, SAMPLES, STEP = (2, 3, 4, 6, 8, 12), (16, 64, 256, 1024), 5, 0.01
 REPEATS = 5
@@ -138,7 +138,7 @@ def _urdf(joints: int) -> Path:
     return path
 
 
-def _windows(model: EmittedModel, count: int) -> Windows:
+def _windows(model: ArmModel, count: int) -> Windows:
     generator = torch.Generator().manual_seed(0)
     shape = (count, SAMPLES, model.n)
     q, qd, tau = (torch.randn(shape, dtype=torch.float64, generator=generator) for _ in range(3))
@@ -146,13 +146,13 @@ def _windows(model: EmittedModel, count: int) -> Windows:
     return Windows(dt, q, qd, tau[:, 1:]).to(next(model.parameters()).device)
 
 
-def _step(model: EmittedModel, windows: Windows) -> None:
+def _step(model: ArmModel, windows: Windows) -> None:
     rollout_loss(model, windows, loss_scales(windows, model.joint_types), 1).backward()
     if windows.q.is_cuda:
         torch.cuda.synchronize()
 
 
-def _rate(model: EmittedModel, batch: int) -> float:
+def _rate(model: ArmModel, batch: int) -> float:
     """Windows a second."""
     windows, times = _windows(model, batch), []
     clock = time.perf_counter if windows.q.is_cuda else time.process_time  # others may use the processor
@@ -163,7 +163,7 @@ def _rate(model: EmittedModel, batch: int) -> float:
     return batch / statistics.median(times[1:])
 
 
-def _memory(model: EmittedModel) -> float:
+def _memory(model: ArmModel) -> float:
     """Bytes that a window more keeps for the gradient."""
     held = []
     for count in (64, 128):

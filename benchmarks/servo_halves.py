@@ -48,7 +48,7 @@ def fitted_servos(urdf: Path, preset: str, logs: Sequence[Path]) -> dict[str, An
     """Fit the model to logs; return what its record says of servos."""
     arm = spelgen.load_arm(urdf)
     fit = spelgen.fit(spelgen.build(arm, preset), spelgen.read_logs(logs, arm))
-    return dict(fit.record["servo"])
+    return dict(fit.record.servo)
 
 
 def compared(first: dict[str, Any], second: dict[str, Any]) -> Iterator[bool]:

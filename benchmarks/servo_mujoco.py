@@ -1,16 +1,54 @@
-"""An arm under position servos as MuJoCo simulates it: dry friction by constraints, gears with backlash as joints."""
+"""An arm under position servos in MuJoCo: as a simulated robot for other benchmarks, and as a rival of a fitted model.
+
+    python benchmarks/servo_mujoco.py RUN --train LOGS... --test LOGS...
+
+MuJoCo's position actuators are how such an arm is usually simulated. kp, kv, armature and frictionloss of each joint,
+an offset of its commands and the delay are fitted to windows of the training logs, starting from the parameters of the
+run's model, by `mujoco.minimize`, the least squares of `mujoco.sysid`. The bodies are the URDF's, and friction is as
+hard as MuJoCo allows, as `spelgen export --to mjcf` writes both. The actuators, the model and its other baselines then
+replay the test logs.
+"""
 
 from __future__ import annotations
 
+import argparse
 import re
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
+from mujoco import minimize, rollout
 
-STEP = 5e-4  # s
+import spelgen
+from spelgen.arm.arm import Arm
+from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.baselines.registry import command_followers
+from spelgen.dynamics.protocol import motors_of
+from spelgen.dynamics.rigid_bodies import about_center, quaternion
+from spelgen.emission.assemble import ArmModel
+from spelgen.evaluation.replay import replays
+from spelgen.exporting.tuning import TUNING as EXPORT_TUNING
+from spelgen.fitting.servo.windows import ServoWindows, servo_windows
+from spelgen.logs.commands import LogRows, delayed_commands, steps_between
+
+if TYPE_CHECKING:
+    from spelgen.emission.assemble import ArmModel
+
+STEP = 5e-4  # [s] of the simulated robot
 HARD = [2e-3, 1.0]  # of constraints: a time constant [s], and no rebound
-SHARE, DAMPING = 0.02, 2e-4  # of a joint of backlash: of the armature, and what it loses, by kp [s]
+SHARE, DAMPING = (
+    0.02,
+    2e-4,
+)  # of a joint of backlash: armature divided by that of its drive, damping by kp [s]
+FIT_STEP = 5e-3  # [s] at most, of fitted actuators; frictionloss is as hard as twice this allows
+WINDOWS, ITERATIONS = 60, 8  # half a minute of fitting
+DIFFERENCE = 1e-4  # finite-difference step of the unknowns
+LOG_RANGE, OFFSET_RANGE, MAX_DELAY = 4.0, 0.3, 0.4  # bounds: of logarithms; [rad, m]; [s]
 
 
 def arm_with_servos(
@@ -21,7 +59,10 @@ def arm_with_servos(
     limit: np.ndarray,
     backlash: float,
 ) -> mujoco.MjModel:
-    """Of the URDF's bodies without shapes; ratios: kd, armature and dry friction by kp; backlash: half of it [rad]."""
+    """Return the URDF's arm without shapes under position servos.
+
+    ratios: kd, armature and dry friction, divided by kp. limit: (n,) torque [Nm]. backlash: half of it [rad].
+    """
     text = re.sub(r"<(visual|collision)>.*?</\1>", "", urdf.read_text(), flags=re.DOTALL)
     spec = mujoco.MjSpec.from_string(text)
     spec.option.timestep = STEP
@@ -49,7 +90,7 @@ def arm_with_servos(
 
 
 def positions(model: mujoco.MjModel, joints: list[str], u: np.ndarray, dt: float, delay: float) -> np.ndarray:
-    """(T, n) under commands (T, n) from rest at the first ones. Encoders are behind the gears, and servos know them."""
+    """Return positions (T, n) [rad] under commands (T, n), from rest at the first; encoders are behind the gears."""
     data = mujoco.MjData(model)
     drive = [model.joint(x).qposadr[0] for x in joints]
     names = {model.joint(k).name for k in range(model.njnt)}
@@ -63,3 +104,175 @@ def positions(model: mujoco.MjModel, joints: list[str], u: np.ndarray, dt: float
         data.ctrl[:] = u[max(0, k - late) // per] - behind
         mujoco.mj_step(model, data)
     return np.array(found)
+
+
+@dataclass(frozen=True, eq=False)
+class PositionActuators:
+    """An arm of n joints in MuJoCo, each of which moves one of the URDF's bodies, under position actuators.
+
+    untrained: a model of these bodies. drives: kp, kv, armature and frictionloss, (4, n). The actuators get the command
+    of ``delay`` [s] ago plus ``offset`` (n,) [rad, m].
+    """
+
+    arm: Arm
+    untrained: ArmModel
+    drives: np.ndarray
+    offset: np.ndarray
+    delay: float
+    about = (
+        "position actuators on the URDF's bodies; kp, kv, armature, frictionloss, offsets and delay fitted to windows "
+        "of the training logs by mujoco.minimize, the least squares of mujoco.sysid"
+    )
+
+    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
+        """See `CommandFollower`."""
+        model = self.model()
+        positions: list[np.ndarray] = []
+        for k, (log, rows) in enumerate(parts):
+            steps = steps_between(log, FIT_STEP)
+            model.opt.timestep = float(np.diff(log.t[rows]).mean()) / steps
+            commands = delayed_commands(log, rows, self.delay, steps) + self.offset
+            positions += [*_positions(model, q[[k]], qd[[k]], commands[None])]
+        return positions
+
+    def model(self) -> mujoco.MjModel:
+        """Return the arm with its actuators as MuJoCo's model; joints and actuators in the order of q."""
+        spec = mujoco.MjSpec()
+        spec.compiler.degree = False
+        spec.option.gravity = np.array(self.arm.gravity, dtype=float)
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        parents = [spec.worldbody]
+        inertias = self.untrained.inertial_parameters.numpy()
+        # MuJoCo has zero where nothing limits
+        limits = np.nan_to_num(self.untrained.servo.limit.numpy(), posinf=0.0)
+        for k, (body, coordinate) in enumerate(zip(self.arm.bodies, self.arm.coordinates, strict=True)):
+            kp, kv, armature, frictionloss = self.drives[:, k]
+            mass, center, tensor = about_center(inertias[k])
+            element = parents[body.parent + 1].add_body(
+                pos=np.array(body.translation, dtype=float),
+                quat=quaternion(body.rotation),
+                explicitinertial=True,
+                mass=mass,
+                ipos=center,
+                # MuJoCo has xx, yy, zz, xy, xz, yz
+                fullinertia=tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]],
+            )
+            parents.append(element)
+            kind = mujoco.mjtJoint.mjJNT_HINGE if body.kind == "revolute" else mujoco.mjtJoint.mjJNT_SLIDE
+            element.add_joint(
+                name=body.name,
+                type=kind,
+                axis=(0, 0, 1),
+                range=coordinate.limits or (0, 0),
+                armature=armature,
+                frictionloss=frictionloss,
+                # how soft frictionloss is goes by the inertia and by these
+                solref_friction=(2 * FIT_STEP, 1),
+                solimp_friction=EXPORT_TUNING.friction_impedance,
+            )
+            actuator = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=body.name)
+            actuator.gainprm[0] = kp
+            actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+            actuator.biasprm[1:3] = -kp, -kv
+            actuator.forcerange = -limits[k], limits[k]
+        return spec.compile()
+
+
+def _positions(model: mujoco.MjModel, q: np.ndarray, qd: np.ndarray, commands: np.ndarray) -> np.ndarray:
+    """Return positions (W, K, n) after each interval, from q and qd (W, n), under commands (W, K, S, n)."""
+    count, _, steps, n = commands.shape
+    state = np.hstack([np.zeros((count, 1)), q, qd])  # MuJoCo's has the time first
+    states, _ = rollout.rollout(model, mujoco.MjData(model), state, commands.reshape(count, -1, n))
+    return np.asarray(states[:, steps - 1 :: steps, 1 : 1 + n])
+
+
+def fit_position_actuators(arm: ConfiguredArm, windows: ServoWindows, trained: ArmModel) -> PositionActuators:
+    """Fit to windows, starting from the drives of a ``trained`` model of the arm. Exits if joints are coupled."""
+    n = len(arm.arm.coordinates)
+    if len(arm.arm.bodies) > n or (motors_of(trained).numpy() != np.eye(n)).any():
+        sys.exit("got coupled joints, expected a motor for each joint and a joint for each body")
+    servo, friction = trained.servo.prepare(), trained.friction.prepare()
+    # kv includes the damping of the joint: they differ only while the torque is limited
+    rows = servo.kp, servo.kd + friction.viscous, trained.armature, friction.coulomb
+    start = np.stack([row.detach().numpy() for row in rows])
+    is_known = trained.servo.trained.numpy() == 0
+    untrained = spelgen.build(arm, "closed-form").requires_grad_(False)
+    initial = PositionActuators(arm.arm, untrained, start, np.zeros(n), float(trained.servo.delay))
+    steps = max(steps_between(log, FIT_STEP) for log, _ in windows.parts)
+    windows = replace(windows, steps=steps)
+    q, qd = windows.q.numpy(), windows.qd.numpy()
+
+    # unknowns: logarithms of the drives and offsets of commands, (5, n), and the delay, all in one vector
+    def actuators(x: np.ndarray) -> PositionActuators:
+        drives, offset = np.split(x[:-1].reshape(5, n), [4])
+        drives = np.exp(drives)
+        drives[0, is_known] = start[0, is_known]
+        return replace(initial, drives=drives, offset=offset[0], delay=float(x[-1]))
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        """Return position errors after the burn-in of each window, (samples n,)."""
+        candidate = actuators(x)
+        model = candidate.model()
+        model.opt.timestep = 1 / windows.rate / steps
+        commands = windows.commands(candidate.delay).numpy() + candidate.offset
+        error = _positions(model, q[:, 0], qd[:, 0], commands) - q[:, 1:]
+        return error[:, windows.settling :].ravel()
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return np.stack([errors(column) for column in x.T], axis=1)
+
+    def jacobian(x: np.ndarray, residuals: np.ndarray) -> np.ndarray:
+        """Return finite differences; an unknown of all joints is changed at once, as it hardly affects other joints."""
+        derivatives = np.zeros((len(residuals) // n, n, len(x)))
+        for columns in (*np.arange(5 * n).reshape(5, n), 5 * n):
+            changed = x.ravel().copy()
+            changed[columns] += DIFFERENCE
+            change = (errors(changed) - residuals.ravel()) / DIFFERENCE
+            derivatives[:, np.arange(n), columns] = change.reshape(-1, n)
+        return derivatives.reshape(len(residuals), -1)
+
+    first = np.append(np.log(start), np.zeros(n))
+    bounds = np.repeat([LOG_RANGE, OFFSET_RANGE], [4 * n, n])
+    x, _ = minimize.least_squares(
+        np.append(first, initial.delay),
+        residuals,
+        (np.append(first - bounds, 0.0), np.append(first + bounds, MAX_DELAY)),
+        jacobian,
+        mu_factor=10.0,
+        max_iter=ITERATIONS,
+        verbose=minimize.Verbosity.SILENT,
+    )
+    return actuators(x.ravel())
+
+
+def main() -> None:
+    """Fit the actuators to the training logs, and print the errors of all predictors on the test logs."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--train", type=Path, nargs="+", required=True)
+    parser.add_argument("--test", type=Path, nargs="+", required=True)
+    asked = parser.parse_args()
+    fit = spelgen.load_run(asked.run)
+    if fit.record.servo is None or fit.urdf is None:
+        parser.error(f"{asked.run} has to be the finished run of an arm under position servos, with its URDF")
+    options = fit.model.facts.options
+    arm = spelgen.load_arm(fit.urdf, options.joints, options.tip, options.angle_tolerance)
+    logs = spelgen.read_logs(asked.train, arm, fit.record.mapping)
+    windows = servo_windows(logs, fit.preprocessing, WINDOWS)
+    start = time.monotonic()
+    actuators = fit_position_actuators(arm, windows, fit.model)
+    print(f"fitted in {time.monotonic() - start:.0f} s; delay {1000 * actuators.delay:.1f} ms")
+    for name, row in zip(("kp", "kv", "armature", "frictionloss"), actuators.drives, strict=True):
+        print(f"{name:14}", *(f"{value:10.4g}" for value in row))
+    followers = {"MuJoCo actuators": actuators} | command_followers(fit.record.servo["linear"], [])
+    test = spelgen.read_logs(asked.test, arm, fit.record.mapping)
+    for replay in replays(fit.model, test, followers, [])[0]:
+        print(f"{replay.name}: RMS of positions over all joints [mrad, mm]")
+        for name, errors in replay.errors.items():
+            print(f"  {name:18}{1000 * errors.mean:8.3g}")
+
+
+if __name__ == "__main__":
+    main()

@@ -65,7 +65,7 @@ def simulated(model: Any, u: torch.Tensor, dead_zone: float, limit: torch.Tensor
     return torch.stack(found, dim=1)
 
 
-def recordings(arm: spelgen.LoadedArm, asked: argparse.Namespace) -> Iterator[list[Trajectory]]:
+def recordings(arm: spelgen.ConfiguredArm, asked: argparse.Namespace) -> Iterator[list[Trajectory]]:
     """Of each seed, as encoders see them."""
     model = spelgen.build(arm, "closed-form")
     t = np.arange(0, asked.seconds, 1 / RATE)
@@ -91,7 +91,7 @@ def recordings(arm: spelgen.LoadedArm, asked: argparse.Namespace) -> Iterator[li
 
 
 def in_mujoco(
-    urdf: Path, arm: spelgen.LoadedArm, u: list[np.ndarray], limit: np.ndarray, backlash: float
+    urdf: Path, arm: spelgen.ConfiguredArm, u: list[np.ndarray], limit: np.ndarray, backlash: float
 ) -> np.ndarray:
     """Positions (B, T, n), as `simulated`."""
     # MuJoCo is an extra
@@ -127,7 +127,7 @@ def main() -> None:
     errors, held, left = {x: [] for x in truths}, {x: [] for x in truths}, {x: 0 for x in truths}
     for seed, logs in enumerate(recordings(arm, asked)):
         since = time.monotonic()
-        found = spelgen.fit(spelgen.build(arm, asked.preset), logs).record["servo"]
+        found = spelgen.fit(spelgen.build(arm, asked.preset), logs).record.servo
         for what, truth in truths.items():
             told = [x[what] for x in found["joints"] if what in x and x[what]["determined"]]
             left[what] += len(found["joints"]) - len(told)

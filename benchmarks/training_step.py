@@ -18,7 +18,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -30,21 +30,20 @@ from published_phnode import ByJvp, Published
 
 from spelgen.design import Design
 from spelgen.dynamics.equations import unbounded
+from spelgen.emission.build import build
 from spelgen.fitting.rollout import position_difference
-from spelgen.pipeline.build import build
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 ROBOT = Path(__file__).parents[1] / "robots" / "six_dof.urdf"
-PRESETS: dict[str, tuple[str | Design, Literal["mlp", "kan"] | None]] = {
-    "phnode": ("phnode", "mlp"),
-    "spel": ("spel", "mlp"),
-    "spel-kan": ("spel-kan", "kan"),
-    "derived M, V": (NETWORKS, "mlp"),
-    "hybrid": ("hybrid", "mlp"),
-    "hybrid-kan": ("hybrid", "kan"),
-    "closed-form": ("closed-form", None),
+PRESETS: dict[str, str | Design] = {
+    "phnode": "phnode",
+    "spel": "spel",
+    "spel-kan": "spel-kan",
+    "derived M, V": NETWORKS,
+    "hybrid": "hybrid",
+    "closed-form": "closed-form",
 }
 WIDTH, WINDOWS, SAMPLES, JOINTS, STEP = 64, 256, 5, 6, 0.02
 PARTS, REPEATS, SLOW_REPEATS = 4, 15, 3
@@ -73,7 +72,7 @@ def rk4(rate: Callable[..., tuple[Tensor, Tensor]], q: Tensor, p: Tensor) -> tup
     return q, p, k1[0]
 
 
-def plain_mass(model: EmittedModel) -> EmittedModel | None:
+def plain_mass(model: ArmModel) -> ArmModel | None:
     """The model with M as it comes; None where nothing is done to it."""
     if not hasattr(getattr(model, "mass", None), "fraction"):
         return None
@@ -82,7 +81,7 @@ def plain_mass(model: EmittedModel) -> EmittedModel | None:
     return plain
 
 
-def training_step(model: EmittedModel, data: Data) -> None:
+def training_step(model: ArmModel, data: Data) -> None:
     """Loss of the windows, and its gradient: geodesic distance and velocity, as in eq. 8 of the paper."""
     model.zero_grad()
     prepared = model.prepare()
@@ -98,7 +97,7 @@ def training_step(model: EmittedModel, data: Data) -> None:
     (distance.square().mean() + velocity.square().mean()).backward()
 
 
-def networks_alone(model: EmittedModel, data: Data) -> None:
+def networks_alone(model: ArmModel, data: Data) -> None:
     """The floor: each network forward and backward once for every evaluation in the step, and nothing else."""
     model.zero_grad()
     dynamics, q, qd = model, data.q[:, 0], data.qd[:, 0]
@@ -143,7 +142,7 @@ def seconds(work: Callable[[], None]) -> float:
     return time.perf_counter() - start
 
 
-def sizes(model: EmittedModel) -> str:
+def sizes(model: ArmModel) -> str:
     """Outputs of the networks of M, D, G and V, and inputs of that of M."""
     if not hasattr(model, "mass"):
         return ""
@@ -168,7 +167,7 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     data = Data(WINDOWS)
-    models = {name: build(ROBOT, preset, net=net, width=WIDTH) for name, (preset, net) in PRESETS.items()}
+    models = {name: build(ROBOT, preset, width=WIDTH) for name, preset in PRESETS.items()}
     plain = {name: plain_mass(model) for name, model in models.items()}
     steps, floors, bare = ({name: list[float]() for name in models} for _ in range(3))
     for _ in range(REPEATS):

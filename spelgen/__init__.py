@@ -6,14 +6,16 @@ from typing import TYPE_CHECKING, Any
 from spelgen.version import __version__
 
 if TYPE_CHECKING:
-    from spelgen.certificate.inspection import Inspection
+    from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+    from spelgen.certificate.inspection import Inspection, inspect
+    from spelgen.certificate.module_check import check
     from spelgen.design import Design
     from spelgen.dynamics.linear_friction import FrictionModel
     from spelgen.dynamics.tip import tip_kinematics
+    from spelgen.emission.build import build, generate
     from spelgen.emission.loading import load_module
     from spelgen.errors import SpelgenError
     from spelgen.evaluation.evaluate import evaluate
-    from spelgen.evaluation.keep import keep_baseline
     from spelgen.evaluation.results import Results
     from spelgen.evaluation.rollout import rollout
     from spelgen.excitation.design import excite
@@ -25,23 +27,20 @@ if TYPE_CHECKING:
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs, write_logs
     from spelgen.logs.trajectory import Trajectory
-    from spelgen.pipeline.build import build
-    from spelgen.pipeline.generate import check, generate, inspect
-    from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
     from spelgen.settings.fits import GaussianPrior, MomentumFit, Rollout, TorqueFit
     from spelgen.simulation.simulate import simulate
 
 
 _HOME = {
-    "load_arm": "pipeline.loaded_arm",
-    "LoadedArm": "pipeline.loaded_arm",
-    "inspect": "pipeline.generate",
+    "load_arm": "arm.configured_arm",
+    "ConfiguredArm": "arm.configured_arm",
+    "inspect": "certificate.inspection",
     "Inspection": "certificate.inspection",
-    "generate": "pipeline.generate",
+    "generate": "emission.build",
     "Design": "design",
-    "build": "pipeline.build",
+    "build": "emission.build",
     "load_module": "emission.loading",
-    "check": "pipeline.generate",
+    "check": "certificate.module_check",
     "read_logs": "logs.read",
     "write_logs": "logs.read",
     "Trajectory": "logs.trajectory",
@@ -51,7 +50,6 @@ _HOME = {
     "excite": "excitation.design",
     "identify": "identification.identify",
     "LeastSquares": "identification.identification",
-    "keep_baseline": "evaluation.keep",
     "FrictionModel": "dynamics.linear_friction",
     "Identification": "identification.identification",
     "fit": "fitting.fit",
@@ -72,6 +70,7 @@ _HOME = {
 """The file that each name of the API lives in; loaded on first use (PEP 562), so `import spelgen` stays fast."""
 
 __all__ = [
+    "ConfiguredArm",
     "Design",
     "Fit",
     "FrictionModel",
@@ -79,7 +78,6 @@ __all__ = [
     "Identification",
     "Inspection",
     "LeastSquares",
-    "LoadedArm",
     "MomentumFit",
     "Preprocessing",
     "Results",
@@ -99,7 +97,6 @@ __all__ = [
     "generate",
     "identify",
     "inspect",
-    "keep_baseline",
     "load_arm",
     "load_module",
     "load_run",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
@@ -14,8 +14,6 @@ Preset = Literal["hybrid", "closed-form", "minimal", "spel", "spel-kan", "phnode
 """Those that come with spelgen."""
 
 PRESET_NAMES: tuple[str, ...] = get_args(Preset)
-
-Net = Literal["mlp", "kan"]
 
 BRISTLE_REACH = {
     "revolute": (1e-4, 4e-4, 1.6e-3, 6.4e-3, 2.5e-2, 1e-1),
@@ -47,7 +45,7 @@ class Design:
     memory: Literal["bristles", "none"]
     """Whether friction remembers the way a joint came."""
     net: Literal["mlp", "kan", "none"]
-    """What networks are made of: those that M and V are, or that stand beside rigid bodies."""
+    """Networks of M and V: tanh or Kolmogorov-Arnold; residual networks in addition to rigid bodies: tanh."""
     encoding: Literal["joint", "lie-group", "none"]
     """What a network reads: cos q and sin q or scaled q of the joints it depends on, or the nine or three
     numbers of every joint's R or r.
@@ -61,21 +59,19 @@ CHOICES: dict[str, tuple[str, ...]] = {name: get_args(kind) for name, kind in ge
 """The values of each key of a design."""
 
 
-def load_design(preset: str | Path | Design, net: Net | None = None) -> Design:
-    """The design of a preset: one that comes with spelgen by its name, one of yours by its YAML file.
+def load_design(preset: str | Path | Design) -> Design:
+    """Return the design of a preset, by the name of one of spelgen or the YAML file of your own.
 
-    ``net`` takes the place of its own networks. Raises SettingsError.
+    Raises SettingsError.
     """
     if isinstance(preset, Design):
-        design = preset
-    elif str(preset) in PRESET_NAMES:
-        design = _read(PRESETS / f"{preset}.yaml")
-    elif Path(preset).suffix in (".yaml", ".yml"):
-        design = _read(Path(preset))
-    else:
-        expected = f"one of {', '.join(PRESET_NAMES)}, or a YAML file"
-        raise SettingsError(f"the preset {str(preset)!r}", expected=expected)
-    return design if net is None else replace(design, net=net)
+        return preset
+    if str(preset) in PRESET_NAMES:
+        return _read(PRESETS / f"{preset}.yaml")
+    if Path(preset).suffix in (".yaml", ".yml"):
+        return _read(Path(preset))
+    expected = f"one of {', '.join(PRESET_NAMES)}, or a YAML file"
+    raise SettingsError(f"the preset {str(preset)!r}", expected=expected)
 
 
 def _read(path: Path) -> Design:
@@ -129,6 +125,8 @@ def _conflicts(values: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
         yield "mass", "net", "net: none goes with mass: closed-form alone"
     if (values["net"] == "none") != (values["encoding"] == "none"):
         yield "net", "encoding", "encoding is the input of networks: none for a model without networks"
+    if rigid and values["net"] == "kan":
+        yield "mass", "net", "residual networks in addition to rigid bodies need net: mlp"
     if rigid and values["encoding"] == "lie-group":
         yield "mass", "encoding", "residual terms beside rigid bodies need encoding: joint"
     if rigid and values["input"] != "derived":

@@ -1,49 +1,42 @@
-"""Define ModelSpec, everything an emitted module is made from, as plain frozen data.
+"""ModelSpec: everything that a model is made of, as frozen data with a canonical JSON form.
 
-It is the wall between deriving and training. The facts that an emitted module carries are written and read back here.
+It is the boundary between deriving and training: the derivation of structure produces it, and models are
+assembled and modules are written from it.
 """
 
 from __future__ import annotations
 
-import ast
 import hashlib
 import json
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from spelgen.design import Design, Net
+from spelgen.design import Design
 from spelgen.errors import ModuleError, SettingsError
-from spelgen.files import read_bytes
 from spelgen.urdf.robot import Assume
 
 Kind = Literal["zero", "constant", "varying"]
+JointType = Literal["revolute", "prismatic"]
+Triple = tuple[float, float, float]
 Entries = tuple[tuple[int, int, float], ...]
-"""A sparse symmetric matrix by its lower triangle: (row, column, value), 0-based."""
+"""A sparse symmetric matrix by its lower triangle: (row, column, value), from 0."""
 
-MODULE_FORMAT = 8
-"""Of emitted modules: it changes when a module, or weights of one, written before cannot be used any more."""
-LARGEST_MODULE = 2**22  # bytes: the largest that `build` writes has a tenth
-_MOST_WEIGHTS = 2**24  # of the hidden layers of one network: 134 MB in double precision
-_MOST_LAYERS = 16
-_FACTS_WIDTH = 100
-_FOREIGN = (
-    SyntaxError, ValueError, KeyError, TypeError, StopIteration, AttributeError, RecursionError, MemoryError,
-)  # fmt: skip
-"""What parsing a text that is no module of ours may raise."""
+# Format of specifications. It changes when a specification, or weights, of an earlier version cannot be used any more.
+SPEC_FORMAT = 9
+# Largest number of weights in the hidden layers of one network: 134 MB in double precision.
+MAX_WEIGHTS = 2**24
+MAX_LAYERS = 16
 
 
 @dataclass(frozen=True)
 class Options:
-    """What the user chose when building; enough to build the same module again from the same URDF."""
+    """The options of `spelgen build`; with the URDF they determine the model."""
 
     preset: str = "hybrid"
     design: Design | None = None
-    """None: that of the preset of this name, which comes with spelgen."""
-    net: Net | None = None
-    """None: the design's own."""
+    """None: the preset of this name, which comes with spelgen."""
     assume: Assume = "kinematics"
     joints: tuple[str, ...] | None = None
     tip: str | None = None
@@ -52,74 +45,78 @@ class Options:
     depth: int = 2
 
     def __post_init__(self) -> None:
-        """Raise SettingsError for networks that no memory holds: the facts of a module may say any number."""
+        """Raise SettingsError for networks that are too large for memory."""
         weights = self.width * self.width * self.depth
-        if min(self.width, self.depth) < 1 or self.depth > _MOST_LAYERS or weights > _MOST_WEIGHTS:
+        if min(self.width, self.depth) < 1 or self.depth > MAX_LAYERS or weights > MAX_WEIGHTS:
             raise SettingsError(
                 f"{self.depth} hidden layers of {self.width} units",
-                expected=f"1 to {_MOST_LAYERS} layers of at least 1, with at most {_MOST_WEIGHTS:,} weights",
+                expected=f"1 to {MAX_LAYERS} layers of at least 1, with at most {MAX_WEIGHTS:,} weights",
             )
 
 
 @dataclass(frozen=True)
 class JointSpec:
-    """One joint: ``name`` as in the URDF, ``identifier`` for code; units are rad or m, and Nm or N."""
+    """A joint by its name in the URDF; units are rad or m, and Nm or N."""
 
     name: str
-    identifier: str
-    kind: Literal["revolute", "prismatic"]
+    joint_type: JointType
     lower: float | None
     upper: float | None
     center: float
-    reach: float
-    """Position is scaled as (q - center) / reach where the joint is prismatic."""
+    half_range: float
+    """The position of a prismatic joint is scaled as (q - center) / half_range."""
     speed: float
+    """Typical velocity [rad/s, m/s]."""
     friction: float
-    """Size of friction torque the model starts from."""
+    """Typical friction torque, the initial value [Nm, N]."""
     armature: float
-    """What the drive adds to M, to start from [kg m^2, kg]; 0: nothing."""
+    """Rotor inertia times gear ratio squared, the initial value [kg m^2, kg]; 0: none."""
     gear: float
-    """Turns of the motor in a turn of the joint."""
+    """Revolutions of the motor per revolution of the joint."""
     mass_sensitivity: float
+    """Change of M with this joint, relative to the joint of the largest change."""
     potential_sensitivity: float
-    """How much M, or V, changes with this joint, relative to the joint it changes with most."""
-
-
-Triple = tuple[float, float, float]
+    """The same of V."""
 
 
 @dataclass(frozen=True)
-class BodySpec:
-    """A body of a closed-form model, as ``arm.Body`` has it, with the inertial parameters to start from."""
+class LinkSpec:
+    """A rigid body and its initial inertial parameters, in the frame of its joint, whose z is the axis."""
 
+    name: str
     parent: int
+    """Index of the link that carries it; -1: the base."""
     joint: int
-    kind: Literal["revolute", "prismatic"]
+    """Index of the joint that moves it by ratio * q + offset."""
+    joint_type: JointType
     ratio: float
     offset: float
-    placement: tuple[tuple[float, ...], ...]
-    """Of its joint's frame in its parent's: three rows of [R p] [m]."""
-    pseudo_inertia: tuple[float, ...]
-    """The upper triangle of [[S, m c], [(m c)^T, m]], row by row, with S the second moments of mass."""
+    position: Triple
+    """Origin of the joint's frame in the parent's frame at q = 0 [m]."""
+    rotation: tuple[Triple, Triple, Triple]
+    mass: float
+    center_of_mass: Triple
+    inertia: tuple[float, float, float, float, float, float]
+    """About the center of mass, (xx, xy, xz, yy, yz, zz) [kg m^2]."""
 
 
 @dataclass(frozen=True)
 class ServoSpec:
-    """The position servo of a joint; N and m in place of Nm and rad where it is prismatic."""
+    """The position servo of a joint; N and m instead of Nm and rad if it is prismatic."""
 
     kp: float
-    """Torque by the distance from the command [Nm/rad], to start from."""
+    """Torque per distance from the command, the initial value [Nm/rad]."""
     known: bool
-    """Whether kp is known, and so no weight."""
+    """Whether kp is known, and therefore not trained."""
     kd: float
-    """Torque by velocity [Nm s/rad], to start from."""
+    """Torque per velocity, the initial value [Nm s/rad]."""
     limit: float | None
-    """The most torque that it gives; None: nothing says."""
+    """Largest torque; None: unlimited."""
 
 
 @dataclass(frozen=True)
 class OutputSpec:
-    """One learned function of ``joints``: f(q) = mean + scale x network, entering M through ``basis``."""
+    """A learned function f(q) = mean + scale x network of ``joints``, whose part of M is f times ``basis``."""
 
     joints: tuple[int, ...]
     basis: Entries
@@ -129,7 +126,7 @@ class OutputSpec:
 
 @dataclass(frozen=True)
 class ConstantSpec:
-    """One trained constant, in units of ``scale``, entering M through ``basis``."""
+    """A trained constant in units of ``scale``, whose part of M is the constant times ``basis``."""
 
     basis: Entries
     start: float
@@ -137,162 +134,109 @@ class ConstantSpec:
 
 
 @dataclass(frozen=True)
+class InputSpec:
+    """An entry of the input matrix G: the torque of a joint per input of a motor."""
+
+    joint: int
+    motor: int
+    value: float
+    trained: bool
+
+
+@dataclass(frozen=True)
 class ModelSpec:
-    """A model, ready to be written as source text. Indices are 0-based."""
+    """A model; indices are from 0. Raises ModuleError if indices and names contradict each other."""
 
     robot: str
     urdf: str
     urdf_sha256: str
-    gravity: tuple[float, float, float]
+    gravity: Triple
     options: Options
     design: Design
     joints: tuple[JointSpec, ...]
     entries: tuple[tuple[int, int, Kind, tuple[int, ...]], ...]
-    """(row, column, kind, joints) of M's lower triangle: what a reader is shown."""
+    """(row, column, kind, joints) of the lower triangle of M, for people."""
     outputs: tuple[OutputSpec, ...]
     constants: tuple[ConstantSpec, ...]
     potential: tuple[int, ...]
+    """The joints that V depends on."""
     potential_scale: float
     margin: float
-    """The least eigenvalue of M, relative to the nominal mean M, that is left as it is."""
+    """Smallest eigenvalue of M relative to the nominal mean of M, below which M is corrected."""
     started_from_urdf: bool
-    bodies: tuple[BodySpec, ...] = ()
-    """Of a closed-form model."""
-    inputs: tuple[tuple[int, int, float, bool], ...] = ()
-    """(row, column, value, trained) of G; none where every joint's own torque acts on it as it is."""
+    """Whether initial inertial parameters are those of the URDF."""
+    links: tuple[LinkSpec, ...] = ()
+    """Of a model of rigid bodies."""
+    inputs: tuple[InputSpec, ...] = ()
+    """Empty: each input is the torque of its own joint."""
     motor_speeds: tuple[tuple[float, ...], ...] = ()
-    """By joint velocities, where motors move several joints."""
+    """Rows of C: the motors rotate at C qd; empty: each motor drives its own joint."""
     servos: tuple[ServoSpec, ...] = ()
-    """Of joints that are commanded positions."""
+    """Of joints whose inputs are commanded positions."""
 
-    def to_json(self) -> str:
-        """Canonical JSON."""
-        plain = asdict(self)
-        for name in ("servos", "motor_speeds"):  # arms without keep the digest of before there were such
-            if not plain[name]:
-                del plain[name]
-        return json.dumps(plain, sort_keys=True, ensure_ascii=True)
+    def __post_init__(self) -> None:
+        n, links = len(self.joints), self.links
+        joints = [*self.potential, *(x.joint for x in links), *(j for x in self.outputs for j in x.joints)]
+        bases = [x.basis for x in self.outputs] + [x.basis for x in self.constants]
+        joints += [index for basis in bases for row in basis for index in row[:2]]
+        joints += [index for x in self.inputs for index in (x.joint, x.motor)]
+        joints += [index for row, column, _, depends in self.entries for index in (row, column, *depends)]
+        names = [joint.name for joint in self.joints], [link.name for link in links]
+        consistent = (
+            n > 0
+            and all(0 <= joint < n for joint in joints)
+            and all(-1 <= link.parent < index for index, link in enumerate(links))
+            and all(len(set(group)) == len(group) for group in names)
+            and [len(row) for row in self.motor_speeds] in ([], [n] * n)
+            and len(self.servos) in (0, n)
+        )
+        if not consistent:
+            raise ModuleError("a specification whose indices contradict each other", do="build it again")
 
     @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints in the URDF, which logs use."""
+        return tuple(joint.name for joint in self.joints)
+
+    @property
+    def joint_types(self) -> tuple[JointType, ...]:
+        """``revolute`` or ``prismatic``, for each joint."""
+        return tuple(joint.joint_type for joint in self.joints)
+
+    def to_json(self) -> str:
+        """Return the canonical JSON, in one line of ASCII."""
+        plain = {"format": SPEC_FORMAT, **asdict(self)}
+        return json.dumps(plain, sort_keys=True, ensure_ascii=True, separators=(",", ":"))
+
+    @cached_property
     def sha256(self) -> str:
         """Digest of the canonical JSON."""
         return hashlib.sha256(self.to_json().encode()).hexdigest()
 
 
-@dataclass(frozen=True)
-class Facts:
-    """What an emitted module says of itself. ``joints`` are the URDF's own names, which logs use."""
+def spec_from_json(text: str, file: Path | None = None) -> ModelSpec:
+    """Return the specification in a JSON text. Raises ModuleError, which names ``file``."""
+    from pydantic import TypeAdapter, ValidationError  # slow to import
 
-    robot: str
-    urdf: str
-    urdf_sha256: str
-    spec_sha256: str
-    options: Options
-    joints: tuple[str, ...]
-    joint_types: tuple[str, ...]
-
-
-def facts_json(spec: ModelSpec) -> str:
-    """What the module made from ``spec`` says of itself, as JSON for people and programs."""
-    facts: dict[str, object] = {
-        "format": MODULE_FORMAT,
-        "robot": spec.robot,
-        "urdf": spec.urdf,
-        "urdf_sha256": spec.urdf_sha256,
-        "spec_sha256": spec.sha256,
-        "options": dict(sorted(asdict(spec.options).items())),
-        "joints": {joint.name: joint.kind for joint in spec.joints},
-    }
-    items = [f"{json.dumps(key)}: {_filled(value)}" for key, value in facts.items()]
-    return "{" + ", ".join(items[:3]) + ",\n " + ",\n ".join(items[3:]) + "}"
-
-
-def _filled(value: object) -> str:
-    """JSON of a value, or of a group on as many lines as it takes, with items kept whole."""
-    if not isinstance(value, dict):
-        return json.dumps(value)
-    lines = [""]
-    for key, item in value.items():
-        text = f"{json.dumps(key)}: {json.dumps(item)}"
-        if lines[-1] and len(lines[-1]) + len(text) > _FACTS_WIDTH:
-            lines.append("")
-        lines[-1] += f", {text}" if lines[-1] else text
-    return "{" + ",\n  ".join(lines) + "}"
-
-
-def read_facts(path: str | Path) -> Facts:
-    """The facts in the emitted module at ``path``; nothing of it is executed. Raises ModuleError without them."""
-    return parse_facts(read_source(path), Path(path))
-
-
-def read_source(path: str | Path) -> str:
-    """The text of the module at ``path``. Raises ModuleError."""
-    path = Path(path)
-    if not path.exists():
-        raise ModuleError("no such file", file=path, do="build it with `spelgen build`")
-    content = read_bytes(path, ModuleError, "a module written by `spelgen build`", LARGEST_MODULE)
     try:
-        return content.decode("utf-8").replace("\r\n", "\n")
-    except ValueError as problem:
-        raise _no_facts(problem, path) from None
-
-
-def parse_facts(source: str, file: Path | None = None) -> Facts:
-    """The facts in a module's source text; nothing of it is executed. Raises ModuleError without them."""
-    try:
-        record = _record(source)
-        if record.get("format") == MODULE_FORMAT:
-            return _facts(source)
-    except SettingsError as problem:
-        raise ModuleError(f"options of no module ({problem})", file=file, do="build it again") from None
-    except _FOREIGN as problem:
-        raise _no_facts(problem, file) from None
+        content = json.loads(text, parse_constant=_no_number)
+        version = content.pop("format") if isinstance(content, dict) and "format" in content else None
+        if version != SPEC_FORMAT:
+            raise ModuleError(
+                f"a specification of format {version!r}", file=file, expected=f"{SPEC_FORMAT}, of this version",
+                do="build the module again with `spelgen build`, and train it again",
+            )  # fmt: skip
+        spec = TypeAdapter(ModelSpec).validate_python(content)
+        if json.loads(spec.to_json()) == {"format": version, **content}:
+            return spec
+        reason = "keys or values of other types"
+    except (ValidationError, ValueError, RecursionError, SettingsError) as problem:
+        reason = " ".join(str(problem).split())[:200]
     raise ModuleError(
-        "a module of another version of spelgen",
-        file=file,
-        expected="a module written by this version of `spelgen build`",
-        do=f"build it again from {record.get('urdf')} with `spelgen build`, and train it again",
-    )
+        f"no specification of a model ({reason})", file=file, expected="JSON as `spelgen build` writes it",
+        do="build the module again with `spelgen build`",
+    )  # fmt: skip
 
 
-@lru_cache(maxsize=8)  # a run reads one module again and again
-def _record(source: str) -> dict[str, Any]:
-    record: dict[str, Any] = json.loads(next(_texts(ast.parse(source), "FACTS")))
-    return record
-
-
-def _facts(source: str) -> Facts:
-    from pydantic import TypeAdapter  # slow to import
-
-    record = _record(source)
-    joints = record["joints"]
-    # a field of another type is refused here, and not wherever it is used first
-    return TypeAdapter(Facts).validate_python(
-        record | {"joints": tuple(joints), "joint_types": tuple(joints.values())}
-    )
-
-
-def _no_facts(problem: Exception, file: Path | None) -> ModuleError:
-    return ModuleError(
-        f"no facts of spelgen in it ({type(problem).__name__})",
-        file=file,
-        expected="a module written by this version of `spelgen build`",
-        do="build it again, or check the path",
-    )
-
-
-def _texts(tree: ast.Module, name: str) -> Iterator[str]:
-    """The strings that a file assigns to ``name``."""
-    for node in tree.body:
-        if (
-            isinstance(node, ast.Assign)
-            and isinstance(node.value, ast.Constant)
-            and [target.id for target in node.targets if isinstance(target, ast.Name)] == [name]
-        ):
-            yield str(node.value.value)
-
-
-def logged_joints(model: Any) -> tuple[str, ...]:
-    """The joints of a model by the names that logs use: the URDF's, or its own where it comes from none."""
-    facts = getattr(model, "facts", None)
-    return tuple(model.joint_names) if facts is None else facts.joints
+def _no_number(name: str) -> float:
+    raise ValueError(f"{name} is no number of a specification")

@@ -1,4 +1,4 @@
-"""Run many independent tasks: on Ray, which runs a task again when its worker or its machine dies."""
+"""Run independent tasks: one after the other here, or several at a time on Ray, which reruns tasks of dead workers."""
 
 from __future__ import annotations
 
@@ -12,21 +12,29 @@ from typing import Any, Protocol, TypeVar
 
 from spelgen.errors import RunError
 
-RETRIES = 5  # of a task whose worker died
-OBJECT_STORE = 100_000_000  # bytes of memory that tasks share: they hand over paths and a few numbers
+# Number of times that a task is run again after its worker died.
+RETRIES = 5
+# Shared memory of Ray [bytes]. It is small because tasks exchange only paths and a few numbers.
+OBJECT_STORE = 100_000_000
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
 class RunTasks(Protocol):
-    """Run tasks; see ``workers``."""
+    """Function that runs tasks; see `workers`."""
 
     def __call__(
         self, work: Callable[[Task], Result], tasks: Sequence[Task]
     ) -> Iterator[tuple[Task, Result | Exception]]:
-        """Yield each task with what ``work`` returns for it, or the exception it ended with, as they end."""
+        """Yield each task with its result or its exception, in the order in which the tasks end."""
         ...
+
+
+def default_jobs() -> int:
+    """Return the number of cores that this process may use if Ray is installed, else 1."""
+    # a container or a job of a scheduler may own fewer cores than the machine has
+    return 1 if find_spec("ray") is None else len(os.sched_getaffinity(0))
 
 
 def run_here(
@@ -43,22 +51,24 @@ def run_here(
 
 @contextmanager
 def workers(jobs: int, address: str | None = None) -> Iterator[RunTasks]:
-    """Give a function that runs tasks, ``jobs`` at a time on a Ray of this machine, or on the cluster at an address.
+    """Yield a function that runs tasks: `jobs` at a time with Ray on this machine, or on a cluster.
 
-    One job at a time needs no Ray. address: of a cluster that runs already, "auto" for this machine's. Raises
-    RunError without Ray, and where no cluster answers.
+    A single job at a time does not need Ray. address: of a running Ray cluster, "auto" for the one of this machine.
+    Raises RunError if Ray is not installed, and if no cluster answers.
     """
     if jobs == 1 and address is None:
         yield run_here
         return
     if find_spec("ray") is None:
         raise RunError(
-            "several runs at a time, and no Ray",
-            expected="the extra fleet",
-            do="pip install 'spelgen[fleet]', or --jobs 1",
+            "several runs at a time without Ray",
+            expected="the extra parallel",
+            do="pip install 'spelgen[parallel]', or --jobs 1",
         )
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is reported to anybody
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or Ray warns of its new default
+    # no usage statistics are sent
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    # avoids a warning of Ray about a changed default
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     import ray
 
     cluster: dict[str, Any] = {"address": address}
@@ -73,7 +83,8 @@ def workers(jobs: int, address: str | None = None) -> Iterator[RunTasks]:
             do="start one by `ray start --head`, or omit --address",
         ) from error
     try:
-        with redirect_stdout(sys.stderr):  # Ray reports workers that died there: stdout is for results
+        # Ray reports dead workers on stdout, which is for results
+        with redirect_stdout(sys.stderr):
             yield _run_on_ray
     finally:
         ray.shutdown()
@@ -82,7 +93,7 @@ def workers(jobs: int, address: str | None = None) -> Iterator[RunTasks]:
 def _run_on_ray(
     work: Callable[[Task], Result], tasks: Sequence[Task]
 ) -> Iterator[tuple[Task, Result | Exception]]:
-    """Run tasks of one processor core each. A task may run again after its worker died, so it must be able to."""
+    """Run tasks of one core each. A task must be able to run again, because its worker may die."""
     import ray
 
     remote: Any = ray.remote(num_cpus=1, max_retries=RETRIES)(_work_or_die)
@@ -97,7 +108,7 @@ def _run_on_ray(
 
 
 def _work_or_die(work: Callable[[Task], Result], task: Task) -> Result:
-    """Do a task in a worker. One that is asked to end dies at once, and so its task runs again."""
+    """Do a task in a worker. A worker that is interrupted dies at once, so that Ray runs its task again."""
     try:
         return work(task)
     except KeyboardInterrupt:
@@ -115,8 +126,9 @@ def _outcome(reference: Any) -> Any:
         if isinstance(error.cause, Exception):
             return error.cause
         return error
-    except RayError as error:  # its workers died each time, or Ray's own processes did
+    except RayError as error:
+        # the workers of the task died each time, or processes of Ray itself did
         return RunError(
             f"a worker that died {RETRIES + 1} times ({type(error).__name__})",
-            do="the same command does what is left",
+            do="the same command runs the remaining tasks",
         )

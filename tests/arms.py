@@ -1,4 +1,4 @@
-"""Small arms made by hand, as exact as those read from files."""
+"""Small serial arms with exact rational geometry, and the reference arms with their known structure."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STRAIGHT = tuple(tuple(Fraction(int(i == j)) for j in range(3)) for i in range(3
 def chain(
     links: Sequence[tuple[str, Rows, Sequence[float]]], gravity: Sequence[float] = (0, 0, -9.81)
 ) -> Arm:
-    """A serial arm from (kind, rotation, translation) by joint; without inertials."""
+    """A serial arm from the (type, rotation, translation) of each joint, without inertials."""
     bodies = tuple(
         Body(
             f"j{i + 1}",
@@ -74,7 +74,7 @@ def random_rotation(rng: np.random.Generator) -> Rows:
 
 
 def reference_arms(shared: Path, assume: str) -> Iterator[tuple[str, dict[str, Any], Arm, Structure]]:
-    """The arms of the reference data with what is known of each, derived once for all tests."""
+    """The arms of the reference data with their known structure, derived once for all tests."""
     for name, known in json.loads((shared / "arms" / "expected.json").read_text()).items():
         if known[assume] is not None:
             joints = known["joints"] and tuple(known["joints"])

@@ -1,4 +1,4 @@
-"""A headless Chromium, spoken to over pipes in its DevTools protocol: no driver, no port."""
+"""A headless Chromium, controlled over pipes by its DevTools protocol: no driver, no port."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def executable() -> str | None:
 
 
 class Chromium:
-    """One browser with one page. problems: what the console and the log said of it. requests: what it asked for."""
+    """One browser with one page. problems: messages of console and log. requests: requested addresses."""
 
     def __init__(self, profile: Path) -> None:
         to_browser, from_browser = os.pipe(), os.pipe()
@@ -50,7 +50,7 @@ class Chromium:
     def open(
         self, page: Path, *, width: int = 1400, dark: bool = False, script: bool = True, media: str = "screen"
     ) -> None:
-        """Load a file and forget what was found of the one before."""
+        """Load a file and clear the problems and requests of the previous one."""
         self.problems, self.requests, self.loaded = [], [], False
         self.ask(
             "Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=False
@@ -77,7 +77,7 @@ class Chromium:
         self.ask("Input.dispatchKeyEvent", type="keyUp", **known)
 
     def picture(self, path: Path, *, top: int = 0, height: int | None = None) -> None:
-        """What the page looks like, whole or a part of it."""
+        """Return an image of the page or of a part of it."""
         width, whole = self.run(
             "[document.documentElement.clientWidth, document.documentElement.scrollHeight]"
         )

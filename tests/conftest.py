@@ -1,7 +1,9 @@
-"""What every test shares: one thread for tiny matrices, and where the robots and the reference data lie."""
+"""Shared by all tests: one thread for tiny matrices, the order of files, tests with bounds of time, common fixtures."""
 
+import fcntl
 import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,11 +12,75 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by torch and numpy when th
 
 ROOT = Path(__file__).parents[1]
 
+# The files that take longest. Workers of pytest-xdist take whole files in this order, so the longest start first.
+LONGEST_FILES = (
+    "test_types",
+    "test_torque_fit",
+    "test_servo",
+    "test_contracts",
+    "test_workflow",
+    "test_coupled_motors",
+    "test_export_onnx",
+    "test_training",
+    "test_meshes",
+    "test_docs",
+    "test_evaluation",
+    "test_selection",
+    "test_run_folder",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run the longest files first, so that no worker is left with one of them when the others are done."""
+    order = {name: index for index, name in enumerate(LONGEST_FILES)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))  # stable: others keep their order
+
+
+class WorkerLock:
+    """A readers-writer lock between the workers of pytest-xdist, on two files of the checkout.
+
+    Every test locks ``running``, a timed one exclusively. To do so it locks ``entry`` first, so that no other test
+    starts while a timed one waits for those that are running.
+    """
+
+    def __init__(self) -> None:
+        self.running = os.open(ROOT / "tests" / "conftest.py", os.O_RDONLY)
+        self.exclusive = False
+
+    def acquire(self, exclusive: bool) -> None:
+        with open(ROOT / "pyproject.toml") as entry:
+            fcntl.flock(entry, fcntl.LOCK_EX)
+            fcntl.flock(self.running, fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH)
+        self.exclusive = exclusive
+
+    def release(self) -> None:
+        fcntl.flock(self.running, fcntl.LOCK_UN)
+        self.exclusive = False
+
+
+LOCK = WorkerLock()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[object]:
+    """Run tests marked ``timed`` while no other worker runs a test, which would slow them down.
+
+    Consecutive timed tests keep the lock: other workers wait for them only once.
+    """
+    timed, timed_next = (
+        x is not None and x.get_closest_marker("timed") is not None for x in (item, nextitem)
+    )
+    if not (timed and LOCK.exclusive):
+        LOCK.acquire(exclusive=timed)
+    try:
+        return (yield)
+    finally:
+        if not (timed and timed_next):
+            LOCK.release()
+
 
 def pytest_collection_finish() -> None:
-    """What was imported lives as long as the tests do: the garbage collector need not go through it every time, which
-    takes a twentieth of the time.
-    """
+    """Exempt imported modules from garbage collection: they live as long as the tests (saves 5 % of the time)."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000)
@@ -28,7 +94,7 @@ def robots() -> Path:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of reference data beside the checkout; tests that read it skip where it is absent."""
+    """The folder of reference data next to the checkout; tests that read it skip if it is absent."""
     folder = ROOT.parent / "shared"
     if not folder.is_dir():
         pytest.skip("the reference data (../shared) is not on this machine")
@@ -53,5 +119,5 @@ def short_torque_fits(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """``--update`` writes the golden copies anew."""
+    """Add ``--update``, which rewrites the golden copies."""
     parser.addoption("--update", action="store_true", help="write golden files anew")

@@ -17,12 +17,12 @@ from flint import fmpq_mpoly
 from polynomials import polynomials
 from torch import nn
 
+from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.design import Design
-from spelgen.emission.emit import emit
-from spelgen.pipeline.generate import make_spec
-from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
+from spelgen.emission.build import derive_spec
+from spelgen.emission.text import module_text
 from spelgen.spec import Options
-from spelgen.structure.structure import Structure
+from spelgen.structure.structure import Structure, derive
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 GANTRY = """<robot name="gantry"><link name="base"/><link name="bridge"/><link name="trolley"/>
@@ -35,7 +35,7 @@ NETWORKS = Design(
     mass="derived", potential="derived", dissipation="per-joint", input="derived", memory="none", net="mlp",
     encoding="joint",
 )  # fmt: skip
-"""M and V by networks of the derived structure alone."""
+"""M and V by networks of the derived structure, without rigid bodies."""
 SIX = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")
 
 
@@ -56,17 +56,18 @@ def built(
     robot: str,
     assume: str = "kinematics",
     preset: str = "hybrid",
-    net: str | None = None,
     design: Design | None = None,
+    *,
+    standalone: bool = False,
 ) -> tuple[str, Structure]:
-    """Source and structure of one of the robots that come with spelgen."""
-    loaded = _loaded(robot)
-    options = Options(preset=preset, design=design, net=net, assume=assume)
-    return emit(make_spec(loaded, options)), loaded.structure_for(assume)
+    """Return the source of a module, and the structure, of one of the robots that come with spelgen."""
+    arm = _loaded(robot)
+    spec = derive_spec(arm, Options(preset=preset, design=design, assume=assume))
+    return module_text(spec, standalone=standalone), derive(arm.arm, assume)
 
 
 @cache
-def _loaded(robot: str) -> LoadedArm:
+def _loaded(robot: str) -> ConfiguredArm:
     return load_arm(ROBOTS / f"{robot}.urdf")
 
 
@@ -77,18 +78,17 @@ def random_model(
     seed: int,
     deviation: float | None = None,
     preset: str = "hybrid",
-    net: str | None = None,
     design: Design | None = None,
 ) -> nn.Module:
     """The robot's model with random weights, as ``randomise`` draws them."""
-    source = built(robot, preset=preset, net=net, design=design)[0]
+    source = built(robot, preset=preset, design=design)[0]
     model = import_source(source, folder / f"{robot}_spel.py").Model(seed=seed)
     randomise(model, seed, deviation)
     return model
 
 
 def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> None:
-    """Draw every weight anew: with this standard deviation, or with the inverse root of a layer's inputs."""
+    """Randomise every parameter: with this standard deviation, or with the inverse root of a layer's inputs."""
     generator = torch.Generator().manual_seed(seed)
     for name, parameter in model.named_parameters():
         draw = torch.randn(parameter.shape, dtype=parameter.dtype, generator=generator)
@@ -105,14 +105,14 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
 
 
 def network_inputs(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
-    """What the networks of a model read of q, (..., encoded)."""
+    """The inputs of the networks of a model, (..., encoded)."""
     owner = getattr(model, "residuals", model)
     encoded: torch.Tensor = owner.encoding(q)
     return encoded
 
 
 def outputs_alone(network: nn.Module, encoded: torch.Tensor) -> torch.Tensor:
-    """A network's outputs y, (..., outputs), without what a model makes of them."""
+    """A network's outputs y, (..., outputs), before a model scales and combines them."""
     count = len(network.biases[-1])
     layers = network.prepare(torch.eye(count, dtype=encoded.dtype), encoded.new_zeros(count))
     y: torch.Tensor = network(encoded, layers)[0]
@@ -132,7 +132,7 @@ def frictionless(model: nn.Module) -> nn.Module:
 
 
 class ExactFunctions(nn.Module):
-    """Stands in for a network: y = (polynomial - mean) / scale, with exact derivatives."""
+    """Replaces a network: y = (polynomial - mean) / scale, with exact derivatives."""
 
     def __init__(
         self, functions: list[fmpq_mpoly], mean: torch.Tensor, scale: torch.Tensor, encoding: nn.Module

@@ -1,15 +1,15 @@
-"""Run folders to export: models whose weights were moved at random, so that no part of them is idle."""
+"""Models and run folders for export tests; their parameters are random, so that no term is zero."""
 
 from pathlib import Path
 
 import torch
 from emitted import ROBOTS
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.emission.build import build
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.fits import TorqueFit
 
 COUPLED = """<robot name="2 fast; } int main( /* */"><link name="base"/>
@@ -52,7 +52,7 @@ def arm_of(robot):
 
 
 def saved_run(model, urdf, folder: Path) -> RunFolder:
-    """A run folder as `spelgen train` leaves it, of this model."""
+    """A run folder of this model, with the files that `spelgen train` writes."""
     record = {"robot": urdf.stem, "objective": "torque", "config": {}, "preprocessing": {}, "mapping": {}}
     record |= {"joints": [], "validation_fraction": 0.25, "seed": 0, "data_digest": ""}
     record |= {"training": [], "validation": []}

@@ -1,8 +1,7 @@
-"""How files drawn at random are tried: in `make test` always the same few, in `make fuzz` new ones until time is up.
+"""Random files for tests: the same FEW in each run of `make test`, new ones until the time is up in `make fuzz`.
 
-A test hands over what it does with one example, which must end within SECONDS (of the reference in machine.py) as
-users may expect: with an answer or a SpelgenError whose lines name what is wrong. The memory that all of them took is
-looked at in the end.
+Each example must end within SECONDS (of the reference in time_bounds.py) with a result or with a SpelgenError.
+`make fuzz` also bounds the memory that all examples took.
 """
 
 from __future__ import annotations
@@ -17,20 +16,22 @@ from typing import Any
 
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
-from machine import slowness
+from time_bounds import slowness
 
 from spelgen.errors import SpelgenError
 
 MINUTES = float(
     os.environ.get("FUZZ_MINUTES", "0")
-)  # of all tests that fuzz; 0: the same examples every time
-TESTS = 7  # among which they are shared
+)  # for all tests together; 0: the same examples in each run
+TESTS = 7  # tests that share these minutes
+FEW = 12  # examples of a test in `make test`
 SECONDS = 10
-MEMORY = 1_000_000  # kB beside what the process had before
+MEMORY = 1_000_000  # kB in addition to what the process had before
 
 
 def fuzz(draw: st.SearchStrategy, examples: int, use: Callable[[Any], Any]) -> None:
-    """Use examples of what is drawn."""
+    """Call ``use`` with examples of a strategy: ``examples`` at a time in `make fuzz`, at most FEW otherwise."""
+    count = examples if MINUTES else min(examples, FEW)
     kept = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
 
     def run(number: int) -> None:
@@ -38,7 +39,7 @@ def fuzz(draw: st.SearchStrategy, examples: int, use: Callable[[Any], Any]) -> N
             answered(lambda: use(example))
 
         drawn = seed(number)(given(draw)(once))
-        settings(max_examples=examples, derandomize=not MINUTES, print_blob=bool(MINUTES), **kept)(drawn)()
+        settings(max_examples=count, derandomize=not MINUTES, print_blob=bool(MINUTES), **kept)(drawn)()
 
     if not MINUTES:
         run(0)
@@ -55,12 +56,12 @@ def fuzz(draw: st.SearchStrategy, examples: int, use: Callable[[Any], Any]) -> N
 
 
 def answered(use: Callable[[], Any]) -> bool:
-    """Whether there was an answer; if not, that it was refused as users may expect."""
+    """Return whether ``use`` gave a result; check that otherwise it raised an error with a text."""
     for each in (signal.SIGALRM, signal.SIGPROF):
         signal.signal(each, _late)
     seconds = SECONDS * _slowness()
     signal.setitimer(signal.ITIMER_PROF, seconds)  # of its own time: others may use the machine
-    signal.alarm(int(10 * seconds))  # and what waits uses none
+    signal.alarm(int(10 * seconds))  # a process that waits uses none
     try:
         use()
         return True

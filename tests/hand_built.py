@@ -1,4 +1,4 @@
-"""Arms of one or two bodies, small enough to do their mechanics by hand."""
+"""Arms of one or two bodies whose mechanics can be derived by hand."""
 
 from fractions import Fraction
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""An HTML page as a parser sees it."""
+"""An HTML page as parsed: elements, text, links."""
 
 from html.parser import HTMLParser
 
@@ -10,7 +10,7 @@ VOID = {"meta", "br", "link", "input"}
 
 
 class Page(HTMLParser):
-    """Checks nesting, and gathers what the tests ask for."""
+    """Checks nesting, and gathers elements, text and links."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The view of the arm as a system on SO(3)^k x R^3^l: rotation matrices in, rates of all three axes of each joint out.
+"""The paper's equations on SO(3)^k x R^3^l: rotation matrices in, rates of all three axes of each joint out.
 
 The emitted module integrates one number for each joint. Here the same equations stand as the paper has them
 (Wang, Chen, Ding, Sci Rep 15:33179, 2025), to compare with models that are trained so and to show that nothing
@@ -38,7 +38,7 @@ def from_group(joint_types: Sequence[str], elements: Sequence[torch.Tensor]) -> 
 
 
 class GroupModel(Protocol):
-    """What the view needs of an emitted module; see its docstrings for shapes."""
+    """The methods of an emitted module that the equations need; see its docstrings for shapes."""
 
     joint_types: tuple[str, ...]
 

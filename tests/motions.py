@@ -1,4 +1,4 @@
-"""Motions that tests and benchmarks record their arms in."""
+"""Smooth random motions for tests and benchmarks."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""M(q) and V(q) of an arm as exact polynomials in the cosines and sines of its angles and in its sliding
-distances.
+"""Exact polynomials of M(q) and V(q) in cosines and sines of angles and in sliding distances.
 
 The same recursion as everywhere, over the rational polynomials. The structure does not need them
 (``structure`` works with values alone): they are its independent proof. Closed forms are expanded one

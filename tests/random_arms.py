@@ -1,4 +1,4 @@
-"""Random arms as URDF text: chains of any joint types, with special and with general geometry."""
+"""Random arms as URDF text: chains of all joint types, with special and with general geometry."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 RIGHT = tuple(repr(k * pi / 2) for k in (0, 0, 1, -1, 2))
 HALF = tuple(repr(k * pi / 4) for k in (1, -1, 3))
-# far enough from every multiple of pi/2 that sizes tell what is zero
+# far enough from every multiple of pi/2 that zeros are recognised by magnitude
 GENERAL = tuple(
     f"{k / 100:g}" for k in range(-310, 311) if abs((k / 100 + pi / 4) % (pi / 2) - pi / 4) > 0.05
 )
@@ -33,7 +33,7 @@ class Follower:
 
 @dataclass(frozen=True)
 class DrawnArm:
-    """The text of a URDF, the joints of its chain, root first, and what follows them."""
+    """The text of a URDF, the joints of its chain, root first, and its mimic joints."""
 
     text: str
     joints: tuple[str, ...]

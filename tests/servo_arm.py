@@ -1,4 +1,4 @@
-"""An arm of two links in a vertical plane under position servos, simulated by itself in small steps."""
+"""A two-link arm in a vertical plane under position servos, with a simulator of its own."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Servos:
 
 
 def write_servo_arm(folder: Path, settings: str = "input: position\n") -> Path:
-    """The URDF, with its settings beside it."""
+    """Write the URDF with its settings file."""
     links = [
         LINK.format(name=name, com=com, mass=mass, inertia=inertia)
         for name, com, mass, inertia in zip(("upper", "lower"), COM, MASS, INERTIA, strict=True)

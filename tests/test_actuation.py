@@ -1,6 +1,4 @@
-"""G, the input matrix: what the URDF's transmissions and the sidecar's gears and couplings make of it, in the
-report, in the simulation, in the emitted module and in training.
-"""
+"""The input matrix G from transmissions, gears and couplings, in report, simulation, module and training."""
 
 from dataclasses import replace
 
@@ -10,14 +8,15 @@ import torch
 from emitted import import_source, randomise
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.certificate.inspection import inspect
 from spelgen.cli.main import app
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
+from spelgen.emission.build import generate
 from spelgen.errors import SettingsError, SpelgenError
 from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
 from spelgen.logs.windows import Windows
-from spelgen.pipeline.generate import generate, inspect
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.simulation.protocol import make_friction
 from spelgen.simulation.random_inputs import random_inputs
 
@@ -84,7 +83,7 @@ COUPLED = MOTOR + "couplings:\n- {joints: [pitch, roll], matrix: [[50, 0], [-10,
                 (3, 3): ("coupled", -60.0),
             },
         ),
-        # the sidecar goes before the URDF, and what neither knows is learned
+        # the settings file precedes the URDF, and values that neither states are trained
         (
             WRIST[1:],
             COUPLED,
@@ -106,13 +105,13 @@ def test_the_kinds_of_entries(tmp_path, transmissions, sidecar, expected):
     assert inputs(urdf(tmp_path, *transmissions, sidecar=sidecar)) == expected
 
 
-def test_what_is_told(tmp_path):
+def test_actuation_is_reported(tmp_path):
     told = CliRunner().invoke(app, ["inspect", str(urdf(tmp_path, *WRIST[1:], sidecar=MOTOR))]).output
     (line,) = [x for x in told.splitlines() if x.split()[:1] == ["G"]]
     assert line.split("G", 1)[1].strip() == "motor torques, gain trained at joint 1, coupled at joints 2,3"
 
 
-def test_a_joint_without_a_transmission_is_told(tmp_path):
+def test_a_joint_without_a_transmission_is_reported(tmp_path):
     (found,) = [x for x in inspect(urdf(tmp_path, *WRIST[1:])).diagnostics if x.code == "no-transmission"]
     assert found.where == "joint 'j1'"
 
@@ -202,7 +201,7 @@ class TestModule:
 
 
 def test_the_simulation_moves_joints_by_motors(coupled):
-    """The logged torques, times G, are what the rigid bodies feel."""
+    """The logged torques, times G, are the torques on the rigid bodies."""
     loaded = load_arm(coupled[0])
     short = {"trajectories": 2, "duration": 0.5, "rate": 20.0}
     settings = loaded.settings.model_copy(

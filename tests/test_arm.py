@@ -1,4 +1,4 @@
-"""The arm taken from a robot: which joints, which bodies, how exact, and against Pinocchio's reading."""
+"""The arm made from a robot has the right joints, bodies and exact numbers, compared with Pinocchio's reading."""
 
 import json
 import re
@@ -105,7 +105,7 @@ class TestChain:
         assert names(arm) == ["a", "b"]
         assert "ambiguous-chain" in codes(arm)
 
-    def test_named_joints_and_a_tip_lock_what_they_leave_out(self, robot):
+    def test_named_joints_and_a_tip_lock_all_other_joints(self, robot):
         two = robot(joint("a", "0", "1"), joint("b", "1", "2"), joint("c", "2", "3"))
         arm = make_arm(two, joints=["a", "c"])
         assert names(arm) == ["a", "c"]
@@ -148,7 +148,7 @@ class TestChain:
             ),
         ],
     )
-    def test_what_cannot_be_chosen_is_told(self, robot, choice, message):
+    def test_invalid_choices_of_joints_are_refused(self, robot, choice, message):
         made = robot(
             joint("a", "0", "1"),
             joint("b", "0", "2"),
@@ -159,7 +159,7 @@ class TestChain:
             make_arm(made, **choice)
         assert str(told.value).replace(str(made.path), "FILE") == message
 
-    def test_wrong_order_is_told_with_the_right_one(self, robot):
+    def test_wrong_order_is_refused_with_the_right_one(self, robot):
         with pytest.raises(ArmError, match="expected the order from the root to the tip; use a,b"):
             make_arm(robot(joint("a", "0", "1"), joint("b", "1", "2")), joints=["b", "a"])
 
@@ -237,7 +237,7 @@ class TestSnapping:
         assert rounded_angle(angle, 2e-3) == meant
         assert rounded_angle(angle, 0.0) == angle
 
-    def test_everything_snapped_is_said_once_per_joint(self, robot):
+    def test_snapped_values_are_reported_once_per_joint(self, robot):
         rounded = joint("a", "0", "1", xyz="1e-12 0 0.3", rpy="1.5708 0 -3.1416", axis="0.0001 0 1")
         made = robot(rounded)
         arm = make_arm(made)
@@ -263,7 +263,7 @@ class TestSnapping:
         assert codes(arm) == ["snapped-inertia"]
         assert make_arm(read_urdf(made.path), angle_tolerance=0.0).bodies[0].inertia[5] == Fraction(1, 10**20)
 
-    def test_full_precision_is_not_worth_a_word(self, robot):
+    def test_full_precision_is_not_reported(self, robot):
         assert codes(make_arm(robot(joint("a", "0", "1", rpy=f"{pi / 2} 0 1.57079632679")))) == []
 
 
@@ -337,7 +337,7 @@ class TestExactness:
 
 
 class TestLumping:
-    def test_fixed_and_locked_links_are_lumped_and_said(self, robot):
+    def test_fixed_and_locked_links_are_lumped_and_reported(self, robot):
         made = robot(
             joint("a", "0", "1"),
             joint("f", "1", "2", "fixed"),
@@ -349,7 +349,7 @@ class TestLumping:
         lumped = next(each for each in arm.diagnostics if each.code == "lumped")
         assert lumped.message == "also carries '2', '3' (4 kg) by fixed or locked joints"
 
-    def test_has_inertials_wants_mass_in_every_body(self, robot):
+    def test_has_inertials_requires_mass_in_every_body(self, robot):
         joints = joint("a", "0", "1"), joint("b", "1", "2")
         assert make_arm(robot(*joints)).has_inertials
         bare = make_arm(robot(*joints, bare=("2",)))

@@ -1,5 +1,6 @@
 """Baselines: integrated as accurately as they need, whatever the model needs, and identified from the same logs."""
 
+import hashlib
 import json
 import math
 
@@ -9,7 +10,8 @@ import torch
 from typer.testing import CliRunner
 
 import spelgen
-from spelgen.baselines.baseline import JudgedArm
+from spelgen.arm.configured_arm import load_arm
+from spelgen.baselines.baseline import EvaluatedArm
 from spelgen.baselines.names import URDF, URDF_WITH_DRIVES
 from spelgen.baselines.predictor import accurate_solver
 from spelgen.baselines.rosenbrock import roll_out_stiff
@@ -18,11 +20,18 @@ from spelgen.cli.main import app
 from spelgen.dynamics.bristles import moved_bristles
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
+from spelgen.emission.build import generate
+from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.fitted import load_run
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows
-from spelgen.pipeline.generate import generate
-from spelgen.pipeline.loaded_arm import load_arm
+
+MOTION = (
+    (np.sin, np.cos),
+    (np.cos, lambda x: -2 * np.sin(x)),
+    (lambda x: -np.sin(x), lambda x: -4 * np.cos(x)),
+)
+"""q, qd and qdd of two joints, of t and 2 t."""
 
 
 class Slider:
@@ -125,7 +134,7 @@ def test_the_urdf_stands_once_as_it_is_and_once_with_its_drives(robots):
     names = [coordinate.name for coordinate in arm.arm.coordinates]
     q = torch.zeros(1, 4, 3, dtype=torch.float64)
     probe = Windows(torch.full((1, 3), 0.05, dtype=torch.float64), q, q, q[:, :3])
-    plain, driven = UrdfValues().predictors(JudgedArm(names, arm.robot.path, None, probe, []))
+    plain, driven = UrdfValues().predictors(EvaluatedArm(names, arm.robot.path, {}, None, probe, []))
     assert (plain.name, driven.name) == (URDF, URDF_WITH_DRIVES)
     at = torch.full((1, 3), 0.3, dtype=torch.float64)
     rotors = [arm.settings.joint(name) for name in names]
@@ -140,6 +149,45 @@ def test_the_urdf_stands_once_as_it_is_and_once_with_its_drives(robots):
     for found, joint in zip(back, rotors, strict=True):
         assert found == pytest.approx(-5 * joint.viscous + joint.coulomb[1])
     assert not math.isnan(sum(lost))
+
+
+def test_a_resumed_run_fits_baselines_only_if_they_are_missing(robots, tmp_path, monkeypatch):
+    """The baselines of a resumed run are those that it has, for its logs are the same."""
+    arm = load_arm(robots / "two_link.urdf")
+    bodies = RegressorDynamics(arm.arm, urdf_parameters(arm.arm), np.zeros(2), lambda qd, _: 0.5 * qd)
+    t = np.arange(300) / 100
+    q, qd, qdd = (np.stack([f(t), g(2 * t)], axis=1) for f, g in MOTION)
+    tau = bodies.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd))).numpy()
+    logs = [Trajectory(t=t, q=q, qd=qd, tau=tau)]
+    folder, resume = tmp_path / "run", RunOptions(resume=True)
+    first = spelgen.fit(spelgen.build(arm, "closed-form"), logs, arm=arm, folder=folder)
+    assert first.baselines["parameters"]
+    kept = (folder / "least_squares.json").read_bytes()
+    (folder / "least_squares.json").unlink()
+    spelgen.fit(load_run(folder).model, logs, folder=folder, options=resume)
+    assert (folder / "least_squares.json").read_bytes() == kept
+
+    def refuse(*arguments):
+        raise AssertionError("fitted again")
+
+    monkeypatch.setattr("spelgen.fitting.fit.fit_baselines", refuse)
+    again = spelgen.fit(load_run(folder).model, logs, folder=folder, options=resume)
+    assert (folder / "least_squares.json").read_bytes() == kept
+    assert again.baselines == json.loads(kept)
+
+
+def run_command(*words):
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    return done.stdout
+
+
+def digests(folder):
+    return {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
 
 
 def test_least_squares_is_kept_with_a_run_and_stands_in_its_evaluation(robots, tmp_path):
@@ -161,19 +209,25 @@ def test_least_squares_is_kept_with_a_run_and_stands_in_its_evaluation(robots, t
     logs = ["--data", str(tmp_path / "logs")]
     # whoever sets a limit in time need not know that these logs are fitted in seconds
     quick = ["--set", "progress=false", "--set", "max_minutes=5"]
-    for command in (
-        ["train", str(module), "--robot", str(robots / "rpr.urdf"), *logs, "-o", str(folder), *quick],
-        ["evaluate", str(folder), *logs, "-o", str(tmp_path / "found.csv")],
-        ["report", str(folder)],
-    ):
-        done = CliRunner().invoke(app, command)
-        assert done.exit_code == 0, done.output
+    run_command("train", str(module), "--robot", str(robots / "rpr.urdf"), *logs, "-o", str(folder), *quick)
+    trained = digests(folder)
+    text = run_command("evaluate", str(folder), *logs)
+    run_command("evaluate", str(folder), *logs, "-o", str(tmp_path / "found.csv"))
+    after = digests(folder)
+    assert after.pop("evaluation.json"), "the one file that evaluate writes"
+    assert after == trained
+    assert text.startswith("Evaluated on training logs: good enough for "), "the assessment comes first"
+    run_command("report", str(folder))
     kept = json.loads((folder / "least_squares.json").read_text())
-    fit, train = load_run(folder), read_logs(tmp_path / "logs" / "train.parquet", arm)
-    again = fit.save(tmp_path / "again")
-    spelgen.keep_baseline(again, train)
-    again = json.loads((again / "least_squares.json").read_text())
-    assert again == kept, "in Python as on the command line"
+    assert load_run(folder).baselines == kept
+    again = load_run(folder).save(tmp_path / "again")
+    assert (again / "least_squares.json").read_bytes() == (folder / "least_squares.json").read_bytes()
+    in_memory = spelgen.fit(
+        spelgen.load_module(module), read_logs(tmp_path / "logs" / "train.parquet", arm), arm=arm
+    )
+    assert json.loads(json.dumps(in_memory.baselines)) == kept, "in Python as on the command line"
+    test = read_logs(tmp_path / "logs" / "test.parquet", arm)
+    assert spelgen.evaluate(in_memory, test).to_dict() == spelgen.evaluate(folder, test).to_dict()
     found = json.loads((folder / "evaluation.json").read_text())
     assert {"model", "least squares"} <= set(found["torque"])
     assert found["torque"]["least squares"]["mean_nmse"] < 1e-3

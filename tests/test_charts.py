@@ -1,4 +1,4 @@
-"""What a chart says of its curves: a legend of those that are visible, and a note on those beyond its frame."""
+"""The legend of a chart lists its visible curves, and a note lists the curves outside its frame."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""`spelgen logs`: what it measures is what was put in, and what is wrong is found."""
+"""`spelgen logs` reports the properties that simulated logs have, and finds each inserted fault."""
 
 import json
 import re
@@ -11,6 +11,7 @@ from scipy.integrate import cumulative_trapezoid
 from typer.testing import CliRunner
 
 from spelgen.arm.actuation import Drives
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.dynamics.regressor import body_chain, regressor, urdf_parameters
 from spelgen.errors import LogError, SpelgenError, SpelgenErrors
@@ -21,12 +22,11 @@ from spelgen.log_checks import check_logs as check_logs_room
 from spelgen.log_checks import robot_checks
 from spelgen.log_checks.check_logs import check_logs, require_sound_logs
 from spelgen.log_checks.statistics import noise_level, quantisation_step, statistics
-from spelgen.logs import checks, chunks
+from spelgen.logs import checks, read, segments
 from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.render.logs_page import page
 from spelgen.settings.log_mapping import LogMapping
 
@@ -254,15 +254,20 @@ def test_what_logs_do_not_need_does_not_refuse_them(spelgen, robots, arm, log, t
     assert "No findings." in shown.stdout
 
 
-def test_logs_larger_than_memory_are_told_by_parts(spelgen, robots, arm, log, tmp_path, monkeypatch):
+def test_logs_beyond_the_bound_of_memory_are_checked_by_segments(
+    spelgen, robots, arm, log, tmp_path, monkeypatch
+):
+    """The report covers the kept samples and names their number."""
     names = [coordinate.name for coordinate in arm.coordinates]
     write_logs(tmp_path / "logs.parquet", [log], names)
     command = ["logs", "logs.parquet", "--robot", robots / "rpr.urdf", "--format", "json"]
-    whole = json.loads(spelgen(*command).stdout)
-    monkeypatch.setattr(chunks, "TUNING", replace(chunks.TUNING, in_memory=1000, chunk_samples=600))
-    told = json.loads(spelgen(*command).stdout)
-    assert [x["name"] for x in told["trajectories"]] == [f"motion [{k}]" for k in range(1, 5)]
-    assert [x["low"] for x in told["joints"]] == [x["low"] for x in whole["joints"]]
+    tuning = replace(segments.TUNING, kept_bytes=100_000, segment_samples=100)
+    for module in (read, segments):
+        monkeypatch.setattr(module, "TUNING", tuning)
+    report = json.loads(spelgen(*command).stdout)
+    (note,) = (x for x in report["findings"] if x["code"] == "subsampled")
+    assert "one of 2 segments of up to 100 samples was kept, 1000 samples" in note["message"]
+    assert report["samples"] == 1000
 
 
 @pytest.mark.parametrize("constant", [0.0, 0.1, 5.0])

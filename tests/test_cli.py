@@ -1,13 +1,11 @@
-"""The command line as a user meets it: exit codes, one clear line per error, nothing half-written."""
+"""Commands return the documented exit codes, print one clear line per error and write no partial files."""
 
 import contextlib
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -15,6 +13,7 @@ from typer.testing import CliRunner
 
 from spelgen import __version__
 from spelgen.cli.main import app
+from spelgen.fitting.progress import TrainingProgress
 
 ROOT = Path(__file__).parents[1]
 COMMANDS = ["inspect", "build", "simulate", "excite", "logs", "train", "evaluate", "report", "check"]
@@ -89,7 +88,7 @@ def test_help_and_inspect_load_nothing_heavy(robots):
         assert done.stdout.splitlines()[-1] == "set()", done.stderr
 
 
-# ---- what goes where
+# ---- standard output, standard error and files
 
 
 def test_inspect_text_fits_80_columns(spelgen, robots):
@@ -359,7 +358,7 @@ def trained(robots, tmp_path_factory):
         return folder, {name: CliRunner().invoke(app, words) for name, words in steps.items()}
 
 
-def test_the_whole_way_succeeds(trained):
+def test_all_commands_succeed(trained):
     folder, results = trained
     for name, result in results.items():
         assert result.exit_code == 0, (name, result.stderr)
@@ -369,7 +368,7 @@ def test_the_whole_way_succeeds(trained):
     )
 
 
-def test_evaluate_tells_rivals(trained):
+def test_evaluate_shows_baselines(trained):
     _, results = trained
     assert "velocity stays constant" in results["evaluate"].stdout
 
@@ -386,23 +385,21 @@ def test_a_second_run_needs_force_or_resume(trained, monkeypatch):
     assert "after 3 epochs" in more.stdout
 
 
-def test_interrupted_training_leaves_a_run(spelgen, trained, tmp_path):
+def test_interrupted_training_writes_a_usable_run(spelgen, trained, tmp_path, monkeypatch):
+    """Ctrl-C after the first epoch; test_training.py sends the signals to a process."""
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
     folder, _ = trained
-    run = tmp_path / "run"
-    command = [sys.executable, "-m", "spelgen", "train", "arm_spel.py", "--data", "logs", "-o", str(run)]
-    command += ["--set", "optimizer=adamw", "--set", "momentum_steps=0"]  # L-BFGS would have ended by itself
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(
-        command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # whoever runs the tests may ignore it
-    ) as started:  # fmt: skip
-        while not (run / "metrics.jsonl").exists() and started.poll() is None:
-            time.sleep(0.05)
-        started.send_signal(signal.SIGINT)
-        out, err = started.communicate(timeout=60)
-    assert started.returncode == 130, err
-    assert b"interrupted after" in out
-    assert spelgen("report", run).exit_code == 0
+    monkeypatch.chdir(folder)
+    command = ["train", "arm_spel.py", "--data", "logs", "-o", tmp_path / "run"]
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingProgress, "epoch", interrupt)
+        done = spelgen(*command, "--set", "optimizer=adamw", "--set", "momentum_steps=0")
+    assert done.exit_code == 130, done.stderr
+    assert "interrupted after" in done.stdout
+    assert spelgen("report", tmp_path / "run").exit_code == 0
 
 
 # ---- words that nearly fit
@@ -431,11 +428,14 @@ def test_help_shows_whole_sentences(spelgen):
             ["train", "m.py", "--set", "prior.body=1"],
             "--set prior: unknown key 'body'; did you mean 'bodies'?",
         ),
-        (["build", "x.urdf", "--net", "mpl"], "'mpl' is none of mlp, kan. Did you mean 'mlp'?"),
+        (
+            ["build", "x.urdf", "--assume", "inertal"],
+            "'inertal' is none of kinematics, inertials. Did you mean 'inertials'?",
+        ),
         (["logs", "x", "--robot", "y", "--format", "xml"], "'xml' is none of text, json."),
     ],
 )
-def test_what_may_have_been_meant_is_told(spelgen, words, told):
+def test_the_likely_name_is_suggested(spelgen, words, told):
     result = spelgen(*words)
     assert result.exit_code == 2
     assert result.stderr.rstrip().endswith(told)

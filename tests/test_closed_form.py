@@ -5,12 +5,10 @@ import pinocchio as pin
 import pytest
 import torch
 from emitted import import_source
-from typer.testing import CliRunner
 
-from spelgen.cli.main import app
+from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.body_regressor import regressor_of
-from spelgen.pipeline.generate import generate
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.emission.build import generate
 from spelgen.structure.pseudo_inertia import pseudo_inertia
 from spelgen.structure.sampling import float_energies
 
@@ -184,10 +182,3 @@ def test_friction_at_a_standstill_has_its_slope(emitted):
     saturating = constants.saturation * away / (away**2 + constants.saturation_velocity**2).sqrt()
     dry = dry * away / (away**2 + constants.coulomb_smoothing_velocity**2).sqrt()
     near(torque, constants.viscous * away + saturating + dry)
-
-
-def test_it_has_no_network_to_choose(robots, tmp_path):
-    command = ["build", str(robots / "rpr.urdf"), "--preset", "closed-form", "--net", "kan"]
-    done = CliRunner().invoke(app, [*command, "-o", str(tmp_path / "arm.py")])
-    assert done.exit_code == 2
-    assert "closed-form has no networks" in done.output

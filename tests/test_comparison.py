@@ -1,39 +1,54 @@
-"""A comparison in small: same data for every preset, measures that can fail, tables beside published figures."""
+"""`spelgen compare`: all presets have the same data, losses are the paper's, interrupted runs are resumed."""
 
 import json
 import math
-import shutil
+import os
+import signal
+import threading
+import time
 from dataclasses import asdict, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
 import torch
 import yaml
+from html_page import Page
+from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.constant_velocity import hold_velocity
 from spelgen.baselines.predictor import Predictor
-from spelgen.comparison import metrics, runs
-from spelgen.comparison.formatting import comparison_tables
-from spelgen.comparison.known_urdf import known_urdf
-from spelgen.comparison.metrics import mass_error, true_mass
-from spelgen.comparison.runs import predict_example, run_study, time_steps
-from spelgen.comparison.study import VARIANTS, ablation_variants, prepare_study
+from spelgen.cli.main import app
+from spelgen.comparison import jobs
+from spelgen.comparison.arms import ComparedArm, Comparison, ablation_designs, load_comparison
+from spelgen.comparison.figures import PredictionLoss, mass_error, predict_example, spread_windows, true_mass
+from spelgen.comparison.inputs import arm_inputs
+from spelgen.comparison.study import duration, prepare_study, run_study
+from spelgen.comparison.tables import arm_sections, arm_sentence, arm_tables, comparison_sentence
 from spelgen.design import load_design
-from spelgen.emission.loading import load_module
-from spelgen.errors import RunError
+from spelgen.emission.build import build
+from spelgen.errors import RunError, SettingsError, SpelgenError
 from spelgen.evaluation import invariants
 from spelgen.evaluation.tuning import EvaluationTuning
+from spelgen.fitting.fitted import load_run
 from spelgen.fitting.rollout import roll_out
-from spelgen.logs.read import Trajectory, read_logs
+from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import cut_windows, joined
 from spelgen.render.comparison_page import write_comparison
-from spelgen.tasks import run_here
+from spelgen.simulation.simulate import simulate
+from spelgen.tasks import run_here, workers
 from spelgen.urdf.read import read_urdf
 
-CHOSEN = [variant for variant in VARIANTS if variant.name in ("phnode", "hybrid")]
+PRESETS = ("phnode", "hybrid")
 JOINTS = ("joint1", "joint2")
+QUICK = {"presets": ["spel"], "width": 4, "depth": 1, "training": {"epochs": 2, "momentum_steps": 0}}
+
+
+def silent(text):
+    """Ignore notes."""
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +60,7 @@ def quick():
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory, robots):
-    """two_link with few trajectories, to be trained for a moment."""
+    """two_link with 8 trajectories and 25 training steps."""
     folder = tmp_path_factory.mktemp("robot")
     urdf = folder / "two_link.urdf"
     urdf.write_bytes((robots / "two_link.urdf").read_bytes())
@@ -56,6 +71,11 @@ def robot(tmp_path_factory, robots):
     return urdf
 
 
+def simulated(robot, **changes):
+    """A comparison of PRESETS on the simulated robot."""
+    return Comparison(arms={"arm": ComparedArm(urdf=robot)}, **{"presets": PRESETS, **changes})
+
+
 @pytest.fixture(scope="module")
 def notes():
     return []
@@ -63,55 +83,33 @@ def notes():
 
 @pytest.fixture(scope="module")
 def study(robot, quick, notes, tmp_path_factory):
-    found = prepare_study(robot, tmp_path_factory.mktemp("study"), variants=CHOSEN)
-    run_study(found, run_here, note=notes.append)
-    return found
+    prepared = prepare_study(simulated(robot), tmp_path_factory.mktemp("study"))
+    notes.append(prepared.announcement(1))
+    return run_study(prepared, run_here, notes.append)
 
 
-def test_models_know_the_kinematics_alone(study):
-    known = read_urdf(study.urdf)
-    assert set(JOINTS) <= {joint.name for joint in known.joints}
-    assert all(link.inertial is None for link in known.links)
-    assert "joints" not in yaml.safe_load(study.urdf.with_suffix(".yaml").read_text())
+@pytest.fixture
+def results(study):
+    return {result.preset: result for result in study.results.values()}
 
 
-def test_inertials_that_are_wrong_are_possible_ones(robot, tmp_path):
-    """Each body's own, by about the error that is asked; friction and drives are not told."""
-    true = {x.name: x.inertial for x in read_urdf(robot).links if x.inertial}
-    for error in (0.0, 0.3, 1.0):
-        path = tmp_path / f"wrong_{error}.urdf"
-        path.write_bytes(known_urdf(robot, error))
-        found = {x.name: x.inertial for x in read_urdf(path).links if x.inertial}
-        away = [abs(np.log(float(found[x].mass) / float(true[x].mass))) for x in true]
-        assert found.keys() == true.keys()
-        assert (max(away) == 0) if error == 0 else (0.1 * error < np.mean(away) < 3 * error)
-        for inertial in found.values():
-            ixx, ixy, ixz, iyy, iyz, izz = inertial.tensor
-            moments = np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
-            assert moments[0] > 0 and moments[2] <= moments[0] + moments[1] + 1e-9
-    assert b"<dynamics" not in path.read_bytes()
+def trained(job):
+    """The trained model of a job."""
+    model = job.build()
+    model.load_state_dict(torch.load(job.folder / "model.pt"))
+    return model
 
 
-def test_with_a_wrong_urdf_models_are_trained_by_defaults(robot, quick, tmp_path):
-    found = prepare_study(robot, tmp_path, variants=CHOSEN[1:], urdf_error=0.3)
-    assert found.urdf.read_bytes() == known_urdf(robot, 0.3)
-    with pytest.MonkeyPatch.context() as patch:
-        seen = []
-
-        def train(*arguments, **options):
-            seen.append(arguments[3])
-            raise KeyboardInterrupt
-
-        patch.setattr(runs, "train", train)
-        with pytest.raises(KeyboardInterrupt):
-            run_study(found, run_here, note=print)
-    assert seen == [None]
-    with pytest.raises(RunError, match="a comparison with other settings"):
-        prepare_study(robot, tmp_path, variants=CHOSEN[1:], urdf_error=1.0)
+def test_models_of_simulated_arms_know_only_the_kinematics(study):
+    for job in study.jobs:
+        known = read_urdf(job.inputs.urdf)
+        assert set(JOINTS) <= {joint.name for joint in known.joints}
+        assert all(link.inertial is None for link in known.links)
+        assert "joints" not in yaml.safe_load(job.inputs.urdf.with_suffix(".yaml").read_text())
 
 
 def test_the_ablation_changes_one_thing_at_a_time():
-    designs = [load_design(x.preset) for x in ablation_variants()]
+    designs = [load_design(design) for design in ablation_designs().values()]
     changes = [
         {key for key, value in asdict(a).items() if value != asdict(b)[key]} for a, b in pairwise(designs)
     ]
@@ -120,99 +118,130 @@ def test_the_ablation_changes_one_thing_at_a_time():
     assert designs[-1] == load_design("hybrid")
 
 
-def test_training_sees_the_beginning_only(study):
-    names = load_module(study.module(CHOSEN[0])).joint_names
-    training, testing = (read_logs([study.logs], names, role=role) for role in ("train", "test"))
+def test_training_logs_are_the_first_seconds_of_other_motions_than_the_test_logs(study):
+    training, testing = study.jobs[0].inputs.split(0, 1)
     assert {len(x.t) for x in training} == {5}
     assert {len(x.t) for x in testing} == {21}
     assert not {x.name for x in training} & {x.name for x in testing}
 
 
-def test_every_run_is_noted_and_measured(study, notes):
-    assert len(notes) == 2
-    results = {result.variant: result for result in study.results()}
-    assert set(results) == {"phnode", "hybrid"}
+def test_the_number_of_runs_and_the_time_are_stated_before_each_run_is_reported(study, notes):
+    assert len(notes) == 3
+    assert notes[0].startswith("2 runs (1 arm, 2 presets, 1 seed, 1 split); estimated time ")
+    assert notes[1].startswith("1/2 arm, phnode, seed 0: prediction loss, 1 s ") and notes[1].endswith(
+        " left"
+    )
+    assert notes[2].startswith("2/2 arm, hybrid, seed 0: ")
+
+
+def test_an_estimate_uses_the_time_of_finished_runs_of_the_same_preset(study, robot):
+    more = prepare_study(simulated(robot, seeds=3), study.folder)
+    assert len(more.jobs) == 6 and len(more.results) == 2
+    first, later = (next(x for x in more.jobs if (x.preset, x.seed) == ("phnode", seed)) for seed in (0, 2))
+    assert more.estimates[later.name] == pytest.approx(more.results[first.name].seconds + 10)
+    left = sum(more.estimates[x.name] for x in more.jobs if x.seed)
+    assert more.announcement(2).endswith(f", 2 finished before; estimated time {duration(left / 2)}")
+
+
+def test_figures_of_a_run_agree_with_one_another(results):
+    assert set(results) == set(PRESETS)
     for result in results.values():
-        parts = result.prediction
-        assert parts.loss == pytest.approx(parts.position + parts.velocity)
-        assert result.invariants.least_eigenvalue > 0
-    assert results["hybrid"].sizes.outputs == (1, 2, 0, 1)
-    assert results["phnode"].sizes.outputs == (21, 21, 6, 1)  # as in the paper
-    assert results["phnode"].sizes.inputs == 4
+        loss = result.simulated.prediction
+        assert loss.loss == pytest.approx(loss.position + loss.velocity)
+        assert result.errors == {"prediction loss, 1 s": {"model": loss.loss}}
+        assert result.simulated.invariants.least_eigenvalue > 0
+    assert results["hybrid"].simulated.sizes.outputs == (1, 2, 0, 1)
+    # as in the paper
+    assert results["phnode"].simulated.sizes.outputs == (21, 21, 6, 1)
+    assert results["phnode"].simulated.sizes.inputs == 4
 
 
-def test_losses_are_of_the_logs_that_they_are_named_after(study):
-    """Worked out again from the logs of each role: sums over joints, means over samples and windows."""
-    (result,) = (x for x in study.results() if x.variant == "hybrid")
-    model = load_module(study.module(CHOSEN[1]))
-    model.load_state_dict(torch.load(study.run(CHOSEN[1], 0) / "model.pt"))
+def test_losses_are_the_mean_squared_errors_of_rollouts_from_the_logs(study, results):
+    """Recomputed from the logs of each role: sums over joints, means over samples and windows."""
+    job = next(job for job in study.jobs if job.preset == "hybrid")
+    model, figures = trained(job), results["hybrid"].simulated
     for key, role, samples in (("train", "train", 5), ("test", "test", 5), ("prediction", "test", 21)):
         cut = [
             log[start : start + samples]
-            for log in read_logs([study.logs], model.joint_names, role=role)
+            for log in read_logs(job.inputs.data, JOINTS, role=role)
             for start in range(len(log.t) - samples + 1)
         ]
         windows = joined([cut_windows([each], samples, measured=False) for each in cut])
+        substeps = load_run(job.folder).substeps
         with torch.no_grad():
-            predicted = [x.numpy() for x in roll_out(model, windows, result.substeps)]
+            predicted = [x.numpy() for x in roll_out(model, windows, substeps)]
         q, qd = (np.stack([getattr(each, name)[1:] for each in cut]) for name in ("q", "qd"))
-        away = (predicted[0] - q + np.pi) % (2 * np.pi) - np.pi
-        position, velocity = (x.sum(axis=-1).mean() for x in (away**2, (predicted[1] - qd) ** 2))
-        assert getattr(result, key).position == pytest.approx(position, rel=1e-9), key
-        assert getattr(result, key).velocity == pytest.approx(velocity, rel=1e-9), key
-    assert result.train != result.test
+        difference = (predicted[0] - q + np.pi) % (2 * np.pi) - np.pi
+        position, velocity = (x.sum(axis=-1).mean() for x in (difference**2, (predicted[1] - qd) ** 2))
+        assert getattr(figures, key).position == pytest.approx(position, rel=1e-9), key
+        assert getattr(figures, key).velocity == pytest.approx(velocity, rel=1e-9), key
+    assert figures.train != figures.test
 
 
-def test_a_comparison_goes_on_where_it_stopped(study, robot, quick):
-    lost, kept = study.result(CHOSEN[0], 0), study.result(CHOSEN[1], 0)
+def test_only_the_run_without_a_result_is_run_again_and_gives_the_same_figures(study, robot):
+    lost, kept = (job.folder / "result.json" for job in study.jobs)
     before = lost.read_text(), kept.stat().st_mtime_ns
     lost.unlink()
-    notes = []
-    again = prepare_study(robot, study.folder, variants=CHOSEN)
-    run_study(again, run_here, note=notes.append)
-    assert notes[0] == "1 of 2 runs are done already"
+    again = prepare_study(simulated(robot), study.folder)
+    assert list(again.results) == [study.jobs[1].name]
+    run_study(again, run_here, silent)
     assert kept.stat().st_mtime_ns == before[1]
     first, second = (json.loads(x) for x in (before[0], lost.read_text()))
-    assert first["prediction"] == second["prediction"]
+    for result in (first, second):
+        del result["simulated"]["step_seconds"]
+    assert first["simulated"] == second["simulated"]
 
 
-def test_a_comparison_with_a_module_of_somebody_else_is_refused(study, robot):
-    module = study.module(CHOSEN[0])
-    own = module.read_text()
-    module.write_text(own + "print('anything')\n")
-    with pytest.raises(RunError, match="a module that spelgen cannot verify"):
-        prepare_study(robot, study.folder, variants=CHOSEN)
-    module.write_text(own)
+def test_runs_with_other_steps_are_other_runs(study, robot):
+    assert not prepare_study(simulated(robot, steps=40), study.folder).results
 
 
-def test_another_comparison_in_the_folder_is_refused(study, robot):
-    with pytest.raises(RunError, match="a comparison with other settings"):
-        prepare_study(robot, study.folder, variants=CHOSEN, steps=40)
+def test_each_run_has_its_own_seed(robot, monkeypatch, tmp_path):
+    seeds = []
+
+    def fit(model, logs, config=None, **options):
+        seeds.append(options["seed"])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(jobs, "fit", fit)
+    prepared = prepare_study(simulated(robot, seeds=3, presets=("hybrid",)), tmp_path)
+    for job in prepared.jobs:
+        with pytest.raises(KeyboardInterrupt):
+            jobs.run_job(job)
+    assert seeds == [0, 1, 2]
+    first, other, same = (prepared.jobs[k].build().state_dict() for k in (0, 1, 0))
+    assert all(torch.equal(first[name], same[name]) for name in first)
+    assert not all(torch.equal(first[name], other[name]) for name in first)
 
 
-def test_seeds_may_be_added(study, robot):
-    more = prepare_study(robot, study.folder, variants=CHOSEN, seeds=2)
-    assert len(list(more.results())) == 2  # those of the first seed, which is not run again
-
-
-def test_begun_anew_nothing_of_the_old_runs_goes_on(study, robot, tmp_path):
-    folder = tmp_path / "study"
-    shutil.copytree(study.folder, folder)
-    again = prepare_study(robot, folder, variants=CHOSEN, force=True)
-    assert not list(again.results())
-    assert not list(folder.rglob("checkpoint.pt"))
-
-
-def test_tables_stand_beside_published_figures(study):
-    results = list(study.results())
-    tables = comparison_tables(results, time_steps(study), study.settings.published)
-    rows = {row.label: list(map(row.text, table.columns)) for table in tables for row in table.rows}
+def test_tables_have_published_figures_and_ratios_to_the_baseline(study, results):
+    (section,) = arm_sections(study)
+    rows = {row.label: list(map(row.text, table.columns)) for table in section.tables for row in table.rows}
     assert rows["outputs of M"] == ["21", "1"]
-    assert rows["parameters"] == [f"{result.sizes.parameters:,}" for result in results]
+    assert rows["parameters"] == [f"{result.simulated.sizes.parameters:,}" for result in results.values()]
     assert rows["published: prediction loss"] == ["0.194", ""]
-    base, ours = (result.prediction.loss for result in results)
+    base, ours = (result.simulated.prediction.loss for result in results.values())
     assert rows["phnode's prediction loss / this"] == ["1", f"{base / ours:.3g}"]
-    assert all(line == line.rstrip() and len(line) <= 80 for x in tables for line in x.text().splitlines())
+    lines = [line for table in section.tables for line in table.text().splitlines()]
+    assert all(line == line.rstrip() and len(line) <= 80 for line in lines)
+
+
+def test_the_sentence_has_the_best_model_and_the_ratios_of_the_others(study, results):
+    base, ours = (result.simulated.prediction.loss for result in results.values())
+    ratio = f"{base / ours:.3g} times smaller than with phnode" if ours < base else "than with hybrid"
+    (section,) = arm_sections(study)
+    assert section.sentence.startswith(
+        "hybrid has the smallest prediction loss, 1 s: " if ours < base else "phnode"
+    )
+    assert ratio in section.sentence
+    assert comparison_sentence([section]) == section.sentence
+    assert comparison_sentence([section, section]).endswith(" on 2 arms.")
+    better = {"prediction loss, 1 s": {"model": 0.2, "URDF": 0.1}}
+    known = [replace(result, errors=better) for result in results.values()]
+    assert arm_sentence(known) == (
+        "phnode and hybrid have the smallest prediction loss, 1 s: 0.2; "
+        "but these baselines have a smaller one: URDF (0.1)."
+    )
 
 
 def test_the_true_mass_matrix_is_pinocchios_with_the_rotors(robots):
@@ -235,33 +264,43 @@ def test_the_error_of_m_has_no_units():
     assert mass_error(true, true) == 0.0
 
 
-def test_the_page_shows_predictions_and_m_beside_the_truth(study):
-    page = write_comparison(study, []).read_text()
-    learned = page[page.index("The mass matrix along this trajectory") :]
+def test_the_page_opens_with_the_sentence_and_the_table(study):
+    (section,) = arm_sections(study)
+    text = " ".join(Page(write_comparison(study, [section]).read_text()).text)
+    start = text[text.index("presets compared", text.index("Skip to the content")) :]
+    sentence = start.index(section.sentence.split(":")[0])
+    assert sentence < start.index("published: prediction loss") < start.index("outputs of M")
+    assert "64 + " not in text and "5 + 20 steps" in " ".join(text.split())
+
+
+def test_the_page_shows_predictions_and_m_with_the_true_m(study, results):
+    page = write_comparison(study, arm_sections(study)).read_text()
+    learned = page[page.index("The mass matrix along this motion") :]
     assert learned.count('<svg class="chart"') == 3
     for name in ("M11", "M21", "M22"):
         assert f'aria-label="{name}"' in learned
     assert learned.count("<title>true</title>") == 3
-    (result,) = (x for x in study.results() if x.variant == "hybrid")
-    q = torch.tensor(result.example.q, dtype=torch.float64)
-    model = load_module(study.module(CHOSEN[1]))
-    model.load_state_dict(torch.load(study.run(CHOSEN[1], 0) / "model.pt"))
-    np.testing.assert_allclose(result.mass, model.mass_matrix(q).detach(), rtol=1e-12)
+    figures = results["hybrid"].simulated
+    q = torch.tensor(figures.example.q, dtype=torch.float64)
+    model = trained(next(job for job in study.jobs if job.preset == "hybrid"))
+    np.testing.assert_allclose(figures.mass, model.mass_matrix(q).detach(), rtol=1e-12)
 
 
-def test_a_run_that_is_not_finite_counts_as_worst(study):
-    (result,) = (x for x in study.results() if x.variant == "hybrid")
-    broken = replace(result, seed=1, prediction=metrics.Prediction(None, None, None))
-    table = comparison_tables([result, broken, broken], {"hybrid": 1.0}, {})[1]
+def test_a_run_that_is_not_finite_counts_as_infinitely_bad(results):
+    result = results["hybrid"]
+    figures = replace(result.simulated, prediction=PredictionLoss(None, None, None))
+    broken = replace(result, seed=1, simulated=figures, errors={"prediction loss, 1 s": {"model": None}})
+    table = arm_tables([result, broken, broken], {})[0]
     assert {row.label: row.text("hybrid") for row in table.rows}["prediction loss, 1 s"] == "-"
+    assert arm_sentence([result, broken, broken]) == "No model has a finite prediction loss, 1 s."
 
 
-def test_windows_and_examples_of_every_fourth_sample_begin_with_a_fourth_one():
-    """Where a controller holds its torque for four samples, a window's input is then exactly what acted."""
+def test_decimated_windows_and_examples_start_at_a_multiple_of_the_decimation():
+    """A controller that holds its torque for four samples then has exactly the input of the windows."""
     count = 200
-    q = torch.arange(count, dtype=torch.float64).unsqueeze(-1).numpy()  # a sample's number
+    q = torch.arange(count, dtype=torch.float64).unsqueeze(-1).numpy()  # number of the sample
     log = Trajectory(0.002 * q[:, 0], q, q, np.floor(q / 4), "a")
-    windows = metrics.thinned([log], 5, 4)
+    windows = spread_windows([log], 5, 4)
     assert not (windows.q % 4).any()
     assert torch.equal(windows.tau, windows.q[:, :-1] / 4)
     example = predict_example(Predictor("", hold_velocity), [log], 10, 4)
@@ -269,15 +308,198 @@ def test_windows_and_examples_of_every_fourth_sample_begin_with_a_fourth_one():
     np.testing.assert_allclose(example.t, 0.008 * np.arange(11), atol=1e-12)
 
 
-def test_invariants_notice_what_breaks_them(study, quick):
-    model = load_module(study.module(CHOSEN[1]))
-    testing = read_logs([study.logs], model.joint_names, role="test")
-    still = metrics.thinned(testing, 21, 1)
+def test_invariants_show_a_model_that_gains_energy_or_has_an_indefinite_mass_matrix(robots, quick):
+    model = build(robots / "two_link.urdf", "hybrid", width=8)
+    logs = simulate(load_arm(robots / "two_link.urdf"), trajectories=4).test
+    still = spread_windows(logs, 21, 1)
     windows = replace(still, qd=0.5 + still.qd)
     low, high = (torch.full((2,), bound, dtype=torch.float64) for bound in (-math.pi, math.pi))
     kept = invariants.invariants(model, windows, low, high)
     assert kept.energy_rise <= 1e-12 < kept.least_eigenvalue
-    model.friction_torque = lambda pose, qd, *state: -5.0 * qd  # drives instead of braking
+    # drives instead of braking
+    model.friction_torque = lambda pose, qd, *state: -5.0 * qd
     assert invariants.invariants(model, windows, low, high).energy_rise > 1e-3
     model.mass_matrix = lambda q: torch.diag_embed(torch.cat([q.cos()[..., :1], 1 + 0 * q[..., :1]], dim=-1))
     assert invariants.invariants(model, windows, low, high).least_eigenvalue < -1
+
+
+@pytest.fixture(scope="module")
+def logs(robots, tmp_path_factory):
+    """Logs of two_link: four trajectories for training, four for testing."""
+    folder = tmp_path_factory.mktemp("two_link")
+    arm = load_arm(robots / "two_link.urdf")
+    found = simulate(arm, trajectories=8)
+    write_logs(folder / "train.parquet", found.train, JOINTS)
+    write_logs(folder / "test.parquet", found.test, JOINTS)
+    return folder
+
+
+@pytest.fixture
+def listed_arms(robots, logs, tmp_path, short_epochs):
+    """Write arms.yaml with arms that have these logs, and load it."""
+
+    def loaded(arms="ab", **changes):
+        arm = {"urdf": str(robots / "two_link.urdf"), "data": [str(logs)]}
+        path = tmp_path / "arms.yaml"
+        path.write_text(json.dumps({"arms": dict.fromkeys(arms, arm), **QUICK, **changes}))
+        return load_comparison(path)
+
+    return loaded
+
+
+def compared(comparison, folder, run_tasks=run_here):
+    return run_study(prepare_study(comparison, folder), run_tasks, silent)
+
+
+def kill_two(folder: Path, killed: list[int]) -> None:
+    """Kill the worker that trains arm a and end the worker that trains arm b, each after its first checkpoint."""
+    waiting = {"a": signal.SIGKILL, "b": signal.SIGTERM}
+    # a loaded machine takes minutes to start workers
+    for _ in range(30_000):
+        for lock in folder.glob("runs/*/*/.lock"):
+            try:
+                text, arm = lock.read_text(), lock.parts[-3]
+            except FileNotFoundError:
+                # the run ended after the folder was listed
+                continue
+            if arm in waiting and text.startswith("process") and (lock.parent / "config.json").exists():
+                killed.append(int(text.split()[1]))
+                os.kill(killed[-1], waiting.pop(arm))
+        if not waiting:
+            return
+        time.sleep(0.01)
+
+
+def test_runs_of_killed_workers_are_resumed_and_end_with_the_same_weights(listed_arms, tmp_path):
+    pytest.importorskip("ray")
+    folder, killed = tmp_path / "out", []
+    comparison = listed_arms(training={"epochs": 12, "patience": 12, "momentum_steps": 0})
+    killer = threading.Thread(target=kill_two, args=(folder, killed))
+    killer.start()
+    with workers(2) as run_tasks:
+        study = compared(comparison, folder, run_tasks)
+    killer.join()
+    assert len(set(killed)) == 2
+    assert sorted(result.arm for result in study.results.values()) == ["a", "b"]
+    assert not study.failures
+    assert len(list(folder.glob("runs/*/*/result.json"))) == 2
+    # the same logs, killed at different times
+    a, b = (torch.load(next((folder / "runs" / x).glob("*/model.pt"))) for x in "ab")
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_finished_runs_are_kept_and_changed_runs_are_run_again(listed_arms, tmp_path):
+    folder = tmp_path / "out"
+    first = compared(listed_arms("a"), folder)
+    files = {x: x.stat().st_mtime_ns for x in folder.glob("runs/*/*/result.json")}
+    again = compared(listed_arms("a"), folder)
+    assert again.results == first.results
+    stored = json.loads((folder / "comparison.json").read_text())["results"]
+    assert [x["key"] for x in stored] == [x.key for x in first.results.values()]
+    assert files == {x: x.stat().st_mtime_ns for x in folder.glob("runs/*/*/result.json")}
+    more = compared(listed_arms("a", seeds=2), folder)
+    assert [x.seed for x in more.results.values()] == [0, 1]
+    assert all(files[x] == x.stat().st_mtime_ns for x in files)
+    other = compared(listed_arms("a", width=5), folder)
+    assert {x.parameters for x in other.results.values()} != {x.parameters for x in first.results.values()}
+
+
+def test_models_on_logs_are_ranked_with_the_baselines(listed_arms, tmp_path):
+    study = compared(listed_arms("ab"), tmp_path / "out")
+    sections = arm_sections(study)
+    assert [section.name for section in sections] == ["a", "b"]
+    (table,) = sections[0].tables
+    assert {"spel", "URDF", "URDF and drives", "velocity stays constant"} <= set(table.columns)
+    assert table.rows[0].label == "relative RMS, 1 s"
+    errors = [table.rows[0].values[name] for name in table.columns]
+    assert errors == sorted(errors)
+    page = write_comparison(study, sections).read_text()
+    assert "The preset with the smallest error is spel on 2 arms." in page
+
+
+def test_an_arm_that_fails_is_reported_and_the_others_are_run(listed_arms, tmp_path):
+    comparison = listed_arms("a")
+    broken = tmp_path / "broken.urdf"
+    broken.write_text("<robot")
+    arms = {"broken": ComparedArm(urdf=broken), **comparison.arms}
+    study = compared(comparison.model_copy(update={"arms": arms}), tmp_path / "out")
+    assert [result.arm for result in study.results.values()] == ["a"]
+    assert str(broken) in study.failures["broken"]
+    assert "unexpected" not in study.failures["broken"]
+    assert str(broken) in write_comparison(study, arm_sections(study)).read_text()
+    broken_arms = {"broken": arms["broken"], "again": arms["broken"]}
+    with pytest.raises(RunError, match="no arm that can be compared"):
+        prepare_study(comparison.model_copy(update={"arms": broken_arms}), tmp_path / "none")
+
+
+def test_each_trajectory_is_in_the_test_logs_of_one_fold(listed_arms, tmp_path):
+    comparison = listed_arms("a", splits=4)
+    inputs = arm_inputs(comparison.arms["a"], tmp_path, 4)
+    tested = []
+    for number in range(4):
+        training, testing = ({x.q.tobytes() for x in logs} for logs in inputs.split(number, 4))
+        assert len(training) == 6 and len(testing) == 2 and not training & testing
+        tested += testing
+    assert len(set(tested)) == 8
+    with pytest.raises(SpelgenError, match="9 or more, for as many splits"):
+        prepare_study(listed_arms("a", splits=9), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("presets: [spel]\n", "arms.yaml:1: arms: got nothing, expected a value"),
+        (
+            "arms:\n  a: {urdf: none.urdf}\npresets: [spell]\n",
+            "arms.yaml:3: presets.0: unknown preset 'spell'; did you mean 'spel'?\n"
+            "arms.yaml:2: arms.a.urdf: no such file: none.urdf; check the path",
+        ),
+        (
+            "arms:\n  ../a: {urdf: .}\n",
+            "arms.yaml:2: arms.../a: got '../a', expected a name of letters, digits, '.', '_' and '-'",
+        ),
+    ],
+)
+def test_errors_in_the_list_of_arms_have_file_and_line(text, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("arms.yaml").write_text(text)
+    with pytest.raises(SettingsError if "\n" not in message else SpelgenError) as error:
+        load_comparison(Path("arms.yaml"))
+    assert str(error.value) == message
+
+
+def test_the_command_compares_logs_of_one_arm(robots, logs, tmp_path, short_epochs):
+    options = ["--presets", "closed-form", "--jobs", "1", "-o", str(tmp_path / "out")]
+    command = ["compare", str(robots / "two_link.urdf"), "--data", str(logs), *options]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 0, result.output
+    assert result.stderr.startswith("1 run (1 arm, 1 preset, 1 seed, 1 split); estimated time ")
+    assert "two_link: closed-form has the smallest relative RMS, 1 s: " in result.stdout
+    assert (tmp_path / "out" / "comparison.html").exists()
+    again = CliRunner().invoke(app, command)
+    assert again.stderr == "1 run (1 arm, 1 preset, 1 seed, 1 split), 1 finished before\n"
+    assert again.stdout == result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["two_link.urdf", "--presets", "spell"], "the preset 'spell'"),
+        (
+            ["two_link.urdf", "--urdf-error", "0.3", "--steps", "5"],
+            "--steps: does not apply with --urdf-error",
+        ),
+        (["two_link.urdf", "--ablation", "--presets", "spel"], "--ablation: names the presets itself"),
+        (["arms.yaml", "--data", "."], "in a YAML file each arm has its own"),
+        (["servo.urdf"], "give logs of the arm with --data"),
+    ],
+)
+def test_wrong_options_are_one_error(arguments, message, robots, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("two_link", "servo"):
+        Path(f"{name}.urdf").write_bytes((robots / "two_link.urdf").read_bytes())
+    Path("servo.yaml").write_text("input: position\n")
+    Path("arms.yaml").write_text("arms:\n  a: {urdf: two_link.urdf}\n")
+    result = CliRunner().invoke(app, ["compare", *arguments, "--jobs", "1"])
+    assert result.exit_code and message in " ".join(result.output.replace("│", " ").split())
+    assert "Traceback" not in result.output

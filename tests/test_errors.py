@@ -1,4 +1,4 @@
-"""How errors and diagnostics read."""
+"""The text of errors and diagnostics: file, line, element, got, expected, remedy."""
 
 import json
 
@@ -29,7 +29,7 @@ from spelgen.errors import Diagnostic, LogError, SpelgenError, SpelgenErrors, Ur
         ),
     ],
 )
-def test_an_error_leaves_out_what_it_does_not_know(error, text):
+def test_an_error_omits_unknown_fields(error, text):
     assert str(error) == text
 
 
@@ -61,7 +61,7 @@ def test_a_diagnostic_is_the_public_json_object():
     )
 
 
-def test_what_several_files_share_is_told_once():
+def test_an_error_of_several_files_is_reported_once():
     """A hundred logs without the same column are one thing to mend."""
     lacking = [LogError("3 columns", file=f"{k}.csv", expected="4") for k in range(9)]
     told = str(SpelgenErrors([*lacking, LogError("another", file="0.csv")]))

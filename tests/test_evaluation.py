@@ -1,4 +1,4 @@
-"""Evaluation: baselines against exact solutions, errors that mean what they say, results that are valid JSON."""
+"""Errors of an evaluation equal those of exact solutions; baselines are exact; results are valid JSON."""
 
 import json
 from dataclasses import replace
@@ -11,12 +11,14 @@ import torch
 import typer
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.constant_velocity import hold_velocity
 from spelgen.baselines.names import observed
 from spelgen.cli import evaluate_command
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.dynamics.tip import tip_kinematics
+from spelgen.emission.build import build
 from spelgen.emission.loading import load_module
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.evaluation.evaluate import evaluate
@@ -29,11 +31,9 @@ from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.fits import Rollout
 
-STAND_IN = Path(__file__).with_name("stand_in.py")
+STAND_IN = Path(__file__).with_name("planar_model.py")
 JOINTS = ("shoulder", "elbow")
 UR10E = [
     f"{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -279,7 +279,7 @@ def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
 
 def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
     """No run, no file of logs: an arm, arrays, and whatever else predicts; the filter reaches torques too."""
-    from spelgen.pipeline.build import build
+    from spelgen.emission.build import build
 
     arm = load_arm(cart)
     model, dynamics = build(arm, preset="closed-form"), urdf_dynamics(cart, ["slide", "swing"])
@@ -304,7 +304,7 @@ def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
 
 def test_mimic_joints_have_baselines_tips_and_predictions(cart):
     """The pendulum follows the slider: its own dynamics made the logs, in single precision the model is judged too."""
-    from spelgen.pipeline.build import build
+    from spelgen.emission.build import build
 
     mimic = '<axis xyz="0 -1 0"/><mimic joint="slide" multiplier="2" offset="0.1"/>'
     cart.write_text(CART.replace('<axis xyz="0 -1 0"/>', mimic))

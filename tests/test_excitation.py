@@ -1,4 +1,4 @@
-"""`spelgen excite`: motions within limits, at rest at both ends, that show what a motion at random does not."""
+"""`spelgen excite`: motions stay within limits, start and end at rest, and are more informative than random ones."""
 
 import csv
 
@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.errors import SettingsError, SpelgenErrors
 from spelgen.excitation.criterion import Criterion
 from spelgen.excitation.design import excite
 from spelgen.excitation.trajectory import ExcitationTrajectory, motion_bounds
-from spelgen.pipeline.loaded_arm import load_arm
 from tests.hand_built import coupled_urdf
 
 CHOICE = {"duration": 10.0, "sample_rate": 100.0, "harmonics": 5, "reach": 0.8, "speed": 0.6}
@@ -64,11 +64,11 @@ def test_velocities_and_accelerations_are_derivatives(found):
     )
 
 
-def test_the_motion_is_worth_the_search(loaded, found):
+def test_the_optimised_motion_is_more_informative(loaded, found):
     assert found.condition < found.first / 3
     assert (
         found.parameters == 36 + 6 * 4 - 2
-    )  # rigid bodies, friction and rotors; what these share counts once
+    )  # rigid bodies, friction and rotors; parameters in common count once
     assert (found.efforts < 1).all()
     assert excite(loaded, **CHOICE, trials=1).first == found.first
 
@@ -170,7 +170,7 @@ def test_values_that_cannot_be_are_refused(loaded, changes, message):
     assert str(caught.value) == f"excite: {message}"
 
 
-def test_it_is_told_in_a_notebook(found):
+def test_a_notebook_shows_the_result(found):
     assert repr(found).startswith("<Excitation of 'ur10e': 10 s, condition number ")
     assert found._repr_html_().count("<tr>") == 7
 

@@ -1,4 +1,4 @@
-"""What was learned, as a URDF and settings again: exactly for closed-form models, nearest for others."""
+"""Export to URDF: exact for closed-form models, the nearest rigid bodies for others."""
 
 import numpy as np
 import pytest
@@ -8,19 +8,19 @@ from emitted import ROBOTS
 from exported_runs import saved_run
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
+from spelgen.emission.build import build
 from spelgen.errors import RunError
 from spelgen.exporting.export import export
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 
 pytest.importorskip("pinocchio")
 
 
 def run_of(robot, folder, preset, change=lambda model: None):
-    """A run folder as `spelgen train` leaves it, of a model whose weights ``change`` has moved."""
+    """A run folder, with the files that `spelgen train` writes, of a model whose parameters ``change`` has modified."""
     urdf = ROBOTS / f"{robot}.urdf"
     model = build(urdf, preset)
     with torch.no_grad():
@@ -76,8 +76,8 @@ def test_friction_goes_back_as_the_urdf_can_say_it(tmp_path):
         assert urdf.damping == pytest.approx(joint.viscous)
 
 
-def test_what_stands_beside_bodies_is_told(tmp_path):
-    """The bodies of hybrid go back exactly; what else M, gravity and friction have is told as figures."""
+def test_residual_terms_are_reported(tmp_path):
+    """The bodies of hybrid are exported exactly; residual terms of M, gravity and friction are reported as figures."""
     run, model = run_of("two_link", tmp_path, "hybrid", heavier)
     loaded, told = exported(run, tmp_path / "bodies.urdf")
     assert max(differences(model, loaded)) < 1e-8
@@ -109,16 +109,16 @@ def test_networks_go_back_as_the_nearest_bodies(tmp_path):
     assert "bodies are the rigid bodies nearest to the model; M differs by" in told
 
 
-def test_the_models_own_friction_law_lies_beside(tmp_path):
+def test_the_friction_model_is_exported(tmp_path):
     run, model = run_of("rpr", tmp_path, "closed-form", heavier)
     exported(run, tmp_path / "learned.urdf")
     told = yaml.safe_load((tmp_path / "learned.urdf.friction.yaml").read_text())
-    law = [told["joints"][name]["law"]["coulomb"] for name in model.facts.joints]
+    law = [told["joints"][name]["law"]["coulomb"] for name in model.joint_names]
     np.testing.assert_allclose(law, model.coulomb.detach().numpy(), rtol=1e-10)
     assert len((tmp_path / "learned.urdf.README.md").read_text().splitlines()) == 5
 
 
-def test_what_lies_there_stays_unless_forced(tmp_path):
+def test_existing_files_are_kept_unless_forced(tmp_path):
     run, _ = run_of("two_link", tmp_path, "closed-form")
     path = tmp_path / "learned.urdf"
     exported(run, path)
@@ -139,7 +139,7 @@ def test_a_run_without_its_robot_is_refused(tmp_path):
 
 @pytest.mark.parametrize("robot", ["rpr", "panda"])
 def test_exported_bodies_have_the_models_base_parameters(robot, tmp_path):
-    """By the names and combinations of `inspect`, whatever the single parameters are."""
+    """By the names and combinations of `inspect`, for all values of the single parameters."""
     run, model = run_of(robot, tmp_path, "closed-form", heavier)
     export(run.path, "urdf", tmp_path / "learned.urdf")
     arm = load_arm(ROBOTS / f"{robot}.urdf")

@@ -1,4 +1,4 @@
-"""C and CasADi of a trained model give what the torch model gives, and the C is sound."""
+"""Exported C and CasADi functions equal the torch model; the C passes address and undefined-behaviour sanitizers."""
 
 import re
 import shutil
@@ -12,7 +12,9 @@ import torch
 from exported_runs import COUPLED, MOTORS, arm_of, moved_model, run_folder
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
+from spelgen.emission.build import build
 from spelgen.errors import RunError
 from spelgen.exporting import friction_expressions, parity
 from spelgen.exporting.c_export import c_files, called_by_c, compile_library
@@ -23,8 +25,6 @@ from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.export import export
 from spelgen.exporting.model_expressions import expression_functions
 from spelgen.exporting.parity import check_parity, random_inputs, require_parity
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 
 ONE_JOINT = """<robot name="one"><link name="base"/>
 <link name="arm"><inertial><origin xyz="0.1 0 0"/><mass value="1"/>
@@ -38,7 +38,7 @@ BOTH = [("two_link", "closed-form"), ("rpr", "hybrid")]
 
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory):
-    """By robot and preset: what is exported, the C's folder, and its library."""
+    """Per robot and preset: the exported model, the folder of the C files, and the library."""
     found = {}
     for robot, preset in BOTH:
         trained = Trained(moved_model(robot, preset), arm_of(robot), NAMES)
@@ -54,7 +54,7 @@ def compiled(tmp_path_factory):
 @pytest.mark.parametrize("flags", [(), ("float",)], ids=["double", "float"])
 @pytest.mark.parametrize("program", ["gcc", "clang"])
 @pytest.mark.parametrize("case", BOTH, ids=lambda each: "-".join(each))
-def test_c_gives_what_the_model_gives(case, program, flags, compiled):
+def test_c_equals_the_model(case, program, flags, compiled):
     if shutil.which(program) is None:
         pytest.skip(f"no {program} on this machine")
     trained, folder, _ = compiled[case]
@@ -85,7 +85,7 @@ def test_derivatives_at_right_angles_are_the_models(monkeypatch):
 
 
 @needs_gcc
-def test_the_header_tells_operations_and_the_readme_the_check(compiled):
+def test_the_header_states_operations_and_the_readme_the_check(compiled):
     _, folder, told = compiled["rpr", "hybrid"]
     header = (folder / "rpr.h").read_text()
     assert re.search(r"At most \d\d+ operations, in forward_dynamics_derivatives", header)
@@ -95,7 +95,7 @@ def test_the_header_tells_operations_and_the_readme_the_check(compiled):
 
 @pytest.mark.parametrize("preset", ["closed-form", "hybrid"])
 @pytest.mark.parametrize("robot", ["rpr", "scara"])
-def test_casadi_gives_what_the_model_gives(robot, preset):
+def test_casadi_equals_the_model(robot, preset):
     found = export_casadi(Trained(moved_model(robot, preset), arm_of(robot), NAMES))
     assert len(found.files) == len(NAMES) + 1
     assert len(found.files["README.md"].decode().splitlines()) == 5
@@ -194,7 +194,7 @@ int main(void)
 
 @needs_gcc
 @pytest.mark.parametrize("case", BOTH, ids=lambda each: "-".join(each))
-def test_c_is_sound_whatever_it_is_given(case, compiled):
+def test_c_is_sound_for_all_inputs(case, compiled):
     """Zero, large, overflowing and infinite states, under address and undefined-behaviour sanitizers; NaN stays."""
     trained, folder, _ = compiled[case]
     name, n = trained.described.name, trained.described.n
@@ -280,7 +280,7 @@ def test_in_single_precision_a_joint_that_creeps_moves_its_bristles(tmp_path):
     np.testing.assert_allclose(z - start, 200e-9, rtol=0.01)
 
 
-def test_export_needs_the_run_folder_alone(tmp_path):
+def test_export_needs_only_the_run_folder(tmp_path):
     run = run_folder("two_link", "closed-form", tmp_path)
     told = CliRunner().invoke(app, ["export", str(run.path), "--to", "casadi", "-o", str(tmp_path / "out")])
     assert told.exit_code == 0, told.output

@@ -1,4 +1,4 @@
-"""MuJoCo loads what was learned and has the same M, bias and forward dynamics."""
+"""MuJoCo loads the exported MJCF and computes the same M, bias forces and forward dynamics."""
 
 import re
 import shutil
@@ -11,14 +11,14 @@ from emitted import ROBOTS
 from exported_runs import COUPLED, MOTORS, arm_of, moved_model, run_folder
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.dynamics.tip import tip_kinematics
+from spelgen.emission.build import build
 from spelgen.errors import RunError
 from spelgen.exporting.export import export
 from spelgen.exporting.mjcf_export import check_mjcf
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 
 
 @pytest.mark.parametrize("robot", ["rpr", "scara", "panda"])
@@ -70,7 +70,7 @@ def test_a_joint_that_friction_holds_does_not_creep():
         ("spel", "the rigid bodies nearest to the model"),
     ],
 )
-def test_what_mujoco_has_no_words_for_is_told(preset, which, tmp_path):
+def test_terms_that_mujoco_lacks_are_reported(preset, which, tmp_path):
     run = run_folder("two_link", preset, tmp_path)
     told = CliRunner().invoke(app, ["export", str(run.path), "--to", "mjcf", "-o", str(tmp_path / "arm.xml")])
     assert told.exit_code == 0, told.output
@@ -94,7 +94,7 @@ def test_followers_motors_and_passive_joints_go_along(tmp_path):
 
 @pytest.mark.parametrize("torque", ["motor", "joint"])
 def test_coupled_motors_turn_by_several_joints(torque, tmp_path):
-    """Their rotors couple M: tendons' armature in MuJoCo, couplings in the settings beside a URDF."""
+    """Their rotors couple M: armature of tendons in MuJoCo, couplings in the settings of a URDF."""
     urdf = tmp_path / "wrist.urdf"
     shutil.copy(ROBOTS / "six_dof.urdf", urdf)
     names = [each.name for each in load_arm(urdf).arm.coordinates]

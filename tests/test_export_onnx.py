@@ -1,4 +1,4 @@
-"""ONNX Runtime gives what the model gives, at any batch size."""
+"""ONNX Runtime computes the same numbers as the model, for any batch size."""
 
 import logging
 
@@ -8,12 +8,12 @@ import pytest
 import torch
 from exported_runs import COUPLED, MOTORS, arm_of, moved_model
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.emission.build import build
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.export import export
 from spelgen.exporting.onnx_export import called_by_onnx, onnx_model, onnx_session
 from spelgen.exporting.parity import check_parity
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 
 
 def coupled_model(folder):
@@ -30,7 +30,7 @@ def coupled_model(folder):
     return model.requires_grad_(False), arm
 
 
-def test_onnx_gives_what_the_model_gives(tmp_path):
+def test_onnx_equals_the_model(tmp_path):
     """The check at export time compares every file with the model to 1e-10; here another batch size, by hand."""
     model, arm = coupled_model(tmp_path)
     found = export(model, "onnx", arm=arm)
@@ -43,7 +43,7 @@ def test_onnx_gives_what_the_model_gives(tmp_path):
 
 
 def test_the_files_are_plain_onnx_of_equal_bytes():
-    """No operator of one runtime alone, no traces of the machine, the same bytes twice; z is flat."""
+    """Only standard operators, no traces of the machine, the same bytes twice; z is flat."""
     trained = Trained(moved_model("two_link", "closed-form"), arm_of("two_link"))
     prepared = trained.model.prepared()
     content = onnx_model(prepared, "forward_dynamics")
@@ -59,7 +59,7 @@ def test_the_files_are_plain_onnx_of_equal_bytes():
 
 
 @pytest.mark.parametrize("preset", ["spel", "minimal", "spel-kan", "phnode"])
-def test_networks_go_to_onnx(preset):
+def test_networks_are_exported_to_onnx(preset):
     """Presets of networks, which C and CasADi refuse; forward dynamics has all of their parts."""
     trained = Trained(moved_model("two_link", preset), arm_of("two_link"))
     files = {"forward_dynamics": onnx_model(trained.model.prepared(), "forward_dynamics")}

@@ -1,4 +1,4 @@
-"""What hybrid has beside rigid bodies: exported where it is not zero, left out where it is."""
+"""Residual terms of hybrid models are exported where they are not zero and omitted where they are."""
 
 import shutil
 
@@ -7,14 +7,13 @@ import pytest
 import torch
 from exported_runs import arm_of, moved_model
 
-from spelgen.errors import RunError
+from spelgen.emission.build import build
 from spelgen.exporting.c_export import called_by_c, compile_library
 from spelgen.exporting.c_source import c_functions, c_source, write_c
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
 from spelgen.exporting.describe import Trained, describe
 from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.parity import check_parity
-from spelgen.pipeline.build import build
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
 ENTRIES = {name: entry for name, entry in ENTRY_POINTS.items() if name != "servo_torque"}
@@ -30,7 +29,7 @@ RESIDUALS = "residuals."
 
 
 def with_parts(robot, *parts, net=None):
-    """A hybrid model whose bodies have moved, and of what stands beside them these parts alone."""
+    """A hybrid model with modified bodies and only these residual terms."""
     model, moved = build(arm_of(robot), "hybrid", net=net), moved_model(robot, "hybrid")
     names = tuple(PARTS[part] for part in parts)
     with torch.no_grad():
@@ -55,7 +54,7 @@ def c_library(model, folder):
     return called_by_c(compile_library(write_c(model, functions, folder), "gcc"), functions)
 
 
-def test_what_is_zero_is_left_out():
+def test_zero_terms_are_omitted():
     """C of a fit without residuals is that of closed-form, byte for byte."""
     model = with_parts("rpr")
     ours = describe(model, arm_of("rpr"))
@@ -77,7 +76,7 @@ def test_what_is_zero_is_left_out():
     ],
     ids="-".join,
 )
-def test_each_part_goes_alone(parts, tmp_path):
+def test_each_term_is_exported_by_itself(parts, tmp_path):
     """Unused functions and tables would be refused by the compiler."""
     trained = Trained(with_parts("scara", *parts), arm_of("scara"))
     model, names = trained.described, list(ENTRIES)
@@ -89,8 +88,8 @@ def test_each_part_goes_alone(parts, tmp_path):
 
 @needs_gcc
 @pytest.mark.parametrize("name", ENTRIES)
-def test_an_entry_goes_alone(name, tmp_path):
-    """What only other entries call raises no warning, which the export's own compilation refuses."""
+def test_a_single_entry_is_exported_by_itself(name, tmp_path):
+    """Functions that only other entries call cause no compiler warning, which the export would treat as an error."""
     model = with_parts("rpr", *PARTS)
     described = describe(model, arm_of("rpr"))
     functions = c_functions(described, {name: ENTRIES[name]})
@@ -137,13 +136,3 @@ def test_splines_at_their_ends_and_beyond(tmp_path):
             for step in (1e-6, -1e-6)
         )
         np.testing.assert_allclose(slope[:, :, 0], (ahead - behind) / 2e-6, rtol=1e-4, atol=1e-4)
-
-
-def test_kolmogorov_arnold_networks_are_refused_unless_zero():
-    model = with_parts("two_link", net="kan")
-    assert not describe(model, arm_of("two_link")).residuals
-    model.residuals.mass.weights[-1].add_(0.1)
-    with pytest.raises(
-        RunError, match="Kolmogorov-Arnold networks beside rigid bodies, expected closed-form"
-    ):
-        describe(model, arm_of("two_link"))

@@ -1,4 +1,4 @@
-"""Programs of torch.export give what the model gives, for any batch, and bring its weights."""
+"""Programs of torch.export compute the same numbers as the model, for any batch, and contain its parameters."""
 
 import io
 
@@ -9,7 +9,7 @@ from safetensors.torch import load
 from spelgen.exporting.export import export
 
 
-def test_programs_stand_alone():
+def test_programs_are_self_contained():
     """The check at export time compares every program with the model; here a batch of another size."""
     model = moved_model("two_link", "phnode")  # whose M and G are networks of all joints: every preset goes
     found = export(model, "torch", arm=arm_of("two_link"))

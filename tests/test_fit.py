@@ -1,4 +1,4 @@
-"""Fits in memory: the same as those of files, saved and loaded again; torques predicted and scored; both solvers."""
+"""Fits in memory equal fits of files, survive saving and loading, and give the torques that they report."""
 
 import json
 
@@ -99,27 +99,27 @@ def test_a_saved_fit_is_loaded_as_it_was(tmp_path):
 
 def test_what_was_used_is_recorded_and_nothing_else(tmp_path):
     found = spelgen.fit(spelgen.load_module(STAND_IN), motions(), Rollout(epochs=1, momentum_steps=0))
-    assert found.record["objective"] == "rollout"
-    assert found.record["config"] == {
+    assert found.record.objective == "rollout"
+    assert found.record.options == {
         "window": 5, "stride": 1, "momentum_steps": 0, "optimizer": "lbfgs", "weight_decay": 2e-5,
         "urdf_weight": 1.0, "epochs": 1, "patience": 60, "solver": "rk4",
     }  # fmt: skip
-    assert found.record["preprocessing"] == {"cutoff": None, "decimation": 1, "gap": 4.0, "torque_delay": 0.0}
-    json.dumps(found.record)
+    assert found.record.preprocessing == Preprocessing(decimation=1, torque_delay=0.0)
+    json.dumps(found.record.to_dict())
 
 
 def test_validation_may_be_given():
     logs = motions()
     found = spelgen.fit(spelgen.load_module(STAND_IN), logs[:4], quick(epochs=1), validation=logs[4:])
-    assert found.record["training"] == [x.name for x in logs[:4]]
-    assert found.record["validation"] == [x.name for x in logs[4:]]
-    assert found.record["validation_fraction"] is None
+    assert found.record.training == [x.name for x in logs[:4]]
+    assert found.record.validation == [x.name for x in logs[4:]]
+    assert found.record.validation_fraction is None
 
 
 def test_one_trajectory_alone_is_enough():
     (log,) = motions(count=1, samples=60)
     found = spelgen.fit(spelgen.load_module(STAND_IN), log, quick(epochs=1))
-    assert found.record["training"] == ["motion_0"]
+    assert found.record.training == ["motion_0"]
 
 
 def test_logs_that_cannot_be_fitted_are_told():
@@ -240,7 +240,7 @@ def test_windows_are_fitted_by_dopri5():
     plain = spelgen.fit(
         spelgen.load_module(STAND_IN), motions(), Rollout(epochs=2, momentum_steps=0, substeps=8)
     )
-    assert found.record["config"]["solver"] == "dopri5"
+    assert found.record.config.solver == "dopri5"
     assert found.best_validation == pytest.approx(plain.best_validation, rel=0.05)
     windows = cut_windows(motions(), 5, measured=False)
     scales = loss_scales(windows, ("revolute", "revolute"))

@@ -1,4 +1,4 @@
-"""Options of a fit: each objective has its own, and one that does not apply is told with what it belongs to."""
+"""Each objective accepts its own options; any other option is refused with the objective that it belongs to."""
 
 from pathlib import Path
 
@@ -7,12 +7,12 @@ from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
+from spelgen.emission.build import build, generate
 from spelgen.errors import OptionError, SettingsError
 from spelgen.fitting.fit import fit
+from spelgen.fitting.objectives import FitOptions, choose_config
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import write_logs
-from spelgen.pipeline.build import build
-from spelgen.pipeline.generate import generate
 from spelgen.settings.fits import CONFIGS, OWNERS, MomentumFit, Rollout, TorqueFit, fit_config
 from spelgen.settings.settings import load_settings
 from spelgen.settings.training import TrainingSettings
@@ -175,3 +175,23 @@ def test_a_name_in_place_of_a_configuration_is_told(robots):
         SettingsError, match=r"got 'torque' as the configuration of a fit, expected spelgen\.Torq"
     ):
         fit(model, [], "torque")
+
+
+def test_logs_are_read_for_the_choice_of_an_objective_only_if_it_depends_on_them(robots):
+    """An option that does not apply is reported before logs are read, which may take long."""
+
+    def unread():
+        raise AssertionError("the logs were read")
+
+    bodies, networks = (
+        build(robots / "two_link.urdf", preset, width=4) for preset in ("closed-form", "spel")
+    )
+    assert choose_config(networks, None, unread).objective == "rollout"
+    assert choose_config(bodies, FitOptions("torque"), unread).objective == "torque"
+    with pytest.raises(OptionError, match="belongs to the objective rollout, this fits torque"):
+        choose_config(bodies, FitOptions("torque", {"epochs": 3}), unread)
+    assert choose_config(bodies, None, lambda: [10.0, 100.0]).objective == "torque"
+    slow = choose_config(bodies, None, lambda: [10.0])
+    assert (slow.objective, slow.urdf_weight) == ("rollout", 0.0)
+    regularized = FitOptions(defaults={"urdf_weight": 2.0, "substeps": 3})
+    assert choose_config(bodies, regularized, lambda: [10.0]).urdf_weight == 2.0

@@ -1,4 +1,4 @@
-"""What `inspect --formulas` writes: what a person reads, the files, and names that would be code."""
+"""Files of `inspect --formulas`: readable text, complete, and free of code from names."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import sys
 
 import pytest
 from arms import random_arm
-from formulas_read import assert_equal_to_pinocchio, read_back
+from formula_parsing import assert_equal_to_pinocchio, read_back
 from typer.testing import CliRunner
 
 from spelgen.arm.arm import make_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.formula_files import sympy_source
 from spelgen.certificate.formula_text import text, to_dict
 from spelgen.certificate.formulas import formulas
+from spelgen.certificate.inspection import inspect
 from spelgen.cli.main import app
 from spelgen.errors import SpelgenError
-from spelgen.pipeline.generate import inspect
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf
 
@@ -49,7 +49,7 @@ m2] about the origin of the joint's frame, turned so that z is the joint's axis,
 of all that moves rigidly with the joint: 1 joint1, 2 joint2. q is the joint's
 position [rad, m]."""
 
-# What a roboticist would write on a board.
+# The notation that a roboticist would write by hand.
 ON_A_BOARD = {
     "rpr": {
         "M11": "Ixx3R*(0.5*cos(2*q3) + 0.5) - Ixy3*sin(2*q3) + Izz1R + 2*hz2R*q2 + m2R*q2**2",
@@ -76,7 +76,7 @@ def spelgen(tmp_path, monkeypatch):
     return lambda *arguments: CliRunner().invoke(app, [str(each) for each in arguments])
 
 
-def test_small_arms_are_told_whole(robots, spelgen):
+def test_small_arms_are_shown_completely(robots, spelgen):
     assert spelgen("inspect", robots / "two_link.urdf", "--formulas").stdout == TWO_LINK + "\n"
 
 
@@ -87,7 +87,7 @@ def test_entries_as_on_a_board(robots, robot):
     assert {name: rows[name] for name in ON_A_BOARD[robot]} == ON_A_BOARD[robot]
 
 
-def test_large_entries_are_counted_and_told_alone(robots, spelgen):
+def test_large_entries_are_counted_and_shown_on_request(robots, spelgen):
     whole = spelgen("inspect", robots / "ur10e.urdf", "--formulas").stdout
     assert "\nM11: 540 terms, not written out\n" in whole
     assert "--entry 1,1 shows M11 alone" in " ".join(whole.split())
@@ -175,7 +175,7 @@ def test_same_bytes_under_any_hash_seed(robots):
     assert len(told) == 1
 
 
-def test_a_long_entry_is_missing_and_said():
+def test_a_long_entry_is_omitted_and_reported():
     arm = random_arm(4, 0)
     source = sympy_source(formulas(arm, derive(arm), longest=100))
     names: dict = {}
@@ -185,7 +185,7 @@ def test_a_long_entry_is_missing_and_said():
     assert "M" not in names
 
 
-def test_what_is_too_large_is_not_expanded():
+def test_too_large_entries_are_not_expanded():
     """The first entries of eight generic joints have more than 10^5 terms."""
     arm = random_arm(8, 0)
     found = formulas(arm, derive(arm))

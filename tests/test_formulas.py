@@ -1,4 +1,4 @@
-"""Closed forms: each equals Pinocchio, as text, as LaTeX and in the SymPy file."""
+"""Closed forms equal Pinocchio as text, as LaTeX and as a SymPy file."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import sympy
-from formulas_read import assert_close, assert_equal_to_pinocchio, read_back, without_latex
+from formula_parsing import assert_close, assert_equal_to_pinocchio, read_back, without_latex
 from hypothesis import HealthCheck, given, settings
 from random_arms import arms
 
 from spelgen.arm.arm import make_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.formula_files import latex, sympy_source
 from spelgen.certificate.formula_text import text
 from spelgen.certificate.formulas import WRITABLE, formulas
 from spelgen.certificate.numeric_samples import with_random_inertias
 from spelgen.files import write_text
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.structure.expansion import Budget, Expansion
 from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf
@@ -54,7 +54,7 @@ def written(robot, assume="kinematics"):
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_sympy_file_alone_equals_pinocchio(robots, robot, tmp_path):
+def test_the_sympy_file_by_itself_equals_pinocchio(robots, robot, tmp_path):
     """The file is executed where this package cannot be imported; Pinocchio reads the URDF by itself."""
     arm, _, found = written(robot)
     write_text(tmp_path / "closed_forms.py", sympy_source(found))
@@ -119,7 +119,7 @@ def test_sympy_proves_each_expression(robot):
 
 
 def test_python_users_get_sympy(robots):
-    """Names and shapes of what `load_arm(path).formulas()` gives, and that SymPy goes on from there."""
+    """Names and shapes of the result of `load_arm(path).formulas()`, which SymPy can process further."""
     found = load_arm(robots / "rpr.urdf").formulas()
     q1, q2, q3 = found.q
     names = {symbol.name: symbol for symbol in found.base_parameters}
@@ -140,7 +140,7 @@ def test_python_users_get_sympy(robots):
 @settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
 @given(drawn=arms())
 def test_random_arms_equal_pinocchio(drawn, tmp_path_factory):
-    """Any joint types, tilted and parallel axes, followers in the chain and beside it."""
+    """Any joint types, tilted and parallel axes, mimic joints in the chain and on branches."""
     path = tmp_path_factory.mktemp("drawn") / "arm.urdf"
     path.write_text(drawn.text)
     arm = make_arm(read_urdf(path), joints=drawn.joints)

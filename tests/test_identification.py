@@ -1,4 +1,4 @@
-"""Identification: the regressor against Pinocchio, least squares against known arms and published figures."""
+"""The regressor equals Pinocchio's; least squares recovers known arms and published figures."""
 
 import json
 
@@ -7,6 +7,8 @@ import pinocchio as pin
 import pytest
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.certificate.inspection import inspect
 from spelgen.cli.main import app
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.regressor import regressor, urdf_parameters
@@ -18,8 +20,6 @@ from spelgen.identification.least_squares import correlation_time
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
-from spelgen.pipeline.generate import inspect
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.structure.pseudo_inertia import parameters_of, pseudo_inertia, reference_factor
 
 ROBOTS = ("two_link", "rpr", "scara", "six_dof", "ur10e", "panda")
@@ -70,7 +70,7 @@ def test_base_parameters_are_those_of_inspect(robots, robot):
     values = base.combination[: base.bodies, :inertial] @ urdf_parameters(arm)
     np.testing.assert_allclose(values, [float(each.value) for each in exact], rtol=1e-12, atol=1e-12)
     assert all(name[:-1] in FrictionModel().effects for name in base.names[base.bodies :])
-    # the first joint's rotor cannot be told from the inertia about its axis
+    # the first joint's rotor and the inertia about its axis are indistinguishable
     assert "armature1" not in base.names
     assert base.identifiability()["armature1"] == "in combination"
     assert base.identifiability()["viscous1"] == "alone"
@@ -169,7 +169,7 @@ def test_correlated_errors_count_for_less():
     assert correlation_time([slow])[0] == pytest.approx((1 + 0.8) / (1 - 0.8), rel=0.2)
 
 
-def test_what_motion_does_not_show_is_said(robots):
+def test_unobservable_parameters_are_reported(robots):
     arm = load_arm(robots / "six_dof.urdf").arm
     samples, _ = excited(arm)
     samples.qd[:, 3:], samples.qdd[:, 3:], samples.q[:, 3:] = 0.0, 0.0, 0.4
@@ -180,7 +180,7 @@ def test_what_motion_does_not_show_is_said(robots):
     assert found.to_dict()["condition"] is None
 
 
-def test_errors_tell_what_is_missing(robots):
+def test_errors_name_the_missing_data(robots):
     arm = load_arm(robots / "two_link.urdf").arm
     with pytest.raises(LogError, match="24 Hz"):
         least_squares(arm, [], LeastSquares())
@@ -265,7 +265,7 @@ def test_ur10e_gives_the_published_figures(shared):
 
 
 @pytest.mark.parametrize("cutoff", [1.0, 8.0, 45.0, 160.0])
-def test_samples_leave_out_what_a_filter_makes_up_at_both_ends(cutoff):
+def test_samples_omit_the_transients_of_the_filter(cutoff):
     """A log that begins and ends in motion; no filter above 50 Hz leaves nothing to leave out."""
     t = np.arange(0.0, 10.0, 1e-3)
     q = np.column_stack([1.5 * np.sin(t)])

@@ -1,4 +1,4 @@
-"""The structure as an HTML page: whole, self-contained, and safe whatever the URDF's names are."""
+"""The structure page is complete, self-contained HTML for all names that a URDF can have."""
 
 import re
 
@@ -6,16 +6,16 @@ import pytest
 from html_page import Page
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.certificate.inspection import inspect
 from spelgen.cli.main import app
-from spelgen.pipeline.generate import inspect
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.render.inspection_page import page
 
 HOSTILE = "<script>alert(1)</script>{{ 7 * 7 }}&quot;'&amp;"
 
 
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "panda"])
-def test_page_tells_what_the_text_tells(robots, robot):
+def test_the_page_states_the_same_as_the_text(robots, robot):
     found = inspect(robots / f"{robot}.urdf")
     shown = Page(page(found))
     told = " ".join(" ".join(shown.text).split())

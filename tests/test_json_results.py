@@ -1,4 +1,4 @@
-"""Results for scripts: one line of JSON on stdout, and an exit code of their own for figures beyond a limit."""
+"""With --format json a command prints one line of JSON; figures beyond a limit have their own exit code."""
 
 import json
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""Tables of text: the same everywhere, nothing lost, nothing interpreted."""
+"""Tables of text are the same in every environment, complete and without interpretation of markup."""
 
 import os
 import subprocess

@@ -1,16 +1,16 @@
-"""A module from its file or its text: what it carries, and what is refused."""
+"""A module is loaded from its file or its text; text that is no emitted module is refused."""
 
 from pathlib import Path
 
 import pytest
 import torch
 
+from spelgen.emission.build import build
 from spelgen.emission.loading import load_module
 from spelgen.errors import ModuleError
-from spelgen.pipeline.build import build
 
 ROBOTS = Path(__file__).parents[1] / "robots"
-STAND_IN = Path(__file__).parent / "stand_in.py"
+STAND_IN = Path(__file__).parent / "planar_model.py"
 
 
 def test_a_file_and_its_text_give_the_same_model():
@@ -18,7 +18,7 @@ def test_a_file_and_its_text_give_the_same_model():
     models = [load_module(STAND_IN), load_module(str(STAND_IN)), load_module(source)]
     for model in models:
         assert model.source == source
-        assert (model.facts.robot, model.facts.joints) == ("stand_in", ("shoulder", "elbow"))
+        assert (model.facts.robot, model.joint_names) == ("stand_in", ("shoulder", "elbow"))
         assert torch.equal(model.inertia, models[0].inertia)
     assert not torch.equal(load_module(source, seed=1).inertia, models[0].inertia)
 

@@ -1,4 +1,4 @@
-"""Logs: read back exactly, refused clearly, filtered without delay, split and cut without leaking."""
+"""Logs are read exactly, filtered without delay, split without leakage, and refused with one clear error."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -11,17 +11,16 @@ import pyarrow.parquet
 import pytest
 import torch
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.emission.build import build
 from spelgen.errors import LogError, SpelgenErrors
 from spelgen.logs.checks import check
-from spelgen.logs.chunks import scan
 from spelgen.logs.filtering import low_pass, regular_times, resampled
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.trajectory import split_at_gaps
 from spelgen.logs.windows import cut_windows, split_validation
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import load_arm
 
 JOINTS = ("a", "b")
 
@@ -96,7 +95,7 @@ def test_recordings_are_told_apart_wherever_their_rows_lie(tmp_path):
     np.testing.assert_array_equal(found[17].q[:, 0], [17, 3017, 6017, 9017])
 
 
-@pytest.mark.parametrize("step", ["read", "scan", "check"])
+@pytest.mark.parametrize("step", ["read", "check"])
 def test_many_short_recordings_take_time_by_their_number(tmp_path, step):
     """Two samples each: sixteen times as many took 256 times as long."""
     random, seconds = np.random.default_rng(0), []
@@ -105,7 +104,6 @@ def test_many_short_recordings_take_time_by_their_number(tmp_path, step):
         write_logs(tmp_path / "x.parquet", logs, JOINTS)
         run = {
             "read": lambda: read_logs(tmp_path / "x.parquet", JOINTS),
-            "scan": lambda: list(scan([tmp_path / "x.parquet"], JOINTS)),
             "check": lambda logs=logs: check(logs, JOINTS, ("prismatic",) * 2),
         }[step]
         start = process_time()
@@ -290,7 +288,7 @@ def test_a_velocity_that_is_no_derivative_is_a_warning():
 
 
 def changed(q=None, qd=None, tau=None) -> Trajectory:
-    """The swing, with columns set to a constant, by joint."""
+    """The swing, with columns of some joints set to a constant."""
     arrays = {name: getattr(swing(), name).copy() for name in ("q", "qd", "tau")}
     for array, values in zip(arrays.values(), (q, qd, tau), strict=True):
         for joint, value in (values or {}).items():
@@ -416,7 +414,7 @@ def test_only_dense_logs_are_filtered_unasked():
     assert automatic.resolved([100.0, 20.0]).cutoff is None
     assert filtered.resolved([100.1]).decimation == 4
     assert Preprocessing(cutoff=0.0).resolved([1000.0]).decimation == 1
-    # what a logger's clock is off decides nothing
+    # an offset of a logger's clock has no effect
     for nominal in (50.0, 60.0, 100.0, 120.0, 500.0):
         rates = nominal * np.array([0.999, 1.0, 1.001])
         assert len({filtered.resolved([rate]).decimation for rate in rates}) == 1

@@ -1,4 +1,4 @@
-"""Meshes from anywhere: drawn, or the arm is drawn without them; no pipe is opened, no file unpacks to gigabytes."""
+"""Meshes are drawn or replaced by tubes within bounds of time and memory; pipes are never opened."""
 
 import base64
 import json
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from machine import in_time
+from time_bounds import in_time
 
 from spelgen.render import shapes
 from spelgen.render.mesh_child import mesh_file
@@ -53,7 +53,7 @@ def test_an_arm_of_fine_meshes_is_drawn(tmp_path):
 
 
 def gltf(buffer: dict[str, object], count: int = 3, view: int | None = 0) -> str:
-    """A mesh of positions in a buffer; view None: as many zeros as it says."""
+    """A mesh of positions in a buffer; view None: ``count`` zeros."""
     positions = {"componentType": 5126, "count": count, "type": "VEC3"}
     if view is not None:
         positions["bufferView"] = view
@@ -125,12 +125,12 @@ def archive_of_gigabytes(folder: Path) -> str:
     return "m.zip"
 
 
-def stl_that_says_more_than_it_has(folder: Path) -> str:
+def stl_that_states_more_than_it_has(folder: Path) -> str:
     (folder / "m.stl").write_bytes(bytes(80) + struct.pack("<I", MANY) + bytes(5000))
     return "m.stl"
 
 
-def ply_that_says_more_than_it_has(folder: Path) -> str:
+def ply_that_states_more_than_it_has(folder: Path) -> str:
     fields = "property float x\nproperty float y\nproperty float z\n"
     (folder / "m.ply").write_text(
         f"ply\nformat ascii 1.0\nelement vertex {MANY}\n{fields}end_header\n0 0 0\n"
@@ -167,13 +167,14 @@ def box_without_size(folder: Path) -> str:
 DRAWN = (box_without_size, plain_obj, plain_gltf, gltf_with_a_file, obj_whose_material_is_a_pipe)
 LEFT_OUT = (
     pipe, gltf_whose_buffer_is_a_pipe, gltf_whose_buffer_lies_elsewhere, gltf_of_gigabytes, archive_of_gigabytes,
-    stl_that_says_more_than_it_has, ply_that_says_more_than_it_has, corners_that_are_no_numbers,
+    stl_that_states_more_than_it_has, ply_that_states_more_than_it_has, corners_that_are_no_numbers,
     gltf_of_triangles_without_corners, triangle_beyond_all_areas,
 )  # fmt: skip
 
 
+@pytest.mark.timed
 @pytest.mark.parametrize("make", DRAWN + LEFT_OUT)
-def test_meshes_are_drawn_or_left_out_in_bounds(tmp_path, make):
+def test_meshes_are_drawn_or_omitted_within_bounds(tmp_path, make):
     pytest.importorskip("trimesh")
     path = tmp_path / "r.urdf"
     path.write_text(ARM.replace("FILE", make(tmp_path)))
@@ -184,13 +185,13 @@ def test_meshes_are_drawn_or_left_out_in_bounds(tmp_path, make):
     # kB, of the largest process so far: another test's may have been larger, and each begins as a copy of this one
     copied = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert after.ru_maxrss <= max(used.ru_maxrss, copied, 1_100_000)
-    assert time.monotonic() - begin < 60  # what waits for a pipe uses no processor
+    assert time.monotonic() - begin < 60  # a process that waits for a pipe uses no processor time
 
 
 @pytest.mark.parametrize(
     "name", ["package://arm/meshes/m.obj", "../meshes/m.obj", "file://FOLDER/meshes/m.obj"]
 )
-def test_meshes_are_found_by_each_way_to_name_them(tmp_path, name):
+def test_meshes_are_found_by_each_form_of_path(tmp_path, name):
     (tmp_path / "meshes").mkdir()
     plain_obj(tmp_path / "meshes")
     (tmp_path / "urdf").mkdir()

@@ -1,4 +1,4 @@
-"""The momentum observer: what it finds of forces that a model lacks, and what holding them is worth."""
+"""The momentum observer estimates constant and changing external torques from past samples only."""
 
 from pathlib import Path
 
@@ -19,9 +19,9 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows
 
-STAND_IN = Path(__file__).with_name("stand_in.py")
+STAND_IN = Path(__file__).with_name("planar_model.py")
 RATE = 100.0
-OFFSET = torch.tensor([0.6, -0.4], dtype=torch.float64)  # Nm that logs do not tell of
+OFFSET = torch.tensor([0.6, -0.4], dtype=torch.float64)  # Nm that are not logged
 UNFILTERED = Preprocessing(cutoff=0, decimation=1)
 
 
@@ -61,7 +61,7 @@ def test_a_step_is_followed_with_the_time_constant(monkeypatch, time_constant):
         torch.testing.assert_close(disturbance[0], expected, atol=0.02, rtol=0)
 
 
-def test_it_looks_at_the_past_alone():
+def test_it_depends_only_on_past_samples():
     model, past = load_module(STAND_IN), past_steps(RATE)
     windows = cut_windows(motions(), past + 21, 20, measured=False)
     _, before = observe(model, windows, past)
@@ -71,7 +71,7 @@ def test_it_looks_at_the_past_alone():
     torch.testing.assert_close(observe(model, windows, past)[1], before)
 
 
-def test_what_has_velocities_as_its_state_lacks_an_acceleration():
+def test_models_in_velocities_are_observed():
     model, past = load_module(STAND_IN), past_steps(RATE)
     windows = cut_windows(motions(), past + 51, 20, measured=False)
     ahead, disturbance = observe(VelocityState(model), windows, past)
@@ -80,7 +80,7 @@ def test_what_has_velocities_as_its_state_lacks_an_acceleration():
     torch.testing.assert_close(disturbance, missing, atol=0.15, rtol=0.15)
 
 
-def test_rollouts_that_hold_it_stand_beside_open_loop():
+def test_rollouts_with_the_estimate_are_compared_with_open_loop():
     result = evaluate(
         load_module(STAND_IN), motions(), preprocessing=UNFILTERED, steps=(), seconds=(0.1, 0.5)
     )
@@ -100,7 +100,7 @@ def test_rollouts_that_hold_it_stand_beside_open_loop():
     }
 
 
-def test_a_window_whose_numbers_blow_up_spoils_no_other():
+def test_a_diverged_window_affects_no_other():
     model = load_module(STAND_IN)
     windows = cut_windows(motions(), 11, 60, measured=False)
     solver = Solver(model, 1)
@@ -113,7 +113,7 @@ def test_a_window_whose_numbers_blow_up_spoils_no_other():
     torch.testing.assert_close((q[others], qd[others]), (sound[0][others], sound[1][others]))
 
 
-def test_without_a_past_windows_are_what_follows():
+def test_the_steps_before_a_window_are_removed():
     windows = cut_windows(motions(), 21, 60, measured=False)
     ahead = without_past(windows, 10)
     torch.testing.assert_close(ahead.tau, windows.tau[:, 10:])

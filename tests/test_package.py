@@ -1,4 +1,4 @@
-"""The package as users install it: a wheel and an sdist, away from the repository, and what it depends on."""
+"""Wheel and sdist contain all files of the package, install elsewhere and build the same modules."""
 
 import os
 import pkgutil
@@ -10,9 +10,9 @@ from importlib.metadata import PackageNotFoundError, metadata, requires
 from pathlib import Path
 
 import pytest
+from spelgen.pipeline import generate as pipeline
 
 import spelgen
-from spelgen.pipeline import generate as pipeline
 
 ROOT = Path(__file__).parents[1]
 
@@ -24,7 +24,7 @@ def installed(tmp_path_factory) -> Path:
 
 
 def pip_install(source: Path, site: Path) -> Path:
-    """Install a checkout, a wheel or an sdist, without what it depends on."""
+    """Install a checkout, a wheel or an sdist, without its dependencies."""
     pytest.importorskip("hatchling", reason="building the package needs hatchling")
     options = ["-qq", "--no-deps", "--no-build-isolation", "--no-compile", "--target", str(site)]
     subprocess.run([sys.executable, "-m", "pip", "install", *options, str(source)], check=True)
@@ -32,7 +32,7 @@ def pip_install(source: Path, site: Path) -> Path:
 
 
 def files_of(site: Path) -> set[str]:
-    """What lies in an installation, but for what pip notes about its source."""
+    """The files of an installation, except pip's notes about the source."""
     files = [path for path in site.rglob("*") if path.is_file() and path.parent.name != "bin"]
     return {str(path.relative_to(site)) for path in files if path.name not in ("direct_url.json", "RECORD")}
 
@@ -79,7 +79,7 @@ def test_importing_it_imports_nothing_heavy():
 
 def test_objects_are_short_to_read(robots):
     arm = spelgen.load_arm(robots / "rpr.urdf")
-    assert repr(arm) == "<LoadedArm 'rpr': 3 joints of rpr.urdf>"
+    assert repr(arm) == "<ConfiguredArm 'rpr': 3 joints of rpr.urdf>"
     told = "3 outputs, 2 constants, 11 base parameters"
     assert repr(arm.structure) == f"<Structure of 3 joints (kinematics used): {told}>"
     told = "3 outputs and 2 constants, 11 base inertial parameters"
@@ -89,7 +89,7 @@ def test_objects_are_short_to_read(robots):
         assert each._repr_html_().count("<tr>") >= 2
 
 
-# ---- what it depends on
+# ---- dependencies
 
 
 def pinned(name: str) -> dict[str, str]:
@@ -106,7 +106,7 @@ def canonical(name: str) -> str:
 
 
 def test_every_package_is_pinned_by_hash():
-    """And `make demo` installs what the package itself needs with Pinocchio, nothing of the other extras."""
+    """`make demo` installs the dependencies of the package and Pinocchio, and nothing of the other extras."""
     demo, tools = pinned("requirements.txt"), pinned("requirements-tools.txt")
     assert demo.items() <= tools.items()
     assert not {"ray", "mujoco", "onnx", "casadi", "mkdocs", "mypy"} & set(demo)
@@ -118,7 +118,7 @@ def test_every_package_is_pinned_by_hash():
 
 
 def licence(package: str) -> str | None:
-    """What a package says of its licence; None where it is not installed."""
+    """The licence that a package states; None if it is not installed."""
     try:
         about = metadata(package)
     except PackageNotFoundError:
@@ -132,7 +132,7 @@ def licence(package: str) -> str | None:
 
 
 def test_licences_of_dependencies_are_listed(request):
-    """`pytest --update` writes the list anew."""
+    """`pytest --update` rewrites the list."""
     packages = sorted({*pinned("requirements.txt"), *pinned("requirements-torch.txt")})
     page = ROOT / "docs" / "licences.md"
     if request.config.getoption("--update"):
@@ -144,7 +144,7 @@ def test_licences_of_dependencies_are_listed(request):
     assert sorted(listed) == packages
     for package, text in listed.items():
         assert text == (licence(package) or text)
-        # what may not be combined with the Apache licence of this package, or forbids use
+        # licences that conflict with the Apache licence of this package, or that forbid use
         assert (
             not re.search(r"\b(A?GPL|AGPL|proprietary|non-?commercial)", text, re.IGNORECASE)
             or "LGPL" in text

@@ -1,4 +1,4 @@
-"""Pages as people see them, in a headless browser: quiet, alone, within their width, and led by the keyboard."""
+"""Pages in a headless browser: no console messages, no requests, no overflow, usable by keyboard."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 from chromium import Chromium, executable
 from test_report import run  # noqa: F401  (a fixture)
 
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.render.inspection_page import page
 from spelgen.render.report_page import write_report
 
@@ -38,7 +38,7 @@ def browser(tmp_path_factory):
 
 @pytest.fixture
 def pages(run, robots, tmp_path):  # noqa: F811
-    """The report of a run whose folder has its URDF, and what `inspect` writes of a longer arm."""
+    """The report of a run whose folder has its URDF, and the page of `inspect` of a longer arm."""
     (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
     panda = load_arm(robots / "panda.urdf")
     (tmp_path / "panda.html").write_text(page(panda.inspect(), urdf=panda.robot.path), encoding="utf-8")
@@ -56,7 +56,7 @@ def test_pages_say_nothing_ask_for_nothing_and_stay_within_their_width(browser, 
         assert [url for url in browser.requests if not url.startswith("data:")] == [path.as_uri()]
 
 
-def test_the_arm_is_printed_and_without_script_said_to_be_missing(browser, pages):
+def test_the_arm_is_printed_and_reported_missing_without_scripts(browser, pages):
     shown = (
         "['.without-script', 'canvas.arm', '.controls']"
         ".map(x => getComputedStyle(document.querySelector(x)).display)"

@@ -1,39 +1,33 @@
-"""Every preset keeps what an emitted module promises, and is the model that the papers write down."""
+"""Each preset is the model that its paper writes down; see test_contracts.py for properties that all presets share."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
 import pytest
 import torch
 from emitted import (
-    GANTRY,
     NETWORKS,
     bounded,
     built,
     frictionless,
-    import_source,
     network_inputs,
     outputs_alone,
     random_model,
 )
 from lie_group import geodesic_distance, group_rates
 from published_phnode import ByJvp, Published
-from test_model import bias
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.design import Preset, load_design
-from spelgen.dynamics.protocol import has_friction_state
+from spelgen.emission.build import make_spec
 from spelgen.fitting.rollout import position_difference
-from spelgen.pipeline.generate import generate, make_spec
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.spec import Options
 from tests.lie_group import to_group
 
 ROOT = Path(__file__).parents[1]
-PRESETS = [("phnode", "mlp"), ("phnode", "kan"), ("spel", "mlp"), ("spel-kan", "kan"), ("hybrid", "kan")]
+PRESETS = ["phnode", "spel", "spel-kan", "hybrid"]
 ROBOTS = ("two_link", "rpr", "six_dof")
-each = pytest.mark.parametrize(("preset", "net"), PRESETS)
 each_robot = pytest.mark.parametrize("robot", ROBOTS)
 
 
@@ -51,99 +45,17 @@ def test_presets_are_the_files():
     files = {path.stem for path in (ROOT / "spelgen" / "presets").glob("*.yaml")}
     assert {name for name in get_args(Preset) if name in files} == files
     for name in files:
-        design = load_design(name)
-        assert design.net == "none" or load_design(name, "kan").net == "kan"
-        assert make_spec(load_arm(ROOT / "robots" / "rpr.urdf"), Options(preset=name)).options.net == (
-            design.net if design.net in ("mlp", "kan") else None
+        assert make_spec(load_arm(ROOT / "robots" / "rpr.urdf"), Options(preset=name)).design == load_design(
+            name
         )
 
 
-@each_robot
-@each
-def test_written_out_derivatives_equal_autograd(robot, preset, net, tmp_path):
-    model = frictionless(random_model(robot, tmp_path, seed=4, preset=preset, net=net))
-    n = model.n
-    q, qd, _, _ = states(n)
-    q.requires_grad_()
-    (gravity,) = torch.autograd.grad(model.potential_energy(q).sum(), q)
-    near(model.gravity(q), gravity)
-    p = model.momentum(q, qd).detach()
-    (slope,) = torch.autograd.grad(model.hamiltonian(q, p).sum(), q)
-    rate = model(torch.zeros(()), torch.cat([q, p], dim=-1))
-    near(rate[..., n:], -slope)
-    near(rate[..., :n], qd)
-    near(model.nonlinear_effects(q, qd), bias(model, q, qd))
-
-
-@each_robot
-@each
-def test_forward_and_inverse_dynamics_undo_each_other(robot, preset, net, tmp_path):
-    model = random_model(robot, tmp_path, seed=3, preset=preset, net=net)
-    if preset == "phnode":  # random gains may be next to zero
-        torch.nn.init.zeros_(model.input_network.weights[-1])
-    q, qd, _, tau = states(model.n)
-    near(model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau)), tau, 1e-8)
-
-
-@each_robot
-@each
-def test_mass_matrix_and_dissipation_are_positive(robot, preset, net, tmp_path):
-    # larger weights make U of phnode, 3 n rows of an inverse, too ill-conditioned for 16 digits
-    deviation = None if preset == "phnode" else 3.0
-    for seed in range(5):
-        model = random_model(robot, tmp_path, seed=seed, deviation=deviation, preset=preset, net=net)
-        q, qd, _, _ = states(model.n, 500)
-        with torch.no_grad():
-            assert torch.linalg.eigvalsh(model.mass_matrix(q))[:, 0].min() > 0
-            damping = model.dissipation(q, qd)
-            assert torch.linalg.eigvalsh(damping)[:, 0].min() > -1e-12 * damping.abs().max()
-            torque = model.friction_torque(q, qd)
-            near(torque, (damping @ qd.unsqueeze(-1)).squeeze(-1))
-
-
-@pytest.mark.parametrize("batch", [(), (1,), (0,), (2, 3), (2, 0)])
-@each
-def test_any_batch_shape(preset, net, batch, tmp_path):
-    model = random_model("rpr", tmp_path, seed=0, preset=preset, net=net)
-    q, qd, tau = (torch.rand(*batch, 3, dtype=torch.float64) for _ in range(3))
-    for value in (model.gravity(q), model.forward_dynamics(q, qd, tau), model.inverse_dynamics(q, qd, tau)):
-        assert value.shape == (*batch, 3)
-    for value in (model.mass_matrix(q), model.dissipation(q, qd), model.input_matrix(q)):
-        assert value.shape == (*batch, 3, 3)
-    assert model.potential_energy(q).shape == batch
-    assert model(torch.zeros(()), torch.cat([q, qd, tau], dim=-1)).shape == (*batch, 9)
-
-
-@each
-def test_backpropagation_reaches_every_weight(preset, net, tmp_path):
-    model = random_model("rpr", tmp_path, seed=0, deviation=0.3, preset=preset, net=net)
-    q, qd, _, tau = states(3)
-    past = [0.3 * model.memory(qd)] if has_friction_state(model) else []
-    model.forward_dynamics(q, qd, tau, *past).square().sum().backward()
-    for name, parameter in model.named_parameters():
-        # V's own level moves nothing
-        assert "potential.biases" in name or parameter.grad.abs().max() > 0, name
-
-
-@pytest.mark.parametrize("preset", get_args(Preset))
-def test_arm_whose_mass_matrix_is_constant(preset, tmp_path):
-    """A gantry: M is a diagonal of trained numbers, and gravity does no work."""
-    urdf = tmp_path / "gantry.urdf"
-    urdf.write_text(GANTRY, encoding="utf-8")
-    model = import_source(generate(urdf, preset=preset), tmp_path / "gantry.py").Model()
-    q, qd, _, tau = states(2)
-    near(model.mass_matrix(q), model.mass_matrix(q[:1]).expand(len(q), 2, 2))
-    near(model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau)), tau)
-    assert (model.gravity(q) == 0).all()
-    assert model(torch.zeros(()), torch.cat([q, qd, tau], dim=-1)).shape == (len(q), 6)
-
-
 @pytest.mark.parametrize("robot", ["rpr", "six_dof", "panda"])
-def test_kan_outputs_read_their_own_joints_only(robot, tmp_path):
+def test_kan_outputs_depend_only_on_their_own_joints(robot, tmp_path):
     model = random_model(robot, tmp_path, seed=2, net="kan")
     outputs = built(robot, net="kan")[1].outputs
     q = states(model.n)[0]
-    network = model.residuals.mass
+    network = model.mass.network
     before = outputs_alone(network, network_inputs(model, q))
     for joint in range(model.n):
         moved = q.clone()
@@ -155,7 +67,7 @@ def test_kan_outputs_read_their_own_joints_only(robot, tmp_path):
 @pytest.mark.parametrize("preset", ["spel", "spel-kan"])
 @each_robot
 def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
-    """Its networks see all joints, as the paper's do; what the structure fixes stays fixed."""
+    """Its networks depend on all joints, as in the paper; zeros, constants and relations of the structure remain."""
     model = random_model(robot, tmp_path, seed=1, preset=preset)
     for weight in model.mass.network.parameters():
         weight.data *= 0.5
@@ -172,7 +84,7 @@ def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
 @pytest.mark.parametrize("part", ["mass.network", "potential", "input_network"])
 @pytest.mark.parametrize("net", ["mlp", "kan"])
 def test_networks_read_rotation_matrices(net, part, tmp_path):
-    """Layer by layer as the papers write them, on what varies of the 9 numbers of R and the 3 of r."""
+    """Layer by layer as in the papers, on the varying entries of the 9 numbers of R and the 3 of r."""
     owner = random_model("rpr", tmp_path, seed=5, preset="phnode", net=net)
     model, encoding = owner.get_submodule(part), owner.encoding
     q = states(3)[0]
@@ -194,12 +106,12 @@ def test_networks_read_rotation_matrices(net, part, tmp_path):
     near(outputs_alone(model, network_inputs(owner, q)), layer)
 
 
-@pytest.mark.parametrize(("preset", "net"), [*PRESETS, ("hybrid", "mlp")])
+@each
 @pytest.mark.parametrize("robot", ["rpr", "six_dof"])
-def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset, net, tmp_path):
+def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset, tmp_path):
     """Eq. 15 and 18 over three axes a joint, all derivatives automatic, against the n x n module."""
-    design = replace(NETWORKS, net=net) if preset == "hybrid" else None
-    model = random_model(robot, tmp_path, seed=6, preset=preset, net=net, design=design)
+    design = NETWORKS if preset == "hybrid" else None
+    model = random_model(robot, tmp_path, seed=6, preset=preset, design=design)
     n = model.n
     q, p, _, tau = states(n)
     parts = to_group(model.joint_types, q)
@@ -218,7 +130,7 @@ def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset
 
 @pytest.mark.parametrize("net", ["mlp", "kan"])
 def test_phnode_is_its_three_axis_model_held_by_bearings(net, tmp_path):
-    """H = 1/2 p^T M^-1 p over 3 n axes: moving along z alone, p_z follows the n x n module."""
+    """H = 1/2 p^T M^-1 p over 3 n axes: for motion only along z, p_z is that momentum of the n x n module."""
     model = frictionless(random_model("six_dof", tmp_path, seed=7, preset="phnode", net=net))
     n = model.n
     q, qd, _, _ = states(n)
@@ -257,7 +169,7 @@ def test_geodesic_distance_is_the_angle_between():
 
 
 def test_published_formulation_keeps_its_energy():
-    """The benchmark's baseline is the equations it stands for: without friction and input dH/dt = 0."""
+    """The benchmark's baseline conserves energy: without friction and input dH/dt = 0."""
     torch.manual_seed(0)
     model = Published(2, 8, 8)
     for network in (model.dissipation.network, model.gains):
@@ -279,7 +191,7 @@ def test_published_formulation_keeps_its_energy():
     assert rate.abs().min() > 0
 
 
-def test_one_jvp_gives_what_a_derivative_for_each_entry_gives():
+def test_one_jvp_equals_a_derivative_per_entry():
     torch.manual_seed(0)
     published, by_jvp = Published(2, 8, 4), ByJvp(2, 8, 4)
     by_jvp.load_state_dict(published.state_dict())

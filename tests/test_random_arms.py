@@ -1,4 +1,4 @@
-"""Random arms: what spelgen derives from a URDF against Pinocchio's own reading of the same text."""
+"""Structures derived from random URDFs agree with Pinocchio's reading of the same text."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def read(drawn: DrawnArm, folder: Path) -> Arm:
 
 @RANDOM
 @given(drawn=arms())
-def test_structure_is_what_pinocchio_shows(tmp_path, drawn):
+def test_structure_agrees_with_pinocchio(tmp_path, drawn):
     arm = read(drawn, tmp_path)
     for inertials in (False, True):
         seen = measured(drawn, inertials=inertials, rng=np.random.default_rng(0))
@@ -189,7 +189,7 @@ def test_values_are_those_of_pinocchio(tmp_path, drawn):
 
 
 def test_rational_rotations_keep_the_zeros_of_half_right_angles():
-    """Half a right angle has no rational cosine; what several of them make zero stays zero all the same."""
+    """Half a right angle has no rational cosine; zeros that several of them cause are recognised nevertheless."""
     for tilt in product(range(8), repeat=3):
         rotation = rotation_from_rpy([k * pi / 4 for k in tilt])
         found = exact_rotation(rotation)

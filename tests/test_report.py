@@ -1,4 +1,4 @@
-"""The report: one complete HTML page from a run folder, whatever the folder holds."""
+"""The report is one complete HTML page for any content of a run folder."""
 
 import json
 import math
@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 from html_page import Page
+from spelgen.pipeline import generate as pipeline
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.design import PRESETS
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.pipeline import generate as pipeline
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.render.report_page import render_report, write_report
 from spelgen.render.run_facts import commands
 from spelgen.settings.fits import Rollout
@@ -131,19 +131,19 @@ def test_numbers_are_those_of_the_run(run):
     assert "34 for training, 17 for validation" in text
     assert "--objective rollout --set seed=7 --set epochs=30 --set cutoff=8.0 --set decimation=1" in text
     assert "2,000 steps on the momentum" in text and "rk4, 4 steps between samples" in text
-    assert "spelgen build rpr.urdf --net mlp -o module.py spelgen train module.py --data LOGS" in text
+    assert "spelgen build rpr.urdf -o module.py spelgen train module.py --data LOGS" in text
 
 
-def test_a_run_of_one_s_own_preset_says_which_file_it_needs(run, robots, tmp_path):
+def test_a_run_of_a_custom_preset_names_the_file_that_it_needs(run, robots, tmp_path):
     preset = tmp_path / "mine.yaml"
     preset.write_text((PRESETS / "minimal.yaml").read_text())
-    module = pipeline.generate(load_arm(robots / "rpr.urdf", joints=["joint1", "joint2"]), preset, net="kan")
+    module = pipeline.generate(load_arm(robots / "rpr.urdf", joints=["joint1", "joint2"]), preset)
     (run / "module.py").write_text(module, encoding="utf-8")
     first = commands(RunFolder(run), read_facts(run / "module.py"), None)[0]
-    assert first == "spelgen build rpr.urdf --preset mine.yaml --net kan --joints joint1,joint2 -o module.py"
+    assert first == "spelgen build rpr.urdf --preset mine.yaml --joints joint1,joint2 -o module.py"
 
 
-def test_long_trainings_are_told_in_minutes_and_hours(run):
+def test_long_trainings_are_reported_in_minutes_and_hours(run):
     lines = (run / "metrics.jsonl").read_text().splitlines()
     for seconds, said in ((150, "2.5 min"), (9000, "2.5 h")):
         last = json.loads(lines[-1]) | {"seconds": seconds}
@@ -151,7 +151,7 @@ def test_long_trainings_are_told_in_minutes_and_hours(run):
         assert f"30 epochs, 600 steps, {said}" in render_report(run)
 
 
-def test_a_run_that_never_got_better_says_so(run):
+def test_a_run_without_improvement_is_reported(run):
     line = json.loads((run / "metrics.jsonl").read_text().splitlines()[0]) | {"best": 0.001}
     (run / "metrics.jsonl").write_text(json.dumps(line) + "\n")
     assert "the model of the start: no epoch was better, validation loss 0.001" in render_report(run)
@@ -184,20 +184,20 @@ def test_learned_constants_are_those_of_the_weights(run):
     ("config.json", "There is no <code>config.json</code>"),
     ("model.pt", "Not trained yet"),
 ])  # fmt: skip
-def test_what_is_missing_is_said(run, lacking, said):
+def test_missing_parts_are_reported(run, lacking, said):
     assert said not in render_report(run)
     (run / lacking).unlink()
     assert said in render_report(run)
 
 
-def test_a_module_alone_is_enough(run):
+def test_a_run_of_only_a_module_has_a_report(run):
     for path in run.iterdir():
         if path.name != "module.py":
             path.unlink()
     Page(render_report(run))
 
 
-def test_torn_last_line_of_metrics_is_left_out(run):
+def test_an_incomplete_last_line_of_metrics_is_omitted(run):
     whole = render_report(run).count("epochs, 600 steps")
     with (run / "metrics.jsonl").open("a") as file:
         file.write('{"epoch": 31, "st')
@@ -211,7 +211,7 @@ def test_broken_line_of_metrics_is_an_error(run):
         render_report(run)
 
 
-def test_no_run_is_an_error_that_says_what_to_do(tmp_path):
+def test_a_folder_without_a_run_is_refused_with_a_remedy(tmp_path):
     with pytest.raises(RunError) as told:
         write_report(tmp_path / "nothing")
     assert str(told.value).endswith(
@@ -250,7 +250,7 @@ def test_a_run_of_any_preset_has_its_page(run, robots, preset):
         assert f"Torque of {joint}" in text and f"torque [{unit}]" in text
 
 
-def test_what_the_page_shows_is_there_as_data(run, robots):
+def test_the_report_is_available_as_json(run, robots):
     (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
     found = json.loads(write_report(run, run / "report.json").read_text(encoding="utf-8"))
     assert found["evaluation"] == EVALUATION and found["least_squares"] is None

@@ -1,4 +1,4 @@
-"""The robots that come with spelgen: read without a remark, physically possible, true to their sources."""
+"""The robots of the repository are read without warnings, physically consistent and true to their sources."""
 
 from pathlib import Path
 
@@ -122,8 +122,8 @@ def test_no_file_but_the_urdf_is_needed(robot):
     }
 
 
-def test_it_moves_as_its_dh_table_says(robot):
-    """The last DH frame is rigid in the last joint's frame, whatever the joints do."""
+def test_it_moves_according_to_its_dh_table(robot):
+    """The last DH frame is fixed in the last joint's frame for all joint positions."""
     model = pin.buildModelFromUrdf(str(ROBOTS / f"{robot}.urdf"))
     data = model.createData()
     tools = []
@@ -162,7 +162,7 @@ def test_three_parallel_joints_save_outputs():
 
 @pytest.mark.parametrize(("robot", "other"), [("panda", "panda_erd"), ("ur10e", "ur10e_official")])
 def test_its_joints_are_where_the_manufacturers_file_has_them(robot, other, shared):
-    """The first joint is left out: the manufacturer's base link is turned."""
+    """Without the first joint: the manufacturer's base link is rotated."""
     ours = pin.buildModelFromUrdf(str(ROBOTS / f"{robot}.urdf"))
     theirs = pin.buildModelFromUrdf(str(shared / "arms" / f"{other}.urdf"))
     for joint in range(2, ours.njoints):

@@ -1,4 +1,4 @@
-"""A run folder from elsewhere runs nothing, belongs to one training at a time, and is whole whenever that is killed."""
+"""Run folders: foreign modules are not executed, one training at a time, and no kill corrupts them."""
 
 import functools
 import json
@@ -7,19 +7,19 @@ import re
 import resource
 import time
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from killing import killed
-from machine import in_time
+from process_kill import killed
+from time_bounds import in_time
 from typer.testing import CliRunner
 
 import spelgen
 from spelgen.cli.main import app
-from spelgen.errors import LogError, ModuleError, RunError
+from spelgen.emission.build import generate
+from spelgen.errors import ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.exporting.export import export
 from spelgen.fitting.dataset import Validation
@@ -30,10 +30,8 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.train import train
 from spelgen.fitting.tuning import WindowTuning
 from spelgen.fitting.window import momentum
-from spelgen.logs import chunks
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.generate import generate, require_own_module
 from spelgen.render.report_page import render_report
 from spelgen.settings.fits import Rollout
 
@@ -341,6 +339,7 @@ def test_facts_of_another_type_or_size_are_told(plain, tmp_path, case):
             use(run)
 
 
+@pytest.mark.timed
 def test_a_huge_file_is_not_read(plain, start, tmp_path):
     run = copied(plain, tmp_path)
     with (run / "notes.bin").open("wb") as file:
@@ -354,14 +353,3 @@ def test_a_huge_file_is_not_read(plain, start, tmp_path):
             file.truncate(40 * 10**9)
         with pytest.raises(spelgen.SpelgenError, match=r"got a file of 40000000000 bytes, expected at most"):
             load_run(huge)
-
-
-def test_a_log_that_changes_under_training_is_told(start, tmp_path, monkeypatch):
-    monkeypatch.setattr(chunks, "TUNING", replace(chunks.TUNING, in_memory=100, chunk_samples=25))
-    path = tmp_path / "train.parquet"
-    write_logs(path, motions(), JOINTS)
-    (chunk, _), *_ = chunks.scan([path], JOINTS)
-    chunk.load()
-    write_logs(path, motions(3), JOINTS)
-    with pytest.raises(LogError, match=r"train\.parquet: a file that has changed since it was first read"):
-        chunk.load()

@@ -1,4 +1,4 @@
-"""Several runs on one page, an identification as a page, and an evaluation as a table for programs."""
+"""The page of several runs, the page of an identification, and evaluations as machine-readable tables."""
 
 import csv
 import io
@@ -11,18 +11,18 @@ from html_page import Page
 from test_report import EVALUATION, run  # noqa: F401  (a fixture)
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.errors import RunError
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import CSV_HEAD, csv_text
 from spelgen.identification.identify import identify
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.render.identification_page import page
 from spelgen.render.runs_page import render_runs
 
 
-def test_runs_stand_side_by_side_and_the_better_one_is_named(run, tmp_path):  # noqa: F811
+def test_runs_are_compared_and_the_better_one_is_named(run, tmp_path):  # noqa: F811
     better = tmp_path / "better"
     shutil.copytree(run, better)
     changed = json.loads(json.dumps(EVALUATION))
@@ -37,7 +37,7 @@ def test_runs_stand_side_by_side_and_the_better_one_is_named(run, tmp_path):  # 
     assert result.exit_code == 0 and (tmp_path / "both.html").exists()
 
 
-def test_runs_of_servos_are_compared_by_what_they_replay(run, tmp_path):  # noqa: F811
+def test_servo_runs_are_compared_by_replays(run, tmp_path):  # noqa: F811
     better = tmp_path / "better"
     shutil.copytree(run, better)
     for folder, mean, logs in ((run, 0.008, {"a": 0.008, "b": 0.008}), (better, 0.006, {"b": 0.006})):
@@ -52,13 +52,13 @@ def test_runs_of_servos_are_compared_by_what_they_replay(run, tmp_path):  # noqa
     assert "b 8 6 mean of all 8 6" in text and " a 8" not in text
 
 
-def test_a_run_without_evaluation_cannot_be_set_beside_others(run):  # noqa: F811
+def test_a_run_without_evaluation_cannot_be_compared(run):  # noqa: F811
     (run / "evaluation.json").unlink()
     with pytest.raises(RunError, match=r"not evaluated.*spelgen evaluate"):
         render_runs([run, run])
 
 
-def test_runs_of_one_name_are_told_apart_by_the_folders_that_differ(run, tmp_path):  # noqa: F811
+def test_runs_of_one_name_are_distinguished_by_their_folders(run, tmp_path):  # noqa: F811
     again = tmp_path / "again" / "run"
     shutil.copytree(run, again)
     page = render_runs([run, again])
@@ -78,7 +78,7 @@ def test_the_table_holds_every_figure_once_with_its_unit():
     assert found["Torque error by joint, RMSE", "joint2 [N]", "model"] == "2.0"
 
 
-def test_an_identification_is_a_page_that_tells_what_the_text_tells(robots):
+def test_the_page_of_an_identification_states_the_same_as_the_text(robots):
     arm = load_arm(robots / "rpr.urdf")
     t = np.arange(600) / 100
     q, qd, tau = (np.stack([f(k) for k in (1, 2, 3)], axis=1) for f in (

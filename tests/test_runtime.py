@@ -1,4 +1,4 @@
-"""The runtime where it stands: derivatives against autograd, shapes and types, and what a module takes of it."""
+"""Parts of the runtime: derivatives against autograd, units, and the selection of classes that a module contains."""
 
 import ast
 import json
@@ -9,26 +9,24 @@ from pathlib import Path
 
 import pytest
 import torch
-from emitted import ROBOTS, SIX, built, import_source, random_model
+from emitted import ROBOTS, SIX, built, import_source
 from exported_runs import arm_of
-from torch import Tensor
-from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
-
-from spelgen.design import PRESET_NAMES, load_design
-from spelgen.dynamics.body_regressor import pseudo_inertia
-from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
-from spelgen.dynamics.protocol import has_friction_state, sliding_memory
 from spelgen.emission.bundle import bundle, load_runtime, names_in
 from spelgen.emission.tailored import kinds
 from spelgen.emission.unit_joints import hidden_units
+from spelgen.runtime.joints import Joints, vector
+from torch import Tensor
+from torch.func import jacrev, jvp, vjp
+
+from spelgen.arm.configured_arm import load_arm
+from spelgen.design import PRESET_NAMES, load_design
+from spelgen.dynamics.body_regressor import pseudo_inertia
+from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
+from spelgen.emission.build import build, make_spec
 from spelgen.fitting.torque.weights import body_weights, upper_cholesky
-from spelgen.pipeline.build import build
-from spelgen.pipeline.generate import make_spec
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.runtime.derived_mass import DerivedMass
 from spelgen.runtime.encoding import JointEncoding
 from spelgen.runtime.friction_laws import turning
-from spelgen.runtime.joints import Joints, vector
 from spelgen.runtime.masked_kan import MaskedKAN
 from spelgen.runtime.masked_mlp import MaskedMLP
 from spelgen.runtime.residual_terms import HARMONICS, SPLINES, ResidualTerms
@@ -43,14 +41,7 @@ FIRST_STAGE = (  # friction's laws then: |gravity torque|, tanh and exp
     ("torch.rsqrt(velocity * velocity + width**2)", "(velocity / width).tanh() / velocity"),
     ("slow.square().square().square()", "(-((qd / self.stribeck_velocity) ** 2)).exp()"),
 )
-PRESETS = (
-    ("hybrid", "mlp"),
-    ("hybrid", "kan"),
-    ("spel", "mlp"),
-    ("spel-kan", "kan"),
-    ("phnode", "mlp"),
-    ("closed-form", None),
-)
+PRESETS = ("hybrid", "spel", "spel-kan", "phnode", "closed-form")
 JOINTS = Joints(
     revolute=(True, False, True),
     center=(0.0, 0.5, 0.0),
@@ -85,7 +76,7 @@ def test_encoding_is_cos_sin_and_scaled_distance_with_its_derivatives(joints):
 
 
 @pytest.mark.parametrize("kind", [MaskedMLP, MaskedKAN])
-def test_networks_equal_autograd_and_read_their_own_joints(kind):
+def test_derivatives_of_networks_equal_autograd_and_inputs_are_masked(kind):
     encoding = JointEncoding(JOINTS)
     outputs = [(0,), (1, 2), (2,)]
     generator = torch.Generator().manual_seed(0)
@@ -106,7 +97,7 @@ def test_networks_equal_autograd_and_read_their_own_joints(kind):
     assert (slopes != 0).tolist() == [[joint in read for joint in range(3)] for read in outputs]
 
 
-def test_units_are_shared_out_by_how_many_outputs_read_the_same_joints():
+def test_hidden_units_are_shared_in_proportion_to_outputs():
     hidden = hidden_units([(2,), (1, 2), (1, 2)], width=64, fewest=4)
     assert hidden == (((2,), 21), ((1, 2), 43))
     crowded = hidden_units([(k,) for k in range(9)], width=8, fewest=2)
@@ -169,7 +160,7 @@ def test_friction_stays_between_a_tenth_and_ten_times_for_all_weights():
     assert factor.min() < 0.2 and factor.max() > 5
 
 
-def test_residual_of_m_never_takes_more_than_the_armature():
+def test_the_residual_of_m_is_smaller_than_the_armature():
     motors = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.8], [0.0, -0.7, 1.2]], dtype=torch.float64)
     for armature in (
         torch.diag(vector((0.1, 20.0, 3.0))),
@@ -197,7 +188,7 @@ def test_entries_of_a_symmetric_matrix():
     near(matrix[:, 1, 1], c[:, 0])
 
 
-def test_bound_leaves_what_is_positive_definite_and_mends_what_is_not():
+def test_the_bound_changes_only_matrices_that_are_not_positive_definite():
     center = torch.diag(torch.tensor([5.0, 1.0, 1e-3], dtype=torch.float64))
     constants = [(value, value) for value in center.diagonal().tolist()]
     mass = DerivedMass(
@@ -231,7 +222,7 @@ def test_bound_leaves_what_is_positive_definite_and_mends_what_is_not():
         assert torch.linalg.eigvalsh(relative)[:, 0].min() >= 1e-3
 
 
-def test_bodies_are_possible_for_all_weights():
+def test_bodies_are_physically_consistent_for_all_parameters():
     ten = (2.0, 0.1, 0.2, 0.3, 0.5, 0.01, 0.02, 0.6, 0.03, 0.4)
     nominal = pseudo_inertia(torch.tensor(ten, dtype=torch.float64))
     row, column = torch.triu_indices(4, 4)
@@ -243,7 +234,7 @@ def test_bodies_are_possible_for_all_weights():
         assert torch.linalg.eigvalsh(root @ root.mT)[0, 0] > 0
 
 
-def test_friction_laws_resist_and_read_as_what_they_are():
+def test_friction_is_dissipative_and_equals_its_formula():
     laws = SlidingFriction(JOINTS.friction, JOINTS.speed)
     constants = laws.prepare()
     near(constants.coulomb, torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64))
@@ -262,14 +253,14 @@ def test_friction_laws_resist_and_read_as_what_they_are():
     near(x * turning(x, torch.ones(4)), torch.tensor([0.0, 1e-9, 0.6, -1.0], dtype=torch.float64))
 
 
-def test_a_module_takes_what_it_uses_under_the_names_of_kinds():
+def test_a_module_contains_the_classes_that_it_uses():
     runtime, rpr = load_runtime(), load_arm(ROBOTS / "rpr.urdf")
-    for preset, net in PRESETS:
-        source = built("rpr", preset=preset, net=net)[0]
+    for preset in PRESETS:
+        source = built("rpr", preset=preset)[0]
         tree = ast.parse(source)
         defined = {node.name for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
         own = defined - {"Model", "make_parts", "mass_entries"}
-        classes = kinds(make_spec(rpr, Options(preset=preset, net=net)))
+        classes = kinds(make_spec(rpr, Options(preset=preset)))
         assert set(classes) <= own
         for name in own:
             text = runtime.definitions[classes.get(name, name)].text
@@ -285,63 +276,12 @@ def test_a_module_takes_what_it_uses_under_the_names_of_kinds():
 
 def test_tailored_part_is_short_and_shows_the_entries():
     for robot in SIX:
-        for preset, net in PRESETS:
-            lines = built(robot, preset=preset, net=net)[0].splitlines()
+        for preset in PRESETS:
+            lines = built(robot, preset=preset)[0].splitlines()
             end = next(number for number, line in enumerate(lines) if line.startswith("# ---- spelgen's"))
-            assert end < 250, f"{robot}, {preset}, {net}: {end} lines"
+            assert end < 250, f"{robot}, {preset}: {end} lines"
     assert "return symmetric([f3], [f1, c2], [f2, 0, c1])" in built("rpr")[0]
     assert "m22 = f9 + 2 * f12 - f5" in built("six_dof")[0]
-
-
-@pytest.mark.parametrize(
-    ("robot", "preset", "net"),
-    [*(("rpr", *each) for each in PRESETS), ("six_dof", "hybrid", "mlp"), ("six_dof", "closed-form", None)],
-)
-def test_transforms_work_for_every_preset(robot, preset, net, tmp_path):
-    """Without a branch on data: torch.func."""
-    model = random_model(robot, tmp_path, seed=1, preset=preset, net=net)
-    n = model.n
-    q, qd, tau = draw(5, n), draw(5, n, seed=1), draw(5, n, seed=2)
-    qdd = model.forward_dynamics(q, qd, tau)
-    near(vmap(model.forward_dynamics)(q, qd, tau), qdd, 1e-9)
-    one = q[0], qd[0], tau[0]
-    forward, reverse = jacfwd(model.forward_dynamics)(*one), jacrev(model.forward_dynamics)(*one)
-    near(forward, reverse, 1e-8)
-    curvature = hessian(model.hamiltonian, argnums=1)(q[0], model.momentum(q[0], qd[0]))
-    near(curvature, torch.linalg.inv(model.mass_matrix(q[0])), 1e-8)
-    if not has_friction_state(model):
-        return
-    z = model.memory(qd)
-    near(vmap(model.forward_dynamics)(q, qd, tau, z), model.forward_dynamics(q, qd, tau, z), 1e-9)
-
-
-@pytest.mark.parametrize(("preset", "net"), PRESETS)
-def test_every_preset_is_one_graph(preset, net, tmp_path):
-    """Strict export with a batch of any size, and all that torch.compile traces."""
-    model = random_model("rpr", tmp_path, seed=1, preset=preset, net=net).requires_grad_(False)
-    q, qd, tau = draw(5, 3), draw(5, 3, seed=1), draw(5, 3, seed=2)
-    state = torch.cat([q, qd, sliding_memory(model, qd).flatten(-2), tau], dim=-1)
-    batch = {"t": None, "state": {0: torch.export.Dim("batch")}}
-    program = torch.export.export(model, (torch.zeros(()), state), dynamic_shapes=batch, strict=True)
-    more = torch.cat([state, state])
-    near(program.module()(torch.zeros(()), more), model(torch.zeros(()), more), 1e-9)
-    compiled = torch.compile(model.forward_dynamics, fullgraph=True, backend="eager")
-    near(compiled(q, qd, tau), model.forward_dynamics(q, qd, tau), 1e-9)
-
-
-@pytest.mark.parametrize(("preset", "net"), PRESETS)
-def test_single_precision_and_batches_of_any_shape(preset, net, tmp_path):
-    module = import_source(built("rpr", preset=preset, net=net)[0], tmp_path / "rpr_single.py")
-    double, single = module.Model(seed=1), module.Model(seed=1, dtype=torch.float32)
-    assert {x.dtype for x in single.state_dict().values() if x.is_floating_point()} == {torch.float32}
-    for shape in ((), (3,), (2, 3)):
-        q, qd, tau = (draw(*shape, 3, seed=seed) for seed in range(3))
-        exact = double.inverse_dynamics(q, qd, tau)
-        for model in (single, module.Model(seed=1).float()):
-            found = model.inverse_dynamics(q.float(), qd.float(), tau.float())
-            assert found.dtype == torch.float32
-            near(found.double(), exact, 1e-4)
-        assert single.hamiltonian(q.float(), qd.float()).shape == shape
 
 
 def test_values_are_in_units(tmp_path):
@@ -406,12 +346,12 @@ def network_of_first_stage(network, inputs, generator):
 
 
 @pytest.mark.parametrize("case", json.loads(NUMBERS.read_text()))
-def test_numbers_are_those_of_the_first_stage(case, tmp_path):
+def test_numbers_equal_those_of_the_first_release(case, tmp_path):
     """Modules of the first stage, made by templates, gave these with the same seed and the same change of weights."""
-    robot, preset, net = case.split()
+    robot, preset, _ = case.split()
     design = load_design("closed-form") if preset == "closed-form" else None
     design = design and replace(design, memory="none")
-    source = built(robot, preset=preset, net=None if net == "default" else net, design=design)[0]
+    source = built(robot, preset=preset, design=design)[0]
     for now, first in FIRST_STAGE:
         source = source.replace(now, first)
     model = import_source(source, tmp_path / f"{robot}_numbers.py").Model(seed=3)
@@ -440,8 +380,8 @@ def test_numbers_are_those_of_the_first_stage(case, tmp_path):
         near(found[name], torch.tensor(expected, dtype=torch.float64), 1e-12)
 
 
-def test_every_weight_says_what_it_stands_for():
-    """Fits, exports and reports find weights by kind: a part that declares nothing would pass for a network."""
+def test_every_parameter_has_a_kind():
+    """Fits, exports and reports find parameters by kind; without a kind they would be treated as networks."""
     networks = (
         "network.",
         "residuals.mass.",
@@ -465,8 +405,8 @@ def test_every_weight_says_what_it_stands_for():
 
 
 @pytest.mark.parametrize("preset", ["closed-form", "minimal"])
-def test_what_is_no_state_is_refused_with_what_to_pass(preset):
-    """Arrays, another precision, and shapes that do not go together, by whatever is called."""
+def test_invalid_states_are_refused_with_a_remedy(preset):
+    """Arrays, another precision and inconsistent shapes, in every method."""
     model = build(arm_of("rpr"), preset)
     q = draw(5, 3)
     for call in (model.inverse_dynamics, model.forward_dynamics):

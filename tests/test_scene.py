@@ -1,4 +1,4 @@
-"""The arm of a page: it stands where other programs say, and what is drawn of it is whole."""
+"""The 3D scene of a page: link poses equal those of the kinematics, and shapes are closed."""
 
 import json
 from itertools import pairwise
@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.tip import tip_kinematics
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import json_data
 from spelgen.render.scene import scene
@@ -32,7 +32,7 @@ def frames(links, q):
 
 
 @pytest.mark.parametrize("robot", ["rpr", "scara", "panda", "ur10e"])
-def test_links_stand_where_pytorch_kinematics_has_them(robots, robot):
+def test_link_poses_equal_those_of_pytorch_kinematics(robots, robot):
     import torch
 
     arm = load_arm(robots / f"{robot}.urdf")
@@ -71,7 +71,7 @@ def test_tubes_are_closed_and_look_outward():
     assert volume == pytest.approx(2 * 0.5**2 * np.pi, rel=0.1)  # negative were it inside out
 
 
-def test_every_cell_tells_what_it_is_and_why(robots):
+def test_every_cell_states_its_kind_and_the_reason(robots):
     arm = load_arm(robots / "rpr.urdf")
     cells = matrix(arm.arm, arm.structure)
     assert (

@@ -1,9 +1,7 @@
-"""Arms under position servos: from settings to a module, from logs to ratios to kp, and to replayed commands."""
+"""Arms under position servos: parameters relative to kp are recovered, and replayed commands track the logs."""
 
 import json
 import re
-import shutil
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -17,14 +15,11 @@ from servo_arm import COM, GRAVITY, MASS, STRIBECK_VELOCITY, Servos, servo_logs,
 from typer.testing import CliRunner
 
 import spelgen
-from spelgen.baselines import mujoco_actuators
-from spelgen.baselines.mujoco_actuators import kept_actuators
-from spelgen.baselines.names import DELAYED_COMMAND, LINEAR_SERVOS, POSITION_ACTUATORS
+from spelgen.baselines.names import DELAYED_COMMAND, LINEAR_SERVOS
 from spelgen.cli.main import app
 from spelgen.dynamics.servo_rollout import replayed
-from spelgen.errors import LogError, OptionError, RunError, SettingsError
+from spelgen.errors import LogError, OptionError, SettingsError
 from spelgen.files import write_json
-from spelgen.fitting.dataset import digest
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.servo import objective
@@ -63,6 +58,12 @@ def fitted(arm, logs, tmp_path_factory):
     return spelgen.fit(spelgen.build(arm, "closed-form"), logs[:4], arm=arm, folder=folder)
 
 
+@pytest.fixture(scope="module")
+def results(fitted, logs):
+    """The evaluation of the fit on the log that was not fitted."""
+    return spelgen.evaluate(fitted, logs[4:])
+
+
 def test_ratios_to_kp_are_found(fitted):
     model, kp = fitted.model, np.array(TRUTH.kp)
     with torch.no_grad():
@@ -76,8 +77,7 @@ def test_ratios_to_kp_are_found(fitted):
     assert float(model.delay) == pytest.approx(TRUTH.delay, abs=0.004)
 
 
-def test_replay_of_another_motion_beats_the_baselines(fitted, logs):
-    results = spelgen.evaluate(fitted, logs[4:])
+def test_replay_of_another_motion_beats_the_baselines(fitted, logs, results):
     for replay in results.replays:
         errors = {name: each.mean for name, each in replay.errors.items()}
         assert errors["model"] < 0.4 * min(errors[LINEAR_SERVOS], errors[DELAYED_COMMAND])
@@ -85,73 +85,6 @@ def test_replay_of_another_motion_beats_the_baselines(fitted, logs):
     assert "Commands replayed, whole log" in results.text()
     again = spelgen.evaluate(fitted.folder, logs[4:])
     assert again.to_dict() == results.to_dict()
-
-
-def test_actuators_of_mujoco_are_what_it_has_to_beat(fitted, logs, monkeypatch):
-    pytest.importorskip("mujoco")
-    run = RunFolder(fitted.folder)
-    spelgen.keep_baseline(run.path, logs[:1])
-    found = kept_actuators(run)
-    simulated = found.model()
-    assert simulated.actuator_gainprm[:, 0] == pytest.approx(TRUTH.kp, rel=0.05)
-    assert -simulated.actuator_biasprm[:, 2] == pytest.approx(TRUTH.kd, rel=0.05)
-    # MuJoCo takes a servo's spring half a step late
-    assert simulated.dof_armature == pytest.approx(TRUTH.armature, rel=0.15)
-    # it knows neither dead zones nor friction that falls with velocity: dry friction is all that holds a joint
-    rest = np.array(TRUTH.coulomb) + np.array(TRUTH.kp) * TRUTH.dead_zone
-    assert (simulated.dof_frictionloss > 0.9 * rest).all()
-    assert (simulated.dof_frictionloss < 1.1 * (rest + TRUTH.stribeck)).all()
-    assert found.delay == pytest.approx(TRUTH.delay, abs=0.005)
-    results = spelgen.evaluate(run.path, logs[4][:400])
-    for replay in results.replays:
-        assert replay.errors[POSITION_ACTUATORS].mean < 0.4 * replay.errors[LINEAR_SERVOS].mean
-    notes = " ".join(x.message for x in results.diagnostics if x.code == "baseline")
-    assert "by mujoco.minimize, the least squares of mujoco.sysid" in notes
-    monkeypatch.setitem(sys.modules, "mujoco", None)  # as if it were not installed
-    assert kept_actuators(run) is None
-    alone = spelgen.evaluate(run.path, logs[4][:40])
-    assert "no-position-actuators" in {x.code for x in alone.diagnostics}
-
-
-def test_actuators_of_mujoco_are_fitted_to_files_when_they_are_needed(
-    fitted, logs, arm, tmp_path, monkeypatch
-):
-    pytest.importorskip("mujoco")
-    monkeypatch.setattr(mujoco_actuators, "fitted_actuators", lambda run, logs: {"fitted to": len(logs)})
-    run = RunFolder(tmp_path / "run")
-    shutil.copytree(fitted.folder, run.path)
-    path = spelgen.write_logs(tmp_path / "logs.parquet", logs[:4], arm)
-    read = spelgen.read_logs(path, arm, {"input": "position"})  # where no zero is negative
-    write_json(run.config, run.read_config() | {"data_digest": digest(read)})
-    spelgen.keep_baseline(run.path, [path])
-    assert kept_actuators(run) is None
-    assert run.read_json(run.baseline)["fitted to"] == 4
-    spelgen.keep_baseline(run.path, [path])
-    spelgen.write_logs(path, logs[:3], arm)
-    assert kept_actuators(run) is None
-    assert "fitted to" not in run.read_json(run.baseline)  # other logs than the model was fitted to
-    path.unlink()
-    assert kept_actuators(run) is None
-
-
-@pytest.mark.parametrize(
-    "record",
-    [
-        None,
-        {"drives": [[1.0, 1.0]] * 4, "offset": [0.0, 0.0]},
-        {"drives": [[1.0]] * 4, "offset": [0.0], "delay": 0.1},
-        {"drives": [["x", "y"]] * 4, "offset": [0.0, 0.0], "delay": 0.1},
-        {"mjcf": "<mujoco><include file='/etc/passwd'/></mujoco>", "offset": [0.0, 0.0], "delay": 0.1},
-    ],
-    ids=["nothing", "no delay", "another arm", "no numbers", "a file"],
-)
-def test_actuators_from_elsewhere_are_what_was_written_or_an_error(record, fitted, tmp_path):
-    pytest.importorskip("mujoco")
-    run = RunFolder(tmp_path / "run")
-    shutil.copytree(fitted.folder, run.path)
-    write_json(run.baseline, {"position_actuators": record})
-    with pytest.raises(RunError, match=r"least_squares\.json: got actuators of MuJoCo that cannot be used"):
-        kept_actuators(run)
 
 
 def test_a_module_of_servos_stands_alone_and_says_so(arm, tmp_path):
@@ -177,7 +110,7 @@ def test_within_its_dead_zone_a_servo_gives_nothing(arm):
 
 
 def test_joints_get_the_laws_that_they_have(fitted):
-    shoulder, elbow = fitted.record["servo"]["joints"]
+    shoulder, elbow = fitted.record.servo["joints"]
     assert shoulder["dead_zone"]["value"] == pytest.approx(TRUTH.dead_zone[0], rel=0.03)
     assert "dead_zone" not in elbow and not fitted.model.servo.dead_zone[1]
     with torch.no_grad():
@@ -230,7 +163,7 @@ def test_a_known_kp_stays(tmp_path, logs, monkeypatch):
     model = spelgen.build(write_servo_arm(tmp_path, settings), "closed-form")
     fit = spelgen.fit(model, [x[:100] for x in logs[:2]])
     assert float(model.servo.kp()[0].detach()) == pytest.approx(14.0)
-    assert [x["kp"]["known"] for x in fit.record["servo"]["joints"]] == [True, False]
+    assert [x["kp"]["known"] for x in fit.record.servo["joints"]] == [True, False]
 
 
 def test_commands_are_held_and_late():
@@ -244,8 +177,8 @@ def test_commands_are_held_and_late():
     assert late == pytest.approx(np.array([[0.0, 0.0], [0.5, 1.0]]), abs=1e-9)
 
 
-def test_its_report_shows_servos_and_replays_and_no_torques(fitted, logs):
-    write_json(RunFolder(fitted.folder).evaluation, spelgen.evaluate(fitted, logs[4:]).to_dict())
+def test_its_report_shows_servos_and_replays_and_no_torques(fitted, results):
+    write_json(RunFolder(fitted.folder).evaluation, results.to_dict())
     page = render_report(fitted.folder)
     told = " ".join(page.split())
     assert "Typical log replayed: motion 4" in page and told.count('class="line hold"') >= 2
@@ -265,7 +198,7 @@ def test_commands_are_read_and_written(tmp_path, logs, arm):
 
 
 def test_what_is_told_covers_the_truth(fitted):
-    told = fitted.record["servo"]["joints"]
+    told = fitted.record.servo["joints"]
     for k, joint in enumerate(told):
         for what, truth in (
             ("kd", TRUTH.kd[k] / TRUTH.kp[k]),
@@ -277,7 +210,7 @@ def test_what_is_told_covers_the_truth(fitted):
             assert joint[what]["value"] == pytest.approx(truth, rel=0.03 if k == 0 else 0.04), what
             assert joint[what]["low"] < truth < joint[what]["high"], what
     # the elbow's small weight does not tell dry friction from a dead zone
-    assert told[0]["dry"]["determined"] and "dry/kp of elbow" in servo_summary(fitted.record).text
+    assert told[0]["dry"]["determined"] and "dry/kp of elbow" in servo_summary(fitted.record.servo).text
 
 
 @pytest.mark.parametrize(

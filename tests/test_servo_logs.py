@@ -1,4 +1,4 @@
-"""What `spelgen logs` tells of logs of commanded positions."""
+"""`spelgen logs` on logs of commanded positions."""
 
 import json
 import re
@@ -28,7 +28,7 @@ def logs():
 
 
 def changed(logs, **columns):
-    """The logs, with columns that functions of a trajectory make anew."""
+    """The logs, with columns replaced by functions of a trajectory."""
     return [replace(x, **{name: made(x) for name, made in columns.items()}) for x in logs]
 
 
@@ -36,7 +36,7 @@ def codes(report):
     return {each.code for each in report.findings}
 
 
-def test_logs_of_a_servo_arm_are_told(arm, logs):
+def test_the_report_of_logs_of_a_servo_arm(arm, logs):
     found = spelgen.check_logs(logs, arm)
     assert not found.errors and not found.warnings
     shoulder, elbow = found.joints
@@ -53,7 +53,7 @@ def test_logs_of_a_servo_arm_are_told(arm, logs):
     assert told["joints"][1]["name"] == "elbow"
 
 
-def test_the_command_tells_them_too(arm, logs, tmp_path):
+def test_the_command_prints_the_report(arm, logs, tmp_path):
     path = spelgen.write_logs(tmp_path / "logs.csv", logs, arm)
     command = ["logs", str(path), "--robot", str(arm.robot.path), "--html", str(tmp_path / "page.html")]
     told = CliRunner().invoke(app, command)
@@ -97,12 +97,12 @@ def only(column, values):
         ({"u": lambda x: x.u + 3.0}, "beyond-position-limit"),
     ],
 )
-def test_what_is_odd_about_commands_is_told(arm, logs, columns, code):
+def test_anomalous_commands_are_reported(arm, logs, columns, code):
     found = spelgen.check_logs(changed(logs, **columns), arm)
     assert code in codes(found)
 
 
-def test_what_is_left_at_rest_is_told(arm):
+def test_errors_at_rest_are_reported(arm):
     shoulder, elbow = spelgen.check_logs(servo_logs(2, 12.0, swing=0.0), arm).joints
     # dry friction and the links' weight hold that much, in ratio to kp
     assert 0.3 * 0.15 / 14 < shoulder.following.steady_state_error < (0.15 + 0.9) / 14
@@ -115,7 +115,7 @@ def test_servos_that_give_all_they_can_are_counted(arm):
     assert 0.5 < shoulder.following.saturated <= 1.0
 
 
-def test_sparse_logs_are_told(arm, logs):
+def test_sparse_logs_are_reported(arm, logs):
     slow = [x[::4] for x in logs]
     assert "sparse" in codes(spelgen.check_logs(slow, arm))
 

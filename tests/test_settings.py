@@ -1,4 +1,4 @@
-"""The sidecar file: what is read, and what a wrong one is told."""
+"""The settings file: valid values are read, wrong ones are refused with line, expectation and remedy."""
 
 import re
 import subprocess
@@ -9,9 +9,9 @@ import pytest
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.errors import SettingsError, SpelgenErrors
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.joint import JointSettings
 from spelgen.settings.settings import OF_A_STEP, Settings, load_mapping, load_settings
 from spelgen.simulation.protocol import make_friction
@@ -31,7 +31,7 @@ def urdf(tmp_path, monkeypatch):
 
 
 def told(path):
-    """What is said of a file whose every group is read."""
+    """Errors of a file after every group was read."""
     with pytest.raises(SettingsError) as error:
         settings = load_settings(path)
         for group in OF_A_STEP:
@@ -145,7 +145,7 @@ def test_settings_do_not_change(urdf):
         ),
     ],
 )
-def test_a_wrong_value_is_told_with_its_place(urdf, text, message):
+def test_a_wrong_value_is_reported_with_its_place(urdf, text, message):
     assert told(urdf(text)) == message
 
 
@@ -174,11 +174,11 @@ def test_a_wrong_value_is_told_with_its_place(urdf, text, message):
         ("about: a\n---\nabout: b", "arm.yaml:2: not plain YAML: found another document"),
     ],
 )
-def test_what_is_no_plain_yaml_is_refused(urdf, text, message):
+def test_anything_but_plain_yaml_is_refused(urdf, text, message):
     assert told(urdf(text)) == message
 
 
-def test_all_errors_of_a_file_are_told_at_once(urdf):
+def test_all_errors_of_a_file_are_reported_at_once(urdf):
     with pytest.raises(SpelgenErrors) as error:
         load_settings(urdf("gear: 1\njoints:\n  a: {gear: 0}\n"))
     assert str(error.value).splitlines() == [
@@ -200,7 +200,7 @@ def test_the_other_suffix_is_not_passed_over(tmp_path, monkeypatch):
     assert told("arm.urdf") == "arm.yml: got 'arm.yml', expected 'arm.yaml'; rename it"
 
 
-def test_joints_that_do_not_exist_are_told_with_their_lines(urdf):
+def test_joints_that_do_not_exist_are_reported_with_their_lines(urdf):
     path = urdf("joints:\n  elbow: {}\n  elbw: {}\nsimulation:\n  positions:\n    wrist: [0, 1]\n")
     load_settings(path, ["elbow", "elbw", "wrist", "shoulder"])
     with pytest.raises(SpelgenErrors) as error:
@@ -211,7 +211,7 @@ def test_joints_that_do_not_exist_are_told_with_their_lines(urdf):
     ]
 
 
-def test_a_group_of_one_step_refuses_that_step_alone(urdf):
+def test_an_error_in_the_settings_of_a_step_refuses_only_that_step(urdf):
     settings = load_settings(
         urdf("gravity: [0, 0, -1.6]\ntraining: {epochs: many}\nlogs: {units: {q: deg}}\n")
     )
@@ -223,7 +223,7 @@ def test_a_group_of_one_step_refuses_that_step_alone(urdf):
     assert str(error.value) == message
 
 
-def test_errors_of_a_step_are_listed_beside_those_of_the_arm(urdf):
+def test_errors_of_a_step_are_listed_with_those_of_the_arm(urdf):
     with pytest.raises(SpelgenErrors) as error:
         load_settings(urdf("joints: {zz: {gear: 2}}\nlogs: {bogus: 1}\n"), ["shoulder"])
     first, second = str(error.value).splitlines()
@@ -252,8 +252,8 @@ def test_reading_settings_imports_nothing_heavy():
 
 
 @pytest.mark.parametrize("name", ["rpr", "scara", "panda", "ur10e"])
-def test_a_starter_says_what_holds_anyway_and_can_be_said(robots, tmp_path, name):
-    """As it is written it changes nothing; with every line said it is right, and still changes nothing."""
+def test_a_starter_file_states_the_defaults(robots, tmp_path, name):
+    """The file changes nothing as written, nor with every comment activated."""
     urdf = tmp_path / "arm.urdf"
     urdf.write_bytes((robots / f"{name}.urdf").read_bytes())
     assert CliRunner().invoke(app, ["init", str(urdf)]).stdout == f"wrote {tmp_path}/arm.yaml\n"

@@ -1,4 +1,4 @@
-"""Simulated logs: exact solutions, friction, inputs held, seeds, and another integrator."""
+"""Simulated logs equal exact solutions and another integrator; inputs are held, seeds are deterministic."""
 
 import numpy as np
 import pinocchio as pin
@@ -7,9 +7,9 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipj
 
 from spelgen.arm.arm import make_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import RunError, SettingsError
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.joint import JointSettings
 from spelgen.settings.settings import Settings, load_settings
 from spelgen.simulation import integration

@@ -1,4 +1,4 @@
-"""The docs as a site: every page has its place, every name that is written out exists, and the site builds."""
+"""The documentation site lists each page, resolves each API name and builds."""
 
 import importlib
 import importlib.util
@@ -17,7 +17,7 @@ SITE = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
 
 
 def places(entries):
-    """The files of a nav, whatever it is made of."""
+    """The files of a nav of any nesting."""
     if isinstance(entries, str):
         return [entries]
     return [x for each in entries for x in places(each.values() if isinstance(each, dict) else each)]
@@ -28,7 +28,7 @@ def test_every_page_has_one_place():
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_what_is_written_out_exists(page):
+def test_every_documented_name_exists(page):
     for name in re.findall(r"^::: (\S+)$", page.read_text(encoding="utf-8"), re.MULTILINE):
         module, member = name.rsplit(".", 1)
         assert getattr(importlib.import_module(module), member).__doc__, name

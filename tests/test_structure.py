@@ -1,6 +1,4 @@
-"""The derived structure: the project's robots by count, all reference arms by fact, and long arms by time of
-growth.
-"""
+"""The derived structure of the robots and of all reference arms is the known one; its cost grows slowly with joints."""
 
 from fractions import Fraction
 
@@ -9,7 +7,7 @@ import pytest
 from arms import planar, random_arm, reference_arms
 
 from spelgen.arm.arm import make_arm
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.structure.recursion import triangle
 from spelgen.structure.sampling import float_samples
 from spelgen.structure.structure import Structure, derive
@@ -43,7 +41,7 @@ def test_counts_of_the_own_robots(robots, robot):
     assert all(0 not in output.joints for output in structure.outputs), "no output reads joint 1"
 
 
-def test_rpr_reads_as_the_paper_says(robots):
+def test_rpr_has_the_structure_of_the_paper(robots):
     structure = derive(load_arm(robots / "rpr.urdf").arm)
     assert sorted(output.joints for output in structure.outputs) == [(1, 2), (1, 2), (2,)]
     assert {(e.row, e.column): e.kind for e in structure.entries if e.kind != "varying"} == {
@@ -54,7 +52,7 @@ def test_rpr_reads_as_the_paper_says(robots):
     assert structure.potential == (2,)
 
 
-def test_planar_chain_separates_what_joints_share():
+def test_a_planar_chain_separates_shared_functions():
     """M_11 of a planar 3R arm mixes q2, q3 and q2 + q3; the smallest form reads them apart."""
     structure = derive(planar(3))
     assert [output.joints for output in structure.outputs] == [(2,), (1,), (1, 2)]
@@ -63,7 +61,7 @@ def test_planar_chain_separates_what_joints_share():
 
 @pytest.mark.parametrize("robot", COUNTS)
 def test_smallest_form_is_exact(robots, robot):
-    """sum c A + sum f B gives M back, with c and f read off M as the structure says."""
+    """sum c A + sum f B equals M, with c and f taken from the entries of M that the structure names."""
     loaded = load_arm(robots / f"{robot}.urdf")
     structure = derive(loaded.arm)
     keys = triangle(len(structure.joints))
@@ -77,7 +75,7 @@ def test_smallest_form_is_exact(robots, robot):
 
 
 def test_factors_are_exact_fractions(robots):
-    """two_link is eq. 20 of the paper: M_11 holds twice what M_21 does."""
+    """two_link is eq. 20 of the paper: M_11 contains twice the functions of M_21."""
     structure = derive(load_arm(robots / "two_link.urdf").arm)
     assert structure.outputs[0].basis == ((0, 0, Fraction(2)), (1, 0, Fraction(1)))
 
@@ -98,7 +96,7 @@ def test_reference_arms(shared, assume):
 
 @pytest.mark.parametrize(("joints", "seed"), [(6, 0), (7, 1), (8, 2), (10, 3)])
 def test_generic_arms_follow_the_formula(joints, seed):
-    """With random geometry every entry varies but M_nn, and one relation is left: n(n+1)/2 - 1 outputs, one
+    """With random geometry every entry except M_nn varies, with one relation: n(n+1)/2 - 1 outputs, one
     constant.
     """
     structure = derive(random_arm(joints, seed))

@@ -1,4 +1,4 @@
-"""A mapping read off the column names of a log as loggers write it: the log is read by it as it was."""
+"""A mapping suggested from column names reads the log with its original values."""
 
 import csv
 
@@ -8,10 +8,10 @@ import pyarrow.parquet
 import pytest
 from typer.testing import CliRunner
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.logs.read import read_logs
 from spelgen.logs.suggest import suggest_mapping
-from spelgen.pipeline.loaded_arm import load_arm
 
 T = np.arange(200) * 0.008
 Q = np.stack([0.8 * np.sin(3 * T), 0.7 * np.cos(2 * T), 0.1 + 0.02 * np.sin(T), np.sin(T)], axis=1)
@@ -53,7 +53,7 @@ def test_lists_of_joint_states_with_times_in_milliseconds(scara, tmp_path):
     assert 'units: {"t": "ms"}' in text
 
 
-def test_numbered_columns_beside_set_points_without_velocities(scara, tmp_path):
+def test_numbered_columns_with_set_points_and_without_velocities(scara, tmp_path):
     head = ["timestamp", *(f"target_q_{k}" for k in range(4)), *(f"actual_q_{k}" for k in range(4))]
     head += [f"actual_current_{k}" for k in range(4)]
     rows = [[1.7e9 + t, *(0 * q), *q, *tau] for t, q, tau in zip(T, Q, TAU, strict=True)]
@@ -78,7 +78,7 @@ def test_matrices_of_an_archive(scara, tmp_path):
     require_same(suggested(tmp_path / "log.npz", scara)[0])
 
 
-def test_the_command_writes_it_and_goes_on_with_it(robots, tmp_path):
+def test_the_command_writes_the_mapping_and_uses_it(robots, tmp_path):
     head = ["time", "pos1", "pos2", "pos3", "pos4", "effort1"]
     path = written(tmp_path / "log.csv", head, [[t, *q, tau[0]] for t, q, tau in zip(T, Q, TAU, strict=True)])
     command = [

@@ -1,4 +1,4 @@
-"""The polynomials: an independent proof of the structure, and equal to Pinocchio."""
+"""Exact polynomials of M and V prove the derived structure and equal Pinocchio."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from arms import planar, random_arm
 from flint import fmpq_mat
 from polynomials import Polynomials, polynomials
 
-from spelgen.pipeline.loaded_arm import load_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import derive
 

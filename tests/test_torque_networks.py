@@ -1,14 +1,14 @@
-"""Networks fitted to torques: the torques of an arm that they can be, met to many digits."""
+"""Networks fitted to torques reproduce an arm that they can represent to many digits."""
 
 import torch
 from emitted import NETWORKS, ROBOTS, built, import_source
 
+from spelgen.emission.build import generate
 from spelgen.fitting.objectives import default_objective
 from spelgen.fitting.torque import networks as torque_networks
 from spelgen.fitting.torque.networks import fit_networks
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.logs.dynamics_samples import DynamicsSamples
-from spelgen.pipeline.generate import generate
 
 
 def recorded(model, seed, count=150):
@@ -43,8 +43,8 @@ def test_another_arms_torques_are_met(tmp_path):
     assert missed(model, recorded(true, 7)) < 1e-6
 
 
-def test_what_is_penalised_stays(tmp_path):
-    """A penalty against the torques leaves an error that nothing else would."""
+def test_penalised_parameters_stay(tmp_path):
+    """A strong penalty keeps the constants at their initial values against the torques."""
     module = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py")
     true, model = module.Model(seed=0), module.Model(seed=0)
     constants = model.mass.raw_constants
@@ -56,8 +56,8 @@ def test_what_is_penalised_stays(tmp_path):
     assert (constants - 1).abs().max() < 0.01
 
 
-def test_blocks_give_what_all_at_once_gives(tmp_path, monkeypatch):
-    """The loss and its gradient; what many steps make of the last digits is another thing."""
+def test_blocks_equal_a_single_batch(tmp_path, monkeypatch):
+    """The loss and its gradient are compared, as many steps would amplify rounding."""
     module = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py")
     true = module.Model(seed=0)
     samples = TorqueSamples.of([recorded(true, 5), recorded(true, 6)])
@@ -73,4 +73,4 @@ def test_blocks_give_what_all_at_once_gives(tmp_path, monkeypatch):
 def test_networks_are_fitted_to_torques_only_where_that_is_asked_for(tmp_path):
     """Without a word on it windows are predicted."""
     model = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py").Model()
-    assert default_objective(model, [1000.0]) == "rollout"
+    assert default_objective(model, lambda: [1000.0]) == "rollout"

@@ -1,4 +1,4 @@
-"""Logs of a controlled arm: it follows its sines, encoders count in steps, what is logged is near what happened."""
+"""Logs of a controlled arm: tracking error, encoder steps and logged torques are as specified."""
 
 from dataclasses import replace
 
@@ -7,9 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from spelgen.arm.actuation import Drives
+from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SettingsError, SpelgenErrors
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
 from spelgen.simulation import tracking
@@ -70,7 +70,7 @@ def test_the_arm_follows_its_sines_to_a_few_degrees(recordings):
 
 @pytest.mark.parametrize("choice", ["same", "own"])
 def test_trajectories_follow_one_path_or_each_its_own(loaded, choice):
-    """On one path, what a trajectory does late another has done before: the whole path is trained on."""
+    """On one path, trajectories overlap, so that the whole path is trained on."""
     settings = changed(loaded.settings, {"paths": choice})
     period = 1 / settings.tracking.frequency
     begun = paths(loaded.arm, settings, np.array([0.0, 2 / 6 * period]))
@@ -91,7 +91,7 @@ def test_paths_of_excitation_go_from_rest_to_rest_within_range_and_speed(loaded)
         assert 0.3 < np.abs(path.qd).max() <= 1
 
 
-def test_options_of_sines_beside_excitation_are_refused():
+def test_options_of_sines_are_refused_for_excitation():
     with pytest.raises(ValueError, match="amplitude and frequency of sines, beside paths: excitation"):
         TrackingSettings(paths="excitation", amplitude=0.2, frequency=0.5)
 
@@ -113,7 +113,7 @@ def test_encoders_count_in_whole_steps_and_miss_less_than_half_a_step(recordings
         assert 0.49 * step < missed.max() <= 0.5000001 * step
 
 
-def test_what_is_logged_is_near_what_happened(recordings):
+def test_logs_approximate_the_true_motion(recordings):
     settings, kept, _ = recordings
     away = []
     for _, recording in kept:
@@ -156,7 +156,7 @@ def test_torques_are_held_between_ticks_and_explain_the_motion(recordings, loade
     np.testing.assert_allclose(recording.states[start + 4], end, atol=1e-9)
 
 
-def test_seventy_percent_train_and_what_follows_tests(recordings):
+def test_the_first_seventy_percent_train_and_the_rest_tests(recordings):
     _, _, logs = recordings
     assert [len(x.t) for x in logs.train] == [2800, 2800]
     assert [len(x.t) for x in logs.test] == [1200, 1200]
@@ -191,7 +191,7 @@ def test_motors_behind_gears_get_their_share_and_a_passive_joint_none():
 
 
 def test_the_arm_is_held_against_its_weight_from_the_start(loaded):
-    """Without gains and without a sine to follow, what the controller starts with keeps the arm at rest."""
+    """Without gains and without a sine, the initial torque of the controller keeps the arm at rest."""
     friction = make_friction(loaded.arm, loaded.settings)
     engine = arm_dynamics(loaded.arm, loaded.settings, friction)
     still = sines(np.full(N, 0.4), 0.0, 0.125, np.zeros(N), np.arange(50) / 125)
@@ -216,20 +216,20 @@ def test_the_arm_is_held_against_its_weight_from_the_start(loaded):
         ),
     ],
 )
-def test_impossible_motions_are_refused(tracking, message):
+def test_infeasible_motions_are_refused(tracking, message):
     with pytest.raises(SettingsError) as error:
         track(slider(), changed(Settings(), tracking, sample_rate=500.0))
     assert str(error.value) == message
 
 
-def test_every_joint_whose_range_is_too_small_is_told():
+def test_every_joint_whose_range_is_too_small_is_reported():
     joints = [coordinate(upper=-0.5), coordinate("b", upper=-0.4)]
     bodies = [body(name, parent=k - 1, coordinate=k, inertia=point(1, 0.1)) for k, name in enumerate("ab")]
     with pytest.raises(SpelgenErrors, match=r"of 'a'.*\n.*of 'b'"):
         track(arm(joints, bodies), changed(Settings(), {"amplitude": 0.5}, sample_rate=500.0))
 
 
-def test_where_nothing_is_said_an_arm_is_controlled_and_follows(shared):
+def test_by_default_an_arm_is_controlled(shared):
     """An arm of seven joints without friction that would fall within a second, and one that friction stops at once."""
     for name in ("kinova_gen3_7dof_2f85", "kuka_iiwa14_lbrstack"):
         loaded = load_arm(shared / "arms" / f"{name}.urdf")
@@ -241,7 +241,7 @@ def test_where_nothing_is_said_an_arm_is_controlled_and_follows(shared):
         assert max(np.ptp(log.q, axis=0).max() for log in logs) > 0.05
 
 
-def test_said_inputs_or_a_protocol_are_taken_at_their_word(robots):
+def test_specified_inputs_or_a_protocol_are_used(robots):
     loaded = load_arm(robots / "two_link.urdf")
     assert len(np.unique(simulate(loaded, trajectories=2, duration=0.5)[0].tau)) <= 5
     bare = replace(loaded, settings=Settings())

@@ -1,4 +1,4 @@
-"""Training: exact solutions, exact resumption, recovery from blow-ups, interruptions, refusals."""
+"""Training reaches exact solutions, resumes exactly, recovers from divergence and handles interruptions."""
 
 import io
 import json
@@ -46,7 +46,7 @@ from spelgen.logs.windows import Windows, cut_windows
 from spelgen.settings.fits import MomentumFit, Rollout
 from spelgen.settings.log_mapping import LogMapping
 
-STAND_IN = Path(__file__).with_name("stand_in.py")
+STAND_IN = Path(__file__).with_name("planar_model.py")
 JOINTS = ("shoulder", "elbow")
 ADAMW = {"optimizer": "adamw", "batch": 32, "learning_rate": 1e-2}
 QUICK = Rollout(epochs=6, momentum_steps=20, **ADAMW)
@@ -61,7 +61,7 @@ def quick(**changed) -> Rollout:
 
 
 def truth():
-    """A stand-in with other parameters than the one that is trained."""
+    """A planar model with other parameters than the trained one."""
     model = load_module(STAND_IN)
     with torch.no_grad():
         model.inertia.copy_(torch.tensor([0.4, -0.5, -1.0]))
@@ -98,7 +98,7 @@ def logs(tmp_path_factory) -> Path:
 
 
 def lines(folder: Path) -> list[dict]:
-    """metrics.jsonl without what a clock says."""
+    """metrics.jsonl without durations."""
     records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     return [{key: value for key, value in record.items() if key != "seconds"} for record in records]
 
@@ -359,7 +359,7 @@ def test_early_stop_and_time_limit(logs, tmp_path):
 
 
 def until_a_signal(logs: Path, folder: Path) -> None:
-    """In a process of its own: a training that would never end, and in `told` how it ended."""
+    """Run a training without end in a process of its own, and write to `told` how it ended."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever runs the tests may ignore it
     with folder.with_name("told").open("w") as told:
         os.dup2(told.fileno(), 2)
@@ -386,7 +386,7 @@ def test_a_signal_leaves_a_usable_run(logs, tmp_path, number):
     epoch = torch.load(folder / "checkpoint.pt", weights_only=True)["epoch"]
     config = Rollout(epochs=epoch + 1, batch=32, patience=100000, momentum_steps=0, optimizer="adamw")
     assert train(STAND_IN, [logs], folder, config, options=RunOptions(resume=True)).epochs == epoch + 1
-    assert not list(folder.glob(".*"))  # no half-written file is left
+    assert not list(folder.glob(".*"))  # no partial file remains
 
 
 def test_a_run_is_not_overwritten_unasked(logs, tmp_path):

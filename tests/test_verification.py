@@ -1,12 +1,12 @@
-"""The numerical proof: agrees with what is derived, and reports every fact that is not so."""
+"""The numerical verification confirms the derived structure and reports each false statement."""
 
 from dataclasses import replace
 from fractions import Fraction
 
 import pytest
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.verify import verify
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.structure.structure import Entry, derive
 
 ROBOTS = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")
@@ -24,7 +24,7 @@ def true(rpr):
 
 @pytest.mark.parametrize("assume", ["kinematics", "inertials"])
 @pytest.mark.parametrize("name", ROBOTS)
-def test_what_is_derived_agrees(robots, name, assume):
+def test_the_derived_structure_is_confirmed(robots, name, assume):
     loaded = load_arm(robots / f"{name}.urdf")
     proof = verify(loaded.robot, loaded.arm, derive(loaded.arm, assume))
     assert proof.agrees, proof.text()
@@ -33,7 +33,7 @@ def test_what_is_derived_agrees(robots, name, assume):
 
 
 def entry(structure, row, column, kind, joints=()):
-    """The structure with one entry told otherwise."""
+    """The structure with one entry changed."""
     entries = tuple(
         Entry(row, column, kind, joints) if (x.row, x.column) == (row, column) else x
         for x in structure.entries
@@ -45,7 +45,7 @@ def halved(weights):
     return tuple((row, column, value / Fraction(2)) for row, column, value in weights)
 
 
-# what is told wrongly of rpr -> words of the check that must notice
+# false statement about rpr -> words of the check that must report it
 LIES = {
     "a zero that is none": (lambda s: entry(s, 2, 0, "zero"), "M31"),
     "a constant that varies": (lambda s: entry(s, 0, 0, "constant"), "M11"),
@@ -79,7 +79,7 @@ LIES = {
 
 
 @pytest.mark.parametrize("lie", LIES)
-def test_what_is_not_so_is_reported(rpr, true, lie):
+def test_false_statements_are_reported(rpr, true, lie):
     told, words = LIES[lie]
     proof = verify(rpr.robot, rpr.arm, told(true))
     assert not proof.agrees

@@ -1,4 +1,4 @@
-"""Texts for users are plain technical English: no metaphors from this list, no fragments for sentences."""
+"""Texts for users are plain technical English; docstrings and comments may only get closer to it."""
 
 import ast
 import inspect
@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
+import words
 
 import spelgen
 
@@ -90,6 +91,34 @@ def test_pages(path):
     assert {line: wrong(line) for line in text.splitlines() if wrong(line.strip())} == {}
 
 
-def test_the_list_finds_what_it_is_for():
+def test_docstrings_and_comments_do_not_get_worse():
+    """The counts of tests/words.py per package are bounds that only fall (`python tests/words.py --write`)."""
+    bounds = words.bounds()
+    rows = [(package, *each) for package, counter in words.counts().items() for each in counter.items()]
+    exceeded = {
+        f"{package}: {name}": f"{count}, at most {bound}"
+        for package, name, count in rows
+        if count > (bound := bounds.get(package, {}).get(name, 0))
+    }
+    assert exceeded == {}, "see tests/words.py"
+
+
+def test_constructions_are_found_in_docstrings_and_comments(tmp_path):
+    path = tmp_path / "module.py"
+    path.write_text(
+        '"""Return what is left."""\nx = 1  # by joint, told twice\n"""Hold one."""\ny = "what"\n'
+    )
+    found = [words.constructions(text) for _, text in words.texts(path)]
+    assert sum(found, words.Counter()) == {
+        "what, whatever": 1, "Return what, which, how, ...": 1, "miss, leave (of residuals)": 1,
+        "by (per, with respect to)": 1, "say, tell (of data)": 1, "Hold, opening a docstring": 1,
+    }  # fmt: skip
+    old = {"a": {"alike": 3, "alone (only)": 1}, "b": {"alike": 1}}
+    assert words.lowered({"a": words.Counter({"alike": 2, "alone (only)": 4})}, old) == {
+        "a": {"alike": 2, "alone (only)": 1}
+    }
+
+
+def test_the_list_finds_its_words():
     assert wrong("held-out samples ask for no more") and wrong("What servos lose")
     assert not wrong("the arm starts at rest") and not wrong("pass --trust")

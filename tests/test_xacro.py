@@ -1,4 +1,4 @@
-"""Files called *.xacro are run by the package xacro and read like what they expand to; no others are."""
+"""*.xacro files are expanded by the package xacro and read like the expanded text; other files are never run."""
 
 import importlib.util
 import subprocess
@@ -7,13 +7,15 @@ import time
 
 import numpy as np
 import pytest
+from REMOVED import require_own_module
 
+from spelgen.arm.configured_arm import load_arm
+from spelgen.certificate.module_check import check
+from spelgen.emission.build import generate
 from spelgen.errors import SpelgenError
 from spelgen.fitting.train import train
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.generate import check, generate, require_own_module
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.fits import Rollout
 from spelgen.urdf import xacro_input
 from spelgen.urdf.document import urdf_bytes
@@ -76,7 +78,7 @@ class TestExpansion:
         assert [joint.name for joint in ours.joints] == ["joint1", "joint2"]
         assert ours.link["link2"].inertial.mass == 1.0
 
-    def test_says_whose_lines_it_tells(self, arm):
+    def test_messages_name_the_file_of_each_line(self, arm):
         (told,) = [each for each in read_urdf(arm).diagnostics if each.code == "expanded-xacro"]
         assert told.message == (
             "expanded by xacro: lines are those of the document that `xacro arm.urdf.xacro` prints"
@@ -112,7 +114,7 @@ class TestExpansion:
         (arm.parent / "parts" / "segment.xacro").write_text(SEGMENT.replace("0.02", "0.03"))
         assert f"{arm} has changed since the module was built" in check(module).reasons
 
-    def test_the_folder_it_is_called_in_does_not_stand_in_for_the_package(self, arm, monkeypatch):
+    def test_the_current_folder_does_not_replace_the_package(self, arm, monkeypatch):
         (arm.parent / "xacro.py").write_text("raise SystemExit('a foreign module')")
         monkeypatch.chdir(arm.parent)
         assert b'name="link2"' in urdf_bytes(arm)
@@ -134,7 +136,7 @@ FAILURES = {
 
 @installed
 @pytest.mark.parametrize("case", FAILURES)
-def test_a_failure_of_xacro_is_told_in_one_line(arm, case):
+def test_a_failure_of_xacro_is_reported_in_one_line(arm, case):
     text, reason = FAILURES[case]
     arm.write_text(ARM.replace('<link name="base"/>', text))
     told = refusal(arm)
@@ -158,12 +160,12 @@ def test_time_and_memory_are_bounded(arm, monkeypatch):
 
 
 @installed
-def test_what_xacro_writes_is_bounded(arm, monkeypatch):
+def test_output_of_xacro_is_bounded(arm, monkeypatch):
     monkeypatch.setattr("spelgen.urdf.document.MAX_BYTES", 800)
     assert refusal(arm).endswith("bytes of URDF from xacro, expected at most 800")
 
 
-def test_without_the_package_one_error_says_how_to_get_it(arm, tmp_path, monkeypatch):
+def test_without_the_package_one_error_states_how_to_install_it(arm, tmp_path, monkeypatch):
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "xacro.py").write_text("raise ModuleNotFoundError(name='xacro')")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "empty"))
@@ -174,8 +176,8 @@ def test_without_the_package_one_error_says_how_to_get_it(arm, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("name", ["arm.urdf", "arm.xml", "arm.xacro.urdf", "xacro"])
-def test_what_a_file_holds_never_makes_it_run(arm, name, monkeypatch):
-    """Only a name that ends in .xacro does; the author of a downloaded URDF has no say in it."""
+def test_content_never_causes_expansion(arm, name, monkeypatch):
+    """Only the suffix .xacro does; the content of a downloaded URDF does not."""
     monkeypatch.setattr("subprocess.run", lambda *_, **__: pytest.fail("it was run"))
     path = arm.rename(arm.with_name(name))
     lines = refusal(path).splitlines()

@@ -49,16 +49,17 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class Body:
-    """Hold a joint and all that moves rigidly with it.
+    """A joint and all links that move rigidly with it.
 
-    ``rotation`` and ``translation`` [m] are the pose of the joint's own frame in the parent body's (the root
-    link's for parent -1) at zero position; the joint turns about, or slides along, the +z of its own frame by
-    multiplier * q + offset, q the coordinate. ``inertia`` is (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) [kg, kg
-    m, kg m2] about the joint frame's origin, in the joint frame; None where no link of the body has an
-    inertial.
+    ``link`` is the name of the child link of the joint. ``rotation`` and ``translation`` [m] are the pose of the
+    joint's frame in the frame of the parent body (parent -1: the root link) at zero position; the joint rotates about,
+    or translates along, z of its frame by multiplier * q + offset, q the coordinate. ``inertia`` is (m, m c, Ixx, Ixy,
+    Ixz, Iyy, Iyz, Izz) [kg, kg m, kg m^2] about the origin of the joint's frame, in that frame; None if no link of the
+    body has an inertial.
     """
 
     name: str
+    link: str
     kind: Kind
     parent: int
     coordinate: int
@@ -157,6 +158,7 @@ def _require_small(robot: Robot, chain: Chain) -> None:
 def _body(moved: Moved, coordinate: int) -> Body:
     return Body(
         name=moved.joint.name,
+        link=moved.joint.child,
         kind=_kind(moved.joint),
         parent=moved.pose.parent,
         coordinate=coordinate,

@@ -1,14 +1,15 @@
-"""An arm as its URDF and its sidecar give it, for steps that derive nothing from it."""
+"""An arm from its URDF and its settings."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
 
 from spelgen.arm.actuation import Actuation, derive_actuation
 from spelgen.arm.arm import Arm, make_arm
+from spelgen.errors import Diagnostic
+from spelgen.labels import counted
 from spelgen.settings.settings import Settings, load_settings
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot
@@ -16,9 +17,9 @@ from spelgen.urdf.robot import Robot
 
 @dataclass(frozen=True, repr=False)
 class ConfiguredArm:
-    """The robot of a URDF as read, its sidecar's settings, the arm taken from them, and its inputs.
+    """An arm: the robot of a URDF, its settings, the serial chain, and how motors drive the joints.
 
-    ``joints``, ``tip`` and ``angle_tolerance`` are those that ``load_arm`` was given.
+    ``joints``, ``tip`` and ``angle_tolerance`` are the arguments of ``load_arm``.
     """
 
     robot: Robot
@@ -29,33 +30,49 @@ class ConfiguredArm:
     tip: str | None
     angle_tolerance: float
 
-    @classmethod
-    def load(
-        cls,
-        path: str | Path,
-        joints: Sequence[str] | None = None,
-        tip: str | None = None,
-        angle_tolerance: float = 2e-3,
-    ) -> Self:
-        """Read a URDF and its sidecar, and take the arm from it; see ``load_arm``."""
-        path = Path(path)
-        robot = read_urdf(path)
-        settings = load_settings(path, robot.joint)
-        if joints is None and tip is None:
-            joints, tip = settings.moving_joints, settings.tip
-        arm = make_arm(
-            robot, joints=joints, tip=tip, angle_tolerance=angle_tolerance, gravity=settings.gravity
-        )
-        coordinates = tuple(
-            replace(coordinate, passive=not settings.joint(coordinate.name).actuated)
-            for coordinate in arm.coordinates
-        )
-        return cls(
-            robot=robot,
-            settings=settings,
-            arm=replace(arm, coordinates=coordinates),
-            actuation=derive_actuation(robot, settings, arm.joint_names),
-            joints=None if joints is None else tuple(joints),
-            tip=tip,
-            angle_tolerance=angle_tolerance,
-        )
+    @property
+    def diagnostics(self) -> tuple[Diagnostic, ...]:
+        """Return the diagnostics of the URDF, the settings, the chain and its inputs."""
+        sources = (self.robot, self.arm, self.actuation, self.settings)
+        return tuple(item for source in sources for item in source.diagnostics)
+
+    def __repr__(self) -> str:
+        joints = counted(len(self.arm.coordinates), "joint")
+        return f"<Arm {self.arm.name!r}: {joints} of {self.robot.path.name}>"
+
+
+def load_arm(
+    path: str | Path,
+    joints: Sequence[str] | None = None,
+    tip: str | None = None,
+    angle_tolerance: float = 2e-3,
+) -> ConfiguredArm:
+    """Return the arm in the URDF at ``path``, with the settings in the YAML file of the same name.
+
+    Args:
+        path: URDF or xacro file.
+        joints: names of the moving joints; None: those of the settings, or of the longest actuated chain.
+        tip: name of the last link, in place of ``joints``.
+        angle_tolerance: angles within it [rad] of a multiple of pi/2 are rounded to it; 0: none are.
+
+    Raises UrdfError, ArmError or SettingsError.
+    """
+    path = Path(path)
+    robot = read_urdf(path)
+    settings = load_settings(path, robot.joint)
+    if joints is None and tip is None:
+        joints, tip = settings.moving_joints, settings.tip
+    arm = make_arm(robot, joints=joints, tip=tip, angle_tolerance=angle_tolerance, gravity=settings.gravity)
+    coordinates = tuple(
+        replace(coordinate, passive=not settings.joint(coordinate.name).actuated)
+        for coordinate in arm.coordinates
+    )
+    return ConfiguredArm(
+        robot=robot,
+        settings=settings,
+        arm=replace(arm, coordinates=coordinates),
+        actuation=derive_actuation(robot, settings, arm.joint_names),
+        joints=None if joints is None else tuple(joints),
+        tip=tip,
+        angle_tolerance=angle_tolerance,
+    )

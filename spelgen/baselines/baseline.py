@@ -1,68 +1,70 @@
-"""The interface of a baseline: what a model of an arm has to beat."""
+"""The interface of a baseline: a simple predictor that a fitted model is compared with."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
-import numpy as np
-
-from spelgen.baselines.predictor import Predictor
+from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.baselines.predictor import CommandFollower, Predictor
+from spelgen.emission.assemble import spec_of
 from spelgen.errors import Diagnostic
-from spelgen.fitting.fitted import Fit
-from spelgen.fitting.run_folder import RunFolder
-from spelgen.logs.commands import LogRows
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows
+from spelgen.spec import Options
+
+FittedBaselines = dict[str, Any]
+"""The content of least_squares.json: fitted baselines, and the coverage of the training logs."""
 
 
 @dataclass(frozen=True)
-class JudgedArm:
-    """What baselines may know of an arm under torques that is judged.
+class EvaluatedArm:
+    """An arm under torques, as far as baselines may know it.
 
-    joints: their names, in the order of q. urdf, run: None where these are not known. probe: windows that say in which
-    steps dynamics are to be integrated. notes: what a baseline has to say, such as why it is not there.
+    joints: names, in the order of q. urdf: None if unknown. fitted: the baselines fitted to the training logs.
+    fitted_arm: the arm that these were fitted for; None if there are none. probe: windows by which the integrator's
+    step is chosen. notes: a baseline appends, for example, why it is absent.
     """
 
     joints: Sequence[str]
     urdf: Path | None
-    run: RunFolder | None
+    fitted: FittedBaselines
+    fitted_arm: ConfiguredArm | None
     probe: Windows
     notes: list[Diagnostic]
 
 
-class CommandFollower(Protocol):
-    """Predict the positions of an arm under commands. about: what it is, and how it was fitted."""
-
-    @property
-    def about(self) -> str: ...
-
-    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return positions (K, n) after each interval of each part of a log, from q and qd (parts, n)."""
-
-
 class Baseline:
-    """Predict an arm by simple means. It is listed once, in `registry.py`, and evaluation takes it from there.
+    """Simple predictor of an arm under torques, under position commands, or under both.
 
-    It predicts arms under torques, under commands, or both: one of the last two methods returns something.
+    Each baseline is listed in `registry.py`. It overrides `predictors` or `followers`, and `fit` if it has parameters.
     """
 
-    def fit(self, run: RunFolder, logs: Sequence[Trajectory], files: Sequence[str]) -> dict[str, object]:
-        """Return what is kept of a run's own training logs, as JSON; {} where there is nothing to fit.
-
-        files: the paths of these logs; empty where some were in memory.
-        """
+    def fit(
+        self, arm: ConfiguredArm, logs: Sequence[Trajectory], preprocessing: Preprocessing
+    ) -> dict[str, object]:
+        """Return the parameters fitted to the training logs, as JSON; {} if there is nothing to fit."""
         return {}
 
-    def predictors(self, judged: JudgedArm) -> list[Predictor]:
-        """Return what predicts under torques, none where something for it is missing."""
+    def predictors(self, arm: EvaluatedArm) -> list[Predictor]:
+        """Return the predictors under torques; [] if data or a package for them is absent."""
         return []
 
-    def followers(self, fit: Fit | None, notes: list[Diagnostic]) -> dict[str, CommandFollower]:
-        """Return by name what predicts under commands, beside a model that was fitted to them.
+    def followers(
+        self, linear_servos: Mapping[str, Any] | None, notes: list[Diagnostic]
+    ) -> dict[str, CommandFollower]:
+        """Return the predictors under position commands, by name.
 
-        fit: None for a model of which nothing else is known.
+        linear_servos: parameters of `LinearServos` from the record of a fit; None for a model without a record.
         """
         return {}
+
+
+def arm_of_model(model: object, urdf: Path) -> ConfiguredArm:
+    """Return the arm that a model was built from, read from its URDF. Raises UrdfError, ArmError or SettingsError."""
+    spec = spec_of(model)
+    options = Options() if spec is None else spec.options
+    return load_arm(urdf, options.joints, options.tip, options.angle_tolerance)

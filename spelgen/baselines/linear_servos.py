@@ -1,22 +1,78 @@
-"""Commands that come late, and linear servos: what fits of position servos find first and keep in their record."""
+"""Predictors of arms under position servos: the delayed command, and a linear second-order servo at each joint."""
 
 from __future__ import annotations
 
-from spelgen.baselines.baseline import Baseline, CommandFollower
-from spelgen.baselines.names import DELAYED_COMMAND, LINEAR_SERVOS
-from spelgen.errors import Diagnostic
-from spelgen.fitting.fitted import Fit
-from spelgen.fitting.servo.linear_servos import DelayedCommand, LinearServos
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+
+from spelgen.logs.commands import LogRows, delayed_commands
 
 
-class FittedServos(Baseline):
-    """Predict each joint by itself."""
+@dataclass(frozen=True)
+class DelayedCommand:
+    """Position = command ``delay`` [s] earlier."""
 
-    def followers(self, fit: Fit | None, notes: list[Diagnostic]) -> dict[str, CommandFollower]:
-        """Return linear servos, and the delayed command; none, and a note, for a model without a record."""
-        if fit is None or "servo" not in fit.record:
-            message = "no linear servos to compare with: they are fitted by `train`"
-            notes.append(Diagnostic("info", "no-linear-servos", "logs", None, message))
-            return {}
-        servos = LinearServos(**fit.record["servo"]["linear"])
-        return {LINEAR_SERVOS: servos, DELAYED_COMMAND: DelayedCommand(servos.late)}
+    delay: float
+    about = "the commands themselves, after the delay by which they are nearest to the positions of the training logs"
+
+    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
+        """See `CommandFollower`."""
+        return [delayed_commands(log, rows, self.delay, 1)[:, 0] for log, rows in parts]
+
+
+@dataclass(frozen=True)
+class LinearServos:
+    """Each joint by itself: qdd = w^2 (u(t - delay) + offset - q) - 2 damping w qd.
+
+    frequency: w [rad/s], damping: ratio [1], delay [s], offset [rad, m] of the n joints. late: the delay [s] of
+    `DelayedCommand`, one for all joints.
+    """
+
+    frequency: Sequence[float]
+    damping: Sequence[float]
+    delay: Sequence[float]
+    offset: Sequence[float]
+    late: float
+    about = "a linear second-order servo at each joint, fitted to windows of the training logs"
+
+    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
+        """See `CommandFollower`."""
+        frequency, damping, result = np.array(self.frequency), np.array(self.damping), []
+        for start, speed, (log, rows) in zip(q, qd, parts, strict=True):
+            dt = float(np.diff(log.t[rows]).mean())
+            columns = [delayed_commands(log, rows, late, 1)[:, 0, k] for k, late in enumerate(self.delay)]
+            u = np.stack(columns, axis=-1) + self.offset
+            result.append(linear_response(start, speed, u, dt, frequency, damping))
+        return result
+
+
+def linear_response(
+    q: np.ndarray, qd: np.ndarray, u: np.ndarray, dt: float, frequency: np.ndarray, damping: np.ndarray
+) -> np.ndarray:
+    """Return the positions of second-order servos, exact for commands that are constant in each interval.
+
+    Args:
+        q: (..., n) initial positions [rad, m].
+        qd: (..., n) initial velocities [rad/s, m/s].
+        u: (..., K, n) commands of the K intervals [rad, m].
+        dt: length of an interval [s].
+        frequency: (n,) natural frequency [rad/s].
+        damping: (n,) damping ratio [1].
+
+    Returns:
+        (..., K, n) positions at the end of each interval [rad, m].
+    """
+    system = np.zeros((len(frequency), 3, 3))  # of position, velocity and command
+    system[:, 0, 1] = 1.0
+    system[:, 1, 0], system[:, 1, 2] = -(frequency**2), frequency**2
+    system[:, 1, 1] = -2 * damping * frequency
+    step = expm(system * dt)[:, :2]
+    state, positions = np.stack([q, qd, u[..., 0, :]], axis=-1), np.empty_like(u)
+    for k in range(u.shape[-2]):
+        state[..., 2] = u[..., k, :]
+        state[..., :2] = np.einsum("nij,...nj->...ni", step, state)
+        positions[..., k, :] = state[..., 0]
+    return positions

@@ -1,9 +1,10 @@
-"""A predictor of an arm's motion: a model, a baseline or any other dynamics, with a method that integrates it."""
+"""Predictors of the motion of an arm, under torques or under position commands: a model, or a baseline."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 from spelgen.baselines.rosenbrock import roll_out_stiff
 from spelgen.baselines.tuning import TUNING
 from spelgen.dynamics.protocol import RigidDynamics
+from spelgen.logs.commands import LogRows
 from spelgen.logs.windows import Windows, thinned
 
 States = tuple[Tensor, Tensor]
@@ -19,24 +21,24 @@ States = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True)
 class Solver:
-    """Predict windows, by so many steps of the Rosenbrock method between samples."""
+    """The Rosenbrock method, with `substeps` steps per sample interval."""
 
     dynamics: RigidDynamics
     substeps: int
 
     def __call__(self, windows: Windows, disturbance: Tensor | None = None) -> States:
-        """Return q and qd, (W, K-1, n); under a disturbance (W, n). What leaves all bounds is NaN."""
+        """Return predicted q and qd, (W, K-1, n); NaN if they diverged. disturbance: see `roll_out_stiff`."""
         with torch.no_grad(), np.errstate(over="ignore", invalid="ignore"):
             return roll_out_stiff(self.dynamics, windows, self.substeps, disturbance)
 
 
 def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
-    """Return the solver with the fewest steps between samples that twice as many agree with on the probe."""
+    """Return the solver with the fewest steps per sample interval whose result twice as many steps confirm."""
     windows = thinned(probe, TUNING.probed_windows)
     motion = (windows.qd - windows.qd[:, :1]).square().mean().sqrt().clamp(min=1e-9)
     solver = Solver(dynamics, 1)
     coarse = solver(windows)[1]
-    # shorter steps are for dynamics that leave all bounds, which are not worth them
+    # only dynamics that diverge would need shorter steps, and cannot be predicted with them either
     while (
         2 * solver.substeps <= TUNING.most_substeps
         and windows.dt.mean() / (2 * solver.substeps) >= TUNING.shortest_step
@@ -54,9 +56,9 @@ def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
 
 @dataclass(frozen=True)
 class Predictor:
-    """Predict windows of K samples: q and qd, both (W, K-1, n), from the first sample and the inputs.
+    """A predictor of windows of K samples: q and qd, both (W, K-1, n), from the first sample and the torques.
 
-    solver: what does so; a `Solver` of the dynamics, where there are any. dynamics: None where a prediction needs none.
+    solver: a `Solver` if there are dynamics, else any function. dynamics: None if the prediction needs none.
     """
 
     name: str
@@ -65,5 +67,24 @@ class Predictor:
 
 
 def of_dynamics(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor:
-    """Return dynamics as a predictor, by as many steps as they themselves need on the probe."""
+    """Return the predictor of some dynamics, with the steps that these need on the probe."""
     return Predictor(name, accurate_solver(dynamics, probe), dynamics)
+
+
+class CommandFollower(Protocol):
+    """Predictor of positions under position commands. about: what it is, and how it was fitted."""
+
+    @property
+    def about(self) -> str: ...
+
+    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
+        """Return the positions at the end of each sample interval.
+
+        Args:
+            parts: rows of logs, each with K sample intervals.
+            q: (parts, n) initial positions [rad, m].
+            qd: (parts, n) initial velocities [rad/s, m/s].
+
+        Returns:
+            (K, n) [rad, m] for each part.
+        """

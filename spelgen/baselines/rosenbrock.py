@@ -1,11 +1,10 @@
-"""Roll out dynamics with stiff friction by ROS2, a Rosenbrock method of order two.
+"""Integrate dynamics with stiff friction by ROS2, a Rosenbrock method of order two.
 
 The order is two for any matrix in place of the Jacobian; with the exact one the method is L-stable (Verwer, Spee, Blom
 and Hundsdorfer, SIAM J. Sci. Comput. 20:1456, 1999).
 
-Here the matrix is the Jacobian of friction alone, so that damping and bristles of any stiffness (light links against a
-jump of dry friction) ask for no smaller steps, and what an explicit method would make of it is not taken for an error
-of the dynamics.
+Here the matrix is the Jacobian of friction only, so that damping and bristles of any stiffness (light links with dry
+friction) need no smaller steps, and the error of an explicit method is not confused with an error of the dynamics.
 """
 
 from __future__ import annotations
@@ -18,22 +17,23 @@ from torch import Tensor
 
 from spelgen.baselines.tuning import TUNING
 from spelgen.dynamics.equations import Pose, poses
-from spelgen.dynamics.protocol import has_friction_state, has_momentum, memory_after, sliding_memory
+from spelgen.dynamics.protocol import is_stateful, memory_after, sliding_memory
 from spelgen.logs.windows import Windows
+from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 GAMMA = 1 - 0.5**0.5  # makes the method L-stable
 
 
 State = tuple[Tensor, Tensor, Tensor]
-"""q and qd, (W, n), and friction's memory z, (W, n, K)."""
+"""q and qd, (W, n), and the friction state z, (W, n, K)."""
 
 
 def roll_out_stiff(
     dynamics: Any, windows: Windows, substeps: int, disturbance: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Return positions and velocities (W, K-1, n) predicted for samples 1..K-1 of each window from its sample 0.
+    """Return positions and velocities (W, K-1, n) at samples 1..K-1 of each window, from its sample 0.
 
-    disturbance: (W, n), as `observe` finds it. A window whose velocity has left all bounds is NaN from there.
+    disturbance: (W, n) of `observe`. After a divergence the states of a window are NaN.
     """
     q, qd = windows.q[:, 0], windows.qd[:, 0]
     z = sliding_memory(dynamics, qd) if windows.z is None else windows.z
@@ -51,19 +51,19 @@ def roll_out_stiff(
         inside = ((qd.abs() <= TUNING.bounds * largest) & q.isfinite()).all(dim=-1, keepdim=True)
         if not inside.any():
             break
-        # NaN once is NaN from there on
+        # NaN propagates to all later samples
         q, qd = torch.where(inside, q, torch.nan), torch.where(inside, qd, torch.nan)
         positions[:, k], velocities[:, k] = q, qd
     return positions, velocities
 
 
 def _stepper(dynamics: Any, width: Tensor, disturbance: Tensor) -> Callable[[State, Tensor, Tensor], State]:
-    """Return what takes a step of M qdd = force of some dynamics from a state, under tau.
+    """Return the function that takes a step of M qdd = force from a state, under tau.
 
-    width: (n,) of the differences by velocity. disturbance: a force where momenta were observed, else an acceleration.
+    width: (n,) finite-difference steps of velocity. disturbance: a force if the state has momenta, else acceleration.
     """
     pose_at = poses(dynamics)
-    is_force = has_momentum(dynamics)
+    is_force = isinstance(dynamics, PortHamiltonian)
 
     def forces(pose: Pose, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
         """Return M qdd, (W, n)."""
@@ -73,7 +73,7 @@ def _stepper(dynamics: Any, width: Tensor, disturbance: Tensor) -> Callable[[Sta
     def step(state: State, tau: Tensor, step: Tensor) -> State:
         """Take one step of (q, qd), with A = [[0, 1], [-M^-1 K, -M^-1 D]].
 
-        D = d friction / d qd and, where friction has a state, K = d friction / d q by the way z follows.
+        D = d friction / d qd and, if friction has a state z, K = d friction / d q through z.
         """
         q, qd, z = state
         pose = pose_at(q)
@@ -84,7 +84,7 @@ def _stepper(dynamics: Any, width: Tensor, disturbance: Tensor) -> Callable[[Sta
         )
 
         def solve(velocity: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
-            """Return (1 - h A)^-1 of a state's two halves; the mass is in the second."""
+            """Return (1 - h A)^-1 of (velocity, force), with the mass in the second row."""
             right = (force - h * stiffness * velocity).unsqueeze(-1)
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
             return velocity + h * solution, solution
@@ -93,7 +93,7 @@ def _stepper(dynamics: Any, width: Tensor, disturbance: Tensor) -> Callable[[Sta
         q2, qd2 = q + step * v1, qd + step * a1
         second = pose_at(q2)
         force = forces(second, qd2, tau, memory_after(dynamics, z, q2 - q))
-        # one singular matrix must not stop the other windows
+        # solve_ex: a singular matrix of one window must not stop the others
         a2 = torch.linalg.solve_ex(second.mass, force)[0] - 2 * a1
         v2, a2 = solve(qd2 - 2 * v1, (pose.mass @ a2.unsqueeze(-1)).squeeze(-1))
         end = q + step * (1.5 * v1 + 0.5 * v2)
@@ -106,14 +106,14 @@ def _stepper(dynamics: Any, width: Tensor, disturbance: Tensor) -> Callable[[Sta
 def _friction_slopes(
     dynamics: Any, pose: Pose, qd: Tensor, z: Tensor, width: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return D and K, (W, n): a joint's friction goes by its own motion."""
+    """Return D and K, (W, n): the friction of a joint depends on its own motion only."""
     # central differences: dry friction jumps at standstill
     slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
-    # friction that falls with velocity is left to the explicit part: its damping would be negative
+    # friction that falls with velocity (negative damping) is integrated by the explicit part
     damping = slope.clamp(min=0)
-    if not has_friction_state(dynamics):
+    if not is_stateful(dynamics):
         return damping, torch.zeros_like(damping)
-    # bristles load the way a joint goes
+    # bristles deflect in the direction of motion
     displacement = TUNING.displacement_step * torch.where(qd < 0, -1.0, 1.0).to(qd)
     bent = pose.friction(qd, memory_after(dynamics, z, displacement))
     return damping, ((bent - pose.friction(qd, z)) / displacement).clamp(min=0)

@@ -7,28 +7,39 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class PredictorTuning:
-    """Constants of the Rosenbrock integration of predictions."""
+    """Integration of predictions by the Rosenbrock method."""
 
-    most_substeps: int = 16  # of dynamics between samples; a power of two
-    shortest_step: float = 1e-3  # [s] of dynamics: shorter ones are for those that leave all bounds
-    # of the error of dynamics, what twice as many steps may change: figures move by a thousandth
+    # [1] Largest number of steps between samples; a power of two.
+    most_substeps: int = 16
+    # [s] Shortest step: only dynamics that diverge would need shorter ones.
+    shortest_step: float = 1e-3
+    # [1] Change by twice as many steps that is allowed, relative to the error of the dynamics: reported figures
+    # change by a thousandth.
     tolerance: float = 5e-2
-    least_error: float = 2e-5  # of the motion: dynamics are not expected to be better
-    probed_windows: int = 16  # that say in which steps dynamics are integrated
-    bounds: float = 100.0  # times the largest velocity that was measured: what is faster has left all bounds
-    # of a joint's largest velocity: differences that friction is differentiated by
+    # [1] Smallest expected error of dynamics, relative to the motion.
+    least_error: float = 2e-5
+    # [1] Windows on which the number of steps is chosen.
+    probed_windows: int = 16
+    # [1] Multiple of the largest measured velocity beyond which a prediction has diverged.
+    bounds: float = 100.0
+    # [1] Finite-difference step of friction with respect to velocity, as a fraction of a joint's largest velocity.
     velocity_step: float = 1e-5
-    displacement_step: float = 1e-7  # [rad, m] likewise, of bristles
+    # [rad, m] Finite-difference step of friction with respect to the displacement of bristles.
+    displacement_step: float = 1e-7
 
 
 @dataclass(frozen=True)
 class PositionActuatorTuning:
-    """Decide how MuJoCo's position actuators are fitted, the baseline of servo fits."""
+    """Fit of MuJoCo's position actuators, the baseline of servo fits."""
 
-    step: float = 5e-3  # [s] at most; frictionloss is as hard as twice this allows
-    windows: int = 60  # half a minute of fitting
-    iterations: int = 8  # of mujoco.minimize
-    nudge: float = 1e-4  # of unknowns, for slopes
+    # [s] Largest step; the time constant of frictionloss is twice this value.
+    step: float = 5e-3
+    # [1] Windows that are fitted: half a minute of computation.
+    windows: int = 60
+    # [1] Iterations of mujoco.minimize.
+    iterations: int = 8
+    # [1] Finite-difference step of the unknowns.
+    nudge: float = 1e-4
 
 
 TUNING, ACTUATORS = PredictorTuning(), PositionActuatorTuning()

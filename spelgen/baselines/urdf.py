@@ -1,34 +1,36 @@
-"""Judge the URDF's own values: rigid bodies with its damping and friction, by Pinocchio.
+"""Baselines with the URDF's own values: rigid bodies, damping and friction, computed by Pinocchio.
 
-A second baseline has the drives of the settings beside the URDF, where these name any.
+A second one adds the drives of the settings beside the URDF, if these define any.
 """
 
 from __future__ import annotations
 
-from spelgen.baselines.baseline import Baseline, JudgedArm
+from spelgen.baselines.baseline import Baseline, EvaluatedArm
 from spelgen.baselines.names import URDF, URDF_WITH_DRIVES
 from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.errors import Diagnostic, in_one_line
 
 
 class UrdfValues(Baseline):
-    """Take an arm for what its URDF says."""
+    """The dynamics that the URDF specifies."""
 
-    def predictors(self, judged: JudgedArm) -> list[Predictor]:
-        """Return one or two predictors; none, and a note, where Pinocchio cannot read the file or is not installed."""
-        if judged.urdf is None:
-            judged.notes.append(_missing("robot.urdf", "no arm is known"))
+    def predictors(self, arm: EvaluatedArm) -> list[Predictor]:
+        """Return one or two predictors; [] and a note if Pinocchio cannot read the file or is not installed."""
+        if arm.urdf is None:
+            arm.notes.append(_missing("robot.urdf", "no arm is known"))
             return []
         try:
             from spelgen.dynamics.pinocchio_urdf import has_drives, urdf_dynamics  # an extra
 
-            plain = urdf_dynamics(judged.urdf, judged.joints)
-            predictors = [of_dynamics(URDF, plain, judged.probe)]
-            if has_drives(judged.urdf, judged.joints):
-                driven = urdf_dynamics(judged.urdf, judged.joints, drives=True)
-                predictors.append(of_dynamics(URDF_WITH_DRIVES, driven, judged.probe))
-        except Exception as error:  # Pinocchio and its parser raise many kinds; the evaluation stands without
-            judged.notes.append(_missing(judged.urdf.name, in_one_line(error)))
+            plain = urdf_dynamics(arm.urdf, arm.joints)
+            predictors = [of_dynamics(URDF, plain, arm.probe)]
+            if has_drives(arm.urdf, arm.joints):
+                driven = urdf_dynamics(arm.urdf, arm.joints, drives=True)
+                predictors.append(of_dynamics(URDF_WITH_DRIVES, driven, arm.probe))
+        except (
+            Exception
+        ) as error:  # Pinocchio and its parser raise many kinds; the evaluation continues without it
+            arm.notes.append(_missing(arm.urdf.name, in_one_line(error)))
             return []
         return predictors
 

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import textwrap
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from spelgen.arm.actuation import Actuation, InputEntry
 from spelgen.arm.arm import Arm, Coordinate
+from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.certificate.facts import Fact, facts
 from spelgen.errors import Diagnostic
 from spelgen.labels import counted, joint_ranges, joints_in_ranges, printable, short_name
 from spelgen.listing import WIDTH, Listing
 from spelgen.structure.servo_rank import servo_rank
-from spelgen.structure.structure import Entry, Structure
+from spelgen.structure.structure import Entry, Structure, derive
+from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:  # SymPy is read in only for formulas
     from spelgen.certificate.formulas import Entry as PlaceOfEntry
@@ -261,3 +264,25 @@ def reach(coordinate: Coordinate) -> str:
     if coordinate.kind == "revolute":
         unit = "rad"
     return f"{coordinate.lower:g} .. {coordinate.upper:g} {unit}"
+
+
+def inspect(
+    arm: ConfiguredArm | str | Path,
+    joints: Sequence[str] | None = None,
+    tip: str | None = None,
+    assume: Assume = "kinematics",
+    *,
+    angle_tolerance: float = 2e-3,
+) -> Inspection:
+    """Return the derived structure of an arm.
+
+    Args:
+        arm: the result of ``load_arm``, or the path of a URDF; the other arguments of ``load_arm`` go with a path.
+        assume: ``kinematics``: the structure for any inertial parameters; ``inertials``: for those of the URDF.
+
+    Raises what ``load_arm`` raises, and ArmError if the URDF has no inertials to assume.
+    """
+    if not isinstance(arm, ConfiguredArm):
+        arm = load_arm(arm, joints, tip, angle_tolerance)
+    structure = derive(arm.arm, assume)
+    return Inspection(arm.arm, structure, arm.actuation, arm.diagnostics, arm.settings.input)

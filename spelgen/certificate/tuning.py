@@ -7,15 +7,22 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class CertificateTuning:
-    """Hold how much of closed forms is written, and what numbers of a check count as rounding."""
+    """How much of the closed forms is written, and which numbers of a verification count as rounding."""
 
-    readable_terms: int = 40  # of an entry that a person reads among others: three lines of a terminal
-    writable_terms: int = 3000  # of an entry that a program reads, or a person who asks for it alone
-    budget: int = 2_000_000  # multiplications of terms for all entries of an arm, about 2 s
-    rounding: float = 1e-12  # of its scale: a smaller number of a check is rounding; what is measured is told
-    form_rounding: float = 1e-6  # the same for the smallest form, whose long fractions are doubles
-    fine: float = 1e-3  # an arm with smaller nonzero numbers may have products that vanish in rounding
-    frame_rounding: float = 1e-9  # [rad, m] per joint: dropped offsets, and composed rotations of 1e-11 each
+    # [1] Terms of an entry that is printed among others: three lines of a terminal.
+    readable_terms: int = 40
+    # [1] Terms of an entry that a program reads, or that is requested by itself.
+    writable_terms: int = 3000
+    # [1] Multiplications of terms for all entries of an arm, about 2 s.
+    budget: int = 2_000_000
+    # [1] A number of a check below this fraction of its scale is rounding; measured differences are reported.
+    rounding: float = 1e-12
+    # [1] The same bound for the smallest form, whose long fractions are evaluated in double precision.
+    form_rounding: float = 1e-6
+    # [1] An arm with smaller nonzero numbers may have products that vanish in rounding.
+    fine: float = 1e-3
+    # [rad, m] Allowed difference of frames per joint: dropped offsets, and composed rotations of 1e-11 each.
+    frame_rounding: float = 1e-9
 
 
 TUNING = CertificateTuning()

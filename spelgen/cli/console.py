@@ -34,7 +34,7 @@ EXTRAS = {
     "onnxruntime": "deploy",
     "onnxscript": "deploy",
     "safetensors": "deploy",
-    "ray": "fleet",
+    "ray": "parallel",
 }
 
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]

@@ -1,4 +1,4 @@
-"""Commands about trained runs: `evaluate`, how good one is, and `report`, all about it on a page."""
+"""Commands about trained runs: `evaluate` measures one on test logs, `report` writes a page about it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import note, progress_bar, say
-from spelgen.cli.options import Data, Filter, MappingFile, MoreData, Output, Run, Trust
+from spelgen.cli.options import Data, Filter, MappingFile, MoreData, Output, Run
 from spelgen.evaluation.tables import LIMITS, csv_text, figures
 
 Format = Literal["text", "json", "csv"]
@@ -32,14 +32,13 @@ def evaluate(
             help=f"Exit with {MISSED} if a figure is larger: {', '.join(LIMITS)}; once for each.",
         ),
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Torque errors alone, without rollouts.")] = False,
-    trust: Trust = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Torque errors only, without rollouts.")] = False,
 ) -> None:
     """Evaluate a trained run and its baselines on test logs.
 
-    The result is also written to evaluation.json in the run folder.
+    The assessment comes first. The result is also written to evaluation.json in the run folder; nothing else is.
     """
-    # a misspelt limit is refused before minutes of rollouts
+    # a misspelt limit is reported before minutes of rollouts
     paths = options.logs(data, extra_logs)
     limits = list(map(_limit, limit or []))
     from spelgen.evaluation.evaluate import SECONDS, STEPS
@@ -52,7 +51,7 @@ def evaluate(
 
     preprocessing = None if filter is None else Preprocessing(cutoff=filter)
     logs = read_test_logs(run, paths, mapping)
-    model = load_run(run, trust=trust)
+    model = load_run(run)
     steps, seconds = ((), ()) if quick else (STEPS, SECONDS)
     with progress_bar("evaluating") as progress:
         results = evaluate_model(
@@ -65,7 +64,7 @@ def evaluate(
         note(diagnostic)
     forms = {"text": results.text, "csv": lambda: csv_text(results).removesuffix("\n")}
     options.write_result(format, output, forms | {"json": lambda: json.dumps(record)})
-    # after the result, so that a script that failed still has the figures
+    # after the result, so that a script gets the figures in any case
     values = {figure.name: figure.value for figure in figures(results)}
     exceeded = []
     for name, largest in limits:
@@ -106,14 +105,8 @@ def report(
         Path | None,
         typer.Option(metavar="ROBOT.urdf", help="URDF with its meshes, for the picture of the arm."),
     ] = None,
-    trust: Trust = False,
 ) -> None:
     """Write an HTML page about one run or several."""
-    from spelgen.fitting.run_folder import RunFolder
-
-    if trust:
-        for run in runs:
-            RunFolder(run).load_module(trust=True)  # a module that ran once may run again
     if robot is not None and len(runs) > 1:
         raise typer.BadParameter("belongs to the page of one run", param_hint="'--robot'")
     if len(runs) == 1:

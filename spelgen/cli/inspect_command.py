@@ -40,10 +40,13 @@ def inspect(
     """Show the exact structure of an arm's dynamics."""
     chosen_entry = options.entry(entry)
     chosen = options.choose_format(format, output, get_args(Format))
+    from spelgen.certificate.inspection import inspect as inspect_arm
+    from spelgen.certificate.verify import verify as verified
+
     arm = options.load(robot, joints, tip, angle_tolerance)
-    inspection = arm.inspect(assume)
+    inspection = inspect_arm(arm, assume=assume)
     # other programs, which take seconds
-    proof = arm.verify(assume) if verify else None
+    proof = verified(arm.robot, arm.arm, inspection.structure) if verify else None
     closed = None
     if formulas or chosen_entry is not None or chosen in ("latex", "sympy"):
         from spelgen.certificate.formulas import WRITABLE

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,7 +26,7 @@ from spelgen.errors import SpelgenErrors
 from spelgen.files import write_text
 
 if TYPE_CHECKING:
-    from spelgen.pipeline.loaded_arm import LoadedArm
+    from spelgen.arm.configured_arm import ConfiguredArm
 
 
 def excite(
@@ -128,7 +129,7 @@ def logs(
     The logs are not changed. The exit code is 1 if they cannot be used for training.
     """
     from spelgen.log_checks.check_logs import check_logs
-    from spelgen.logs.chunks import stream_logs
+    from spelgen.logs.read import read_bounded_logs
     from spelgen.render.logs_page import page
 
     # the URDF says which joints a mapping must name
@@ -137,7 +138,9 @@ def logs(
         options.require_free(suggest, force=force)
         mapping = _suggested(paths, arm, suggest)
     log_mapping = options.log_mapping(arm, mapping, accept)
-    result = check_logs(stream_logs(paths, arm, log_mapping), arm, log_mapping)
+    logs, notes = read_bounded_logs(paths, arm, log_mapping)
+    result = check_logs(logs, arm, log_mapping)
+    result = replace(result, findings=(*notes, *result.findings))
     if format == "text":
         say(result.text())
     else:
@@ -154,7 +157,7 @@ def logs(
         raise typer.Exit(FAILED)
 
 
-def _suggested(paths: list[Path], arm: LoadedArm, file: Path) -> Path:
+def _suggested(paths: list[Path], arm: ConfiguredArm, file: Path) -> Path:
     """Write the mapping that the first log suggests, and return its file; exit with 1 if the log lacks columns."""
     from spelgen.errors import collect
     from spelgen.logs.formats import log_files

@@ -18,12 +18,12 @@ import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
 from spelgen.cli import (
+    compare_command,
     evaluate_command,
     identify_command,
     inspect_command,
     log_commands,
     model_commands,
-    study_commands,
     train_command,
 )
 from spelgen.cli.console import handle_errors, say
@@ -109,8 +109,7 @@ for command in (
     evaluate_command.evaluate,
     evaluate_command.report,
     model_commands.export,
-    study_commands.compare,
-    study_commands.fleet,
+    compare_command.compare,
     model_commands.check,
 ):
     app.command(cls=Command, context_settings=CONTEXT)(handle_errors(command))

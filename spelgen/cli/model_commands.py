@@ -20,12 +20,10 @@ from spelgen.cli.options import (
     RobotOption,
     TextOrJson,
     Tip,
-    Trust,
 )
-from spelgen.design import PRESET_NAMES, Net
+from spelgen.design import PRESET_NAMES
 from spelgen.exporting.exported import Format
 from spelgen.files import write_text
-from spelgen.spec import parse_facts
 
 
 def init(
@@ -63,9 +61,11 @@ def build(
             metavar="NAME|FILE.yaml", help=f"Preset of the model: {', '.join(PRESET_NAMES)}, or a YAML file."
         ),
     ] = "hybrid",
-    net: Annotated[Net | None, typer.Option(help="Kind of networks; default: that of the preset.")] = None,
     width: Annotated[int, typer.Option(min=1, max=4096, help="Hidden units per layer.")] = 64,
     depth: Annotated[int, typer.Option(min=1, max=16, help="Number of hidden layers.")] = 2,
+    standalone: Annotated[
+        bool, typer.Option("--standalone", help="Include the runtime: the module then needs PyTorch only.")
+    ] = False,
     output: Annotated[
         Path | None,
         options.output_option("MODULE.py", "Output file; default: <robot>_spel.py in this folder."),
@@ -78,26 +78,28 @@ def build(
     if preset not in PRESET_NAMES and Path(preset).suffix not in (".yaml", ".yml"):
         message = f"{preset!r} is none of {', '.join(PRESET_NAMES)}, nor a YAML file"
         raise typer.BadParameter(message, param_hint="'--preset'")
-    # an option without effect would pass for one that was applied
-    if net is not None and preset == "closed-form":
-        raise typer.BadParameter("closed-form has no networks", param_hint="'--net'")
-    from spelgen.pipeline.generate import generate
+    from spelgen.emission.build import make_spec
+    from spelgen.emission.text import module_text
 
     arm = options.load(robot, joints, tip, angle_tolerance)
     path = output or Path(f"{robot.stem}_spel.py")
-    source = generate(arm, preset, net=net, width=width, depth=depth, assume=assume, module=path)
+    spec = make_spec(arm, preset, width=width, depth=depth, assume=assume, module=path)
+    source = module_text(spec, standalone=standalone)
     # the same text: nothing is replaced, and its date stays
     is_new = not path.is_file() or path.read_bytes() != source.encode()
     line = f"{path} is up to date"
     if is_new:
         options.require_free(path, force=force)
         line = f"wrote {write_text(path, source)}"
-    answer(format, {"module": str(path), "new": is_new} | asdict(parse_facts(source)), line)
+    record: dict[str, object] = {"module": str(path), "new": is_new, "robot": spec.robot, "urdf": spec.urdf}
+    record |= {"urdf_sha256": spec.urdf_sha256, "spec_sha256": spec.sha256, "options": asdict(spec.options)}
+    record |= {"joints": spec.joint_names, "joint_types": spec.joint_types}
+    answer(format, record, line)
 
 
 def check(module: Module, robot: RobotOption = None) -> None:
     """Check whether a module is up to date with its URDF."""
-    from spelgen.pipeline.generate import check as check_module
+    from spelgen.certificate.module_check import check as check_module
 
     result = check_module(module, robot)
     for reason in result.reasons:
@@ -123,7 +125,6 @@ def export(
         ),
     ] = None,
     force: Force = False,
-    trust: Trust = False,
     format: TextOrJson = "text",
 ) -> None:
     """Export a trained model to other tools. Each export is compared with the model before it is written.
@@ -141,7 +142,7 @@ def export(
     # names and free places are checked before the model is loaded, which takes seconds
     require_fitting(to, output)
     options.require_free(output, force=force)
-    result = export_run(load_run(run, trust=trust), to, entries=entry or ())
+    result = export_run(load_run(run), to, entries=entry or ())
     # all or nothing: a failed parity check above has left no file
     files = [str(path) for path in result.write(output, force=force)]
     lines = [f"wrote {path}" for path in files]

@@ -17,8 +17,8 @@ from spelgen.settings.log_mapping import Accepted
 from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:
+    from spelgen.arm.configured_arm import ConfiguredArm
     from spelgen.logs.arm_mapping import LoggedArm
-    from spelgen.pipeline.loaded_arm import LoadedArm
     from spelgen.settings.log_mapping import LogMapping
 
 SUFFIXES = {".json": "json", ".csv": "csv", ".html": "html", ".tex": "latex", ".py": "sympy"}
@@ -99,10 +99,6 @@ Filter = Annotated[
         min=0.0,
         help="Cutoff frequency of the zero-phase low-pass filter; 0: no filter.",
     ),
-]
-Trust = Annotated[
-    bool,
-    typer.Option("--trust", help="Execute the module of the run folder even if spelgen did not write it."),
 ]
 Address = Annotated[
     str | None,
@@ -189,9 +185,9 @@ def log_mapping(arm: LoggedArm, mapping: Path | LogMapping | None, codes: Sequen
     return chosen.model_copy(update={"accept": tuple(accepted)})
 
 
-def load(robot: Path, joints: str | None, tip: str | None, angle_tolerance: float) -> LoadedArm:
+def load(robot: Path, joints: str | None, tip: str | None, angle_tolerance: float) -> ConfiguredArm:
     """Return the arm that a command names."""
-    from spelgen.pipeline.loaded_arm import load_arm
+    from spelgen.arm.configured_arm import load_arm
 
     return load_arm(robot, names(joints), tip, angle_tolerance)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,8 +12,9 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
-from spelgen.cli.options import Accept, Data, Force, MappingFile, MoreData, RobotOption, TextOrJson, Trust
+from spelgen.cli.options import Accept, Data, Force, MappingFile, MoreData, RobotOption, TextOrJson
 from spelgen.cli.train_settings import (
+    TIME_LIMIT,
     Request,
     UsageError,
     new_run,
@@ -24,10 +24,10 @@ from spelgen.cli.train_settings import (
 from spelgen.errors import ModuleError, OptionError
 from spelgen.labels import counted
 from spelgen.settings.fits import Objective, Rollout, WindowConfig
-from spelgen.spec import read_facts
 
 if TYPE_CHECKING:
     from spelgen.fitting.fitted import Fit
+    from spelgen.spec import ModelSpec
 
 
 TrainModule = Annotated[
@@ -67,7 +67,6 @@ def train(
     mapping: MappingFile = None,
     resume: Resume = False,
     force: Force = False,
-    trust: Trust = False,
     source: Source = None,
     objective: ObjectiveName = None,
     assignments: Assignments = None,
@@ -86,28 +85,27 @@ def train(
         from spelgen.fitting.run_folder import RunFolder
 
         if module is not None:
-            extra_logs = [module, *(extra_logs or [])]  # with --from, all that stands there is logs
+            extra_logs = [module, *(extra_logs or [])]  # with --from, all arguments are logs
         run = RunFolder(source)
-        run.read_config()  # where there is no run, this says so
-        module = run.module
+        run.read_record()  # raises an error if there is no run
         robot = robot or (run.urdf if run.urdf.exists() else None)
         request = _warm_start(request)
     elif "adapt" in request.values:
         raise UsageError("--set adapt: belongs to --from")
-    if module is None:
+    elif module is None:
         raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
     paths = options.logs(data, extra_logs)
     # `train RUN --resume` names the folder where a module stands otherwise
-    folder = output or (module if resume and module.is_dir() else Path("runs") / module.stem)
-    urdf = None if resume else robot or _unchanged_urdf(module)
-    start = resumed_run(folder, request) if resume else new_run(module, urdf, request)
+    folder = output or _default_folder(module, source, resume=resume)
+    spec = _specification(module, source, folder if resume else None)
+    urdf = None if resume else robot or (None if module is None else _unchanged_urdf(module, spec))
+    start = resumed_run(folder, request) if resume else new_run(urdf, request)
+    from spelgen.emission.build import arm_of_spec
     from spelgen.log_checks.check_logs import require_sound_logs
-    from spelgen.pipeline.loaded_arm import arm_of_module
 
-    facts = read_facts(start.module)
-    # the mapping may speak of all joints of a URDF, and logs are checked beside the arm
-    arm = None if urdf is None else arm_of_module(facts, urdf)
-    log_mapping = options.log_mapping(arm or facts.joints, mapping or start.mapping, accept)
+    # the mapping may contain all joints of a URDF, and logs are checked with the arm
+    arm = None if urdf is None else arm_of_spec(spec, urdf)
+    log_mapping = options.log_mapping(arm or spec.joint_names, mapping or start.mapping, accept)
     # torch is imported where it is needed: --help and mistakes are answered at once
     from spelgen.fitting.fit import RunOptions
     from spelgen.fitting.train import train as train_files
@@ -118,33 +116,29 @@ def train(
     run_options = RunOptions(**machine, resume=resume, force=force, mapping=log_mapping, began=start_time)
     try:
         fit = train_files(
-            start.module,
+            module,
             paths,
             folder,
-            start.config,
+            start.options,
             urdf=urdf,
             source=source,
             preprocessing=Preprocessing(**start.settings.preprocessing),
             validation=start.settings.validation_fraction,
             seed=start.settings.seed,
-            trust=trust,
             require=lambda logs: [] if arm is None else require_sound_logs(logs, arm, log_mapping),
             options=run_options,
         )
     except OptionError as error:
         option = "--objective" if error.option == "objective" else f"--set {error.option}"
         raise UsageError(f"{option}: {error.got}") from error
-    _tell(fit, folder, paths, format, resume=resume)
+    _report(fit, request, folder, format)
 
 
-def _tell(fit: Fit, folder: Path, paths: Sequence[Path], format: str, *, resume: bool) -> None:
-    """Print how the fit ended, and keep the baselines of a new run; exit with 130 if it was interrupted."""
-    # a resumed run has its baselines already, and an interrupted one is not finished
-    interrupted = fit.status == "interrupted"
-    if not resume and not interrupted:
-        from spelgen.evaluation.keep import keep_baseline
-
-        keep_baseline(folder, paths)
+def _report(fit: Fit, request: Request, folder: Path, format: str) -> None:
+    """Print the outcome of the fit; exit with 130 if it was interrupted."""
+    if TIME_LIMIT in request.values and TIME_LIMIT not in type(fit.config).model_fields:
+        objective = fit.config.objective
+        note(f"info: {TIME_LIMIT} limits fits to windows; these logs are fitted by {objective}")
     record = {
         "run": str(folder),
         "status": fit.status,
@@ -152,30 +146,30 @@ def _tell(fit: Fit, folder: Path, paths: Sequence[Path], format: str, *, resume:
         "steps": fit.steps,
         "epochs": fit.epochs,
         "seconds": fit.seconds,
-        # a rollout may have left all bounds, and JSON has no word for that
+        # JSON has no infinity, the loss of a rollout that diverged
         "validation_loss": fit.best_validation if math.isfinite(fit.best_validation) else None,
         "torque_nmse": fit.torque_nmse,
         "findings": [finding.to_dict() for finding in fit.diagnostics],
     }
     answer(format, record, *_outcome(fit), f"run folder: {folder}")
-    if interrupted:
+    if fit.status == "interrupted":
         note("the best model so far is in the run folder; resume it by --resume")
         raise typer.Exit(INTERRUPTED)
 
 
 def _outcome(fit: Fit) -> tuple[str, str]:
-    """Return how a fit ended, with the reason where its status does not say it, and what it came to."""
+    """Return the end of a fit, with a reason in addition to its status, and its result."""
     from spelgen.fitting.servo.report import servo_summary
 
     config, result = fit.config, fit.result
     reason = ""
     if fit.status == "out of time" and isinstance(config, WindowConfig):
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
-    if not isinstance(config, Rollout):  # windows only judge
-        summary = servo_summary(fit.record)
+    if not isinstance(config, Rollout):  # windows only measure the model
+        summary = servo_summary(fit.record.servo)
         if summary is not None:
             result = summary.text
-        elif not fit.record["validation_windows"]:
+        elif not fit.record.validation_windows:
             result = f"{fit.steps} steps were taken"
         return f"{fit.status}: {config.objective} fitted in {fit.seconds:.0f} s{reason}", result
     if fit.status == "stopped early":
@@ -187,7 +181,7 @@ def _outcome(fit: Fit) -> tuple[str, str]:
 
 
 def _warm_start(request: Request) -> Request:
-    """Return the request for a model that was fitted before: by default its load is fitted to torques."""
+    """Return the request to adapt a fitted model: by default its load, to torques."""
     objective, values = request.objective or "torque", dict(request.values)
     if objective == "torque":
         values.setdefault("adapt", "load")
@@ -196,16 +190,37 @@ def _warm_start(request: Request) -> Request:
     return Request(objective, values, warm_start=True)
 
 
-def _unchanged_urdf(module: Path) -> Path | None:
-    """Return the URDF of the module's name near it, where it is still the one the module was built from."""
-    from spelgen.pipeline.generate import find_urdf
+def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -> Path:
+    """Return the run folder: with --resume the argument may be the folder itself."""
+    if resume and module is not None and module.is_dir():
+        return module
+    return Path("runs") / (
+        module.stem if module is not None else f"{(source or Path()).resolve().name}_adapted"
+    )
+
+
+def _specification(module: Path | None, source: Path | None, resumed: Path | None) -> ModelSpec:
+    """Return the specification of the model: of a run that is resumed or adapted, or of a module."""
+    from spelgen.emission.loading import read_spec
+    from spelgen.fitting.run_folder import RunFolder
+
+    folder = resumed or source
+    return (
+        read_spec(module)
+        if folder is None and module is not None
+        else RunFolder(folder or Path()).read_spec()
+    )
+
+
+def _unchanged_urdf(module: Path, spec: ModelSpec) -> Path | None:
+    """Return the URDF near a module, None if it is not the one that the module was built from."""
+    from spelgen.emission.build import find_urdf
     from spelgen.urdf.document import urdf_bytes
 
-    facts = read_facts(module)
     try:
-        path = find_urdf(module, facts.urdf)
+        path = find_urdf(module, spec.urdf)
     except ModuleError:
         return None
     # settings and limits of a changed URDF would belong to another arm
-    is_same = hashlib.sha256(urdf_bytes(path)).hexdigest() == facts.urdf_sha256
+    is_same = hashlib.sha256(urdf_bytes(path)).hexdigest() == spec.urdf_sha256
     return path if is_same else None

@@ -1,1 +1,1 @@
-"""Every preset trained on the same data with the same care, judged side by side, next to published figures."""
+"""Train presets on the same logs and compare them: arms x presets x seeds x splits."""

@@ -1,237 +1,185 @@
-"""A comparison: one robot's logs, a module for each variant, a run for each seed; interrupted, it goes on.
-
-The simulated robot is known to the models by its kinematics alone, or with inertials that are wrong: they are built
-from such a copy of the URDF, and without the sidecar's drives, so that no model starts from the truth that it is judged
-by. With kinematics alone all are trained for the same steps, as the robot's settings say; with wrong inertials as
-`spelgen train` does by itself.
-"""
+"""A comparison from its arms to its results: prepare the inputs, estimate the time, run what is not finished."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import statistics
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
-from typing import Any, cast
 
-import yaml
-from pydantic import TypeAdapter
+import torch
 
-from spelgen.comparison.known_urdf import known_urdf
-from spelgen.comparison.metrics import RunResult
-from spelgen.design import Design, Net, Preset, load_design
-from spelgen.errors import RunError, SettingsError
-from spelgen.files import read_json, write_json, write_text
-from spelgen.fitting.window.momentum import TUNING
-from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.read import read_logs, write_logs
-from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.generate import generate, require_own_module
-from spelgen.pipeline.loaded_arm import LoadedArm, load_arm
-from spelgen.settings.comparison import ComparisonSettings
-from spelgen.settings.fits import Rollout, fit_config
-from spelgen.settings.settings import Settings
-from spelgen.spec import read_facts
+from spelgen.baselines.names import MODEL
+from spelgen.comparison.arms import Comparison, ablation_designs
+from spelgen.comparison.figures import step_seconds
+from spelgen.comparison.inputs import ArmInputs, Progress, arm_inputs
+from spelgen.comparison.jobs import Job, RunResult, run_job
+from spelgen.comparison.tuning import ComparisonTuning
+from spelgen.design import PRESET_NAMES, load_design
+from spelgen.errors import RunError, SpelgenError, in_one_line
+from spelgen.evaluation.plain import record
+from spelgen.files import write_json
+from spelgen.labels import counted
+from spelgen.listing import number
+from spelgen.settings.settings import load_settings
+from spelgen.tasks import RunTasks
 
-SCHEMA = 6
-
-
-@dataclass(frozen=True)
-class Variant:
-    """A preset, or a design of one's own, with a kind of network."""
-
-    name: str
-    preset: Preset | Design
-    net: Net | None = None
-
-
-VARIANTS = (
-    Variant("phnode", "phnode"),
-    Variant("spel", "spel"),
-    Variant("spel-kan", "spel-kan"),
-    Variant("minimal", "minimal"),
-    Variant("hybrid", "hybrid"),
-    Variant("hybrid-kan", "hybrid", "kan"),
-    Variant("closed-form", "closed-form"),
-)
-
-
-def ablation_variants() -> tuple[Variant, ...]:
-    """From phnode to hybrid, one change after the other."""
-    phnode = load_design("phnode")
-    friction = replace(phnode, dissipation="per-joint")
-    inputs = replace(friction, input="derived")
-    outputs = replace(inputs, mass="derived")
-    return (
-        Variant("phnode", "phnode"),
-        Variant("per-joint-friction", friction),
-        Variant("known-inputs", inputs),
-        Variant("fewest-outputs", outputs),
-        Variant("minimal", "minimal"),
-        Variant("hybrid", "hybrid"),
-    )
+TUNING = ComparisonTuning()
+SCHEMA = 1
+PRESETS_ON_LOGS = ("closed-form", "hybrid")
 
 
 @dataclass(frozen=True)
 class Study:
-    """The files of a comparison.
+    """A comparison that is ready to run.
 
-    source: the robot's own URDF. logs: train.parquet and test.parquet. kinematics.urdf: what the models are
-    built from. modules and runs by variant and seed; each finished run holds result.json. training: None, as
-    `spelgen train` does by itself. urdf_error: of the inertials that the models know (see `with_wrong_inertials`);
-    None: they know none.
+    jobs: all runs. results: those that are finished, by the name of the run. failures: reason, by the name of an arm or
+    run. estimates: expected time of the other runs [s], by name.
     """
 
     folder: Path
-    source: Path
-    robot: str
-    settings: ComparisonSettings
-    training: Rollout | None
-    preprocessing: Preprocessing
-    validation_fraction: float
-    variants: tuple[Variant, ...]
-    urdf_error: float | None
+    jobs: tuple[Job, ...]
+    results: dict[str, RunResult]
+    failures: dict[str, str]
+    estimates: dict[str, float]
 
     @property
-    def window(self) -> int:
-        """Samples predicted together in training."""
-        return (self.training or Rollout()).window
+    def arms(self) -> dict[str, list[RunResult]]:
+        """Return the results of each arm, in the order of the jobs."""
+        arms: dict[str, list[RunResult]] = {}
+        for job in self.jobs:
+            if job.name in self.results:
+                arms.setdefault(job.arm, []).append(self.results[job.name])
+        return arms
 
-    @property
-    def decimation(self) -> int:
-        """Samples of a log from one sample of a window to the next."""
-        return self.preprocessing.decimation or 1
-
-    @property
-    def logs(self) -> Path:
-        return self.folder / "logs"
-
-    @property
-    def urdf(self) -> Path:
-        return self.folder / "kinematics.urdf"
-
-    def module(self, variant: Variant) -> Path:
-        return self.folder / f"{variant.name.replace('-', '_')}.py"
-
-    def read_logs(self, role: str) -> list[Trajectory]:
-        """Return the logs to `train` on or to `test` with."""
-        return read_logs([self.logs], read_facts(self.module(self.variants[0])).joints, role=role)
-
-    def run(self, variant: Variant, seed: int) -> Path:
-        return self.folder / "runs" / f"{variant.name}-{seed}"
-
-    def result(self, variant: Variant, seed: int) -> Path:
-        return self.run(variant, seed) / "result.json"
-
-    def results(self) -> Iterator[RunResult]:
-        """Yield the measurements of every finished run."""
-        for variant in self.variants:
-            for seed in range(self.settings.seeds):
-                if self.result(variant, seed).exists():
-                    yield RunResult.read(self.result(variant, seed))
+    def announcement(self, parallel: int) -> str:
+        """Return the number of runs, and an estimate of the time of those that are not finished."""
+        counts = [
+            counted(len({job.arm for job in self.jobs}), "arm"),
+            counted(len({job.design for job in self.jobs}), "preset"),
+            counted(len({job.seed for job in self.jobs}), "seed"),
+            counted(len({job.split for job in self.jobs}), "split"),
+        ]
+        text = f"{counted(len(self.jobs), 'run')} ({', '.join(counts)})"
+        if self.results:
+            text += f", {len(self.results)} finished before"
+        if not self.estimates:
+            return text
+        # parallel runs end together at best, and not before the longest one
+        seconds = max(sum(self.estimates.values()) / parallel, *self.estimates.values(), 0.0)
+        return f"{text}; estimated time {duration(seconds)}"
 
 
-def prepare_study(
-    robot: Path,
-    folder: Path,
-    *,
-    variants: Sequence[Variant] = VARIANTS,
-    seeds: int | None = None,
-    steps: int | None = None,
-    urdf_error: float | None = None,
-    force: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> Study:
-    """Simulate the logs and write the modules, or find them as an earlier call left them.
+def prepare_study(comparison: Comparison, folder: Path, progress: Progress | None = None) -> Study:
+    """Prepare the inputs of all arms, find finished runs, and estimate the time of the others.
 
-    Raises RunError where the folder holds another comparison, or modules that spelgen does not write so, SettingsError
-    where the arm has position servos, and what `load_arm` and `simulate` raise.
+    An arm whose inputs cannot be prepared is a failure. Raises SettingsError for a preset that does not exist,
+    RunError if no arm can be used, and the error of a single arm.
     """
-    loaded = load_arm(robot)
-    if loaded.settings.input == "position":
-        raise SettingsError(
-            "position servos", file=robot.with_suffix(".yaml"), element="input",
-            expected="torques: by these presets are compared",
-            do="`spelgen train` fits what servos have to beat beside the model, `spelgen evaluate` compares them",
-        )  # fmt: skip
-    settings = loaded.settings.comparison
-    chosen = {"seeds": seeds or settings.seeds, "steps": steps or settings.steps}
-    settings = settings.model_copy(update=chosen)
-    training = None
-    if urdf_error is None:
-        training = _training(loaded.settings, settings)
-    study = Study(
-        folder=folder,
-        source=robot,
-        robot=loaded.arm.name,
-        settings=settings,
-        training=training,
-        # simulated states have no noise that a filter would take away
-        preprocessing=Preprocessing(**{**loaded.settings.training.preprocessing, "cutoff": 0.0}),
-        validation_fraction=loaded.settings.training.validation_fraction,
-        variants=tuple(variants),
-        urdf_error=urdf_error,
-    )
-    description = _description(study, loaded)
-    path = folder / "study.json"
-    if path.exists() and not force:
-        if read_json(path, RunError) != description:
-            hint = "--force begins anew, -o names another folder"
-            raise RunError("a comparison with other settings", file=path, do=hint)
-        for variant in study.variants:  # the folder may come from elsewhere
-            require_own_module(study.module(variant), study.urdf)
-        return study
-    for name in ("result.json", "checkpoint.pt"):  # else another comparison's runs would go on
-        for old in sorted(folder.glob(f"runs/*/{name}")):
-            old.unlink()
-    _write_logs(study, loaded, progress)
-    _write_modules(study, loaded)
-    write_json(path, description)
-    return study
+    for preset in set(comparison.presets or ()) - ablation_designs().keys():
+        load_design(preset)
+    jobs: list[Job] = []
+    failures: dict[str, str] = {}
+    for name, arm in comparison.arms.items():
+        try:
+            inputs = arm_inputs(arm, folder / "arms" / name, comparison.splits, progress)
+            jobs += _jobs(name, inputs, comparison, folder / "runs" / name)
+        except SpelgenError as error:
+            if len(comparison.arms) == 1:
+                raise
+            failures[name] = _reason(error)
+    if not jobs:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in failures.items())
+        raise RunError(f"no arm that can be compared ({reasons})")
+    finished = {job.name: job.result() for job in jobs}
+    results = {name: result for name, result in finished.items() if result is not None}
+    estimates: dict[str, float] = {}
+    known: dict[tuple[str, str], float] = {}
+    for job in jobs:
+        if job.name not in results:
+            # runs that differ only by seed or split take about the same time
+            alike = (job.arm, job.preset)
+            if alike not in known:
+                known[alike] = _estimate(job, results)
+            estimates[job.name] = known[alike]
+    return Study(folder, tuple(jobs), results, failures, estimates)
 
 
-def _write_modules(study: Study, loaded: LoadedArm) -> None:
-    """Write the URDF that the models know, and a module of each variant."""
-    study.urdf.write_bytes(known_urdf(study.source, study.urdf_error))
-    gravity = yaml.safe_dump({"gravity": list(loaded.settings.gravity)})
-    write_text(study.urdf.with_suffix(".yaml"), gravity)
-    width, depth = study.settings.width, study.settings.depth
-    for variant in study.variants:
-        source = generate(study.urdf, variant.preset, net=variant.net, width=width, depth=depth)
-        write_text(study.module(variant), source)
+def run_study(study: Study, run_tasks: RunTasks, note: Callable[[str], None]) -> Study:
+    """Run the jobs that are not finished and return the study with their results; comparison.json has these too.
+
+    note: called with a line for each run that ends. A run with an error is a failure; the same command runs it again.
+    """
+    waiting = [job for job in study.jobs if job.name in study.estimates]
+    results, failures = dict(study.results), dict(study.failures)
+    start, done, total = time.monotonic(), 0.0, sum(study.estimates.values())
+    for count, (job, outcome) in enumerate(run_tasks(run_job, waiting), start=1):
+        done += study.estimates[job.name]
+        if isinstance(outcome, Exception):
+            failures[job.name] = _reason(outcome)
+            line = f"failed: {failures[job.name]}"
+        else:
+            results[job.name] = outcome
+            measure, errors = next(iter(outcome.errors.items()))
+            line = f"{measure} {number(errors[MODEL])}, {outcome.seconds:.0f} s"
+        if count < len(waiting):
+            line += f"; about {duration((time.monotonic() - start) * (total / done - 1))} left"
+        note(f"{count}/{len(waiting)} {job.name}: {line}")
+    finished = replace(study, results=results, failures=failures, estimates={})
+    # curves are only in result.json of each run
+    figures = [record(replace(result, simulated=None)) for result in results.values()]
+    write_json(study.folder / "comparison.json", {"schema": SCHEMA, "failures": failures, "results": figures})
+    return finished
 
 
-def _training(settings: Settings, comparison: ComparisonSettings) -> Rollout:
-    """Return how every variant is trained: without the URDF's regularizer, which would tell the answer."""
-    epochs = -(-comparison.steps // TUNING.epoch_steps)
-    options: dict[str, object] = {
-        "urdf_weight": 0.0, "epochs": epochs, "patience": epochs, "momentum_steps": comparison.momentum_steps
-    }  # fmt: skip
-    if comparison.weight_decay is not None:
-        options["weight_decay"] = comparison.weight_decay
-    defaults = settings.training.options
-    return cast("Rollout", fit_config("rollout", rigid_bodies=False, options=options, defaults=defaults))
+def duration(seconds: float) -> str:
+    """Return a time in words, such as `40 s`, `12 min` or `3.5 h`."""
+    if seconds < 90:
+        return f"{max(seconds, 1):.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
-def _description(study: Study, loaded: LoadedArm) -> dict[str, object]:
-    """Return what must be the same for a comparison to go on; seeds may be added."""
-    apart: Any = {"folder": True, "source": True, "settings": {"seeds"}, "variants": {"__all__": {"preset"}}}
-    return {
-        "schema": SCHEMA,
-        "urdf_sha256": loaded.robot.digest,
-        "simulation": loaded.settings.simulation.model_dump(mode="json"),
-        "tracking": loaded.settings.tracking.model_dump(mode="json"),
-        **TypeAdapter(Study).dump_python(study, mode="json", exclude=apart),
+def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) -> list[Job]:
+    """Return the runs of an arm, seed by seed, so that an interrupted comparison has all presets of the first seeds."""
+    settings = load_settings(inputs.truth or inputs.urdf)
+    protocol, presets, seeds = settings.comparison, PRESET_NAMES, settings.comparison.seeds
+    if inputs.truth is None:
+        presets, seeds = PRESETS_ON_LOGS, 1
+    options = {
+        name: value for name, value in comparison.training if name in comparison.training.model_fields_set
     }
+    shared = {
+        "arm": name, "inputs": inputs, "splits": comparison.splits,
+        "width": comparison.width or protocol.width, "depth": comparison.depth or protocol.depth,
+        "training": settings.training.model_copy(update=options),
+        "protocol": protocol.model_copy(update={"steps": comparison.steps or protocol.steps}),
+    }  # fmt: skip
+    axes = range(comparison.seeds or seeds), range(comparison.splits), comparison.presets or presets
+    jobs = []
+    for seed, split, design in product(*axes):
+        run = folder / f"{Path(design).stem}-seed{seed}-split{split}"
+        jobs.append(
+            Job.model_validate({**shared, "design": design, "seed": seed, "split": split, "folder": run})
+        )
+    return jobs
 
 
-def _write_logs(study: Study, loaded: LoadedArm, progress: Callable[[int, int], None] | None) -> None:
-    from spelgen.simulation.simulate import simulate
+def _estimate(job: Job, results: Mapping[str, RunResult]) -> float:
+    """Return the expected time of a run [s]: of finished runs of this arm and preset, else of its training steps."""
+    known = [x.seconds for x in results.values() if (x.arm, x.preset) == (job.arm, job.preset)]
+    if known:
+        return statistics.median(known) + TUNING.measuring
+    if job.inputs.truth is None:
+        return TUNING.run_on_logs
+    torch.set_num_threads(1)
+    training, _ = job.inputs.split(job.split, job.splits)
+    step = step_seconds(job.build(), training, job.equal_steps(), job.training.decimation or 1)
+    return (job.protocol.steps + TUNING.momentum_cost * job.protocol.momentum_steps) * step + TUNING.measuring
 
-    result = simulate(loaded, progress=progress)
-    names = loaded.arm.joint_names
-    training = result.train
-    if study.settings.first is not None:  # the seconds that are trained on
-        training = tuple(x[: int((x.t - x.t[0] < study.settings.first - 1e-9).sum())] for x in training)
-    study.logs.mkdir(parents=True, exist_ok=True)
-    write_logs(study.logs / "train.parquet", training, names)
-    write_logs(study.logs / "test.parquet", result.test, names)
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, SpelgenError):
+        return " ".join(str(error).split())
+    return f"unexpected {in_one_line(error)}"

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 
 from spelgen.design import BRISTLE_REACH
-from spelgen.dynamics.protocol import has_friction_state, motors_of
+from spelgen.dynamics.protocol import motors_of
+from spelgen.runtime.port_hamiltonian import PortHamiltonian
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +41,9 @@ def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleR
     return BristleReach(np.array([BRISTLE_REACH[kind] for kind in kinds]), motors)
 
 
-def bristle_reach(model: Any) -> BristleReach:
+def bristle_reach(model: PortHamiltonian) -> BristleReach:
     """Of a model."""
-    if not has_friction_state(model):
+    if not isinstance(model, RigidBodyDynamics) or not model.elements:
         return BristleReach(np.zeros((model.n, 0)))
     width = model.friction.prepare().coulomb_smoothing_velocity
     tensors = (model.friction.reach, motors_of(model), width)

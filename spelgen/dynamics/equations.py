@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from spelgen.dynamics.protocol import has_momentum, known_past, memory_after
+from spelgen.dynamics.protocol import known_past, memory_after
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 
@@ -33,7 +33,7 @@ PoseAt = Callable[[Tensor], Pose]
 
 def poses(dynamics: object) -> PoseAt:
     """Return what gives these dynamics at positions; weights must not change meanwhile."""
-    if has_momentum(dynamics):
+    if isinstance(dynamics, PortHamiltonian):
         return partial(_of_weights, dynamics, dynamics.prepare())
     # dynamics by a regressor have their own
     pose_at: PoseAt = getattr(dynamics, "pose_at", partial(_of_any, dynamics))

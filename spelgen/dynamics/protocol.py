@@ -1,12 +1,15 @@
-"""What everything has that moves like an arm: emitted modules, Pinocchio's models, models of least squares."""
+"""The interface of all dynamics of an arm: assembled models, models of Pinocchio, models of least squares."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeGuard
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeGuard, runtime_checkable
 
 import torch
 
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
+from spelgen.runtime.residual_dynamics import ResidualDynamics
+from spelgen.runtime.residual_terms import ResidualTerms
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -41,68 +44,51 @@ class RigidDynamics(Protocol):
         """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
 
 
-class ResidualModel(PortHamiltonian):
-    """A model with functions of joints and networks beside its rigid bodies; None where they were taken off."""
-
-    residuals: Any  # see `runtime.residual_terms`
-
-
+@runtime_checkable
 class FrictionState(Protocol):
     """Friction that depends on the state z of bristles, (..., n, elements) [rad, m]."""
 
-    elements: int
-    friction: Any  # the laws, see `runtime.friction_laws`
+    @property
+    def elements(self) -> int:
+        """Bristles per joint."""
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return z of joints that have long gone the way of qd."""
+        """Return z, (..., n, elements), of joints that have moved at qd for a long time."""
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """Return z after joints went one way by (..., n)."""
+        """Return z after a monotonic displacement of the joints, (..., n)."""
 
 
-def has_rigid_bodies(model: object) -> bool:
-    """Return whether a model is made of rigid bodies, with inertial parameters and friction by laws."""
-    return hasattr(model, "inertial_parameters")
+def residual_terms(model: object) -> ResidualTerms | None:
+    """Return the residual terms of a model; None of a model without any, or of one that they were removed from."""
+    return model.residuals if isinstance(model, ResidualDynamics) else None
 
 
-def has_residuals(model: object) -> TypeGuard[ResidualModel]:
-    """Return whether a model has functions of joints and networks beside its rigid bodies."""
-    return getattr(model, "residuals", None) is not None
-
-
-def has_friction_state(model: object) -> TypeGuard[FrictionState]:
-    """Return whether the model's friction depends on the state z of bristles, which all calls then take last."""
-    return getattr(model, "elements", 0) > 0
+def is_stateful(dynamics: object) -> TypeGuard[FrictionState]:
+    """Return whether friction depends on the state z of bristles, the last argument of all calls."""
+    return isinstance(dynamics, FrictionState) and dynamics.elements > 0
 
 
 def motors_of(model: Any) -> Tensor:
-    """Return C, (n, n): the drives' speeds are C qd; the identity where each drive moves its own joint alone."""
-    if hasattr(model, "motors"):
-        motors: Tensor = model.motors
-        return motors
-    return torch.eye(model.n).to(model.friction.nominal)
+    """Return C, (n, n): the motors rotate at C qd; the identity if each motor drives its own joint."""
+    return torch.eye(model.n).to(model.friction.nominal) if model.motors is None else model.motors
 
 
 def input_of(model: object) -> Literal["torque", "position"]:
-    """Return what a model's inputs are: torques, or commands of position servos."""
-    return "position" if hasattr(model, "servo") else "torque"
-
-
-def has_momentum(dynamics: object) -> TypeGuard[PortHamiltonian]:
-    """Return whether momenta can be its state (see ``PortHamiltonian``)."""
-    return hasattr(dynamics, "momentum")
+    """Return the quantity of the inputs of a model: torques, or commands of position servos."""
+    return "position" if isinstance(model, RigidBodyDynamics) and model.servo is not None else "torque"
 
 
 def sliding_memory(dynamics: object, qd: Tensor) -> Tensor:
     """z, (..., n, K), of joints that have long gone the way of qd."""
-    if not has_friction_state(dynamics):
+    if not is_stateful(dynamics):
         return qd.unsqueeze(-1)[..., :0]
     return dynamics.memory(qd)
 
 
 def memory_after(dynamics: object, z: Tensor, displacement: Tensor) -> Tensor:
     """z after joints went one way by (..., n)."""
-    if not z.shape[-1] or not has_friction_state(dynamics):
+    if not z.shape[-1] or not is_stateful(dynamics):
         return z
     return dynamics.memory_after(z, displacement)
 
@@ -123,9 +109,9 @@ def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = No
 
     direction: (..., n) of dry friction without memory, where tau was filtered: its steps must be, too.
     """
-    if z is None or not has_friction_state(dynamics):
+    if z is None or not is_stateful(dynamics):
         return ()
-    if direction is None or not has_rigid_bodies(dynamics):
+    if direction is None or not isinstance(dynamics, RigidBodyDynamics):
         return (z,)
     return z, direction
 
@@ -135,8 +121,9 @@ class VelocityState:
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
-        self.elements = getattr(dynamics, "elements", 0)
-        if has_friction_state(dynamics):
+        self.elements = 0
+        if is_stateful(dynamics):
+            self.elements = dynamics.elements
             self.memory, self.memory_after = dynamics.memory, dynamics.memory_after
 
     def prepare(self) -> None:
@@ -164,4 +151,4 @@ class VelocityState:
 
 def integrable(dynamics: RigidDynamics) -> Any:
     """What a rollout integrates: the dynamics in momenta where they have these, else in velocities."""
-    return dynamics if has_momentum(dynamics) else VelocityState(dynamics)
+    return dynamics if isinstance(dynamics, PortHamiltonian) else VelocityState(dynamics)

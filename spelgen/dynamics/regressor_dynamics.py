@@ -15,7 +15,7 @@ from spelgen.dynamics.body_regressor import pseudo_inertia
 from spelgen.dynamics.bristles import moved_bristles
 from spelgen.dynamics.equations import Pose
 from spelgen.dynamics.regressor import body_chain
-from spelgen.runtime.body_chain import Chain
+from spelgen.runtime.body_chain import ChainConfiguration
 from spelgen.runtime.port_hamiltonian import applied
 
 
@@ -69,7 +69,7 @@ class RegressorDynamics:
         chain, momenta = self._bodies(q)
         return applied(momenta, self.chain.accelerations(chain, qd))
 
-    def _bodies(self, q: Tensor) -> tuple[Chain, Tensor]:
+    def _bodies(self, q: Tensor) -> tuple[ChainConfiguration, Tensor]:
         """Return the bodies' frames as points, and their momenta by joint velocity, (..., n, 12 bodies)."""
         chain = self.chain.forward(q, torch.eye(len(self.inertia)).to(q))
         jacobian = torch.unflatten(self.chain.ratios.mT @ chain.jacobian, -1, (3, -1))

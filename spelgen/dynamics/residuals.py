@@ -8,9 +8,9 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
-from spelgen.dynamics.protocol import has_residuals
-from spelgen.runtime.masked_kan import MaskedKAN
+from spelgen.dynamics.protocol import residual_terms
 from spelgen.runtime.masked_mlp import MaskedMLP
+from spelgen.runtime.residual_dynamics import ResidualDynamics
 
 Model = TypeVar("Model")
 
@@ -19,9 +19,9 @@ NETWORKS = ("mass", "potential")  # of residual terms, by attribute
 
 def idle_residuals(model: object) -> list[str]:
     """Return the names of a model's parameters of residuals that add nothing to it as it is."""
-    if not has_residuals(model):
+    terms = residual_terms(model)
+    if terms is None:
         return []
-    terms = model.residuals
     idle = [name for name, weights in terms.named_parameters(recurse=False) if not weights.any()]
     for part in NETWORKS:
         if _is_idle(getattr(terms, part)):
@@ -38,7 +38,7 @@ def used_parameter_count(model: nn.Module) -> int:
 def without_residuals(model: Model) -> Model:
     """Return a copy of the model that is its rigid bodies alone."""
     alone = copy.deepcopy(model)
-    if has_residuals(alone):
+    if isinstance(alone, ResidualDynamics):
         alone.residuals = None
     return alone
 
@@ -46,7 +46,7 @@ def without_residuals(model: Model) -> Model:
 def without_idle_residuals(model: Model) -> Model:
     """Return a copy of the model without residuals that give nothing, for weights that change no more."""
     reduced = copy.deepcopy(model)
-    if has_residuals(reduced):
+    if isinstance(reduced, ResidualDynamics) and reduced.residuals is not None:
         terms = reduced.residuals
         for part in NETWORKS:
             if _is_idle(getattr(terms, part)):
@@ -56,14 +56,14 @@ def without_idle_residuals(model: Model) -> Model:
     return reduced
 
 
-def _is_idle(network: MaskedMLP | MaskedKAN | None) -> bool:
+def _is_idle(network: MaskedMLP | None) -> bool:
     """Return whether a network gives zero for all inputs, as none at all does."""
     return network is None or not (network.weights[-1].any() or network.biases[-1].any())
 
 
 def residual_torque(model: object, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
     """Return the torque (..., n) [Nm, N] that residuals of M and V take; zero without any."""
-    if not has_residuals(model):
+    if not isinstance(model, ResidualDynamics) or model.residuals is None:
         return torch.zeros_like(q)
     terms = model.residuals
     pose = terms.at(q, model.prepare().residual)
@@ -73,7 +73,7 @@ def residual_torque(model: object, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
 
 def friction_factor(model: object, q: Tensor) -> Tensor:
     """Return how much more friction (..., n) the drives have at q than their laws say; one without residuals."""
-    if not has_residuals(model):
+    if not isinstance(model, ResidualDynamics) or model.residuals is None:
         return torch.ones_like(q)
     factor: Tensor = model.residuals.at(q, model.prepare().residual).friction
     return factor

@@ -1,108 +1,82 @@
-"""A module's source -> an instance of its ``Model``. Loading runs the source: load what you would run."""
+"""A module's file -> its specification and its model. Nothing of the file is executed."""
 
 from __future__ import annotations
 
 import ast
-import hashlib
-import linecache
-import sys
-from functools import lru_cache
-from html import escape
 from pathlib import Path
-from types import CodeType, ModuleType
-from typing import TYPE_CHECKING, Any, cast
 
-import torch
-
-from spelgen.dynamics.parameters import parameter_count
-from spelgen.dynamics.prepared import PreparedModel
+from spelgen.emission.assemble import ArmModel, assemble
+from spelgen.emission.text import module_text
 from spelgen.errors import ModuleError
-from spelgen.labels import printable
-from spelgen.spec import Facts, parse_facts, read_source
+from spelgen.files import read_bytes
+from spelgen.spec import ModelSpec, spec_from_json
 
-METHODS = (
-    "mass_matrix", "potential_energy", "gravity", "nonlinear_effects", "friction_torque", "dissipation",
-    "input_matrix", "momentum", "velocity", "hamiltonian", "forward_dynamics", "inverse_dynamics", "forward",
-    "prepare", "port_hamiltonian_rhs",
-)  # fmt: skip
+# Largest module that is read [bytes]: the largest that `spelgen build` writes has a tenth.
+MAX_MODULE = 2**22
 _EXPECTED = "a module written by this version of `spelgen build`"
 
-if TYPE_CHECKING:
-    from spelgen.dynamics.tip import TipKinematics
-    from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
-    class EmittedModel(PortHamiltonian):
-        """The class ``Model`` of an emitted module, whose own docstrings hold shapes and units."""
+def load_module(module: str | Path, *, seed: int = 0) -> ArmModel:
+    """Return the model of a module that `spelgen build` wrote, with the initial weights of ``seed``.
 
-        source: str
-        """The module's text, as it was loaded."""
-        facts: Facts
-
-        def __getattr__(self, name: str) -> Any: ...  # what a preset has beside this
-        def prepared(
-            self, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
-        ) -> PreparedModel: ...
-
-
-def load_module(module: str | Path, *, seed: int = 0) -> EmittedModel:
-    """An instance of the class ``Model`` of an emitted module, with its ``source`` and ``facts``.
-
-    ``module`` is the file, or the source text itself. ``seed``: of the weights that it starts with. Raises
-    ModuleError for what is no emitted module, or one of another version.
+    module: the file, or its text. Raises ModuleError for a file that was edited or is no such module.
     """
-    in_memory = isinstance(module, str) and "\n" in module
-    file = None if in_memory else Path(module)
-    source = str(module) if file is None else read_source(file)
-    facts = parse_facts(source, file)
-    name = _private_name(source)
-    code = sys.modules[name] = ModuleType(name)  # torch.compile looks for it there
-    path = f"<{name}>" if file is None else str(file)
-    linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)  # for tracebacks
+    is_text = isinstance(module, str) and "\n" in module
+    file = None if is_text else Path(module)
+    text = str(module) if file is None else read_source(file)
+    return assemble(require_unedited(text, file), seed)
+
+
+def read_source(path: Path) -> str:
+    """Return the text of the module at ``path``. Raises ModuleError."""
+    if not path.exists():
+        raise ModuleError("no such file", file=path, do="build it with `spelgen build`")
+    content = read_bytes(path, ModuleError, _EXPECTED, MAX_MODULE)
     try:
-        exec(_compiled(source, path), vars(code))
-        model = code.Model(seed=seed)
-    except Exception as error:
-        problem = f"import fails ({type(error).__name__}: {error})"
-        raise ModuleError(problem, file=file, do="build it again") from error
-    missing = [name for name in ("n", "joint_names", "joint_types", *METHODS) if not hasattr(model, name)]
-    if missing or not isinstance(model, torch.nn.Module):
-        raise ModuleError(f"a class Model without {', '.join(missing)}", file=file, expected=_EXPECTED)
-    # neither how a notebook shows it nor its deployment is a matter of the module, which stands alone
-    code.Model.__repr__, code.Model._repr_html_, code.Model.prepared = _summary, _page, _prepared
-    emitted = cast("EmittedModel", model)
-    emitted.source, emitted.facts = source, facts
-    return emitted
+        return content.decode("utf-8").replace("\r\n", "\n")
+    except ValueError as problem:
+        raise _no_module(problem, path) from None
 
 
-@lru_cache(maxsize=8)  # a run loads one module again and again
-def _compiled(source: str, path: str) -> CodeType:
-    return compile(source, path, "exec")
+def read_spec(path: Path | str) -> ModelSpec:
+    """Return the specification in the module at ``path``. Raises ModuleError."""
+    return parse_spec(read_source(Path(path)), Path(path))
 
 
-def has_run(source: str) -> bool:
-    """Whether this very text was loaded in this process before."""
-    return _private_name(source) in sys.modules
+def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
+    """Return the specification in the text of a module, which may be edited. Raises ModuleError."""
+    try:
+        for node in ast.parse(text).body:
+            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant):
+                names = [target.id for target in node.targets if isinstance(target, ast.Name)]
+                if names == ["FACTS"]:
+                    raise ModuleError(
+                        "a module of an earlier version of spelgen", file=file, expected=_EXPECTED,
+                        do="build it again with `spelgen build`, and train it again",
+                    )  # fmt: skip
+                if names == ["SPEC"]:
+                    return spec_from_json(str(node.value.value), file)
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as problem:
+        raise _no_module(problem, file) from None
+    raise _no_module(None, file)
 
 
-def _private_name(source: str) -> str:
-    """Made from the content, so that two modules never meet."""
-    return f"_spelgen_module_{hashlib.sha256(source.encode()).hexdigest()}"
+def require_unedited(text: str, file: Path | None = None) -> ModelSpec:
+    """Return the specification of a module's text. Raises ModuleError if the text is not what it specifies."""
+    spec = parse_spec(text, file)
+    if text in (module_text(spec, standalone=is_standalone) for is_standalone in (False, True)):
+        return spec
+    raise ModuleError(
+        "a module that was edited, or written by another version of spelgen", file=file, expected=_EXPECTED,
+        do="build it again, or use the edited one from Python: `from MODULE import Model; spelgen.fit(Model(), logs)`",
+    )  # fmt: skip
 
 
-def _summary(model: EmittedModel) -> str:
-    options = model.facts.options
-    preset = options.preset + (f", {options.net}" if options.net in ("mlp", "kan") else "")
-    sizes = f"{model.n} joints, {parameter_count(model)} parameters"
-    return f"<Model of {printable(model.facts.robot)!r} ({preset}): {sizes}>"
-
-
-def _page(model: EmittedModel) -> str:
-    """The module's docstring: what M is made of, and the joints."""
-    return f"<pre>{escape(ast.get_docstring(ast.parse(model.source)) or '')}</pre>"
-
-
-def _prepared(
-    model: EmittedModel, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
-) -> PreparedModel:
-    """The model as it is now, ready for many calls; see ``PreparedModel``."""
-    return PreparedModel(model, tip, dtype=dtype)
+def _no_module(problem: Exception | None, file: Path | None) -> ModuleError:
+    reason = f" ({type(problem).__name__})" if problem is not None else ""
+    return ModuleError(
+        f"no specification of spelgen in it{reason}",
+        file=file,
+        expected=_EXPECTED,
+        do="build it again, or check the path",
+    )

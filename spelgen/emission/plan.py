@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
-import keyword
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from math import isfinite
 
 import numpy as np
 
 from spelgen.arm.actuation import Actuation
 from spelgen.arm.arm import Arm, Coordinate
 from spelgen.design import Design, load_design
-from spelgen.emission.bodies import body_specs
+from spelgen.emission.entry_sums import mean_mass
+from spelgen.emission.links import link_specs
 from spelgen.emission.tuning import TUNING
 from spelgen.errors import SettingsError
 from spelgen.settings.joint import JointSettings
-from spelgen.spec import BodySpec, ConstantSpec, Entries, JointSpec, ModelSpec, Options, OutputSpec, ServoSpec
+from spelgen.spec import (
+    ConstantSpec,
+    Entries,
+    InputSpec,
+    JointSpec,
+    LinkSpec,
+    ModelSpec,
+    Options,
+    OutputSpec,
+    ServoSpec,
+)
 from spelgen.structure.basis import Weights
-from spelgen.structure.nominal import Nominal, nominal, nominal_inertias, working_range
+from spelgen.structure.nominal import Nominal, exact_inertias, nominal, working_range
 from spelgen.structure.structure import Structure
 
 
@@ -38,7 +48,7 @@ def plan_model(
     ``drives``: what is known of the joints' motors and gears; where no rotor inertia is, one is guessed.
     ``servos``: whether positions are commanded. Raises SettingsError where the design has no friction that remembers.
     """
-    design = load_design(options.design or options.preset, options.net)
+    design = load_design(options.design or options.preset)
     if servos and design.memory == "none":
         raise SettingsError(
             f"position servos with the preset {options.preset}", element="input",
@@ -46,20 +56,21 @@ def plan_model(
         )  # fmt: skip
     everything = tuple(range(len(arm.coordinates)))
     sizes = nominal(arm, structure)
-    identifiers = _identifiers(arm.joint_names)
     joints, servo_specs = [], []
     for index, coordinate in enumerate(arm.coordinates):
         drive = (drives or {}).get(coordinate.name, JointSettings())
-        joints.append(_joint(coordinate, identifiers[index], sizes, index, drive))
+        joints.append(_joint(coordinate, sizes, index, drive))
         if servos:
             servo_specs.append(_servo(coordinate, drive))
     inputs = []
     if design.input == "derived" and not (actuation.direct and len(actuation.entries) == len(joints)):
         for entry in actuation.entries:
-            inputs.append((entry.row, entry.column, entry.value, entry.kind == "gain"))
-    bodies: tuple[BodySpec, ...] = ()
+            inputs.append(InputSpec(entry.row, entry.column, entry.value, entry.kind == "gain"))
+    links: tuple[LinkSpec, ...] = ()
+    outputs, constants = _outputs(structure, sizes, design), _constants(structure, sizes)
     if design.mass == "closed-form":
-        bodies = body_specs(arm, nominal_inertias(arm, sizes.from_urdf))
+        links = link_specs(arm, exact_inertias(arm, sizes.from_urdf))
+        joints = _with_armature(joints, np.diagonal(mean_mass(len(joints), outputs, constants)))
     potential = structure.potential
     if design.potential == "dense":
         potential = everything
@@ -69,17 +80,17 @@ def plan_model(
         urdf=urdf,
         urdf_sha256=urdf_sha256,
         gravity=(x, y, z),
-        options=replace(options, net=None if design.net == "none" else design.net),
+        options=options,
         design=design,
         joints=tuple(joints),
         entries=tuple((e.row, e.column, e.kind, e.joints) for e in structure.entries),
-        outputs=_outputs(structure, sizes, design),
-        constants=_constants(structure, sizes),
+        outputs=outputs,
+        constants=constants,
         potential=potential,
         potential_scale=sizes.potential_scale,
         margin=float(f"{max(TUNING.margin * sizes.least_eigenvalue, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
-        bodies=bodies,
+        links=links,
         inputs=tuple(inputs),
         motor_speeds=_motor_speeds(actuation),
         servos=tuple(servo_specs),
@@ -115,23 +126,21 @@ def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
     return tuple(map(tuple, speeds.tolist()))
 
 
-def _joint(
-    coordinate: Coordinate, identifier: str, sizes: Nominal, index: int, drive: JointSettings
-) -> JointSpec:
+def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings) -> JointSpec:
     low, high = working_range(coordinate)
     lower, upper, speed = coordinate.lower, coordinate.upper, coordinate.velocity
     if coordinate.continuous:
         lower = upper = None
+    lower, upper = (None if x is None or not isfinite(x) else float(f"{x:.6g}") for x in (lower, upper))
     if not speed or speed > TUNING.largest_speed:
         speed = TUNING.usual_turning if coordinate.kind == "revolute" else TUNING.usual_sliding
     return JointSpec(
         name=coordinate.name,
-        identifier=identifier,
-        kind=coordinate.kind,
+        joint_type=coordinate.kind,
         lower=lower,
         upper=upper,
         center=float(f"{(low + high) / 2:.6g}"),
-        reach=float(f"{(high - low) / 2:.6g}"),
+        half_range=float(f"{(high - low) / 2:.6g}"),
         speed=speed,
         friction=float(f"{_friction(coordinate, sizes, index):.3g}"),
         armature=float(f"{drive.armature or _guessed_armature(coordinate):.3g}"),
@@ -170,20 +179,10 @@ def _friction(coordinate: Coordinate, sizes: Nominal, index: int) -> float:
     return TUNING.friction_of_torque * max(sizes.joint_torque[index], 0.01 * max(sizes.joint_torque))
 
 
-def _identifiers(names: Sequence[str]) -> list[str]:
-    """Unique ASCII identifiers, recognisable where the name allows it."""
-    used: set[str] = set()
-    identifiers = []
-    for index, name in enumerate(names, start=1):
-        plain = re.sub(r"[^0-9a-z]+", "_", name.lower()).strip("_")[:40]
-        if not plain or keyword.iskeyword(plain) or keyword.issoftkeyword(plain) or plain[0].isdigit():
-            plain = f"joint_{plain or index}"
-        unique, count = plain, 2
-        while unique in used:
-            unique, count = f"{plain}_{count}", count + 1
-        used.add(unique)
-        identifiers.append(unique)
-    return identifiers
+def _with_armature(joints: Sequence[JointSpec], mass: np.ndarray) -> list[JointSpec]:
+    """Return the joints with a small armature for drives without data, from the diagonal of M (n,)."""
+    initial = [float(f"{TUNING.least_armature * value:.3g}") for value in mass]
+    return [replace(x, armature=x.armature or least) for x, least in zip(joints, initial, strict=True)]
 
 
 def _floats(weights: Weights) -> Entries:

@@ -1,4 +1,4 @@
-"""Values -> source text: calls, tuples and assignments laid out as a formatter would."""
+"""Values -> source text: calls, tuples and assignments, laid out to be read."""
 
 from __future__ import annotations
 
@@ -6,58 +6,42 @@ import json
 from dataclasses import dataclass
 
 WIDTH = 110
-_FEW = 3  # equal items that are written out
+_FEW = 3  # equal items that are written one by one
+_STEP = 4  # of the indentation
+SKIP = "  # fmt: skip"  # for ruff: numbers are read by the row
 
 
 @dataclass(frozen=True)
 class Code:
-    """An expression that stands as it is: a name, or an expression of names."""
+    """A name."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class Call:
-    """A call; an argument without a name stands under None."""
+    """A call; positional arguments have the name None."""
 
     callee: str
     arguments: tuple[tuple[str | None, object], ...]
 
 
 def call(callee: str, *positional: object, **named: object) -> Call:
-    """The call of ``callee`` with these arguments."""
+    """Return the call of ``callee`` with these arguments."""
     arguments: list[tuple[str | None, object]] = [(None, value) for value in positional]
     return Call(callee, (*arguments, *named.items()))
 
 
-def assignment(target: str, value: object, indent: int = 0) -> str:
-    """``target = value``, over as many lines as it takes."""
-    return " " * indent + laid_out(f"{target} = ", value, indent)
-
-
-def laid_out(start: str, value: object, indent: int = 0) -> str:
-    """Return ``start`` and ``value`` as a formatter lays them out, where that takes three lines at most.
-
-    Else they are dense, for numbers are read by the row, and marked for the formatter to leave alone.
-    """
-    flat = start + _flat(value)
-    if indent + len(flat) <= WIDTH or not _items(value) or _alike(value):
-        return flat
-    if isinstance(value, Call):
-        body = " " * (indent + 4) + _joined(value)
-        if len(body) <= WIDTH:
-            return f"{start}{value.callee}(\n{body}\n{' ' * indent})"
-    return f"{_dense(start, value, indent)}  # fmt: skip"
-
-
-def _dense(start: str, value: object, indent: int) -> str:
-    """``start`` and ``value``, whose items share lines where they fit."""
-    inner = " " * (indent + 4)
-    lines = [f"{start}{_callee(value)}(", inner]
+def filled(start: str, value: object, indent: int) -> str:
+    """Return ``start`` and ``value``, in one line if it fits, else with several items per line."""
+    text = start + flat(value)
+    if indent + len(text) < WIDTH or not _items(value) or _alike(value):
+        return text
+    inner = " " * (indent + _STEP)
+    opening, closing = "{}" if _is_dict(value) else "()"
+    lines = [f"{start}{_callee(value)}{opening}", inner]
     for key, item in _items(value):
-        text = f"{key}{_flat(item)},"
-        if len(inner + text) > WIDTH and _items(item) and not _alike(item):
-            text = f"{_dense(key, item, indent + 4)},"
+        text = f"{filled(key, item, indent + _STEP)},"
         line = lines[-1]
         if line == inner:
             lines[-1] += text
@@ -65,46 +49,57 @@ def _dense(start: str, value: object, indent: int) -> str:
             lines.append(inner + text)
         else:
             lines[-1] += f" {text}"
-    return "\n".join([*lines, " " * indent + ")"])
+    return "\n".join([*lines, " " * indent + closing])
+
+
+def listed_call(start: str, value: Call, indent: int) -> str:
+    """Return ``start`` and a call with an argument per line."""
+    inner = " " * (indent + _STEP)
+    lines = [f"{inner}{filled(key, item, indent + _STEP)}," for key, item in _items(value)]
+    return "\n".join([f"{start}{value.callee}(", *lines, " " * indent + ")"])
+
+
+def flat(value: object) -> str:
+    """Return a value in one line. Text from a file becomes a string literal of ASCII, whatever it contains."""
+    if isinstance(value, Code):
+        return value.text
+    if isinstance(value, str):
+        return json.dumps(value) if value.isascii() and value.isprintable() else _escaped(value)
+    if isinstance(value, tuple):
+        if _alike(value):
+            return f"({flat(value[0])},) * {len(value)}"
+        return f"({flat(value[0])},)" if len(value) == 1 else f"({_joined(value)})"
+    if _is_dict(value):
+        return "{" + _joined(value) + "}"
+    return f"{value.callee}({_joined(value)})" if isinstance(value, Call) else repr(value)
+
+
+def _escaped(text: str) -> str:
+    """Return a string literal in double quotes; JSON has no escape for characters beyond 16 bits."""
+    return '"' + "".join(rf"\U{ord(x):08x}" if not x.isascii() else json.dumps(x)[1:-1] for x in text) + '"'
+
+
+def _is_dict(value: object) -> bool:
+    return isinstance(value, Call) and value.callee == "dict"
 
 
 def _callee(value: object) -> str:
-    """What stands before the parentheses."""
-    return value.callee if isinstance(value, Call) else ""
+    return value.callee if isinstance(value, Call) and not _is_dict(value) else ""
 
 
 def _items(value: object) -> list[tuple[str, object]]:
-    """What stands between the parentheses: what precedes each item, and the item."""
-    items: list[tuple[str, object]] = []
+    """Return the items of a call or a tuple, each with the text before it; none of other values."""
     if isinstance(value, Call):
-        for key, item in value.arguments:
-            items.append((f"{key}=" if key else "", item))
-    elif isinstance(value, tuple):
-        for item in value:
-            items.append(("", item))
-    return items
+        end = ": " if _is_dict(value) else "="
+        keys = [(flat(key) if _is_dict(value) else key, item) for key, item in value.arguments]
+        return [(f"{key}{end}" if key else "", item) for key, item in keys]
+    return [("", item) for item in value] if isinstance(value, tuple) else []
 
 
 def _alike(value: object) -> bool:
-    """Whether it is a tuple of one thing again and again."""
+    """Return whether a value is a tuple of equal items."""
     return isinstance(value, tuple) and len(value) > _FEW and value.count(value[0]) == len(value)
 
 
 def _joined(value: object) -> str:
-    return ", ".join(key + _flat(item) for key, item in _items(value))
-
-
-def _flat(value: object) -> str:
-    if isinstance(value, Code):
-        return value.text
-    if isinstance(value, str):
-        return json.dumps(value)
-    if isinstance(value, tuple):
-        if _alike(value):
-            return f"({_flat(value[0])},) * {len(value)}"
-        if len(value) == 1:
-            return f"({_flat(value[0])},)"
-        return f"({_joined(value)})"
-    if isinstance(value, Call):
-        return f"{value.callee}({_joined(value)})"
-    return repr(value)
+    return ", ".join(key + flat(item) for key, item in _items(value))

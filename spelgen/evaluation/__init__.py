@@ -1,1 +1,1 @@
-"""A trained model and its baselines, judged on logs."""
+"""Evaluation of a trained model and its baselines on test logs."""

@@ -1,4 +1,4 @@
-"""The motions that charts draw: among predictions, torques and replays, those of middle and of largest error."""
+"""The motions that charts show: predictions, torques and replays of median and of largest error."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scipy.integrate import cumulative_trapezoid
 from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import States
 from spelgen.dynamics.bristles import bristles_along
-from spelgen.evaluation.horizons import JudgedLogs
+from spelgen.evaluation.horizons import EvaluatedLogs
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.torque import friction_past, mean_nmse, predicted_torques
 from spelgen.evaluation.tuning import TRACES as TUNING
@@ -22,6 +22,7 @@ from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
+from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 if TYPE_CHECKING:
     from spelgen.dynamics.protocol import RigidDynamics
@@ -29,9 +30,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DrawnMotion:
-    """Hold positions q (T, n) along a part of a log; t counts from its first sample [s].
+    """Positions q (T, n) along a part of a log, at times t (T,) [s] from its first sample.
 
-    which: "typical" for the middle error of all such motions, "worst" for the largest one. error: None if not finite.
+    which: "typical" for the median error of all such motions, "worst" for the largest. error: None if not finite.
     """
 
     which: str = ""
@@ -43,10 +44,10 @@ class DrawnMotion:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PredictedMotion(DrawnMotion):
-    """Hold a motion beside its prediction, (T, n); error: relative to the motion, or RMS [rad, m] of a replayed log.
+    """A motion and its prediction, (T, n). error: divided by the motion, or RMS [rad, m] of a replayed log.
 
-    start: its time in the log [s]; None where the log is replayed as a whole. u: commands of position servos, whose
-    velocities are not judged.
+    start: time of the first sample in the log [s]; None of a log that is replayed as a whole. u: commands of position
+    servos, without velocities.
     """
 
     start: float | None = None
@@ -58,10 +59,10 @@ class PredictedMotion(DrawnMotion):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TorqueTrace(DrawnMotion):
-    """Hold torques at the joints (T, n) along ten seconds of a log; error: nMSE of the model.
+    """Joint torques (T, n) [Nm, N] along ten seconds of a log; error: nMSE of the model.
 
-    predicted: by predictor. parts: of the model's torque. energy: by where the drives' work went since the start, (T,)
-    [J].
+    predicted: by predictor. parts: terms of the model's torque. energy: work of the drives since the start and its
+    parts, (T,) [J].
     """
 
     qd: Curve
@@ -71,12 +72,12 @@ class TorqueTrace(DrawnMotion):
     energy: dict[str, Curve]
 
 
-Motion = TypeVar("Motion", bound=DrawnMotion)
+Drawn = TypeVar("Drawn", bound=DrawnMotion)
 
 
-def typical_and_worst(motions: Sequence[Motion]) -> tuple[Motion, ...]:
-    """Return the motion of middle error, and that of the largest where there are several."""
-    # a sort keeps the order of equals: the same logs give the same page
+def typical_and_worst(motions: Sequence[Drawn]) -> tuple[Drawn, ...]:
+    """Return the motion of median error, and the motion of largest error if there are several."""
+    # a sort keeps the order of equal errors: the same logs give the same page
     ordered = sorted(motions, key=lambda motion: math.inf if motion.error is None else motion.error)
     chosen = {}
     if ordered:
@@ -86,9 +87,9 @@ def typical_and_worst(motions: Sequence[Motion]) -> tuple[Motion, ...]:
     return tuple(replace(motion, which=which) for which, motion in chosen.items())
 
 
-def thinned(motion: PredictedMotion, most_samples: int) -> PredictedMotion:
-    """Return the motion at no more samples than a chart can show."""
-    stride = -(-len(motion.t) // most_samples)
+def thinned(motion: PredictedMotion, max_samples: int) -> PredictedMotion:
+    """Return the motion at about `max_samples` samples at most."""
+    stride = -(-len(motion.t) // max_samples)
     curves: dict[str, Any] = {}
     for name, values in vars(motion).items():
         if isinstance(values, np.ndarray):
@@ -97,7 +98,7 @@ def thinned(motion: PredictedMotion, most_samples: int) -> PredictedMotion:
 
 
 def predicted_motion(trajectory: str, windows: Windows, states: States, k: int = 0) -> PredictedMotion:
-    """Return window k with what was predicted of it."""
+    """Return window k and its prediction."""
     predicted_q, predicted_qd = states
     return PredictedMotion(
         trajectory=trajectory,
@@ -109,20 +110,20 @@ def predicted_motion(trajectory: str, windows: Windows, states: States, k: int =
     )
 
 
-def replayed_motion(log: Trajectory, missed: np.ndarray) -> PredictedMotion:
-    """Return a log of position servos with its replay, which misses these positions (T-1, n) after its first sample."""
+def replayed_motion(log: Trajectory, error: np.ndarray) -> PredictedMotion:
+    """Return a log of position servos and its replay. error: (T-1, n) [rad, m] after the first sample."""
     return PredictedMotion(
         trajectory=log.name,
-        error=number(float(np.sqrt(np.square(missed).mean()))),
+        error=number(float(np.sqrt(np.square(error).mean()))),
         t=log.t - log.t[0],
         q=log.q,
         u=log.u,
-        predicted_q=np.concatenate([log.q[:1], log.q[1:] + missed]),
+        predicted_q=np.concatenate([log.q[:1], log.q[1:] + error]),
     )
 
 
-def torque_motions(logs: JudgedLogs) -> list[DynamicsSamples]:
-    """Return ten seconds from the middle of each log, for logs begin and end at rest, as thin as charts draw them."""
+def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
+    """Return ten seconds from the middle of each log, as logs begin and end at rest, at the samples of a chart."""
     motions = []
     slow = [piece for piece in logs.pieces if not shows_accelerations(piece.sample_rate)]
     for samples in [*logs.samples, *(_steps(piece, logs) for piece in slow)]:
@@ -132,8 +133,8 @@ def torque_motions(logs: JudgedLogs) -> list[DynamicsSamples]:
     return motions
 
 
-def _steps(piece: Trajectory, logs: JudgedLogs) -> DynamicsSamples:
-    """Return the steps of logs too slow for a filter: the motion halfway, and the torque that acted meanwhile."""
+def _steps(piece: Trajectory, logs: EvaluatedLogs) -> DynamicsSamples:
+    """Return the sample intervals of a log too slow for a filter: mean motion, acceleration and torque in each."""
     steps = cut_windows([piece], 2, measured=logs.used.filtered)
     q = steps.q.mean(dim=1).numpy()
     qdd = steps.qd.diff(dim=1)[:, 0] / steps.dt
@@ -149,12 +150,12 @@ def _steps(piece: Trajectory, logs: JudgedLogs) -> DynamicsSamples:
 
 
 def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples) -> TorqueTrace:
-    """Return what the predictors say of the torques of these samples."""
+    """Return the torques of all predictors on these samples, and the terms of the model's torque."""
     model: Any = dynamics[MODEL]
     q, qd, qdd = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
     with torch.no_grad():
         inputs = np.eye(q.shape[-1])
-        if hasattr(model, "input_matrix"):  # gears may stand between a motor and a joint
+        if isinstance(model, PortHamiltonian):  # gears may connect motors and joints
             inputs = model.input_matrix(q).numpy()
         gravity = model.gravity(q)
         parts = {
@@ -168,7 +169,7 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
         predicted[name] = _at_joints(inputs, predicted_torques(predictor, samples))
     measured = _at_joints(inputs, samples.tau)
     t = np.arange(len(samples.q)) / samples.rate
-    # an offset of the torque is with the friction
+    # friction includes an offset of the torque
     stored = parts["inertia"] + parts["Coriolis"] + parts["gravity"]
     works = {
         "work of the drives": measured,
@@ -193,6 +194,6 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
 
 
 def _at_joints(inputs: np.ndarray, torques: np.ndarray) -> np.ndarray:
-    """Return the joints' torques of the motors'."""
+    """Return joint torques (T, n) of motor torques; inputs: (n, n) or (T, n, n)."""
     by_joint: np.ndarray = (inputs @ torques[..., None])[..., 0]
     return by_joint

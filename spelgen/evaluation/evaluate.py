@@ -1,4 +1,4 @@
-"""Judge a model on test logs, beside its baselines, on the same windows and with the same integrator."""
+"""Evaluate a model and its baselines on test logs, on the same windows and with the same integrator."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from spelgen.baselines.baseline import CommandFollower, JudgedArm
+from spelgen.baselines.baseline import EvaluatedArm
 from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import Predictor, accurate_solver, of_dynamics
-from spelgen.baselines.registry import BASELINES
+from spelgen.baselines.registry import command_followers, torque_predictors
 from spelgen.dynamics.protocol import input_of
 from spelgen.dynamics.residuals import used_parameter_count, without_idle_residuals
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import Diagnostic, LogError, in_one_line
 from spelgen.evaluation.horizons import (
+    EvaluatedLogs,
     Horizon,
-    JudgedLogs,
     Predictions,
     TipPosition,
     horizon_lengths,
@@ -34,12 +34,13 @@ from spelgen.logs.dynamics_samples import SHORTEST, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import Trajectory, require_commands, require_joints, require_torques
+from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
+    from spelgen.arm.configured_arm import ConfiguredArm
     from spelgen.dynamics.protocol import RigidDynamics
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
     from spelgen.fitting.fitted import Fit
-    from spelgen.pipeline.loaded_arm import LoadedArm
 
 STEPS: Sequence[int] = (1, 10)
 SECONDS: Sequence[float] = (1.0,)
@@ -47,10 +48,10 @@ Progress = Callable[[int, int, str], None]
 
 
 def evaluate(
-    model: EmittedModel | Fit | Path | str,
+    model: ArmModel | Fit | Path | str,
     logs: Trajectory | Sequence[Trajectory],
     *,
-    arm: LoadedArm | Path | str | None = None,
+    arm: ConfiguredArm | Path | str | None = None,
     baselines: Mapping[str, RigidDynamics] | None = None,
     preprocessing: Preprocessing | None = None,
     steps: Sequence[int] = STEPS,
@@ -59,41 +60,51 @@ def evaluate(
 ) -> Results:
     """Predict the states and torques of test logs and measure the errors.
 
-    model: an emitted one, a fit, or the folder of a run. arm: of ``load_arm``, or the path of a URDF; by default
-    the fit's: it gives the URDF as a baseline, and errors of the tip. baselines: other dynamics to be judged beside
-    those of `baselines.registry` and what the fit's folder keeps, by name, e.g. ``{"truth": identify(...).dynamics}``.
-    preprocessing: of states and torques; by default as the model was fitted. steps, seconds: horizons in samples and in
-    time; those longer than every trajectory are omitted, with a note. progress: called with the rollouts that are done,
-    all of them, and the name of the next one.
-    All that has dynamics is judged open loop, and with the constant disturbance that a momentum observer finds before a
-    prediction starts (see `momentum_observer.py`). The result is deterministic. Raises LogError.
+    Dynamics are evaluated open loop, and with the constant disturbance that a momentum observer estimates before a
+    prediction starts (see `momentum_observer.py`). The result is deterministic, and nothing is written.
+
+    Args:
+        model: an emitted model, a fit, or the folder of a run.
+        logs: test logs of the same arm.
+        arm: of ``load_arm``, or the path of a URDF; by default the fit's. For the URDF as a baseline, and tip errors.
+        baselines: dynamics that are evaluated in addition to those of `baselines.registry`, by name, for example
+            ``{"truth": identify(...).dynamics}``.
+        preprocessing: of states and torques; by default as the model was fitted.
+        steps: horizons [samples].
+        seconds: horizons [s]. Horizons longer than every trajectory are omitted, with a note.
+        progress: called with the number of finished rollouts, the number of all, and the name of the next one.
+
+    Returns:
+        Errors of the model and of all baselines, and the curves behind them.
+
+    Raises LogError.
     """
-    judged = subject(model, arm)
+    tested = subject(model, arm)
     logs = [logs] if isinstance(logs, Trajectory) else list(logs)
     for trajectory in logs:
-        require_joints(trajectory, judged.joints)
-    notes = check(logs, judged.joints, judged.model.joint_types)
-    seen = [trajectory.name for trajectory in logs if trajectory.name in judged.trained_on]
-    if seen:  # names are all that a run keeps of its logs
+        require_joints(trajectory, tested.joints)
+    notes = check(logs, tested.joints, tested.model.joint_types)
+    seen = [trajectory.name for trajectory in logs if trajectory.name in tested.trained_on]
+    if seen:  # a run keeps only the names of its logs
         message = (
             f"names also used in training: {', '.join(seen)}; errors on training data are not test errors"
         )
         notes.append(Diagnostic("warning", "tested-on-training-data", "logs", None, message))
-    if input_of(judged.model) == "position":
+    if input_of(tested.model) == "position":
         if baselines:
             raise LogError(
                 "baselines that take torques", expected="none: the model is one of position servos"
             )
-        return _judge_commands(judged, logs, notes)
+        return _evaluate_commands(tested, logs, notes)
     require_torques(logs)
-    used = _preprocessing(judged.fit.preprocessing if judged.fit else None, preprocessing, logs)
-    return _judge_torques(judged, logs, notes, used, baselines or {}, (steps, seconds), progress)
+    used = _preprocessing(tested.fit.preprocessing if tested.fit else None, preprocessing, logs)
+    return _evaluate_torques(tested, logs, notes, used, baselines or {}, (steps, seconds), progress)
 
 
 def _preprocessing(
     used: Preprocessing | None, chosen: Preprocessing | None, logs: Sequence[Trajectory]
 ) -> Preprocessing:
-    """Return how logs are prepared: as is chosen, else as for the fit, if there was one."""
+    """Return the preprocessing of test logs: the given one, else that of the fit, else the default."""
     if chosen is None and used is not None:
         return used
     preprocessing = chosen or Preprocessing()
@@ -102,8 +113,8 @@ def _preprocessing(
     return preprocessing.resolved([trajectory.sample_rate for trajectory in logs])
 
 
-def _judge_torques(
-    judged: Subject,
+def _evaluate_torques(
+    tested: Subject,
     logs: Sequence[Trajectory],
     notes: list[Diagnostic],
     used: Preprocessing,
@@ -111,22 +122,20 @@ def _judge_torques(
     ahead: tuple[Sequence[int], Sequence[float]],
     progress: Progress | None,
 ) -> Results:
-    """Judge torques, and the motion that they predict."""
-    all_samples = dynamics_samples(logs, pauses=True, preprocessing=used, reach=judged.reach)
+    """Evaluate the torques, and the motion under the logged torques."""
+    all_samples = dynamics_samples(logs, pauses=True, preprocessing=used, reach=tested.reach)
     samples = [sample for sample in all_samples if len(sample.q)]
-    # a rollout takes a start and a sample after it
-    tests = JudgedLogs(used.pieces(logs, shortest=2), samples, used, judged.reach, judged.model.joint_types)
+    # a rollout needs an initial sample and one more
+    tests = EvaluatedLogs(
+        used.pieces(logs, shortest=2), samples, used, tested.reach, tested.model.joint_types
+    )
     lengths = horizon_lengths(tests, *ahead, notes)
-    probe = tests.windows(judged.window - 1, TUNING.probed_model_windows)
-    # residual terms that were not selected add nothing but time
-    model = without_idle_residuals(judged.model)
+    probe = tests.windows(tested.window - 1, TUNING.probed_model_windows)
+    # residual terms that were not selected only cost time
+    model = without_idle_residuals(tested.model)
     solver = accurate_solver(model, probe)
-    predictors = [Predictor(MODEL, solver, model)]
-    for baseline in BASELINES:
-        predictors += baseline.predictors(JudgedArm(judged.joints, judged.urdf, judged.run, probe, notes))
-    for name, dynamics in baselines.items():
-        predictors.append(of_dynamics(name, dynamics, probe))
-    tip = _tip(judged, notes)
+    predictors = [Predictor(MODEL, solver, model), *_baselines(tested, baselines, probe, notes)]
+    tip = _tip(tested, notes)
     horizons: list[Horizon] = []
     longest: Predictions | None = None
     for name, k in lengths.items():
@@ -134,14 +143,14 @@ def _judge_torques(
             progress(len(horizons), len(lengths), f"predicting {name} ahead")
         horizon, predictions = predict(name, k, tests, predictors, tip, notes)
         horizons.append(horizon)
-        # the curves of the longest horizon show the shorter ones on their way
+        # the curves of the longest horizon contain those of the shorter ones
         if k == max(lengths.values()):
             longest = predictions
-    judged_dynamics: dict[str, RigidDynamics] = {}
+    all_dynamics: dict[str, RigidDynamics] = {}
     torque: dict[str, TorqueErrors] = {}
     for predictor in predictors:
         if predictor.dynamics is not None:
-            judged_dynamics[predictor.name] = predictor.dynamics
+            all_dynamics[predictor.name] = predictor.dynamics
             if samples:
                 torque[predictor.name] = torque_errors(predictor.dynamics, samples)
     if not horizons and not torque:
@@ -150,12 +159,12 @@ def _judge_torques(
             expected=f"motion at {SLOWEST:g} Hz or more, {SHORTEST:g} s without a gap",
             do="omit --quick",
         )
-    steps = coarse_torques(logs, judged.joints, notes) if torque else {}
+    steps = coarse_torques(logs, tested.joints, notes) if torque else {}
     return _results(
-        judged,
+        tested,
         logs,
         notes,
-        motion_traces(judged_dynamics, tests, longest, tip),
+        motion_traces(all_dynamics, tests, longest, tip),
         cutoff=used.cutoff or None,
         substeps=solver.substeps,
         horizons=tuple(horizons),
@@ -164,40 +173,49 @@ def _judge_torques(
     )
 
 
+def _baselines(
+    tested: Subject, given: Mapping[str, RigidDynamics], probe: Windows, notes: list[Diagnostic]
+) -> list[Predictor]:
+    """Return the baselines of the registry, and the given ones. probe: windows that determine integrator steps."""
+    arm = EvaluatedArm(tested.joints, tested.urdf, tested.fitted_baselines, tested.fitted_arm, probe, notes)
+    return [
+        *torque_predictors(arm),
+        *(of_dynamics(name, dynamics, probe) for name, dynamics in given.items()),
+    ]
+
+
 def _results(
-    judged: Subject, logs: Sequence[Trajectory], notes: Sequence[Diagnostic], traces: Traces, **figures: Any
+    tested: Subject, logs: Sequence[Trajectory], notes: Sequence[Diagnostic], traces: Traces, **figures: Any
 ) -> Results:
-    """Return results that name the arm and the logs."""
+    """Return the results with the names of the arm and the logs."""
     return Results(
-        robot=judged.facts.robot if judged.facts else type(judged.model).__name__,
-        joints=tuple(judged.joints),
-        joint_types=tuple(judged.model.joint_types),
+        robot=tested.spec.robot if tested.spec else type(tested.model).__name__,
+        joints=tuple(tested.joints),
+        joint_types=tuple(tested.model.joint_types),
         trajectories=tuple(trajectory.name for trajectory in logs),
-        parameters=used_parameter_count(judged.model),
+        parameters=used_parameter_count(tested.model),
         diagnostics=tuple(notes),
         traces=traces,
         **figures,
     )
 
 
-def _judge_commands(judged: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic]) -> Results:
-    """Judge the positions that follow commands, which are replayed."""
-    followers: dict[str, CommandFollower] = {}
+def _evaluate_commands(tested: Subject, logs: Sequence[Trajectory], notes: list[Diagnostic]) -> Results:
+    """Evaluate the positions under the logged commands."""
     for trajectory in logs:
         require_commands(trajectory)
-    for baseline in BASELINES:
-        followers |= baseline.followers(judged.fit, notes)
-    errors, missed = replays(judged.model, logs, followers, notes)
-    return _results(judged, logs, notes, replay_traces(missed), replays=errors)
+    followers = command_followers(tested.linear_servos, notes)
+    errors, missed = replays(tested.model, logs, followers, notes)
+    return _results(tested, logs, notes, replay_traces(missed), replays=errors)
 
 
-def _tip(judged: Subject, notes: list[Diagnostic]) -> TipPosition | None:
-    if judged.urdf is None:
+def _tip(tested: Subject, notes: list[Diagnostic]) -> TipPosition | None:
+    if tested.urdf is None:
         return None
     try:
-        tip = judged.facts.options.tip if judged.facts else None
-        return tip_kinematics(judged.urdf, tip, joints=judged.joints).position
-    except Exception as error:  # pytorch-kinematics raises many kinds; the evaluation stands without
+        tip = tested.spec.options.tip if tested.spec else None
+        return tip_kinematics(tested.urdf, tip, joints=tested.joints).position
+    except Exception as error:  # pytorch-kinematics raises many kinds; the evaluation continues without it
         message = f"no tip errors: {in_one_line(error)}"
-        notes.append(Diagnostic("info", "no-tip", judged.urdf.name, None, message))
+        notes.append(Diagnostic("info", "no-tip", tested.urdf.name, None, message))
         return None

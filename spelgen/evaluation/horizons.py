@@ -23,7 +23,7 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows, joined
 
 TipPosition = Callable[[Tensor], Tensor]
-"""q (..., n) -> the tip's position (..., 3) [m]."""
+"""Return the position of the tip (..., 3) [m] at q (..., n) [rad, m]."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class StateErrors:
     """Errors at the end of a horizon, root mean square (RMS) over windows, per joint where a tuple.
 
     q, qd: [rad, rad/s; m, m/s], revolute positions as angles on the circle. q_relative_rms, qd_relative_rms:
-    relative to how much q and qd change over the horizon. mean_relative_rms: mean of all of these. tip_mm: distance
-    of the tip [mm]. None: not finite, or not known.
+    divided by the RMS change of q and qd over the horizon. mean_relative_rms: mean of both over all joints. tip_mm:
+    distance of the tip [mm]. None: not finite, or unknown.
     """
 
     q: tuple[float | None, ...]
@@ -45,9 +45,10 @@ class StateErrors:
 
 @dataclass(frozen=True)
 class Horizon:
-    """How far ahead: a number of samples, in the mean `seconds`; from `windows` starting points.
+    """Errors of predictions some samples ahead.
 
-    errors: by predictor, open loop, and as `observed(predictor)` where it holds what a momentum observer finds.
+    steps: number of samples. seconds: mean length [s]. windows: number of predictions. errors: by predictor, open
+    loop, and by `observed(predictor)` with the disturbance that a momentum observer estimates.
     """
 
     name: str
@@ -58,10 +59,11 @@ class Horizon:
 
 
 @dataclass(frozen=True, eq=False)
-class JudgedLogs:
-    """Pieces of test logs, gap-free and filtered, of which windows are cut, and samples of torques.
+class EvaluatedLogs:
+    """Test logs, cut at gaps and filtered.
 
-    samples: of logs dense enough for accelerations, see `dynamics_samples`. reach: of the bristles of friction.
+    pieces: without gaps; windows are cut from them. samples: torques and accelerations of logs that are dense enough,
+    see `dynamics_samples`. used: the preprocessing. reach: break-away displacement of the bristles of friction.
     """
 
     pieces: Sequence[Trajectory]
@@ -72,20 +74,20 @@ class JudgedLogs:
 
     @property
     def rate(self) -> float:
-        """Samples a second [Hz]."""
+        """Mean sample rate [Hz]."""
         return sum(x.sample_rate for x in self.pieces) / len(self.pieces)
 
     @property
     def longest(self) -> int:
-        """Steps of the longest piece."""
+        """Number of steps of the longest piece."""
         return max(map(len, self.pieces)) - 1
 
     def stride(self, span: int, window_count: int) -> int:
-        """Return how many samples lie between the starts of about `window_count` windows of so many steps."""
+        """Return the samples between the starts of windows of `span` steps, for about `window_count` windows."""
         return -(-sum(max(0, len(piece) - span) for piece in self.pieces) // window_count)
 
     def starts(self, span: int, window_count: int) -> list[tuple[Trajectory, int]]:
-        """Return the pieces and first samples of these windows."""
+        """Return the piece and the first sample of each of these windows."""
         stride = self.stride(span, window_count)
         starts: list[tuple[Trajectory, int]] = []
         for piece in self.pieces:
@@ -93,7 +95,7 @@ class JudgedLogs:
         return starts
 
     def windows(self, span: int, window_count: int) -> Windows:
-        """Return the windows of so many steps that begin there, shorter ones where all pieces are."""
+        """Return these windows; they are shorter than `span` if all pieces are."""
         span = min(span, self.longest)
         stride, measured = self.stride(span, window_count), self.used.filtered
         return cut_windows(self.pieces, span + 1, stride, measured=measured, reach=self.reach)
@@ -101,7 +103,7 @@ class JudgedLogs:
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """Predicted q and qd (W, K-1, n) of windows by predictor. starts: the piece and first sample of each."""
+    """Predictions of W windows. starts: piece and first sample of each. states: q and qd (W, K-1, n) by predictor."""
 
     windows: Windows
     starts: list[tuple[Trajectory, int]]
@@ -109,9 +111,9 @@ class Predictions:
 
 
 def horizon_lengths(
-    logs: JudgedLogs, steps: Sequence[int], seconds: Sequence[float], notes: list[Diagnostic]
+    logs: EvaluatedLogs, steps: Sequence[int], seconds: Sequence[float], notes: list[Diagnostic]
 ) -> dict[str, int]:
-    """Return the number of samples of each horizon by name; those longer than every trajectory are only noted."""
+    """Return the number of samples of each horizon by name; longer ones than every trajectory are noted instead."""
     lengths = {}
     for k in steps:
         lengths["1 step" if k == 1 else f"{k} steps"] = k
@@ -130,36 +132,36 @@ def horizon_lengths(
 def predict(
     name: str,
     steps: int,
-    logs: JudgedLogs,
+    logs: EvaluatedLogs,
     predictors: Sequence[Predictor],
     tip: TipPosition | None,
     notes: list[Diagnostic],
 ) -> tuple[Horizon, Predictions]:
-    """Judge rollouts over so many samples: open loop, and with what a momentum observer finds before they start."""
+    """Evaluate rollouts of `steps` samples: open loop, and with the disturbance observed before they start."""
     past = past_steps(logs.rate)
     if past + steps > logs.longest:
         message = f"no observer over {name}: the longest trajectory has {logs.longest} steps"
         notes.append(Diagnostic("info", "no-observer", "logs", None, message))
         past = 0
-    # rollouts cost by their steps
+    # the cost of a rollout is proportional to its steps
     window_count = max(TUNING.fewest_windows, min(TUNING.most_windows, TUNING.most_predicted_steps // steps))
     windows = logs.windows(past + steps, window_count)
     ahead = without_past(windows, past)
     states = {}
-    # both rollouts of a predictor start from the same states of friction, those at the end of the past
+    # both rollouts of a predictor start from the friction state at the end of the observed past
     for predictor in predictors:
         if not past or not isinstance(predictor.solver, Solver):
             states[predictor.name] = predictor.solver(ahead)
             continue
         with torch.no_grad():
             started, disturbance = observe(integrable(predictor.solver.dynamics), windows, past)
-        # in one batch: half as many operations
+        # one batch of both rollouts needs half as many operations
         disturbances = torch.cat([torch.zeros_like(disturbance), disturbance])
         q, qd = predictor.solver(joined([started, started]), disturbances)
         count = len(started)
         states[predictor.name] = q[:count], qd[:count]
         states[observed(predictor.name)] = q[count:], qd[count:]
-    errors = {who: end_errors(state, ahead, logs.joint_types, tip) for who, state in states.items()}
+    errors = {name: end_errors(state, ahead, logs.joint_types, tip) for name, state in states.items()}
     seconds = ahead.dt.sum(dim=1).mean().item()
     starts = [(piece, first + past) for piece, first in logs.starts(past + steps, window_count)]
     return Horizon(name, steps, seconds, len(ahead), errors), Predictions(ahead, starts, states)
@@ -168,10 +170,10 @@ def predict(
 def end_errors(
     states: States, windows: Windows, joint_types: Sequence[str], tip: TipPosition | None
 ) -> StateErrors:
-    """Return errors of predicted q and qd (W, K-1, n) of these windows at their ends."""
+    """Return the errors at the end of each window. states: predicted q and qd (W, K-1, n)."""
     q, qd = (predicted[:, -1] for predicted in states)  # (W, n)
     measured_q, measured_qd = windows.q[:, -1], windows.qd[:, -1]
-    # a revolute joint may have gone a turn farther: the angle between counts
+    # angles of revolute joints are compared modulo a revolution
     q_error = _rms(position_difference(q, measured_q, joint_types))
     qd_error = _rms(qd - measured_qd)
     q_relative = q_error / _rms(position_difference(measured_q, windows.q[:, 0], joint_types))
@@ -187,5 +189,5 @@ def end_errors(
 
 
 def _rms(values: Tensor) -> Tensor:
-    """(W, ...) -> (...)."""
+    """Return the root mean square over windows, (W, ...) -> (...)."""
     return values.square().mean(dim=0).sqrt()

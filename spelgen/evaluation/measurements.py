@@ -1,4 +1,4 @@
-"""The figures and curves of an evaluation, as evaluation.json has them."""
+"""The figures and curves of an evaluation: the content of evaluation.json."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ SCHEMA = 9
 
 @dataclass(frozen=True, repr=False)
 class Measurements:
-    """Gather what `evaluate` measures; `to_dict` is evaluation.json.
+    """All measurements of `evaluate`; `to_dict` is evaluation.json.
 
-    cutoff: of the filter on the test logs [Hz], None without. substeps: of the integrator between samples, for the
-    model. parameters: its trained numbers. torque: by predictor, empty where the logs are too sparse. traces: the
-    curves behind the figures; those of predictions are the longest horizon's. replays: of commands, of an arm under
-    position servos. torque_steps: of joints whose torque is logged in steps of its own size, by name [Nm, N].
+    parameters: number of trained parameters. traces: curves behind the figures, of predictions over the longest
+    horizon. cutoff: of the filter of the test logs [Hz], None without one. substeps: integrator steps of the model per
+    sample interval. torque: errors by predictor, empty if the logs are too sparse for accelerations. torque_steps: see
+    `coarse_torques`. replays: of the commands of an arm under position servos.
     """
 
     robot: str
@@ -48,5 +48,5 @@ class Measurements:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, object]) -> Self:
-        """Return what `to_dict` gave. Raises ValueError where it is something else."""
+        """Return the measurements of a `to_dict`. Raises ValueError for other content."""
         return TypeAdapter(cls).validate_python(content)

@@ -1,13 +1,14 @@
-"""The disturbance that a model lacks, as a generalised-momentum observer finds it: causal, without accelerations.
+"""A generalised-momentum observer of the disturbance torque: causal, without accelerations.
 
     r(t) = K (p(t) - p(0) - integral from 0 to t of (G tau + C^T qd - g - friction + r)),    r(0) = 0
 
-(De Luca and Mattone, ICRA 2003, eq. 9; ICRA 2005), so that r' = K (d - r): r follows what the momentum balance lacks,
-d, as a first-order filter of the time constant 1 / K. Offset-free prediction holds it on (Pannocchia and Rawlings,
-AIChE J. 49:426, 2003).
+(De Luca and Mattone, ICRA 2003, eq. 9; ICRA 2005), so that r' = K (d - r), with d the residual of the momentum balance:
+r is d after a first-order filter with time constant 1 / K. A prediction then keeps r constant, as offset-free control
+does (Pannocchia and Rawlings, AIChE J. 49:426, 2003).
 
-Two deviations: between samples d is a constant, so that the filter is solved exactly; and r is divided by its own
-response to d = 1 since it began, so that a constant disturbance is found at once and not after some time constants.
+Two differences from the reference: d is constant between samples, so that the filter is solved exactly; and r is
+divided by the response of the filter to d = 1, so that a constant disturbance is found at once instead of after some
+time constants.
 """
 
 from __future__ import annotations
@@ -24,15 +25,21 @@ from spelgen.logs.windows import Windows
 
 
 def past_steps(rate: float) -> int:
-    """Return how many steps at this sample rate [Hz] the observer runs for before a prediction starts."""
+    """Return the number of steps of the observer before a prediction, at a sample rate [Hz]."""
     return max(1, round(TUNING.observed_past * rate))
 
 
 def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor]:
-    """Return the windows without their first `past` steps, and the disturbance (W, n) that was observed in these.
+    """Observe the disturbance in the first `past` steps of W windows.
 
-    dynamics: what a rollout integrates, see ``integrable``. The disturbance is a generalised force [Nm, N] where the
-    state has momenta, an acceleration where it has velocities.
+    Args:
+        dynamics: of `integrable`.
+        windows: of more than `past` steps.
+        past: number of steps of the observer.
+
+    Returns:
+        The windows without these steps, and the disturbance (W, n): a generalised force [Nm, N] if the state of the
+        dynamics has momenta, an acceleration [rad/s^2, m/s^2] if it has velocities.
     """
     q = windows.q[:, : past + 1]
     qd = windows.qd[:, : past + 1]
@@ -42,15 +49,15 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
     cache = dynamics.prepare()
     pose = dynamics.at(q, prepared=cache)
     p = dynamics.momentum(pose, qd)
-    # the input jumps at samples: that of the interval after each sample, and that of the interval before
+    # the input is constant in each interval: at a sample, it has the values of the intervals after and before it
     inputs = torch.stack([torch.cat([tau, tau[:, -1:]], dim=1), torch.cat([tau[:, :1], tau], dim=1)])
     _, (at_start, at_end) = dynamics.port_hamiltonian_rhs(pose, p, inputs, cache, *known_past(dynamics, z))
-    lacking = p.diff(dim=1) / dt - (at_start[:, :-1] + at_end[:, 1:]) / 2  # d of each interval, (W, past, n)
+    residual = p.diff(dim=1) / dt - (at_start[:, :-1] + at_end[:, 1:]) / 2  # d in each interval, (W, past, n)
     gain = 1 - torch.exp(-dt / TUNING.observer_time_constant)
-    r = torch.zeros_like(lacking[:, 0])
+    r = torch.zeros_like(residual[:, 0])
     response = torch.zeros_like(gain[:, 0])  # of the filter to d = 1
     for k in range(past):
-        r = r + gain[:, k] * (lacking[:, k] - r)
+        r = r + gain[:, k] * (residual[:, k] - r)
         response = response + gain[:, k] * (1 - response)
     ahead = replace(without_past(windows, past), z=z[:, -1])
     return ahead, r / response

@@ -1,4 +1,4 @@
-"""Judge arms that position servos move by replaying commands: whole logs from their start, and windows."""
+"""Evaluate arms under position servos by replaying logged commands: over whole logs, and over windows."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from spelgen.baselines.baseline import CommandFollower
 from spelgen.baselines.names import MODEL
+from spelgen.baselines.predictor import CommandFollower
 from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import Diagnostic
@@ -20,14 +20,14 @@ from spelgen.logs.filtering import velocities
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 
 @dataclass(frozen=True)
 class ReplayErrors:
-    """Hold root mean squares over time of one predictor [rad, m].
+    """Root mean square position errors of one predictor [rad, m].
 
-    trajectories: over joints, too. mean: of these. joints: over all trajectories.
+    trajectories: by log, over time and joints. mean: mean of these. joints: (n,) over time and all logs.
     """
 
     trajectories: dict[str, float]
@@ -37,31 +37,31 @@ class ReplayErrors:
 
 @dataclass(frozen=True)
 class Replay:
-    """Hold what was replayed, and how wrong each predictor was."""
+    """The errors of a replay by predictor. name: the parts of the logs that were replayed."""
 
     name: str
     errors: dict[str, ReplayErrors]
 
 
-Missed = tuple[Trajectory, np.ndarray]
-"""A log, and predicted less measured positions after each of its intervals, (K, n)."""
+PositionErrors = tuple[Trajectory, np.ndarray]
+"""A log, and predicted minus measured positions at the end of each interval, (K, n) [rad, m]."""
 
 
 class ServoModel:
-    """Roll out a model of position servos under logged commands."""
+    """The model as a `CommandFollower`."""
 
     about = "the model"
 
-    def __init__(self, model: EmittedModel) -> None:
+    def __init__(self, model: ArmModel) -> None:
         self._model = without_idle_residuals(model)
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return positions (K, n) of each part; all run beside each other, the shorter ones on and on."""
+        """See `CommandFollower`. All parts run in one batch, in which shorter ones are padded."""
         steps = max(steps_between(log) for log, _ in parts)
         lengths = [rows.stop - rows.start - 1 for _, rows in parts]
         commands, intervals = [], []
         for (log, rows), length in zip(parts, lengths, strict=True):
-            # in one rollout of all: its small operations cost the same for one part and for many
+            # the operations of a rollout are small: they cost the same for one part and for many
             padding = (0, max(lengths) - length)
             delayed = delayed_commands(log, rows, float(self._model.servo.delay), steps)
             commands.append(np.pad(delayed, (padding, (0, 0), (0, 0)), mode="edge"))
@@ -72,14 +72,14 @@ class ServoModel:
 
 
 def replays(
-    model: EmittedModel,
+    model: ArmModel,
     logs: Sequence[Trajectory],
     baselines: Mapping[str, CommandFollower],
     notes: list[Diagnostic],
-) -> tuple[tuple[Replay, ...], list[Missed]]:
-    """Replay whole logs, and windows of a second one after another, by the model and the baselines.
+) -> tuple[tuple[Replay, ...], list[PositionErrors]]:
+    """Replay whole logs, and consecutive windows of one second, by the model and the baselines.
 
-    Returns these, and what the model misses of whole logs. Notes say what the baselines are.
+    Returns both, and the position errors of the model over whole logs. The baselines are described in `notes`.
     """
     pieces: list[Trajectory] = []
     for log in logs:
@@ -94,7 +94,7 @@ def replays(
     for name, baseline in baselines.items():
         notes.append(Diagnostic("info", "baseline", "logs", None, f"{name}: {baseline.about}"))
     predictors = {MODEL: ServoModel(model), **baselines}
-    # logs begin before the arm moves; within them windows begin in motion
+    # a log begins at rest; a window begins in motion
     logs_from_rest: list[LogRows] = [(piece, slice(0, len(piece))) for piece in pieces]
     at_rest = np.zeros((len(pieces), pieces[0].q.shape[1]))
     replay, missed = _replay("whole log", predictors, logs_from_rest, at_rest)
@@ -108,7 +108,7 @@ def replays(
 def _replay(
     name: str, predictors: Mapping[str, CommandFollower], parts: Sequence[LogRows], qd: np.ndarray
 ) -> tuple[Replay, list[np.ndarray]]:
-    """Return how wrong each predictor is from velocities qd (parts, n) on, and by how much the model misses, (K, n)."""
+    """Return the errors of each predictor from initial velocities qd (parts, n), and those of the model (K, n)."""
     q = np.stack([log.q[rows.start] for log, rows in parts])
     errors: dict[str, list[np.ndarray]] = {}
     for predictor, follower in predictors.items():

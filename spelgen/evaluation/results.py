@@ -1,4 +1,4 @@
-"""The results of an evaluation as people read them, in terminals and notebooks."""
+"""The results of an evaluation, shown in terminals and notebooks."""
 
 from __future__ import annotations
 
@@ -16,14 +16,16 @@ from spelgen.listing import WIDTH
 
 @dataclass(frozen=True, repr=False)
 class Results(Measurements):
-    """Show what `evaluate` measures: the same tables and verdict as `text` in a terminal and in a notebook."""
+    """Measurements of `evaluate`, shown as an assessment and tables, in a terminal as in a notebook."""
 
     def text(self) -> str:
-        """Return every table for a terminal, the best of each row starred, then the verdict."""
+        """Return the assessment, then every table, in which the best of each row is starred."""
+        assessment = verdict(self)
+        paragraph = textwrap.fill(
+            f"{assessment.sentence} {assessment.because}", WIDTH, break_on_hyphens=False
+        )
         tables = [table.text() for table in result_tables(self)]
-        judged = verdict(self)
-        conclusion = textwrap.fill(f"{judged.sentence} {judged.because}", WIDTH, break_on_hyphens=False)
-        return "\n\n".join([f"{self._heading()}; * marks the best of a row", *tables, conclusion])
+        return "\n\n".join([paragraph, f"{self._heading()}; * marks the best of a row", *tables])
 
     def __repr__(self) -> str:
         heading = self._heading()

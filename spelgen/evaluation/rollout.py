@@ -1,4 +1,4 @@
-"""Motion of a model from one state under given inputs."""
+"""Forward simulation of a model from an initial state."""
 
 from __future__ import annotations
 
@@ -21,11 +21,19 @@ def rollout(
     solver: Solver = "rk4",
     substeps: int = 1,
 ) -> tuple[Tensor, Tensor]:
-    """Return positions and velocities, (..., T + 1, n), from q and qd (..., n) on, under tau (..., T, n).
+    """Integrate the motion of a model under torques that are constant in each interval.
 
-    tau[k] is constant for dt [s], or for dt[k] of (..., T). ``model``: an emitted one or any other dynamics. solver:
-    ``rk4`` takes ``substeps`` steps of the classical Runge-Kutta method in each dt, ``dopri5`` torchdiffeq's
-    adaptive steps.
+    Args:
+        model: an emitted model or any other dynamics.
+        q: (..., n) initial positions [rad, m].
+        qd: (..., n) initial velocities [rad/s, m/s].
+        tau: (..., T, n) torques of the T intervals [Nm, N].
+        dt: length of the intervals [s], or of each interval (..., T).
+        solver: ``rk4``: classical Runge-Kutta; ``dopri5``: adaptive steps of torchdiffeq.
+        substeps: of rk4 in each interval.
+
+    Returns:
+        Positions and velocities, each (..., T + 1, n), the initial state included.
     """
     batch = np.broadcast_shapes(q.shape[:-1], tau.shape[:-2])
     samples, n = tau.shape[-2:]

@@ -1,95 +1,111 @@
-"""What is judged, and what is known of how it came about."""
+"""The model that is evaluated, with its fit and its arm as far as they are known."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
+from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.baselines.baseline import FittedBaselines, arm_of_model
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
+from spelgen.emission.assemble import spec_of
 from spelgen.evaluation.tuning import TUNING
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.arm_mapping import GivenMapping
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.settings.log_mapping import LogMapping
+from spelgen.settings.fits import OnWindows
 from spelgen.settings.settings import load_mapping
-from spelgen.spec import Facts, logged_joints, read_facts
+from spelgen.spec import ModelSpec
 from spelgen.urdf.read import read_urdf
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
-    from spelgen.pipeline.loaded_arm import LoadedArm
+    from spelgen.emission.assemble import ArmModel
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A model with its joints as the URDF and logs name them; urdf: its robot's, fit: what found it, where known."""
+    """The evaluated model. joints: names as in the URDF and in logs. urdf: of its robot, fit: None if unknown."""
 
-    model: EmittedModel
+    model: ArmModel
     joints: Sequence[str]
     urdf: Path | None
     fit: Fit | None
 
     @property
-    def facts(self) -> Facts | None:
-        """What the module was built from; None of something that has an arm's dynamics in another way."""
-        return getattr(self.model, "facts", None)
+    def spec(self) -> ModelSpec | None:
+        """Specification of the model; None of a model that was not built from a URDF."""
+        return spec_of(self.model)
 
     @property
     def window(self) -> int:
-        """Samples of the windows that it was fitted to."""
-        return getattr(self.fit and self.fit.config, "window", TUNING.model_window)
+        """Number of samples of the windows that it was fitted to, or a typical one."""
+        if self.fit is not None and isinstance(self.fit.config, OnWindows):
+            return self.fit.config.window
+        return TUNING.model_window
 
     @property
     def reach(self) -> BristleReach:
-        """Reach (n, K) of the bristles that friction remembers with, its own or the usual ones."""
+        """Break-away displacement (n, K) [rad, m] of the bristles of its friction, or a typical one."""
         reach = bristle_reach(self.model)
-        # friction without a state is judged beside least squares with one: z is found for that
+        # if the model's friction has no state, z is still computed for least squares with bristles
         return reach if reach.elements else reach_of(self.model.joint_types)
 
     @property
     def trained_on(self) -> frozenset[str]:
-        """Names of the trajectories that it has seen."""
+        """Names of its training and validation logs."""
         if self.fit is None:
             return frozenset()
-        return frozenset([*self.fit.record["training"], *self.fit.record["validation"]])
+        return frozenset([*self.fit.record.training, *self.fit.record.validation])
 
     @property
-    def run(self) -> RunFolder | None:
-        """The folder of its fit, where there is one."""
-        if self.fit is None or self.fit.folder is None:
+    def fitted_baselines(self) -> FittedBaselines:
+        """The baselines that were fitted with it."""
+        return {} if self.fit is None else self.fit.baselines
+
+    @property
+    def fitted_arm(self) -> ConfiguredArm | None:
+        """The arm that these baselines were fitted for. Raises UrdfError, ArmError or SettingsError."""
+        if self.fit is None or self.fit.urdf is None or not self.fit.baselines:
             return None
-        return RunFolder(self.fit.folder)
+        return arm_of_model(self.model, self.fit.urdf)
+
+    @property
+    def linear_servos(self) -> Mapping[str, Any] | None:
+        """Parameters of the linear servos that were fitted with it."""
+        servo = None if self.fit is None else self.fit.record.servo
+        linear: Mapping[str, Any] | None = None if servo is None else servo["linear"]
+        return linear
 
 
-def subject(judged: EmittedModel | Fit | Path | str, arm: LoadedArm | Path | str | None = None) -> Subject:
-    """Return what is judged: a model, a fit or the folder of a run, on an arm or the URDF of this path."""
-    if isinstance(judged, str | Path):
-        judged = load_run(judged)
-    model, fit = (judged.model, judged) if isinstance(judged, Fit) else (judged, None)
+def subject(tested: ArmModel | Fit | Path | str, arm: ConfiguredArm | Path | str | None = None) -> Subject:
+    """Return the subject of an evaluation: a model, a fit or the folder of a run; arm: see `evaluate`."""
+    if isinstance(tested, str | Path):
+        tested = load_run(tested)
+    model, fit = (tested.model, tested) if isinstance(tested, Fit) else (tested, None)
     urdf = None if fit is None else fit.urdf
     if arm is not None:
         urdf = Path(arm) if isinstance(arm, str | Path) else arm.robot.path
     weights = next(model.parameters(), None)
     if weights is not None and (weights.dtype != torch.float64 or not weights.is_cpu):  # as logs are
         model = copy.deepcopy(model).double().cpu()
-    return Subject(model, logged_joints(model), urdf, fit)
+    return Subject(model, model.joint_names, urdf, fit)
 
 
 def read_test_logs(
     folder: Path | str, paths: Iterable[Path | str], mapping: GivenMapping = None
 ) -> list[Trajectory]:
-    """Return logs of a run's arm (a folder's test.* where there are such), mapped as those that it was trained on."""
+    """Return the test logs of a run's arm (of a folder test.*, if there are any); mapping: None: as in training."""
     run = RunFolder(folder)
-    record, facts = run.read_config(), read_facts(run.module)
+    record, spec = run.read_record(), run.read_spec()
     if mapping is None:
-        mapping = LogMapping(**record["mapping"])
-    elif isinstance(mapping, str | Path) and run.urdf.exists():  # it may speak of all joints of the URDF
+        mapping = record.mapping
+    elif isinstance(mapping, str | Path) and run.urdf.exists():  # it may contain all joints of the URDF
         mapping = load_mapping(mapping, read_urdf(run.urdf).joint)
-    return read_logs(paths, facts.joints, mapping, "test", joint_types=facts.joint_types)
+    return read_logs(paths, spec.joint_names, mapping, "test", joint_types=spec.joint_types)

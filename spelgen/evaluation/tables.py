@@ -1,18 +1,18 @@
-"""Tables and figures of results, by predictor or model: for the terminal, notebooks, files and pages."""
+"""Tables and figures of an evaluation, by predictor or model: for the terminal, notebooks, files and pages."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 from spelgen.baselines.names import MODEL, observed
-from spelgen.labels import UNITS, share, thousandths
+from spelgen.labels import UNITS, Units, share, thousandths
 from spelgen.listing import Listing, number
 
-if TYPE_CHECKING:  # `spelgen --help` names figures, and loads no torch for it
+if TYPE_CHECKING:  # `spelgen --help` lists the figures without loading torch
     from spelgen.evaluation.measurements import Measurements
 
 OBSERVER = (
@@ -21,8 +21,10 @@ OBSERVER = (
 )
 
 Numbers = Mapping[str, float | None]
-"""By column; None where a number is not known."""
+"""By column; None for an unknown number."""
 JointErrors = Sequence[float | None]
+Errors = TypeVar("Errors")
+Value = TypeVar("Value")
 CSV_HEAD = ("table", "row", "predictor", "value")
 PARTS = ("variance", "motion")
 LIMITS = ("torque.nmse", "joint.nmse", "rollout.rms")
@@ -31,19 +33,19 @@ LIMITS = ("torque.nmse", "joint.nmse", "rollout.rms")
 
 @dataclass(frozen=True)
 class Row:
-    """One quantity, in every column that has it. ranked: whether the least of its numbers is best."""
+    """One quantity by column. ranked: whether the smallest number is best."""
 
     label: str
     values: Numbers
     ranked: bool = True
 
     def text(self, column: str) -> str:
-        """Return the number of a column; nothing where it has none."""
+        """Return the number of a column; an empty text without one."""
         return number(self.values[column]) if column in self.values else ""
 
     @property
     def best(self) -> list[str]:
-        """Return the columns with the smallest number, where there is something to compare it with."""
+        """Return the columns with the smallest number; [] if there is only one column."""
         if not self.ranked or len(self.values) < 2:
             return []
         smallest = min((value for value in self.values.values() if value is not None), default=None)
@@ -52,7 +54,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """Quantities down, predictors or models across; `title` says what the numbers are, `note` what rows mean."""
+    """A row for each quantity, a column for each predictor or model. title, note: explain the numbers and the rows."""
 
     title: str
     rows: tuple[Row, ...]
@@ -60,18 +62,18 @@ class Table:
 
     @property
     def columns(self) -> list[str]:
-        """Return the names of all columns, in the order in which rows have them."""
+        """Return the names of all columns, in the order of the rows."""
         names: dict[str, None] = {}
         for row in self.rows:
             names |= dict.fromkeys(row.values)
         return list(names)
 
     def text(self) -> str:
-        """Return it for a terminal; the best of each row is starred."""
+        """Return the table for a terminal; the best of each row is starred."""
         return self.listing().text()
 
     def listing(self) -> Listing:
-        """Return the same as text."""
+        """Return the table with numbers as text."""
         lines, columns = [], self.columns
         for row in self.rows:
             texts, best = [row.label], row.best
@@ -83,18 +85,18 @@ class Table:
 
 
 def table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Table:
-    """Return rows of numbers, by label and column, the least of each marked."""
+    """Return a table of ranked rows, by label and column."""
     return Table(title, tuple(map(Row, rows, rows.values())), note)
 
 
 def result_tables(results: Measurements) -> list[Table]:
-    """Return the tables of an evaluation: commands replayed, errors by horizon and by joint, torques."""
+    """Return the tables of an evaluation: replays, errors by horizon and by joint, torques."""
     tables = [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
     return list(map(_without_empty_baselines, tables))
 
 
 def _without_empty_baselines(full: Table) -> Table:
-    """Return the table without the columns of baselines that have no number."""
+    """Return the table without columns of baselines that have no number."""
     columns = {MODEL}
     for row in full.rows:
         columns |= {name for name, value in row.values.items() if value is not None}
@@ -105,7 +107,7 @@ def _without_empty_baselines(full: Table) -> Table:
 
 
 def joined(runs: Mapping[str, Measurements]) -> list[Table]:
-    """Return the tables and rows that all runs have, with a column for each run: that of its model."""
+    """Return the tables and rows that all runs have, with a column for the model of each run."""
     rows: dict[str, dict[str, dict[str, float | None]]] = {}
     for run, results in runs.items():
         for one_table in result_tables(results):
@@ -121,7 +123,7 @@ def joined(runs: Mapping[str, Measurements]) -> list[Table]:
 
 
 def csv_text(results: Measurements) -> str:
-    """Return the numbers of all tables as one, a row for each; an empty value stands for one that is not known."""
+    """Return the numbers of all tables as CSV, a line for each; unknown values are empty."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(CSV_HEAD)
@@ -132,9 +134,9 @@ def csv_text(results: Measurements) -> str:
     return file.getvalue()
 
 
-def _values(errors: Mapping[str, object], name: str) -> dict[str, Any]:
-    """Return one number of the errors of each predictor."""
-    return {predictor: getattr(of_predictor, name) for predictor, of_predictor in errors.items()}
+def _values(errors: Mapping[str, Errors], value: Callable[[Errors], Value]) -> dict[str, Value]:
+    """Return a value of the errors of each predictor."""
+    return {predictor: value(of_predictor) for predictor, of_predictor in errors.items()}
 
 
 def _horizon_tables(results: Measurements) -> list[Table]:
@@ -145,15 +147,19 @@ def _horizon_tables(results: Measurements) -> list[Table]:
         head = horizon.name
         if not head.endswith(" s"):
             head = f"{head} ({horizon.seconds:.3g} s)"
-        relative[head] = _values(horizon.errors, "mean_relative_rms")
-        tips[head] = _values(horizon.errors, "tip_mm")
+        relative[head] = _values(horizon.errors, lambda x: x.mean_relative_rms)
+        tips[head] = _values(horizon.errors, lambda x: x.tip_mm)
     errors = results.horizons[-1].errors
     note = OBSERVER if any(observed(MODEL) in horizon.errors for horizon in results.horizons) else ""
     tables = [
         table("Error relative to the motion (0: none, 1: as if the arm had stood still)", relative, note),
         table("Error of the tip's position [mm]", tips),
-        _by_joint(results, f"Position error{{}} after {head}", "position", _values(errors, "q")),
-        _by_joint(results, f"Velocity error{{}} after {head}", "velocity", _values(errors, "qd")),
+        _by_joint(
+            results, f"Position error{{}} after {head}", lambda x: x.position, _values(errors, lambda x: x.q)
+        ),
+        _by_joint(
+            results, f"Velocity error{{}} after {head}", lambda x: x.velocity, _values(errors, lambda x: x.qd)
+        ),
     ]
     # no tip is known without a URDF
     if all(value is None for row in tips.values() for value in row.values()):
@@ -166,21 +172,27 @@ def _torque_tables(results: Measurements) -> list[Table]:
     if not torque:
         return []
     rows = {
-        "mean of joints": _values(torque, "mean_nmse"),
-        "with pauses": _values(torque, "nmse_with_pauses"),
-        "worst joint": _values(torque, "worst_nmse"),
+        "mean of joints": _values(torque, lambda x: x.mean_nmse),
+        "with pauses": _values(torque, lambda x: x.nmse_with_pauses),
+        "worst joint": _values(torque, lambda x: x.worst_nmse),
     }
     note = ""
     if results.torque_steps:
         note = f"logged in steps of their own size: {', '.join(results.torque_steps)}"
     return [
         table("Torque error of the inverse dynamics, nMSE over all test samples", rows),
-        _by_joint(results, "Torque error by joint, RMSE{}", "torque", _values(torque, "rmse"), note),
+        _by_joint(
+            results,
+            "Torque error by joint, RMSE{}",
+            lambda x: x.torque,
+            _values(torque, lambda x: x.rmse),
+            note,
+        ),
     ]
 
 
 def _replay_tables(results: Measurements) -> list[Table]:
-    """Return those of commands replayed: by trajectory and by joint."""
+    """Return the tables of replayed commands: by trajectory and by joint."""
     tables, unit = [], thousandths(results.joint_types)
     for replay in results.replays:
         rows: dict[str, Numbers] = {}
@@ -199,10 +211,14 @@ def _replay_tables(results: Measurements) -> list[Table]:
 
 
 def _by_joint(
-    results: Measurements, title: str, quantity: str, errors: Mapping[str, JointErrors], note: str = ""
+    results: Measurements,
+    title: str,
+    unit_of: Callable[[Units], str],
+    errors: Mapping[str, JointErrors],
+    note: str = "",
 ) -> Table:
-    """Return a row for each joint; the unit stands in the title where all have the same, else beside each joint."""
-    units = [getattr(UNITS[kind], quantity) for kind in results.joint_types]
+    """Return a table with a row for each joint; the unit is in the title if all joints have the same."""
+    units = [unit_of(UNITS[joint_type]) for joint_type in results.joint_types]
     if len(set(units)) == 1:
         return table(title.format(f" [{units[0]}]"), _joint_rows(results.joints, errors), note)
     labels = [f"{joint} [{unit}]" for joint, unit in zip(results.joints, units, strict=True)]
@@ -210,7 +226,7 @@ def _by_joint(
 
 
 def _joint_rows(labels: Sequence[str], errors: Mapping[str, JointErrors]) -> dict[str, Numbers]:
-    """Return by joint what the predictors' errors are there."""
+    """Return the errors of all predictors by joint."""
     rows: dict[str, Numbers] = {}
     for k, label in enumerate(labels):
         rows[label] = {name: values[k] for name, values in errors.items()}
@@ -219,7 +235,7 @@ def _joint_rows(labels: Sequence[str], errors: Mapping[str, JointErrors]) -> dic
 
 @dataclass(frozen=True)
 class Figure:
-    """One of the few figures that sum up how good a model is; unit: "variance" and "motion" are parts of these."""
+    """One of the few figures that summarise an evaluation. unit: "variance" and "motion" mean a fraction of these."""
 
     name: str
     label: str
@@ -234,7 +250,7 @@ class Figure:
 
 
 def figures(results: Measurements) -> list[Figure]:
-    """Return what is known of the model: nMSE of torques, errors of the longest rollout and of commands replayed."""
+    """Return the known figures of the model: nMSE of torques, errors of the longest rollout and of replays."""
     candidates: list[tuple[str, str, str, float | None]] = []
     if MODEL in results.torque:
         torque = results.torque[MODEL]
@@ -242,7 +258,7 @@ def figures(results: Measurements) -> list[Figure]:
             ("torque.nmse", "nMSE of torques", "variance", torque.mean_nmse),
             ("joint.nmse", "nMSE of the worst joint's torque", "variance", torque.worst_nmse),
         ]
-    # the longest horizon is the hardest, and what a simulation needs
+    # the longest horizon is the hardest, and the relevant one for simulation
     for horizon in results.horizons[-1:]:
         errors = horizon.errors[MODEL]
         candidates += [

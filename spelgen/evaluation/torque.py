@@ -1,4 +1,4 @@
-"""Torque errors of inverse dynamics on measured trajectories, by one protocol: comparable figures."""
+"""Torque errors of inverse dynamics on measured trajectories, by one protocol for all predictors."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ NEGLIGIBLE = LEAST_SQUARES.negligible
 
 @dataclass(frozen=True)
 class TorqueErrors:
-    """Errors of the inverse dynamics of one predictor by the protocol of `dynamics_samples`.
+    """Errors of the inverse dynamics of one predictor on `dynamics_samples`.
 
-    An nMSE is the mean squared error by the variance of the torque. nmse: of each trajectory, mean over joints. All
-    others are pooled over the samples of all trajectories, so that a log that is short or hardly moves weighs no more
-    than its samples. joint_nmse, rmse [Nm, N]: by joint, None where the torque never varies. mean_nmse: mean over
-    joints. nmse_with_pauses: the same with the pauses between motions.
+    nMSE: mean squared error divided by the variance of the torque. nmse: of each trajectory, mean over joints. All
+    others are pooled over the samples of all trajectories, so that a short log has little weight. joint_nmse, rmse
+    [Nm, N]: per joint, None if the torque is constant. mean_nmse: mean over joints. nmse_with_pauses: mean over joints,
+    with the samples of pauses between motions.
     """
 
     nmse: dict[str, float | None]
@@ -41,12 +41,12 @@ class TorqueErrors:
 
     @property
     def worst_nmse(self) -> float | None:
-        """Return the largest of joint_nmse, which a mean hides."""
+        """Return the nMSE of the worst joint; None if all torques are constant."""
         return max((nmse for nmse in self.joint_nmse if nmse is not None), default=None)
 
 
 def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueErrors:
-    """Return the errors of an inverse dynamics on these samples, of which those of pauses count apart."""
+    """Return the torque errors on these samples; those of pauses are in `nmse_with_pauses` only."""
     residuals, torques, moving, by_trajectory = [], [], [], {}
     for sample in samples:
         residual, rows = predicted_torques(dynamics, sample) - sample.tau, is_moving(sample.qd)
@@ -66,7 +66,7 @@ def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueEr
 
 
 def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
-    """Return the torques of an inverse dynamics on these samples, (T, n)."""
+    """Return the torques of the inverse dynamics on these samples, (T, n) [Nm, N]."""
     q, qd, qdd = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
     with torch.no_grad():
         torques: np.ndarray = dynamics.inverse_dynamics(q, qd, qdd, *friction_past(dynamics, samples)).numpy()
@@ -74,23 +74,26 @@ def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
 
 
 def friction_past(dynamics: Any, samples: DynamicsSamples) -> tuple[Tensor, ...]:
-    """Return what dynamics take of the friction's state on these samples, see `known_past`."""
+    """Return the arguments for the friction state on these samples, see `known_past`."""
     z = None if samples.z is None else torch.from_numpy(samples.z)
     direction = None if samples.direction is None else torch.from_numpy(samples.direction)
     return known_past(dynamics, z, direction)
 
 
 def mean_nmse(residual: np.ndarray, torque: np.ndarray) -> float | None:
-    """Return the nMSE as a mean over joints; None where no torque varies or an error is not finite."""
+    """Return the mean nMSE over joints; None if all torques are constant, or an error is not finite.
+
+    residual, torque: (T, n) [Nm, N].
+    """
     return _mean(_nmse(residual, torque))
 
 
 def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """Return the nMSE of each joint, (T, n) -> (n,): NaN where the torque never varies."""
+    """Return the nMSE of each joint, (T, n) -> (n,); NaN of a constant torque."""
     deviation = torque.std(axis=0)
     largest = np.abs(torque).max(axis=0, initial=0.0)
-    varies = deviation > NEGLIGIBLE * largest  # else a constant, with rounding
-    # a prediction that is not finite must not pass for a torque that says nothing
+    varies = deviation > NEGLIGIBLE * largest  # otherwise constant up to rounding
+    # a prediction that is not finite must not be confused with a constant torque
     squares = np.nan_to_num(np.square(residual).mean(axis=0), nan=np.inf, posinf=np.inf)
     nmse: np.ndarray = np.full_like(squares, np.nan)
     nmse[varies] = squares[varies] / deviation[varies] ** 2
@@ -98,7 +101,7 @@ def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
 
 
 def _mean(nmse: np.ndarray) -> float | None:
-    """Return the mean over joints whose torque varies; None where none does or an error is not finite."""
+    """Return the mean over joints whose torque varies; None without any, or if an error is not finite."""
     varying = nmse[~np.isnan(nmse)]
     return finite(varying.mean(keepdims=True))[0] if varying.size else None
 
@@ -106,17 +109,17 @@ def _mean(nmse: np.ndarray) -> float | None:
 def coarse_torques(
     logs: Sequence[Trajectory], joints: Sequence[str], notes: list[Diagnostic]
 ) -> dict[str, float]:
-    """Return by name the steps [Nm, N] of torques that are logged in steps of their own size, and note them."""
+    """Return the quantisation step [Nm, N] by joint, for torques not much larger than it, and note them."""
     steps = {}
     for k, joint in enumerate(joints):
-        # infinite where a log is not quantised: most of them must be
+        # infinite for a log that is not quantised; the median: most of the logs are quantised
         step = float(np.median(np.nan_to_num([quantisation_step(log.tau[:, k]) for log in logs], nan=np.inf)))
         torque = joined_column(logs, "tau")[:, k]
         if np.isfinite(step) and np.ptp(torque) < LEVELS * step:
             steps[joint] = step
             message = (
                 f"the torque of {joint} is logged in steps of {step:.3g}, as large as the torque itself: "
-                "its error is that of the log, and the verdict omits this joint"
+                "its error is that of the log, and the assessment omits this joint"
             )
             notes.append(Diagnostic("warning", "coarse-torque", "logs", None, message))
     return steps

@@ -1,6 +1,6 @@
-"""The curves behind the figures of an evaluation: for pages, and for programs as `traces` of evaluation.json.
+"""The curves behind the figures of an evaluation: for pages, and as `traces` of evaluation.json.
 
-All are arrays [rad, m, s, Nm, N, kg m^2, J], NaN where a number is not known; JSON has them to five digits.
+All are arrays [rad, m, s, Nm, N, kg m^2, J], NaN for unknown numbers; JSON has five digits.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from spelgen.evaluation.drawn_motions import (
     torque_trace,
     typical_and_worst,
 )
-from spelgen.evaluation.horizons import JudgedLogs, Predictions, TipPosition
+from spelgen.evaluation.horizons import EvaluatedLogs, Predictions, TipPosition
 from spelgen.evaluation.plain import Curve, number
-from spelgen.evaluation.replay import Missed
+from spelgen.evaluation.replay import PositionErrors
 from spelgen.evaluation.tuning import TRACES as TUNING
 from spelgen.fitting.rollout import AT_REST, loss_scales, position_difference
 from spelgen.logs.trajectory import Trajectory, coverage, joined_column
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Quantiles:
-    """10, 50 and 90 % of the starts have at most these errors, by time."""
+    """Quantiles of errors over windows, by time: 10, 50 and 90 %."""
 
     low: Curve
     median: Curve
@@ -47,7 +47,7 @@ class Quantiles:
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """How errors grow with time [s], by predictor: relative to the motion, and of the tip [mm] where it is known."""
+    """Errors over time [s], by predictor: divided by the motion, and of the tip [mm] if it is known."""
 
     seconds: Curve
     windows: int
@@ -64,7 +64,7 @@ class MassCurves:
 
 @dataclass(frozen=True, eq=False)
 class MassTrace:
-    """M along a trajectory by predictor."""
+    """M along a trajectory, by predictor."""
 
     trajectory: str
     t: Curve
@@ -73,7 +73,7 @@ class MassTrace:
 
 @dataclass(frozen=True, eq=False)
 class FrictionTrace:
-    """Friction by velocity: (n, T) by predictor, each joint alone at the mean position."""
+    """Friction torque over velocity, (n, T), by predictor; one joint moves at a time, at the mean position."""
 
     qd: Curve
     by: dict[str, Curve]
@@ -81,7 +81,7 @@ class FrictionTrace:
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """All curves; coverage: of the test logs, see `coverage`."""
+    """All curves of an evaluation. coverage: of the test logs, see `logs.trajectory.coverage`."""
 
     coverage: dict[str, object]
     growth: Growth | None = None
@@ -93,14 +93,14 @@ class Traces:
 
 def motion_traces(
     dynamics: Mapping[str, RigidDynamics],
-    logs: JudgedLogs,
+    logs: EvaluatedLogs,
     predictions: Predictions | None,
     tip: TipPosition | None,
 ) -> Traces:
     """Return all curves of an arm under torques. dynamics: by predictor. predictions: over the longest horizon."""
     growth: Growth | None = None
     predicted: tuple[PredictedMotion, ...] = ()
-    # errors are relative to the motion: there is none at rest
+    # errors are divided by the motion, which is zero at rest
     if predictions is not None and predictions.windows.q.diff(dim=1).abs().max() >= AT_REST:
         errors = _relative_errors(predictions, logs.joint_types)
         growth = _growth(predictions, errors, tip)
@@ -117,14 +117,14 @@ def motion_traces(
     )
 
 
-def replay_traces(missed: Sequence[Missed]) -> Traces:
-    """Return the logs of middle and of largest error of an arm under position servos."""
-    motions = [thinned(replayed_motion(log, error), TUNING.log_samples) for log, error in missed]
-    return Traces(coverage([log for log, _ in missed]), trajectories=typical_and_worst(motions))
+def replay_traces(errors: Sequence[PositionErrors]) -> Traces:
+    """Return the logs of median and of largest error of an arm under position servos."""
+    motions = [thinned(replayed_motion(log, error), TUNING.log_samples) for log, error in errors]
+    return Traces(coverage([log for log, _ in errors]), trajectories=typical_and_worst(motions))
 
 
 def _relative_errors(predictions: Predictions, joint_types: Sequence[str]) -> dict[str, Tensor]:
-    """Return by predictor the root mean square over joints of errors in units of the motion, (W, K-1)."""
+    """Return the RMS error over joints by predictor, divided by the motion, (W, K-1)."""
     windows = predictions.windows
     scales = loss_scales(windows, joint_types)
     errors = {}
@@ -151,7 +151,7 @@ def _growth(predictions: Predictions, errors: Mapping[str, Tensor], tip: TipPosi
 
 
 def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[PredictedMotion, ...]:
-    """Return the windows to draw of the model's predictions, whose errors at their ends are (W,)."""
+    """Return the predictions of the model that charts show. errors: (W,) at the end of each window."""
     motions = []
     for k, ((piece, first), error) in enumerate(zip(predictions.starts, errors.tolist(), strict=True)):
         motion = predicted_motion(piece.name, predictions.windows, predictions.states[MODEL], k)
@@ -161,14 +161,14 @@ def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[Predic
 
 
 def _quantiles(values: Tensor) -> Quantiles:
-    """Return those over windows of (W, T); what is not finite counts as infinite."""
+    """Return the quantiles over windows of values (W, T); NaN counts as infinite."""
     ordered = values.nan_to_num(nan=torch.inf).sort(dim=0).values.numpy()
     last = len(ordered) - 1
     return Quantiles(*(ordered[round(quantile * last)] for quantile in (0.1, 0.5, 0.9)))
 
 
 def _mass_trace(dynamics: Mapping[str, RigidDynamics], motion: DrawnMotion) -> MassTrace:
-    """Return M along a motion that is drawn."""
+    """Return M along a motion of the charts."""
     q = torch.from_numpy(motion.q.copy())
     row, column = np.tril_indices(q.shape[-1])
     curves = {}
@@ -184,7 +184,7 @@ def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Traj
     q = joined_column(pieces, "q")
     # the fastest samples are often spikes of differenced positions
     fast = np.quantile(np.abs(joined_column(pieces, "qd")), 0.995, axis=0)
-    grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)  # dense where friction turns around
+    grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)  # dense near zero, where friction reverses
     speeds = torch.from_numpy(grid[:, None] * fast)  # (81, n)
     alone = torch.diag_embed(speeds)  # one joint at a time
     positions = torch.from_numpy(q.mean(axis=0)).expand_as(alone)

@@ -7,43 +7,63 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class EvaluationTuning:
-    """Constants of the evaluation and of the verdict."""
+    """Measurements of an evaluation, and thresholds of its verdict."""
 
-    # [s] that the momentum observer runs before a prediction (measured: 0.2 and 0.3 s are no better, UR10e)
+    # [s] Time that the momentum observer runs before a prediction; 0.2 and 0.3 s are no better on the UR10e of
+    # `benchmarks/arms.py`.
     observed_past: float = 0.1
-    # [s] 1 / K of the momentum observer (measured: 0.02 to 0.1 s differ by 3 %, UR10e)
+    # [s] 1 / K of the momentum observer; 0.02 to 0.1 s differ by 3 % on the UR10e of `benchmarks/arms.py`.
     observer_time_constant: float = 0.05
-    most_windows: int = 1000  # that a horizon is judged on, evenly spread
-    # of a predictor over a horizon: fewer windows where they are long, but not fewer than the next
+    # [1] Largest number of windows per horizon, evenly spread.
+    most_windows: int = 1000
+    # [1] Largest number of predicted steps per predictor and horizon: long horizons have fewer windows.
     most_predicted_steps: int = 10_000
-    fewest_windows: int = 100  # as far as there are so many
-    probed_model_windows: int = 64  # of which the former are taken
-    # of the torque's variance; convention of this package, as the next two
+    # [1] Smallest number of windows of a long horizon, as far as the logs have as many.
+    fewest_windows: int = 100
+    # [1] Test windows from which the probe of the integration is taken.
+    probed_model_windows: int = 64
+    # [1] Explained fraction of the torque variance that contact detection requires; a convention of this package.
     explained_for_contacts: float = 0.99
-    explained_for_feed_forward: float = 0.95  # likewise
-    explained_for_gravity: float = 0.8  # likewise: what gravity and friction alone come to on most logs
-    close_prediction: float = 0.1  # of the motion: errors up to it are called a simulation
-    rough_prediction: float = 0.3  # of the motion: errors up to it are called a rough simulation
-    slow: float = 0.1  # of a joint's largest velocity: below is called near standstill
-    uneven: float = 1.4  # ratio of slow and fast errors that is worth a word
-    narrow_range: float = 0.5  # of a joint's range: logs that cover less are called narrow
-    sampled_positions: int = 100_000  # at which M must be positive definite
-    free_steps: int = 10_000  # of 1 ms without input
-    started_states: int = 8  # that motion without input starts from
-    headline: int = 20  # [words] of a verdict's sentence: it is read at a glance
-    # [samples] of the windows that say in which steps a model is integrated, where its fit had none
+    # [1] The same for feed-forward control.
+    explained_for_feed_forward: float = 0.95
+    # [1] The same for gravity compensation: gravity and friction explain about as much on most logs.
+    explained_for_gravity: float = 0.8
+    # [1] Error relative to the motion up to which a prediction is called a simulation.
+    close_prediction: float = 0.1
+    # [1] Error relative to the motion up to which a prediction is called a rough simulation.
+    rough_prediction: float = 0.3
+    # [1] Fraction of a joint's largest velocity below which it is called near standstill.
+    slow: float = 0.1
+    # [1] Ratio of the errors of slow and fast motion from which on it is reported.
+    uneven: float = 1.4
+    # [1] Fraction of a joint's range below which the range of the logs is called narrow.
+    narrow_range: float = 0.5
+    # [1] Random positions at which M must be positive definite.
+    sampled_positions: int = 100_000
+    # [1] Steps of 1 ms without input.
+    free_steps: int = 10_000
+    # [1] Initial states of the motion without input.
+    started_states: int = 8
+    # [1] Largest number of words of the first sentence of a verdict.
+    headline: int = 20
+    # [1] Samples of the windows that probe the integration of a model that was not fitted to windows.
     model_window: int = 5
-    replay_window: float = 1.0  # [s] of replays that start anew again and again
+    # [s] Length of replays that are restarted from the measured state.
+    replay_window: float = 1.0
 
 
 @dataclass(frozen=True)
 class TraceTuning:
-    """The numbers of curves behind the figures: what a page can show."""
+    """Resolution of the curves of a report."""
 
-    torque_seconds: float = 10.0  # [s] of torques along a log
-    samples: int = 240  # of a curve along a log or a prediction
-    log_samples: int = 600  # of a whole log that is replayed
-    times: int = 24  # at which the growth of errors is shown
+    # [s] Time along a log over which torques are drawn.
+    torque_seconds: float = 10.0
+    # [1] Samples of a curve along a log or a prediction.
+    samples: int = 240
+    # [1] Samples of the curve of a log that is replayed as a whole.
+    log_samples: int = 600
+    # [1] Times at which the growth of errors is drawn.
+    times: int = 24
 
 
 TUNING, TRACES = EvaluationTuning(), TraceTuning()

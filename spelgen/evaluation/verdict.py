@@ -1,4 +1,4 @@
-"""An evaluation in words: good enough for what, where it fails, and what to record next."""
+"""The assessment of an evaluation in words: what the model is good enough for, where it fails, what to record next."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ TORQUE_USES: tuple[tuple[float, Sequence[str], Sequence[str]], ...] = (
     (TUNING.explained_for_gravity, ["gravity compensation"], ["feed-forward control"]),
     (-math.inf, [], ["control"]),
 )
-"""By the least part of a torque's variance that is explained: what the model is good enough for, and what not."""
+"""By the minimum explained fraction of a torque's variance: the uses that the model is good enough for, or not."""
 Limits = Sequence[tuple[float, float] | None]
-"""Lowest and highest position of each joint; None: it has no limits."""
+"""Lower and upper position of each joint [rad, m]; None without limits."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """sentence: good enough for what, where it fails, what to record next. because: the figures behind it."""
+    """An assessment. sentence: uses, failures, what to record next. because: the figures behind it."""
 
     sentence: str
     because: str
@@ -41,7 +41,7 @@ class Verdict:
 
 @dataclass
 class _Uses:
-    """What a model is good enough for, what not, and the figures that say so."""
+    """The uses that a model is good enough for, the uses that it is not, and the figures that prove both."""
 
     good: list[str] = field(default_factory=list)
     bad: list[str] = field(default_factory=list)
@@ -51,11 +51,14 @@ class _Uses:
 def verdict(
     results: Measurements, identified: Mapping[str, Any] | None = None, limits: Limits = ()
 ) -> Verdict:
-    """Judge an evaluation. identified: least_squares.json, of the training logs. limits: of the joints."""
+    """Return the assessment of an evaluation.
+
+    identified: content of least_squares.json, for the coverage of the training logs. limits: of the joints.
+    """
     uses = _Uses()
-    _judge_torques(results, uses)
-    _judge_motion(results, uses)
-    _judge_replays(results, uses)
+    _assess_torques(results, uses)
+    _assess_motion(results, uses)
+    _assess_replays(results, uses)
     if not uses.proofs:
         return Verdict("No verdict: no horizon and no torque was evaluated.", "")
     sentence = f"Good enough for {listed(uses.good)}" if uses.good else "Not accurate enough yet"
@@ -72,7 +75,7 @@ def verdict(
         details.append(f"next, record {next(iter(recommendations))}")
     because = []
     for detail in details:
-        # a headline is read at a glance
+        # longer details follow the first sentence
         if len(f"{sentence}; {detail}".split()) <= TUNING.headline:
             sentence += f"; {detail}"
         else:
@@ -82,8 +85,8 @@ def verdict(
     return Verdict(f"{sentence}.", " ".join(filter(None, because)))
 
 
-def _judge_torques(results: Measurements, uses: _Uses) -> None:
-    """Judge by the joint whose torque is explained least: a mean hides it."""
+def _assess_torques(results: Measurements, uses: _Uses) -> None:
+    """Assess the torques by the worst joint, since a mean would hide it."""
     torque = results.torque.get(MODEL)
     if torque is None or torque.mean_nmse is None:
         return
@@ -103,7 +106,7 @@ def _judge_torques(results: Measurements, uses: _Uses) -> None:
 
 
 def _worst_torque(results: Measurements) -> tuple[str, float]:
-    """Return the joint of the model's largest nMSE, of those whose torque is not logged in coarse steps, and this."""
+    """Return the joint of the largest nMSE of the model, and this nMSE; joints logged in coarse steps are omitted."""
     worst = ("", -math.inf)
     if MODEL in results.torque:
         for joint, error in zip(results.joints, results.torque[MODEL].joint_nmse, strict=False):
@@ -112,8 +115,8 @@ def _worst_torque(results: Measurements) -> tuple[str, float]:
     return worst
 
 
-def _judge_motion(results: Measurements, uses: _Uses) -> None:
-    # a long horizon may blow up where a short one tells something
+def _assess_motion(results: Measurements, uses: _Uses) -> None:
+    # a long horizon may diverge while a shorter one does not
     finite = [x for x in results.horizons if x.errors[MODEL].mean_relative_rms is not None]
     if results.horizons and not finite:
         uses.bad.append("simulation")
@@ -135,8 +138,8 @@ def _judge_motion(results: Measurements, uses: _Uses) -> None:
         uses.proofs.append(proof)
 
 
-def _judge_replays(results: Measurements, uses: _Uses) -> None:
-    # whole logs stand first: windows forgive what drifts
+def _assess_replays(results: Measurements, uses: _Uses) -> None:
+    # the first replay is of whole logs: over windows, drift is not visible
     for replay in results.replays[:1]:
         error = replay.errors[MODEL].mean
         if error == min(errors.mean for errors in replay.errors.values()):
@@ -148,14 +151,14 @@ def _judge_replays(results: Measurements, uses: _Uses) -> None:
 
 
 def _relative(errors: StateErrors | None) -> float:
-    """Return the mean error relative to the motion; infinite where it is not known."""
+    """Return the mean error divided by the motion; infinite if it is unknown."""
     if errors is None or errors.mean_relative_rms is None:
         return math.inf
     return errors.mean_relative_rms
 
 
 def _better_baselines(results: Measurements) -> list[str]:
-    """Say at which times ahead a constant velocity is better than the model, and which other baseline is, at what."""
+    """Return sentences about the horizons at which a constant velocity, or another baseline, beats the model."""
     times: list[str] = []
     better: dict[str, list[str]] = {}
     for horizon in results.horizons:
@@ -182,15 +185,16 @@ def _better_baselines(results: Measurements) -> list[str]:
 
 
 def _worst_joint(results: Measurements) -> tuple[str, str, str]:
-    """Return the joint whose torque is explained least, or whose motion is where that alone fails; when; and a sentence
-    about it.
+    """Return the joint of the largest torque error, or of the largest motion error if only motion fails.
+
+    Also returns the speed at which the torque error is larger, and a sentence about the joint.
     """
     joint, error = _worst_torque(results)
-    moved, motion_error = _worst_motion(results)
-    motion_alone = error <= 1 - TUNING.explained_for_contacts and motion_error > TUNING.close_prediction
-    if moved and (motion_alone or not joint):
+    moving, motion_error = _worst_motion(results)
+    only_motion = error <= 1 - TUNING.explained_for_contacts and motion_error > TUNING.close_prediction
+    if moving and (only_motion or not joint):
         amount = share(motion_error, "the motion")
-        return moved, "", f"At {moved} the error after {results.horizons[-1].name} is {amount}."
+        return moving, "", f"At {moving} the error after {results.horizons[-1].name} is {amount}."
     if not joint:
         return "", "", ""
     speed = _slow_or_fast(results, results.joints.index(joint))
@@ -199,7 +203,7 @@ def _worst_joint(results: Measurements) -> tuple[str, str, str]:
 
 
 def _worst_motion(results: Measurements) -> tuple[str, float]:
-    """Return the joint that the longest rollouts miss by most of its motion, and by how much of it."""
+    """Return the joint of the largest error in the longest rollouts, divided by its motion, and this error."""
     for last in results.horizons[-1:]:
         errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # NaN of None
         if np.isfinite(errors).all():
@@ -208,7 +212,7 @@ def _worst_motion(results: Measurements) -> tuple[str, float]:
 
 
 def _slow_or_fast(results: Measurements, k: int) -> str:
-    """Return at which speed of joint k the residuals of its torque are larger, where they differ."""
+    """Return the speed of joint k at which its torque residual is larger; "" without a clear difference."""
     if not results.traces.torques:
         return ""
     residuals, speeds = [], []
@@ -217,7 +221,7 @@ def _slow_or_fast(results: Measurements, k: int) -> str:
         speeds.append(np.abs(trace.qd[:, k]))
     squares, speed = np.square(np.concatenate(residuals)), np.concatenate(speeds)
     slow = speed < TUNING.slow * np.nanmax(speed)
-    # a handful of samples tells no root mean square
+    # a root mean square needs more than five samples
     if not 5 < slow.sum() < len(slow) - 5:
         return ""
     ratio = np.sqrt(np.nanmean(squares[slow]) / np.nanmean(squares[~slow]))
@@ -229,7 +233,7 @@ def _slow_or_fast(results: Measurements, k: int) -> str:
 def _recommendations(
     results: Measurements, identified: Mapping[str, Any], limits: Limits, worst: str, speed: str
 ) -> dict[str, str]:
-    """Return which motions to record, the most useful first, and why. worst: a joint, which fails at this speed."""
+    """Return motions to record, the most useful first, with reasons. worst: the worst joint, at `speed`."""
     recommendations = {}
     trained = identified.get("coverage") or {}
     unseen = identified.get("unseen_directions")
@@ -245,7 +249,7 @@ def _recommendations(
     fractions = {}
     for joint, covered, bound in zip(results.joints, trained.get("q", ()), limits, strict=False):
         if bound is not None and bound[1] > bound[0]:
-            # a turn shows all of a joint that can go on turning
+            # one revolution covers the range of a continuous joint
             fractions[joint] = (covered["high"] - covered["low"]) / min(bound[1] - bound[0], 2 * math.pi)
     if fractions:
         joint = min(fractions, key=fractions.__getitem__)
@@ -256,7 +260,7 @@ def _recommendations(
 
 
 def _outside(trained: Mapping[str, Any], tested: Mapping[str, Any], joints: Sequence[str]) -> list[str]:
-    """Return where the test logs go beyond the training logs by a tenth of these."""
+    """Return the quantities whose range in the test logs exceeds that of the training logs by a tenth."""
     exceeded = []
     for quantity, word in (("q", "positions"), ("qd", "velocities")):
         ranges = zip(joints, trained.get(quantity, ()), tested.get(quantity, ()), strict=False)

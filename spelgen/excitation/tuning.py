@@ -7,18 +7,29 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ExcitationTuning:
-    """Numbers that decide which motion `spelgen excite` proposes."""
+    """Design of the motion that `spelgen excite` proposes."""
 
-    starts: int = 40  # motions at random, of which the best is improved
-    harmonics_per_second: float = 0.4  # up to 0.4 Hz: what an arm follows well, far below its drives' ripple
-    fewest_harmonics: int = 5  # as in Swevers et al. 1997
-    memory: int = 30  # steps from which L-BFGS knows the curvature
-    samples_per_harmonic: int = 12  # of a motion that is tried
-    penalty: float = 50.0  # on the squared part of an effort limit that a sample overruns
-    effort: float = 0.9  # of the effort limits: friction comes on top of what the URDF says
-    usual_speed: float = 1.0  # [rad/s] where the URDF names no limit
-    grid: int = 40  # points for each harmonic, between which a motion keeps its limits
-    sliding_speed: float = 0.25  # [m/s] likewise, of sliding joints
+    # [1] Random motions, of which the best one is improved.
+    starts: int = 40
+    # [1/s] Harmonics per second of motion, so that frequencies reach 0.4 Hz: arms track them well, and drive ripple
+    # is far above.
+    harmonics_per_second: float = 0.4
+    # [1] Smallest number of harmonics, as in Swevers et al., IEEE T-RA 13:730, 1997.
+    fewest_harmonics: int = 5
+    # [1] Steps from which L-BFGS approximates the curvature.
+    memory: int = 30
+    # [1] Samples per harmonic of a motion that is evaluated.
+    samples_per_harmonic: int = 12
+    # [1] Weight of the squared violation of an effort limit at a sample.
+    penalty: float = 50.0
+    # [1] Fraction of the effort limits that may be used: friction is added to the URDF's torques.
+    effort: float = 0.9
+    # [rad/s] Speed limit of turning joints for which the URDF has none.
+    usual_speed: float = 1.0
+    # [1] Points per harmonic at which limits of the motion are enforced.
+    grid: int = 40
+    # [m/s] Speed limit of sliding joints for which the URDF has none.
+    sliding_speed: float = 0.25
 
 
 TUNING = ExcitationTuning()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import keyword
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -16,16 +17,18 @@ from torch import Tensor
 
 from spelgen.arm.arm import make_arm
 from spelgen.arm.chain import choose_chain
+from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.arm.lump_links import lump_links
-from spelgen.dynamics.protocol import ResidualModel, has_residuals, has_rigid_bodies, input_of, motors_of
+from spelgen.dynamics.protocol import input_of, motors_of, residual_terms
 from spelgen.dynamics.tip import last_link
 from spelgen.errors import RunError
 from spelgen.exporting.description import Harmonics, Network, Residuals, Servos, Tip, TrainedModel
 from spelgen.exporting.entry_points import EntryPoint, entry_points
-from spelgen.pipeline.loaded_arm import LoadedArm
+from spelgen.runtime.friction_laws import FrictionConstants
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
     from spelgen.runtime.parts import Layers
     from spelgen.runtime.residual_terms import ResidualTerms
 
@@ -39,8 +42,8 @@ class Trained:
     entries: names of the functions to export, for formats of functions; by default all but derivatives.
     """
 
-    model: EmittedModel
-    arm: LoadedArm
+    model: ArmModel
+    arm: ConfiguredArm
     entries: tuple[str, ...] = ()
 
     @cached_property
@@ -66,31 +69,36 @@ class Trained:
     @property
     def memory(self) -> int:
         """How many numbers the memory of friction has."""
-        return self.model.n * int(getattr(self.model, "elements", 0))
+        model = self.model
+        return model.n * model.elements if isinstance(model, RigidBodyDynamics) else 0
 
 
-def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
+def describe(model: ArmModel, loaded: ConfiguredArm) -> TrainedModel:
     """Return the numbers of a trained model of this arm. Raises RunError for a preset without rigid bodies."""
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
-    if not has_rigid_bodies(exact):
-        preset = model.facts.options.preset
-        raise _unsupported(f"the preset {preset}, which is not of rigid bodies")
+    if not isinstance(exact, RigidBodyDynamics):
+        preset = model.spec.options.preset
+        raise RunError(
+            f"the preset {preset}, which is not of rigid bodies",
+            expected="closed-form or hybrid",
+            do="--to torch, onnx, mjcf and urdf take every preset",
+        )
     weights = exact.prepare()
     # what does not depend on q is one matrix, whatever it comes from
     constant_mass = array(weights.armature)
     residuals = Residuals((), None, None, {}, (), {})
-    if has_residuals(exact):
+    if residual_terms(exact) is not None:
         constant_mass += array(weights.residual.constant).reshape(exact.n, exact.n)
         residuals = _residuals(exact)
     return TrainedModel(
         name=identifier(loaded.arm.name),
         arm=loaded.arm,
-        identifiers=tuple(model.joint_names),
+        identifiers=unique_identifiers(model.joint_names),
         inertias=array(exact.inertial_parameters),
         constant_mass=constant_mass,
         motors=array(motors_of(exact)),
         residuals=residuals,
-        friction=weights.friction._make(map(array, weights.friction)),
+        friction=FrictionConstants._make(map(array, weights.friction)),
         reach=array(exact.friction.reach),
         inputs=array(exact.input_matrix(torch.zeros(exact.n).double())),
         actuated=array(exact.actuated),
@@ -104,10 +112,23 @@ def describe(model: EmittedModel, loaded: LoadedArm) -> TrainedModel:
 def identifier(text: str) -> str:
     """Return ASCII letters, digits and underscores of a text: a name that any language takes."""
     plain = re.sub(r"[^0-9a-z]+", "_", text.lower()).strip("_")[:_LONGEST_NAME]
-    # emitted Python has the same names
     if not plain or plain[0].isdigit() or keyword.iskeyword(plain):
         return f"arm_{plain}".rstrip("_")
     return plain
+
+
+def unique_identifiers(names: Sequence[str]) -> tuple[str, ...]:
+    """Return an identifier for each joint, recognisable if the name allows it, that no other joint has."""
+    found: list[str] = []
+    for number, name in enumerate(names, start=1):
+        plain = re.sub(r"[^0-9a-z]+", "_", name.lower()).strip("_")[:_LONGEST_NAME]
+        if not plain or keyword.iskeyword(plain) or keyword.issoftkeyword(plain) or plain[0].isdigit():
+            plain = f"joint_{plain or number}"
+        unique, count = plain, 2
+        while unique in found:
+            unique, count = f"{plain}_{count}", count + 1
+        found.append(unique)
+    return tuple(found)
 
 
 def array(value: Tensor) -> np.ndarray:
@@ -116,7 +137,7 @@ def array(value: Tensor) -> np.ndarray:
     return values
 
 
-def servos_of(model: EmittedModel) -> Servos | None:
+def servos_of(model: ArmModel) -> Servos | None:
     """Return the position servos of a model, None where it has none."""
     if input_of(model) == "torque":
         return None
@@ -124,7 +145,7 @@ def servos_of(model: EmittedModel) -> Servos | None:
     return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
 
 
-def tip_frame(loaded: LoadedArm) -> Tip:
+def tip_frame(loaded: ConfiguredArm) -> Tip:
     """Return the frame of the tip's link behind the body that carries it, by the angles that the URDF has."""
     names = loaded.arm.joint_names
     link = loaded.tip or last_link(loaded.robot, names)
@@ -136,44 +157,31 @@ def tip_frame(loaded: LoadedArm) -> Tip:
     return Tip(link, frame.body, pose, bodies)
 
 
-def _unsupported(subject: str) -> RunError:
-    return RunError(
-        subject,
-        expected="closed-form, or hybrid with tanh networks",
-        do="--to torch, onnx, mjcf and urdf take every preset",
-    )
-
-
-def _residuals(model: ResidualModel) -> Residuals:
-    """Return the residuals without those that are zero. Raises RunError for Kolmogorov-Arnold networks."""
+def _residuals(model: ArmModel) -> Residuals:
+    """Return the residuals without those that are zero."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
     entries: np.ndarray = np.argwhere(np.tril(functions.any(axis=0).reshape(model.n, model.n)))
-    mass = _network(terms.mass, weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
+    mass = _network(weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
     if mass is None:
         entries = entries[:0]
     return Residuals(
         entries=tuple(map(tuple, entries.tolist())),
         mass=mass,
-        potential=_network(terms.potential, weights.potential, terms.encoding),
+        potential=_network(weights.potential, terms.encoding),
         torque=_splines(terms, terms.unit * terms.raw_torque_splines),
         ripple=_ripple(terms, weights.ripple),
         friction=_splines(terms, terms.friction_logarithms()),
     )
 
 
-def _network(
-    network: object, layers: Layers | None, encoding: Any, functions: np.ndarray | None = None
-) -> Network | None:
+def _network(layers: Layers | None, encoding: Any, functions: np.ndarray | None = None) -> Network | None:
     """Return a network y, None where there is none or its last layer is zero; with functions, tanh(y) @ functions.
 
     Its units are sigmoids, which C computes faster than tanh.
     """
     if layers is None or not any(tensor.any() for tensor in layers[-1]):
         return None
-    # an emitted module brings a class of its own; bumps on a grid are what a Kolmogorov-Arnold network is made of
-    if hasattr(network, "grid"):
-        raise _unsupported("Kolmogorov-Arnold networks beside rigid bodies")
     weights, biases = [], []
     for weight, bias in layers:
         weights.append(array(weight))

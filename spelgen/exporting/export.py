@@ -7,23 +7,24 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.emission.build import arm_of_spec
 from spelgen.errors import RunError, suggestion
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
-from spelgen.fitting.fitted import Fit, load_run
+from spelgen.fitting.fitted import Fit, load_run, required_spec
 from spelgen.labels import listed
-from spelgen.pipeline.loaded_arm import LoadedArm, arm_of_module
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 
 def export(
-    trained: Fit | EmittedModel | Path | str,
+    trained: Fit | ArmModel | Path | str,
     to: str = "urdf",
     path: Path | str | None = None,
     *,
-    arm: LoadedArm | Path | str | None = None,
+    arm: ConfiguredArm | Path | str | None = None,
     force: bool = False,
     entries: Sequence[str] = (),
 ) -> Exported:
@@ -53,8 +54,8 @@ def export(
     if arm is None:
         expected = "a run of `spelgen train --robot FILE.urdf`, or an arm"
         raise RunError("no robot.urdf", element="export", expected=expected)
-    if not isinstance(arm, LoadedArm):
-        arm = arm_of_module(trained.facts, arm)
+    if not isinstance(arm, ConfiguredArm):
+        arm = arm_of_spec(required_spec(trained), arm)
     # its module is imported now: what it needs may be an extra
     exported: Exported = pkgutil.resolve_name(exporter.function_name)(Trained(trained, arm, tuple(entries)))
     if path is not None:

@@ -21,7 +21,7 @@ from spelgen.exporting.tuning import TUNING
 from spelgen.structure.nominal import working_range
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 _USUAL_SPEED = {"revolute": 1.0, "prismatic": 0.3}  # rad/s, m/s where the URDF names none
 
@@ -130,7 +130,7 @@ def relative(values: np.ndarray, expected: np.ndarray) -> float:
         return float(np.abs(values - expected).max() / size)
 
 
-def _expected(model: EmittedModel, trained: Trained, name: str, inputs: Values) -> Values:
+def _expected(model: ArmModel, trained: Trained, name: str, inputs: Values) -> Values:
     """Return an entry point's outputs by the model in float64, (states, ...), by name."""
     entry = ENTRY_POINTS[name]
     tensors: list[Tensor] = []

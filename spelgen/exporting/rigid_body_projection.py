@@ -12,18 +12,19 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.protocol import has_rigid_bodies, motors_of
+from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.residuals import without_residuals
+from spelgen.emission.build import build
 from spelgen.exporting.describe import array, servos_of
 from spelgen.exporting.description import Servos
 from spelgen.exporting.parity import random_inputs, usual_speeds
 from spelgen.exporting.tuning import TUNING
 from spelgen.fitting.optimizers import minimise
-from spelgen.pipeline.build import build
-from spelgen.pipeline.loaded_arm import LoadedArm
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 
 class NearestFriction(NamedTuple):
@@ -48,7 +49,7 @@ class RigidBodyProjection:
     of the difference of M and of gravity torque, relative to the model's. bodies: a model of them alone, float64.
     """
 
-    arm: LoadedArm
+    arm: ConfiguredArm
     inertias: np.ndarray
     armature: np.ndarray
     motors: np.ndarray
@@ -58,7 +59,7 @@ class RigidBodyProjection:
     own: bool
     mass_error: float
     gravity_error: float
-    bodies: EmittedModel
+    bodies: ArmModel
 
     @property
     def summary(self) -> tuple[str, str]:
@@ -77,12 +78,12 @@ class RigidBodyProjection:
         return bodies, f"{friction}; {error}"
 
 
-def rigid_body_projection(model: EmittedModel, arm: LoadedArm) -> RigidBodyProjection:
+def rigid_body_projection(model: ArmModel, arm: ConfiguredArm) -> RigidBodyProjection:
     """Return the bodies, armature and friction of a trained model of ``arm``."""
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     q = sampled_positions(arm.arm)
-    own = has_rigid_bodies(model)
-    bodies: EmittedModel = without_residuals(model) if own else _nearest_bodies(model, arm, q)
+    own = isinstance(model, RigidBodyDynamics)
+    bodies: ArmModel = without_residuals(model) if own else _nearest_bodies(model, arm, q)
     return RigidBodyProjection(
         arm=arm,
         inertias=bodies.inertial_parameters.numpy(),
@@ -103,7 +104,7 @@ def sampled_positions(arm: Arm) -> Tensor:
     return torch.from_numpy(random_inputs(arm.coordinates, TUNING.positions)["q"])
 
 
-def _nearest_bodies(model: EmittedModel, arm: LoadedArm, q: Tensor) -> EmittedModel:
+def _nearest_bodies(model: ArmModel, arm: ConfiguredArm, q: Tensor) -> ArmModel:
     """Return the physically consistent bodies whose M and gravity torque are nearest to the model's.
 
     Where these leave a body's parameters open it keeps the URDF's.
@@ -132,7 +133,7 @@ def _relative_rms(values: Tensor, expected: Tensor) -> float:
     return float((values - expected).square().mean().sqrt() / size)
 
 
-def nearest_friction(arm: Arm, model: EmittedModel, q: Tensor) -> NearestFriction:
+def nearest_friction(arm: Arm, model: ArmModel, q: Tensor) -> NearestFriction:
     """Return the viscous and Coulomb friction nearest to the model's."""
     fractions = np.geomspace(0.02, 1.0, TUNING.friction_speeds)
     fractions = np.concatenate([-fractions[::-1], fractions])

@@ -1,11 +1,11 @@
-"""The logs that a model is fitted to: checked, split, filtered, cut into windows, and what it is judged by on these."""
+"""Training data: logs checked, split, filtered and cut into windows, and the validation of a model on them."""
 
 from __future__ import annotations
 
 import copy
 import hashlib
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,24 +18,23 @@ from spelgen.fitting.rollout import LossScales, choose_substeps, loss_scales, ro
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.tuning import ValidationTuning
 from spelgen.logs.checks import check
-from spelgen.logs.chunks import Chunk
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 from spelgen.logs.windows import Split, Windows, cut_windows, split_validation, thinned
 from spelgen.settings.fits import DEFAULTS, Solver
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = ValidationTuning()
 
 
 @dataclass(frozen=True)
 class WindowChoice:
-    """Which windows are cut, and which are set aside.
+    """Choice of the windows for training and validation.
 
-    validation: trajectories, or the fraction of the logs that is set aside, whole trajectories drawn by the seed
-    before anything is cut, so that no sample is in both parts. window, stride, reach: see `cut_windows`.
+    validation: trajectories, or the fraction of the logs that validates. These are whole trajectories, chosen at random
+    with `seed` before windows are cut, so that no sample is in both parts. window, stride, reach: see `cut_windows`.
     """
 
     window: int = 5
@@ -45,11 +44,11 @@ class WindowChoice:
     reach: BristleReach | None = None
 
     def span(self, preprocessing: Preprocessing) -> int:
-        """Return the samples of one window, of logs that are prepared like this."""
+        """Return the number of samples that one window spans, before decimation."""
         return (self.window - 1) * (preprocessing.decimation or 1) + 1
 
     def windows(self, trajectories: Sequence[Trajectory], preprocessing: Preprocessing) -> Windows:
-        """Return all windows of these trajectories, filtered piece by piece; preprocessing: a resolved one."""
+        """Return all windows of the trajectories, whose gap-free pieces are filtered; preprocessing: resolved."""
         return cut_windows(
             preprocessing.pieces(trajectories, shortest=self.span(preprocessing)),
             self.window,
@@ -65,11 +64,10 @@ DEFAULT_CHOICE = WindowChoice()
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
-    """Windows of the logs, ready to fit.
+    """Windows of the logs for training and validation.
 
-    training: all of them, or of logs larger than memory an even sample. preprocessing: as it was resolved.
-    digest: of every number, to resume on the same data only. recordings: what all was cut from, validation included; of
-    logs larger than memory chunks.
+    preprocessing: the resolved one. digest: of all numbers, so that a fit resumes on the same data only. recordings:
+    all trajectories, those of validation included.
     """
 
     training: Windows
@@ -81,7 +79,6 @@ class TrainingData:
     diagnostics: tuple[Diagnostic, ...]
     digest: str
     recordings: Sequence[Trajectory] = ()
-    chunks: Sequence[Chunk] = ()
 
 
 def prepare_data(
@@ -91,7 +88,7 @@ def prepare_data(
     preprocessing: Preprocessing,
     choice: WindowChoice = DEFAULT_CHOICE,
 ) -> TrainingData:
-    """Check the logs and make windows of them. Raises LogError."""
+    """Check the logs, split them and cut windows. Raises LogError."""
     if not trajectories:
         raise LogError("no logs", expected="a trajectory or more")
     split = _split(trajectories, choice)
@@ -126,24 +123,18 @@ def _split(trajectories: Sequence[Trajectory], choice: WindowChoice) -> Split:
 
 
 def digest(trajectories: Iterable[Trajectory]) -> str:
-    """Return a fingerprint of every number."""
+    """Return the SHA-256 digest of all numbers of the trajectories."""
     numbers = hashlib.sha256()
-    for trajectory in trajectories:
-        for array in numbers_of(trajectory):
-            numbers.update(array)
+    for x in trajectories:
+        for array in (x.t, x.q, x.qd, x.tau, x.u):
+            if array is not None:
+                numbers.update(np.ascontiguousarray(array).data)
     return numbers.hexdigest()
-
-
-def numbers_of(trajectory: Trajectory) -> Iterator[memoryview]:
-    """Yield what is digested of a trajectory."""
-    for array in (trajectory.t, trajectory.q, trajectory.qd, trajectory.tau, trajectory.u):
-        if array is not None:
-            yield np.ascontiguousarray(array).data
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """A model's weights, the integrator's steps that they need between samples, and their validation loss."""
+    """Weights of a model, their integration steps between samples, and their validation loss."""
 
     substeps: int
     loss: float
@@ -153,12 +144,12 @@ class Measured:
 class Validation:
     """Validation windows, and a probe of the training windows for the integrator's steps.
 
-    substeps: of rk4 between samples, where they are prescribed. batch: a fourth of the windows predicted together.
+    substeps: steps of rk4 between samples, None to choose them. batch: a fourth of the windows predicted together.
     """
 
     def __init__(
         self,
-        model: EmittedModel,
+        model: ArmModel,
         data: TrainingData,
         device: str = "cpu",
         *,
@@ -174,7 +165,7 @@ class Validation:
         self.probe = data.training[:: -(-len(data.training) // TUNING.probe)].to(device)
 
     def loss(self, substeps: int) -> float:
-        """Return `rollout_loss` of the validation windows; infinite where numbers blow up."""
+        """Return `rollout_loss` of the validation windows; infinite if they diverge."""
         total = 0.0
         try:
             with torch.no_grad():
@@ -186,9 +177,9 @@ class Validation:
         return total / self.size
 
     def substeps(self, present: int | None = None) -> int:
-        """Return the integrator's steps per sample interval: those prescribed, or as many as the model now needs.
+        """Return the integration steps per sample interval, given ones or chosen for the model.
 
-        They are never fewer than the present ones.
+        present: smallest number that is returned.
         """
         if self.solver != "rk4":
             return 1
@@ -197,6 +188,6 @@ class Validation:
         return choose_substeps(self.model, self.probe, self.scales, start=present or 1)
 
     def measure(self) -> Measured:
-        """Return what validation says of the model as it is."""
+        """Return the validation of the model with its current weights."""
         substeps = self.substeps()
         return Measured(substeps, self.loss(substeps), copy.deepcopy(self.model.state_dict()))

@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from spelgen.dynamics.protocol import has_rigid_bodies
-from spelgen.errors import Diagnostic, RunError, SettingsError
+from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.baselines.baseline import FittedBaselines, arm_of_model
+from spelgen.baselines.registry import fit_baselines
+from spelgen.errors import Diagnostic, RunError, SpelgenError
 from spelgen.files import write_json
-from spelgen.fitting.fitted import Fit, load_run
-from spelgen.fitting.objective import FitRequest, Logs, Objective, RunOptions, Status, record_of
-from spelgen.fitting.objectives import chosen_config, objective_of
+from spelgen.fitting.fitted import Fit, load_run, required_spec
+from spelgen.fitting.objective import FitRequest, Objective, RunOptions, Status, new_record
+from spelgen.fitting.objectives import FitOptions, choose_config, objective_of
 from spelgen.fitting.process import locked, require_device, termination_as_interrupt, threads_of_torch
 from spelgen.fitting.progress import TrainingProgress
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.run_record import require_same
-from spelgen.fitting.streaming import LargeLogs
+from spelgen.fitting.run_record import Checkpoint
 from spelgen.logs.dynamics_samples import SHORTEST
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import FitConfig
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
     from spelgen.urdf.robot import Robot
 
 __all__ = ["Fit", "RunOptions", "fit", "load_run"]
@@ -43,9 +44,9 @@ QUIET = RunOptions()
 
 
 def fit(
-    model: EmittedModel,
-    logs: Trajectory | Logs,
-    config: FitConfig | None = None,
+    model: ArmModel,
+    logs: Trajectory | Sequence[Trajectory],
+    config: FitConfig | FitOptions | None = None,
     *,
     preprocessing: Preprocessing = AUTOMATIC,
     validation: float | Sequence[Trajectory] = 0.25,
@@ -54,22 +55,33 @@ def fit(
     folder: Path | str | None = None,
     options: RunOptions = QUIET,
 ) -> Fit:
-    """Fit ``model`` to ``logs``; it then has the best weights that were found.
+    """Fit ``model`` to ``logs``, and the baselines that it is compared with; it then has the best weights found.
 
-    config: a `TorqueFit`, `MomentumFit` or `Rollout`, or of an arm under position servos a `ServoFit`, all that it
-    takes, which needs no validation; by default torque for rigid bodies, where logs are dense enough for accelerations,
-    and rollout for networks. validation: the fraction of the logs that is set aside, whole trajectories drawn by
-    ``seed``, or trajectories. arm: the arm or the URDF that the model was made from, for the regularizer towards it and
-    for the run folder. folder: where checkpoints go after every epoch (see `RunFolder`); without one, `Fit.save`
-    writes all that.
     Ctrl-C or SIGTERM end the fit with status "interrupted".
+
+    Args:
+        model: of `spelgen.build` or `spelgen.load_module`; its weights are changed.
+        logs: of the arm, with torques, or with commands for an arm under position servos.
+        config: a `TorqueFit`, `MomentumFit` or `Rollout`, or for an arm under position servos a `ServoFit`, which uses
+            all logs and needs no validation. Default: torque for rigid bodies if logs are dense enough for
+            accelerations, rollout for networks.
+        preprocessing: filter, gaps and delay of the logs.
+        validation: the fraction of the logs that is set aside, whole trajectories chosen by ``seed``, or trajectories.
+        seed: of the split and of the order of batches.
+        arm: the arm or the URDF that the model was made from: for the regularizer, the baselines and the run folder.
+        folder: where checkpoints are written after every epoch (see `RunFolder`); without one, `Fit.save` writes all.
+        options: how the fit runs.
+
+    Returns:
+        The fitted model with its record, and with the baselines of least squares if ``arm`` is known.
+
     Raises OptionError for an option that does not apply to this model, LogError, and RunError when the folder contains
     a run or cannot be resumed with this.
     """
     began = options.began or time.monotonic()
     run = None if folder is None else RunFolder(folder)
     logs = [logs] if isinstance(logs, Trajectory) else logs
-    config = _config(model, logs, config)
+    config = choose_config(model, config, lambda: sample_rates(logs))
     urdf = run.urdf if run is not None and options.resume else _urdf(arm)
     folder = None if run is None else run.path
     request = FitRequest(model, logs, config, preprocessing, validation, seed, urdf, options, began, folder)
@@ -78,91 +90,118 @@ def fit(
         run.require_free(force=options.force)
     with threads_of_torch(options.threads), termination_as_interrupt(), locked(folder):
         require_device(options.device)
+        return _Fitting(request, objective, run).fitted()
+
+
+class _Fitting:
+    """A fit in progress, from prepared logs to the files of its run folder, if it has one."""
+
+    def __init__(self, request: FitRequest, objective: Objective, run: RunFolder | None) -> None:
+        self.request, self.objective, self.run = request, objective, run
         prepared = objective.prepare()
-        notes = [*prepared.notes, *options.notes]
-        record = record_of(request, prepared)
-        if run is not None and options.resume:
-            require_same(run.read_config(), record, run.path)
-            _resume(objective, run)
+        self.notes: list[Diagnostic] = [*prepared.notes, *request.options.notes]
+        self.record = new_record(request, prepared)
+        self.baselines: FittedBaselines = {}
+
+    def fitted(self) -> Fit:
+        """Run the fit and return its result."""
+        request, objective = self.request, self.objective
+        if self.run is None:
+            self.notes += objective.begin()
+        elif request.options.resume:
+            self._resume(self.run)
         else:
-            notes += objective.begin()
-
-        def save() -> None:
-            if run is not None:
-                checkpoint = objective.checkpoint()
-                run.write_metrics(objective.history)
-                run.save(checkpoint["best_weights"], checkpoint)
-
-        if run is not None and not options.resume:
-            run.start(model.source, urdf, force=options.force)
-            save()
-            write_json(run.config, record)  # now there is a run, and it can be resumed
-        status = _run(objective, save, notes, show=options.progress)
-        if objective.results:
-            record |= objective.results
-            if run is not None:
-                write_json(run.config, record)
-    checkpoint = objective.checkpoint()
-    model.load_state_dict(checkpoint["best_weights"])
-    model.requires_grad_(True)  # of what rested, too
-    return Fit(
-        model=model,
-        config=prepared.config,
-        preprocessing=prepared.preprocessing,
-        history=objective.history,
-        diagnostics=tuple(notes),
-        status=status,
-        record=record,
-        checkpoint=checkpoint,
-        urdf=urdf,
-        folder=folder,
-    )
-
-
-def _config(model: EmittedModel, logs: Logs, config: FitConfig | None) -> FitConfig:
-    """Return the configuration, by default what suits the model and its logs. Raises what `fit` raises for it."""
-    if config is None:
-        config = chosen_config(model, sample_rates(logs))
-    if not isinstance(config, FitConfig):
-        raise SettingsError(
-            f"{config!r} as the configuration of a fit",
-            expected="spelgen.TorqueFit(), MomentumFit(), Rollout() or ServoFit()",
+            self.notes += objective.begin()
+            self.run.start(required_spec(request.model), request.urdf, force=request.options.force)
+            self._save()
+            write_json(self.run.config, self.record.to_dict())  # from now on it is a run and can be resumed
+        status = self._run()
+        model, checkpoint = request.model, Checkpoint.model_validate(objective.checkpoint())
+        model.load_state_dict(checkpoint.best_weights)
+        model.requires_grad_(True)  # also of parameters that the fit kept constant
+        return Fit(
+            model=model,
+            history=objective.history,
+            diagnostics=tuple(self.notes),
+            status=status,
+            record=self.record,
+            checkpoint=checkpoint,
+            baselines=self.baselines,
+            urdf=request.urdf,
+            folder=request.folder,
         )
-    config.require(rigid_bodies=has_rigid_bodies(model))
-    return config
+
+    def _resume(self, run: RunFolder) -> None:
+        run.read_record().require_same_run(self.record, run.path)
+        checkpoint, history = run.load_checkpoint(), run.read_metrics()
+        try:
+            self.objective.resume(checkpoint.content, history)
+        except (KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
+            raise RunError(
+                "a checkpoint of another model", file=run.checkpoint, do="start a new run"
+            ) from error
+        run.write_metrics(self.objective.history)  # epochs after the checkpoint will be run again
+        self.baselines = run.read_baselines()  # the logs are the same
+
+    def _save(self) -> None:
+        """Write the checkpoint, the best weights and the history."""
+        if self.run is not None:
+            checkpoint = self.objective.checkpoint()
+            self.run.write_metrics(self.objective.history)
+            self.run.save(checkpoint["best_weights"], checkpoint)
+
+    def _run(self) -> Status:
+        """Show the notes, fit until an end is reached or Ctrl-C, and fit the baselines of a fit that ended."""
+        arm = self._baseline_arm()
+        with TrainingProgress(show=self.request.options.progress) as progress:
+            for note in self.notes:
+                progress.note(note)
+            try:
+                status = self.objective.run(progress, self._save)
+                self._keep_results()
+                if arm is not None:
+                    self._fit_baselines(arm)
+            except KeyboardInterrupt:
+                return "interrupted"
+        return status
+
+    def _keep_results(self) -> None:
+        if self.objective.results:
+            self.record = self.record.model_copy(update=self.objective.results)
+            if self.run is not None:
+                write_json(self.run.config, self.record.to_dict())
+
+    def _baseline_arm(self) -> ConfiguredArm | None:
+        """Return the arm that baselines are fitted for; None if its URDF is unknown, or if they are fitted already.
+
+        A URDF that cannot be read is reported, and the model is fitted without baselines.
+        """
+        request = self.request
+        if self.baselines or request.urdf is None or not request.urdf.exists():
+            return None
+        try:
+            return arm_of_model(request.model, request.urdf)
+        except SpelgenError as error:
+            message = f"no least squares to compare with: {error}"
+            self.notes.append(Diagnostic("warning", "no-baselines", "run", None, message))
+            return None
+
+    def _fit_baselines(self, arm: ConfiguredArm) -> None:
+        logs = list(self.request.logs)
+        if not isinstance(self.request.validation, float):
+            logs += self.request.validation
+        self.baselines = fit_baselines(arm, logs, self.record.preprocessing)
+        if self.run is not None:
+            write_json(self.run.baseline, self.baselines)
 
 
-def sample_rates(logs: Logs) -> list[float]:
-    """Return those of all logs [Hz] that are long enough for accelerations."""
-    if isinstance(logs, LargeLogs):
-        return logs.contents.rates
+def sample_rates(logs: Sequence[Trajectory]) -> list[float]:
+    """Return the sample rates [Hz] of the logs that are long enough for accelerations."""
     return [log.sample_rate for log in logs if log.duration >= SHORTEST]
 
 
 def _urdf(arm: ArmOfFile | Path | str | None) -> Path | None:
-    """Return the file of an arm that was loaded, or of a path."""
+    """Return the file of a loaded arm, or a path."""
     if arm is None:
         return None
     return Path(arm) if isinstance(arm, str | Path) else Path(arm.robot.path)
-
-
-def _resume(objective: Objective, run: RunFolder) -> None:
-    checkpoint = run.load_checkpoint()
-    try:
-        objective.resume(checkpoint, run.read_metrics())
-    except (KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
-        raise RunError("a checkpoint of another model", file=run.checkpoint, do="start a new run") from error
-    run.write_metrics(objective.history)  # epochs after the checkpoint will be run again
-
-
-def _run(
-    objective: Objective, save: Callable[[], None], notes: Sequence[Diagnostic], *, show: bool
-) -> Status:
-    """Tell the notes, and go on until an end is reached, of which an interruption is one."""
-    with TrainingProgress(show=show) as progress:
-        for note in notes:
-            progress.note(note)
-        try:
-            return objective.run(progress, save)
-        except KeyboardInterrupt:
-            return "interrupted"

@@ -1,4 +1,4 @@
-"""A fitted model with all that a fit found, in memory or from a run folder."""
+"""The result of a fit, in memory or from a run folder."""
 
 from __future__ import annotations
 
@@ -14,73 +14,85 @@ import torch
 
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.residuals import used_parameter_count
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.files import write_json
 from spelgen.fitting.objective import Status
 from spelgen.fitting.process import locked
 from spelgen.fitting.run_folder import RunFolder, trained_model
-from spelgen.fitting.run_record import Content, recorded_config
+from spelgen.fitting.run_record import Checkpoint, Content, Record
 from spelgen.listing import Listing
 from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.filtering import low_pass
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import Trajectory, gap_ends
+from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import FitConfig
+from spelgen.spec import ModelSpec
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit:
-    """A fitted model and the record of its fit.
+    """A fitted model, the record of its fit, and the baselines that were fitted to the same logs.
 
-    config, preprocessing: as they were resolved. history: a record for each epoch. status: how the fit ended; None:
-    not known, of a run that was loaded. record: contents of config.json. checkpoint: those of checkpoint.pt.
-    urdf: of the robot, where it is known. folder: of the run, where there is one.
+    history: lines of metrics.jsonl, one per epoch. status: how the fit ended; None: not known, of a run that was
+    loaded. record: content of config.json. checkpoint: content of checkpoint.pt. baselines: content of
+    least_squares.json, {} without any. urdf: of the robot, None if unknown. folder: of the run, None without one.
     """
 
-    model: EmittedModel
-    config: FitConfig
-    preprocessing: Preprocessing
+    model: ArmModel
     history: Sequence[Content]
     diagnostics: tuple[Diagnostic, ...]
     status: Status | None
-    record: Content
-    checkpoint: Content
+    record: Record
+    checkpoint: Checkpoint
+    baselines: Content
     urdf: Path | None = None
     folder: Path | None = None
 
     @property
+    def config(self) -> FitConfig:
+        """The configuration, resolved: the options that apply to the model."""
+        return self.record.config
+
+    @property
+    def preprocessing(self) -> Preprocessing:
+        """The preprocessing of the logs, resolved."""
+        return self.record.preprocessing
+
+    @property
     def epochs(self) -> int:
-        """Epochs that were run."""
-        return int(self.checkpoint["epoch"])
+        """Number of epochs."""
+        return self.checkpoint.epoch
 
     @property
     def steps(self) -> int:
-        """Steps on windows that were taken."""
-        return int(self.checkpoint["step"])
+        """Number of steps on windows."""
+        return self.checkpoint.step
 
     @property
     def best_epoch(self) -> int:
-        """After which the model was best; 0: before the first."""
-        return int(self.checkpoint["best_epoch"])
+        """The epoch after which the model was best; 0: before the first."""
+        return self.checkpoint.best_epoch
 
     @property
     def best_validation(self) -> float:
-        """`rollout_loss` of the validation windows, without unit."""
-        return float(self.checkpoint["best_loss"])
+        """`rollout_loss` of the validation windows [1]."""
+        return self.checkpoint.best_loss
 
     @property
     def torque_nmse(self) -> dict[str, float]:
-        """Mean squared error by variance of the torques that were fitted, by joint; of a joint without any, none."""
-        by_joint = zip(self.model.joint_names, self.checkpoint.get("torque_nmse", ()), strict=False)
+        """Mean squared torque error divided by the variance, per joint; without joints whose torque is constant."""
+        by_joint = zip(self.model.joint_names, self.checkpoint.torque_nmse, strict=False)
         return {joint: nmse for joint, nmse in by_joint if math.isfinite(nmse)}
 
     @property
     def result(self) -> str:
-        """The outcome in words: the error of torques that were fitted, else the validation loss."""
+        """The outcome in words: the error of the fitted torques, else the validation loss."""
         nmse = self.torque_nmse
         if not nmse:
             return f"validation loss {self.best_validation:.3g}"
@@ -92,23 +104,23 @@ class Fit:
 
     @property
     def seconds(self) -> float:
-        """Time of the steps on windows [s]."""
-        return float(self.checkpoint["seconds"])
+        """Time of the fit [s]."""
+        return self.checkpoint.seconds
 
     @property
     def substeps(self) -> int:
-        """Steps of rk4 between samples that the model needs."""
-        return int(self.checkpoint["substeps"])
+        """Steps of rk4 per sample interval that the model needs."""
+        return self.checkpoint.substeps
 
     @property
     def parameters(self) -> int:
-        """Numbers that were fitted."""
+        """Number of fitted parameters."""
         return used_parameter_count(self.model)
 
     def predict(self, trajectory: Trajectory) -> np.ndarray:
-        """Joint torques (T, n) [Nm, N] of the model's inverse dynamics along a trajectory, at its own times.
+        """Return joint torques (T, n) [Nm, N] of the model's inverse dynamics along a trajectory, at its own times.
 
-        Velocity is filtered as in the fit and differentiated. NaN where a piece between gaps is too short for that.
+        Velocity is filtered as in the fit and differentiated. NaN in pieces between gaps that are too short for that.
         """
         tau, reach = np.full_like(trajectory.q, np.nan), bristle_reach(self.model)
         for start, stop in pairwise(gap_ends(trajectory.t, self.preprocessing.gap)):
@@ -122,7 +134,7 @@ class Fit:
         return tau
 
     def score(self, logs: Trajectory | Sequence[Trajectory]) -> float:
-        """1 - nMSE of the torque on the samples of ``logs`` that move: 1 is perfect, 0 as good as a constant.
+        """Return 1 - nMSE of the torque on the samples of ``logs`` that move: 1 is perfect, 0 as good as a constant.
 
         The mean over trajectories of the mean over joints, by the protocol of `dynamics_samples`. Raises LogError
         where no log is sampled densely enough for accelerations.
@@ -139,24 +151,24 @@ class Fit:
         for x in samples:
             squares = np.square(self._torque(x.q, x.qd, x.qdd, x.z, x.direction) - x.tau).mean(axis=0)
             variance = x.tau.var(axis=0)
-            varies = variance > 0  # a joint without torque says nothing
+            varies = variance > 0  # a constant torque cannot be explained
             scores.append(1 - (squares[varies] / variance[varies]).mean())
         return float(np.mean(scores))
 
     def save(self, folder: Path | str, *, force: bool = False) -> Path:
         """Write the run folder that `spelgen train` writes; return its path.
 
-        `spelgen.keep_baseline(folder, logs)` adds what least squares find, for `evaluate` and `report`. Raises RunError
-        where a run lies, unless forced.
+        Raises RunError if there is a run in the folder, unless ``force``.
         """
-        if not hasattr(self.model, "source"):
-            raise RunError("a model without a module", expected="one of spelgen.build or spelgen.load_module")
+        spec = required_spec(self.model)
         run = RunFolder(folder)
         with locked(run.path):
-            run.start(self.model.source, self.urdf, force=force)
+            run.start(spec, self.urdf, force=force)
             run.write_metrics(self.history)
-            run.save(self.model.state_dict(), self.checkpoint)
-            write_json(run.config, self.record)
+            run.save(self.model.state_dict(), self.checkpoint.content)
+            if self.baselines:
+                write_json(run.baseline, self.baselines)
+            write_json(run.config, self.record.to_dict())
         return run.path
 
     def _torque(self, *motion: np.ndarray | None) -> np.ndarray:
@@ -170,37 +182,43 @@ class Fit:
         end = f"{self.epochs} epochs, {self.result}"
         if self.status:
             end = f"{self.status} after {end}"
-        return f"<Fit of {self.record['robot']!r} to {self.config.objective}: {end}>"
+        return f"<Fit of {self.record.robot!r} to {self.config.objective}: {end}>"
 
     def _repr_html_(self) -> str:
         rows = [
-            ("robot", str(self.record["robot"])),
+            ("robot", self.record.robot),
             ("objective", self.config.objective),
             ("parameters", f"{self.parameters}"),
             ("epochs", f"{self.epochs}"),
             ("result", self.result),
-            *((name.replace("_", " "), f"{value}") for name, value in self.record["config"].items()),
+            *((name.replace("_", " "), f"{value}") for name, value in self.record.options.items()),
         ]
         return Listing("Fit", ("", ""), tuple(rows), left=(0, 1)).html()
 
 
-def load_run(folder: Path | str, *, trust: bool = False) -> Fit:
-    """A run folder of `spelgen train` or `Fit.save`, with its best weights. Raises RunError and ModuleError.
+def required_spec(model: PortHamiltonian) -> ModelSpec:
+    """Return the specification of a model, which a run folder keeps. Raises RunError for a model without one."""
+    if isinstance(model, ArmModel):
+        return model.spec
+    raise RunError(
+        "a model without a specification, which a run folder cannot keep",
+        expected="a model of spelgen.build or spelgen.load_module",
+        do="keep the weights of this one by torch.save(model.state_dict(), FILE)",
+    )
 
-    Its module is a program: unless it ran in this process before, it must be what spelgen itself writes for the robot
-    in the folder, or `trust` be true.
-    """
+
+def load_run(folder: Path | str) -> Fit:
+    """Return a run of `spelgen train` or `Fit.save`, with its best weights. Raises RunError and ModuleError."""
     run = RunFolder(folder)
-    record = run.read_config()
+    record = run.read_record()  # a missing run is reported before its model is assembled
     return Fit(
-        model=trained_model(run, trust=trust),
-        config=recorded_config(record),
-        preprocessing=Preprocessing(**record["preprocessing"]),
+        model=trained_model(run),
         history=run.read_metrics(),
         diagnostics=(),
         status=None,
         record=record,
         checkpoint=run.load_checkpoint(),
+        baselines=run.read_baselines(),
         urdf=run.urdf if run.urdf.exists() else None,
         folder=run.path,
     )

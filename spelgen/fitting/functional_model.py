@@ -9,13 +9,13 @@ import torch
 from torch.func import functional_call
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 Weights = Mapping[str, torch.Tensor]
 
 
 class _Evaluated(torch.nn.Module):
-    def __init__(self, model: EmittedModel) -> None:
+    def __init__(self, model: ArmModel) -> None:
         super().__init__()
         self.model = model
 
@@ -23,7 +23,7 @@ class _Evaluated(torch.nn.Module):
         return function(self.model)
 
 
-def under_weights(model: EmittedModel, weights: Weights, function: Callable[[Any], Any]) -> Any:
+def under_weights(model: ArmModel, weights: Weights, function: Callable[[Any], Any]) -> Any:
     """Return what a function gives for the model under weights that stand in for its own, by their names there."""
     named = {f"model.{name}": weight for name, weight in weights.items()}
     return functional_call(_Evaluated(model), named, (function,))

@@ -1,41 +1,43 @@
-"""What a fit is: the base of all objectives, and what every objective is given."""
+"""The base class of all objectives, and their arguments: the request of a fit."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from spelgen.dynamics.bristles import bristle_reach
-from spelgen.dynamics.protocol import has_rigid_bodies, input_of
-from spelgen.errors import Diagnostic, RunError
+from spelgen.dynamics.protocol import input_of
+from spelgen.emission.assemble import spec_of
+from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import TrainingData, WindowChoice, prepare_data
-from spelgen.fitting.run_record import Content
-from spelgen.fitting.streaming import LargeLogs, prepare_streamed
+from spelgen.fitting.rollout import LossScales
+from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import FitConfig
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.spec import logged_joints
+from spelgen.settings.messages import validated
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
     from spelgen.fitting.progress import TrainingProgress
 
-Logs = Sequence[Trajectory] | LargeLogs
 Status = Literal["finished", "stopped early", "out of time", "interrupted"]
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a fit runs, whatever it fits.
+    """How a fit runs.
 
-    device, threads: of torch. resume: go on from the folder's checkpoint, exactly as if there had been no interruption.
-    force: replace a run. progress: show it on stderr. mapping: how the logs were read, kept with the run. notes: found
-    before, to be reported with the others. began: from when the allowed time counts (`time.monotonic`); None: from now.
+    device, threads: of torch. resume: continue from the folder's checkpoint, exactly as if there had been no
+    interruption. force: replace a run. progress: show it on stderr. mapping: with which the logs were read, kept with
+    the run. notes: earlier diagnostics, reported with the others. began: start of the allowed time (`time.monotonic`);
+    None: now.
     """
 
     device: str = "cpu"
@@ -50,14 +52,14 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class FitRequest:
-    """What is fitted to what, and how: the same for each objective.
+    """The arguments of a fit.
 
-    validation: the fraction of the logs that is set aside, or trajectories. urdf: the robot's, where it is known.
-    began: from when the allowed time counts (`time.monotonic`). folder: of the run.
+    validation: the fraction of the logs that is set aside, or trajectories. urdf: of the robot, None if unknown.
+    began: start of the allowed time (`time.monotonic`). folder: of the run, None without one.
     """
 
-    model: EmittedModel
-    logs: Logs
+    model: ArmModel
+    logs: Sequence[Trajectory]
     config: FitConfig
     preprocessing: Preprocessing
     validation: float | Sequence[Trajectory]
@@ -70,29 +72,34 @@ class FitRequest:
 
 @dataclass(frozen=True)
 class PreparedLogs:
-    """Hold what `Objective.prepare` tells of the logs.
+    """Logs that were checked and cut into windows, and the settings that depend on them.
 
-    config, preprocessing: with all that depends on the logs decided. record: what config.json says of the logs, see
-    `run_record.Record`. notes: for people.
+    config, preprocessing: resolved. digest: see `dataset.digest`. training, validation: names of the logs. scales: of
+    the validation loss; None without one. notes: diagnostics for the user.
     """
 
     config: FitConfig
     preprocessing: Preprocessing
-    record: Content
+    digest: str
+    training: Sequence[str]
+    validation: Sequence[str]
+    training_windows: int
+    validation_windows: int
     notes: Sequence[Diagnostic]
+    scales: LossScales | None = None
 
 
 class Objective(ABC):
-    """One way to fit a model: what it needs of logs, how it starts, goes on and is resumed.
+    """A way to fit a model.
 
-    It is made of a model that it is for, and a config of its own. `fit` calls `prepare` first, then `begin` for a new
-    fit or `resume`, then `run`. It owns the run folder: what an objective wants kept it says by ``save``, and in
-    `checkpoint`, history (the lines of metrics.jsonl) and results (what config.json says of how it went).
+    `fit` calls `prepare`, then `begin` for a new fit or `resume`, then `run`. Only `fit` writes to the run folder: it
+    writes `checkpoint` and history (the lines of metrics.jsonl) whenever ``save`` is called, and results (fields of
+    `run_record.Record`, by name) at the end.
     """
 
     name: ClassVar[str]
     input: ClassVar[Literal["torque", "position"]] = "torque"
-    """What the inputs are of the models that it is for, and what their logs have."""
+    """The input of the models that it fits, which is also in their logs."""
 
     def __init__(self, request: FitRequest) -> None:
         self.request, self.model, self.config = request, request.model, request.config
@@ -102,74 +109,66 @@ class Objective(ABC):
 
     @abstractmethod
     def prepare(self) -> PreparedLogs:
-        """Check the logs and read what is fitted. Raises LogError and RunError."""
+        """Check the logs and prepare their samples. Raises LogError and RunError."""
 
     @abstractmethod
     def begin(self) -> list[Diagnostic]:
-        """Do what comes before the first checkpoint of a new fit; return what there is to tell."""
+        """Do the steps of a new fit before its first checkpoint; return diagnostics."""
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Go on from what the run folder holds, by default a model that is fitted.
+        """Continue from the files of a run folder, by default with a fitted model.
 
-        Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError where that is of another model.
+        Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError for files of another model.
         """
         self.model.load_state_dict(checkpoint["best_weights"])
         self._checkpoint = checkpoint
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Fit until an end is reached, by default nothing more; call ``save`` where `checkpoint` should be kept.
+        """Fit until an end is reached, by default at once; call ``save`` to keep a `checkpoint`.
 
         KeyboardInterrupt may end it anywhere.
         """
         return "finished"
 
     def checkpoint(self) -> Content:
-        """Return what a resumed fit needs, with "best_weights", and the numbers of `run_record.Checkpoint`."""
+        """Return the content of checkpoint.pt: the keys of `run_record.Checkpoint`, and states for `resume`."""
         return self._checkpoint
 
 
 class TorqueLogObjective(Objective):
-    """An `Objective` on logs of torques, which are cut into windows: to fit, or to measure the model on."""
+    """An `Objective` on logs with torques, which are cut into windows: to fit them, or to measure the model."""
 
     def _cut_windows(self, window: int, stride: int) -> TrainingData:
-        """Cut windows of the logs: to be fitted, and to be validated on. Raises LogError and RunError."""
+        """Return the training and validation windows of the logs. Raises LogError and RunError."""
         request = self.request
         reach = bristle_reach(self.model)
         choice = WindowChoice(window, stride, request.validation, request.seed, reach)
-        if not isinstance(request.logs, LargeLogs):
-            joints, kinds = logged_joints(self.model), self.model.joint_types
-            return prepare_data(request.logs, joints, kinds, request.preprocessing, choice)
-        if not isinstance(request.validation, float):
-            raise RunError(
-                "trajectories to validate logs larger than memory on", expected="a fraction of these logs"
-            )
-        return prepare_streamed(request.logs, request.preprocessing, choice)
+        joints, kinds = self.model.joint_names, self.model.joint_types
+        return prepare_data(request.logs, joints, kinds, request.preprocessing, choice)
 
     def _prepared(self, data: TrainingData, config: FitConfig) -> PreparedLogs:
-        """Return what windows tell of the logs."""
+        """Return the prepared logs of these windows."""
         return PreparedLogs(
             config=config,
             preprocessing=data.preprocessing,
-            record={
-                "data_digest": data.digest,
-                "training": list(data.training_names),
-                "validation": list(data.validation_names),
-                "training_windows": len(data.training),
-                "validation_windows": len(data.validation),
-                "scales": {name: x.tolist() for name, x in data.scales._asdict().items()},
-            },
+            digest=data.digest,
+            training=data.training_names,
+            validation=data.validation_names,
+            training_windows=len(data.training),
+            validation_windows=len(data.validation),
             notes=data.diagnostics,
+            scales=data.scales,
         )
 
     def _regularizer(
         self, data: TrainingData, weight: float, notes: list[Diagnostic]
     ) -> UrdfRegularizer | None:
-        """Return the regularizer towards the request's URDF, where that has a weight and can be had."""
+        """Return the regularizer towards the URDF; None without a weight or a readable URDF."""
         urdf = self.request.urdf
         if not weight or urdf is None or not urdf.exists():
             return None
         try:
-            return urdf_regularizer(urdf, logged_joints(self.model), self.model, data.training)
+            return urdf_regularizer(urdf, self.model.joint_names, self.model, data.training)
         except Exception as error:  # Pinocchio and its parser raise many kinds; the fit goes on without
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             message = f"fitted without the URDF's regularizer: {reason}"
@@ -177,25 +176,32 @@ class TorqueLogObjective(Objective):
             return None
 
 
-def record_of(request: FitRequest, prepared: PreparedLogs) -> Content:
-    """Return what goes into config.json: options that were used, resolved, and nothing that does not apply."""
-    model, facts = request.model, getattr(request.model, "facts", None)
-    mapping = request.options.mapping or LogMapping(input=input_of(model))
-    fraction = None
-    if prepared.record["validation"] and isinstance(request.validation, float):
+def new_record(request: FitRequest, prepared: PreparedLogs) -> Record:
+    """Return the record of a fit before it runs, with the resolved options that apply to the model and no others."""
+    model, spec = request.model, spec_of(request.model)
+    config, fraction = prepared.config, None
+    if prepared.validation and isinstance(request.validation, float):
         fraction = request.validation
-    return {
-        "schema": 2,
-        "robot": facts.robot if facts else type(model).__name__,
-        "preset": facts.options.preset if facts else None,
-        "joints": list(logged_joints(model)),
-        "objective": prepared.config.objective,
-        "config": prepared.config.record(rigid_bodies=has_rigid_bodies(model)),
-        "preprocessing": asdict(prepared.preprocessing),
-        "validation_fraction": fraction,
-        "seed": request.seed,
-        **prepared.record,
-        "mapping": mapping.model_dump(exclude_defaults=True),
-        "device": request.options.device,
-        "threads": request.options.threads,
-    }
+    scales = {}
+    if prepared.scales is not None:
+        scales["scales"] = {name: x.tolist() for name, x in prepared.scales._asdict().items()}
+    return Record(
+        schema=2,
+        robot=spec.robot if spec else type(model).__name__,
+        preset=spec.options.preset if spec else None,
+        joints=list(model.joint_names),
+        objective=config.objective,
+        config=validated(type(config), config.record(rigid_bodies=isinstance(model, RigidBodyDynamics))),
+        preprocessing=prepared.preprocessing,
+        validation_fraction=fraction,
+        seed=request.seed,
+        data_digest=prepared.digest,
+        training=list(prepared.training),
+        validation=list(prepared.validation),
+        training_windows=prepared.training_windows,
+        validation_windows=prepared.validation_windows,
+        mapping=request.options.mapping or LogMapping(input=input_of(model)),
+        device=request.options.device,
+        threads=request.options.threads,
+        **scales,
+    )

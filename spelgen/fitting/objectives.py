@@ -1,29 +1,46 @@
-"""The registry of objectives, and which one is fitted where nobody says."""
+"""The registry of objectives, and the choice of the objective and its configuration."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from spelgen.dynamics.protocol import has_rigid_bodies, input_of
-from spelgen.errors import OptionError
+from spelgen.dynamics.protocol import input_of
+from spelgen.errors import OptionError, SettingsError
 from spelgen.fitting.objective import FitRequest, Objective
 from spelgen.fitting.servo.objective import ServoObjective
 from spelgen.fitting.torque.objective import TorqueObjective
 from spelgen.fitting.window.momentum import MomentumObjective
 from spelgen.fitting.window.rollout import RolloutObjective
 from spelgen.logs.rates import shows_accelerations
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import FitConfig, fit_config
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 ALL: tuple[type[Objective], ...] = (TorqueObjective, MomentumObjective, RolloutObjective, ServoObjective)
 OBJECTIVES = {objective.name: objective for objective in ALL}
+Rates = Callable[[], Sequence[float]]
+"""Return the sample rates of the logs [Hz]; called only if the choice depends on them, since it may read the logs."""
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Options of a fit whose objective may not be known yet.
+
+    objective: None: chosen by `default_objective`. options: by name; an option that does not apply is an error.
+    defaults: by name, for options that are not given; those that do not apply are omitted.
+    """
+
+    objective: str | None = None
+    options: Mapping[str, object] = field(default_factory=dict)
+    defaults: Mapping[str, object] = field(default_factory=dict)
 
 
 def objective_of(request: FitRequest) -> Objective:
-    """Return the objective of a request. Raises OptionError where it is not for this model."""
+    """Return the objective of a request. Raises OptionError if it does not apply to the model."""
     name = request.config.objective
     objective = OBJECTIVES[name]
     under = input_of(request.model)
@@ -35,35 +52,34 @@ def objective_of(request: FitRequest) -> Objective:
     return objective(request)
 
 
-def default_objective(model: EmittedModel, rates: Sequence[float]) -> str:
-    """Return the objective that is fitted where nobody names one.
+def default_objective(model: ArmModel, rates: Rates) -> str:
+    """Return the objective for a model and its logs.
 
-    It is that of position servos for an arm under these, "torque" for a model of rigid bodies where logs are sampled
-    densely enough for accelerations (rates [Hz]), and else "rollout".
+    "servo" for an arm under position servos; "torque" for rigid bodies if a log is sampled densely enough for
+    accelerations; else "rollout".
     """
     if input_of(model) == ServoObjective.input:
         return ServoObjective.name
-    if has_rigid_bodies(model) and any(map(shows_accelerations, rates)):
+    if isinstance(model, RigidBodyDynamics) and any(map(shows_accelerations, rates())):
         return "torque"
     return "rollout"
 
 
-def chosen_config(
-    model: EmittedModel,
-    rates: Sequence[float] | None,
-    objective: str | None = None,
-    options: Mapping[str, object] | None = None,
-    defaults: Mapping[str, object] | None = None,
-) -> FitConfig | None:
-    """Return the configuration of an objective, by default of `default_objective`.
-
-    options, defaults: as for `fit_config`. rates: None before logs are read; None is returned where these decide.
-    """
-    rigid_bodies = has_rigid_bodies(model)
+def choose_config(model: ArmModel, requested: FitConfig | FitOptions | None, rates: Rates) -> FitConfig:
+    """Return the configuration of a fit. Raises OptionError for an option that does not apply to the model."""
+    rigid_bodies = isinstance(model, RigidBodyDynamics)
+    if isinstance(requested, FitConfig):
+        requested.require(rigid_bodies=rigid_bodies)
+        return requested
+    if not isinstance(requested, FitOptions | None):
+        raise SettingsError(
+            f"{requested!r} as the configuration of a fit",
+            expected="spelgen.TorqueFit(), MomentumFit(), Rollout() or ServoFit()",
+        )
+    chosen = requested or FitOptions()
+    objective, defaults = chosen.objective, chosen.defaults
     if objective is None:
-        if rates is None and rigid_bodies:
-            return None
-        objective = default_objective(model, rates or [])
-        if rigid_bodies and objective == "rollout":  # bodies need no regularizer where nobody asks for one
-            defaults = {"urdf_weight": 0.0, **(defaults or {})}
-    return fit_config(objective, rigid_bodies=rigid_bodies, options=options, defaults=defaults)
+        objective = default_objective(model, rates)
+        if rigid_bodies and objective == "rollout":  # rigid bodies need no regularizer unless it is requested
+            defaults = {"urdf_weight": 0.0, **defaults}
+    return fit_config(objective, rigid_bodies=rigid_bodies, options=chosen.options, defaults=defaults)

@@ -17,7 +17,7 @@ from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import Solver
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING, ADAPTIVE = IntegrationTuning(), AdaptiveTuning()
 SOLVER: dict[str, Any] = {"method": "dopri5", "rtol": ADAPTIVE.relative, "atol": ADAPTIVE.absolute}
@@ -138,7 +138,7 @@ def _scale(mean_square: torch.Tensor) -> torch.Tensor:
 
 
 def rollout_errors(
-    model: EmittedModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
+    model: ArmModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
 ) -> torch.Tensor:
     """Return scaled errors (W, K-1, 2n) of the rollout: of the positions, then of the velocities."""
     q, qd = roll_out(model, windows, substeps, solver)
@@ -147,7 +147,7 @@ def rollout_errors(
 
 
 def rollout_loss(
-    model: EmittedModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
+    model: ArmModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
 ) -> torch.Tensor:
     """SPEL eq. 8: squared geodesic distance plus squared velocity error, here scaled per joint and averaged.
 
@@ -157,7 +157,7 @@ def rollout_loss(
     return rollout_errors(model, windows, scales, substeps, solver).square().mean()
 
 
-def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> torch.Tensor:
+def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> torch.Tensor:
     """Return the error of the weak form: p(t) - p(0) against the impulse of all forces along the measured samples.
 
     Forces between samples are the mean of their values at both ends (trapezium rule): no ODE is solved and no
@@ -187,7 +187,7 @@ def momentum_loss(model: EmittedModel, windows: Windows, scales: LossScales) -> 
     return result
 
 
-def probed(model: EmittedModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
+def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
     """Return `rollout_errors` without gradients, NaN where numbers blow up."""
     try:
         with torch.no_grad():
@@ -206,7 +206,7 @@ def integration_error(coarse: torch.Tensor, fine: torch.Tensor) -> float:
     return error if math.isfinite(error) else math.inf
 
 
-def choose_substeps(model: EmittedModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
+def choose_substeps(model: ArmModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
     """Return the fewest rk4 steps per sample interval, from `start` on, with a small error of integration."""
     substeps, coarse = start, probed(model, windows, scales, start)
     while substeps < TUNING.most_substeps:

@@ -1,42 +1,38 @@
-"""A run folder: what lies in it, written so that at every moment it is complete, and the module it trains."""
+"""A run folder: its files, each of which is written completely or not at all, and its model."""
 
 from __future__ import annotations
 
 import io
 import json
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
 from zipfile import ZipFile
 
 import torch
 
-from spelgen.emission.loading import has_run, load_module
-from spelgen.errors import RunError
+from spelgen.emission.assemble import ArmModel, assemble
+from spelgen.errors import ModuleError, RunError
 from spelgen.files import local, read_bytes, read_json, remove, require_regular_file, write_bytes
-from spelgen.fitting.run_record import Checkpoint, Content, Epoch, require, require_record
-from spelgen.spec import read_source
+from spelgen.fitting.run_record import Checkpoint, Content, Epoch, Record, require
+from spelgen.spec import ModelSpec, spec_from_json
 from spelgen.urdf.document import urdf_bytes
 
-if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
-
-
+# Largest specification that is read [bytes]: the largest that `spelgen build` makes has a tenth.
+MAX_SPEC = 2**20
 LARGEST_STATE = 2**29  # bytes of model.pt or checkpoint.pt, unpacked
 
 
 class RunFolder:
     """The files of one training run.
 
-    module: the trained module's source. urdf, settings: of its robot, where known. config: how it was trained. metrics:
-    a line per epoch. checkpoint: everything needed to go on. weights: the best state_dict so far. evaluation: what
-    `evaluate` found. baseline: what least squares found.
+    spec: specification of the model. urdf, settings: of its robot, where known. config: how it was trained. metrics:
+    a line per epoch. checkpoint: everything needed to resume. weights: the best state_dict so far. evaluation: what
+    `evaluate` found. baseline: baselines fitted to the training logs, and the coverage of these.
     """
 
     def __init__(self, path: Path | str) -> None:
         self.path = local(path)
-        self.module = self.path / "module.py"
+        self.spec = self.path / "spec.json"
         self.urdf = self.path / "robot.urdf"
         self.settings = self.path / "robot.yaml"
         self.config = self.path / "config.json"
@@ -47,7 +43,7 @@ class RunFolder:
         self.baseline = self.path / "least_squares.json"
 
     def require_free(self, *, force: bool) -> None:
-        """Raise RunError where a run lies, unless it may be replaced."""
+        """Raise RunError if there is a run in the folder, unless it may be replaced."""
         if self.path.exists() and not self.path.is_dir():
             raise RunError("a file", file=self.path, expected="a folder or a new name")
         if self.config.exists() and not force:
@@ -57,10 +53,10 @@ class RunFolder:
                 do="--resume it, --force to replace it, or -o another",
             )
 
-    def start(self, source: str, urdf: Path | None, *, force: bool) -> None:
-        """Make the folder, write the module's source and copy the robot into it.
+    def start(self, spec: ModelSpec, urdf: Path | None, *, force: bool) -> None:
+        """Make the folder, write the specification and copy the robot into it.
 
-        It is a run when config.json is there: that is written last. Raises RunError where a run lies, unless forced.
+        A folder is a run if it has config.json, which is written last. Raises RunError if there is one, unless forced.
         """
         self.require_free(force=force)
         robot = self._robot_files(urdf)  # before anything is removed: they may be this very run's copies
@@ -71,7 +67,7 @@ class RunFolder:
         )  # fmt: skip
         for old in old_files:
             remove(old)
-        for path, content in [(self.module, source.encode()), *robot]:
+        for path, content in [(self.spec, f"{spec.to_json()}\n".encode()), *robot]:
             write_bytes(path, content)
 
     def _robot_files(self, urdf: Path | None) -> list[tuple[Path, bytes]]:
@@ -87,14 +83,14 @@ class RunFolder:
         write_state(self.checkpoint, checkpoint)
 
     def write_metrics(self, records: Sequence[Content]) -> None:
-        """Make these all lines of metrics.jsonl; no file for none."""
+        """Write these records as metrics.jsonl; no file without any."""
         if records:
             write_bytes(self.metrics, "".join(json.dumps(record) + "\n" for record in records).encode())
         else:
             remove(self.metrics)
 
     def read_metrics(self) -> list[Content]:
-        """The lines of metrics.jsonl, without a last one that is torn."""
+        """Return the lines of metrics.jsonl, without an incomplete last one."""
         lines, records = [], []
         if self.metrics.exists():
             lines = read_bytes(self.metrics, RunError).decode("utf-8", "replace").splitlines()
@@ -116,15 +112,18 @@ class RunFolder:
             )
         return read_json(path, RunError)
 
-    def read_config(self) -> Content:
-        """What config.json says. Raises RunError when it is absent, broken, or lacks what every run has."""
-        return require_record(self.read_json(self.config), self.config)
+    def read_record(self) -> Record:
+        """Return config.json. Raises RunError if it is absent, broken, or has a key absent or of another type."""
+        return require(Record, self.read_json(self.config), self.config)
 
-    def load_checkpoint(self) -> Content:
-        """checkpoint.pt, with the numbers that every one has. Raises RunError."""
-        checkpoint = self.load_state(self.checkpoint)
-        require(Checkpoint, checkpoint, self.checkpoint)
-        _require_finite(checkpoint["best_weights"], self.checkpoint)
+    def read_baselines(self) -> Content:
+        """Return least_squares.json, {} if there is none. Raises RunError if it is broken."""
+        return self.read_json(self.baseline) if self.baseline.exists() else {}
+
+    def load_checkpoint(self) -> Checkpoint:
+        """Return checkpoint.pt. Raises RunError if it is absent, broken, or has a key absent or of another type."""
+        checkpoint = require(Checkpoint, self.load_state(self.checkpoint), self.checkpoint)
+        _require_finite(checkpoint.best_weights, self.checkpoint)
         return checkpoint
 
     def load_state(self, path: Path) -> Content:
@@ -143,16 +142,23 @@ class RunFolder:
             raise RunError(type(found).__name__, file=path, expected="a file of `spelgen train`")
         return found
 
-    def load_module(self, *, trust: bool = False) -> EmittedModel:
-        """Return the run's module with the weights that it starts with.
+    def read_spec(self) -> ModelSpec:
+        """Return spec.json. Raises RunError if there is none, ModuleError if it is no specification."""
+        if not self.spec.exists():
+            if (self.path / "module.py").exists():
+                raise RunError(
+                    "a run of an earlier version of spelgen", file=self.path, expected=f"a run with {self.spec.name}",
+                    do="build the module again with `spelgen build`, and train it again with `spelgen train`",
+                )  # fmt: skip
+            raise RunError(
+                "no such run", file=self.path, expected=f"a folder with {self.spec.name}", do="spelgen train"
+            )
+        text = read_bytes(self.spec, ModuleError, "a specification of a model", MAX_SPEC)
+        return spec_from_json(text.decode("utf-8", "replace"), self.spec)
 
-        Raises ModuleError, and RunError unless it is trusted, ran in this process before, or is what spelgen itself
-        writes for the run's robot.
-        """
-        if not trust and not has_run(read_source(self.module)):
-            # looked up when it is needed: what fits knows no symbolic algebra, and this derives the arm anew
-            import_module("spelgen.pipeline.generate").require_own_module(self.module, self.urdf)
-        return load_module(self.module)
+    def untrained_model(self) -> ArmModel:
+        """Return the model with its initial weights. Raises RunError or ModuleError."""
+        return assemble(self.read_spec())
 
 
 def _require_unpacked_size(path: Path) -> None:
@@ -185,9 +191,9 @@ def write_state(path: Path, state: Content) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def fitted_model(run: RunFolder, *, trust: bool = False) -> EmittedModel:
-    """A run's module (see `RunFolder.load_module`) with its best weights."""
-    model = run.load_module(trust=trust)
+def fitted_model(run: RunFolder) -> ArmModel:
+    """Return the model of a run with its best weights. Raises RunError or ModuleError."""
+    model = run.untrained_model()
     weights = run.load_state(run.weights)
     _require_finite(weights, run.weights)
     try:
@@ -197,8 +203,8 @@ def fitted_model(run: RunFolder, *, trust: bool = False) -> EmittedModel:
     return model
 
 
-def trained_model(run: RunFolder, *, trust: bool = False) -> EmittedModel:
-    """A run's module with its best weights, which take no gradients."""
-    model = fitted_model(run, trust=trust)
+def trained_model(run: RunFolder) -> ArmModel:
+    """Return the model of a run with its best weights, which take no gradients."""
+    model = fitted_model(run)
     model.requires_grad_(False).eval()
     return model

@@ -1,14 +1,23 @@
-"""What the files of a run folder must hold to be read, for they may come from elsewhere, and to be resumed."""
+"""The typed contents of a run folder's files, checked when they are read: the folder may come from elsewhere."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    InstanceOf,
+    ValidationError,
+    ValidationInfo,
+    field_serializer,
+    field_validator,
+)
 
-from spelgen.errors import RunError, SpelgenError
+from spelgen.errors import RunError, SettingsError, SpelgenError
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.settings.fits import CONFIGS, FitConfig, Objective, Substeps
 from spelgen.settings.log_mapping import LogMapping
@@ -16,32 +25,105 @@ from spelgen.settings.messages import validated
 from spelgen.settings.values import Count, NonNegative, Positive, Whole
 
 Content = dict[str, Any]
-"""What a file of a run folder holds, by key: JSON, or what torch saves."""
-ReadContent = Mapping[str, Any]
-"""The same, only read."""
+"""The content of a file of a run folder, by key: JSON, or what torch saves."""
 
 Schema = TypeVar("Schema", bound=BaseModel)
 MAY_CHANGE = ("epochs", "patience", "max_minutes")  # between a run and its resumption
 
 
 class Record(BaseModel):
-    """config.json; the configuration itself is checked by its own class."""
+    """The record of a fit, which config.json keeps: the data, the settings as resolved, and the results.
 
+    config: the options that apply to the model; its type is that of the objective. joints: names in the order of q.
+    validation_fraction: None if validation logs were given. data_digest: SHA-256 of all numbers of the logs. training,
+    validation: names of the logs. scales: of the validation loss. mapping: with which the logs were read. servo:
+    parameters of position servos with intervals, when such a fit is finished.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    version: Literal[2] = Field(default=2, alias="schema")
     robot: str
+    preset: str | None = None
     joints: list[str]
     objective: Objective
-    config: dict[str, object]
+    config: FitConfig
     preprocessing: Preprocessing
     validation_fraction: float | None
     seed: Whole
     data_digest: str
     training: list[str]
     validation: list[str]
+    training_windows: Whole = 0
+    validation_windows: Whole = 0
+    scales: Content | None = None
     mapping: LogMapping
+    device: str = "cpu"
+    threads: int = 1
+    servo: Content | None = None
+
+    @field_validator("config", mode="before")
+    @classmethod
+    def _of_the_objective(cls, options: object, info: ValidationInfo) -> object:
+        """Return the options as the objective's configuration."""
+        if "objective" not in info.data:  # an error of that key
+            return FitConfig()
+        try:
+            return validated(CONFIGS[info.data["objective"]], options)
+        except SpelgenError as error:
+            raise SettingsError(f"config: {error}") from error
+
+    @field_serializer("config")
+    def _options(self, config: FitConfig) -> Content:
+        return config.model_dump(mode="json", exclude_unset=True)
+
+    @field_serializer("mapping")
+    def _mapping(self, mapping: LogMapping) -> Content:
+        return mapping.model_dump(mode="json", exclude_defaults=True)
+
+    @property
+    def options(self) -> Content:
+        """The options of the fit by name, as JSON."""
+        return self._options(self.config)
+
+    def to_dict(self) -> Content:
+        """Return the content of config.json."""
+        return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
+
+    def require_same_run(self, resumed: Record, folder: Path) -> None:
+        """Raise RunError if `resumed`, the record of a resumed fit, has other data or settings."""
+        if self.data_digest != resumed.data_digest:
+            raise RunError(
+                "other logs than the run was started with",
+                file=folder,
+                do="give the same --data or start a new run",
+            )
+        before, after = self._settings(), resumed._settings()
+        changed = []
+        for name in before | after:
+            if name not in MAY_CHANGE and before.get(name) != after.get(name):
+                changed.append(f"{name} {after.get(name)} instead of {before.get(name)}")
+        if changed:
+            raise RunError(
+                ", ".join(changed),
+                file=folder,
+                expected="the settings the run was started with",
+                do="or start a new run",
+            )
+
+    def _settings(self) -> Content:
+        settings = self.model_dump(include={"objective", "validation_fraction", "seed"})
+        return {**self.options, **asdict(self.preprocessing), **settings}
 
 
 class Checkpoint(BaseModel):
-    """The plain numbers of checkpoint.pt; what else it holds are states that torch checks when it takes them."""
+    """The content of checkpoint.pt: the progress of a fit, and the states of its objective that it resumes from.
+
+    seconds: time of the fit [s]. substeps: integrator steps per sample interval. torque_nmse: mean squared torque error
+    divided by the variance, per joint. The last three belong to fits to windows. States are checked by torch.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="allow")
 
     epoch: Whole
     step: Whole
@@ -49,11 +131,16 @@ class Checkpoint(BaseModel):
     best_loss: float
     seconds: NonNegative
     substeps: Substeps
-    best_weights: dict[str, object]
-    # of fits to windows alone
+    best_weights: InstanceOf[dict]  # type: ignore[type-arg]
+    torque_nmse: list[float] = []
     rollbacks: Whole = 0
     learning_rate_factor: Positive = 1.0
     momentum_done: bool = True
+
+    @property
+    def content(self) -> Content:
+        """All that the file contains; states are not copied."""
+        return {name: value for name, value in self if name in self.model_fields_set}
 
 
 class Epoch(BaseModel):
@@ -68,7 +155,7 @@ class Epoch(BaseModel):
 
 
 def require(schema: type[Schema], content: object, file: Path, line: int | None = None) -> Schema:
-    """Return the content as the schema has it. Raises RunError where a key is missing or not of its kind."""
+    """Return the content as an object of the schema. Raises RunError if a key is missing or has another type."""
     try:
         return schema.model_validate(content)
     except ValidationError as error:
@@ -80,45 +167,3 @@ def require(schema: type[Schema], content: object, file: Path, line: int | None 
         ) from error
     except SpelgenError as error:
         raise RunError(str(error), file=file, line=line) from error
-
-
-def require_record(content: Content, file: Path) -> Content:
-    """Return what config.json says. Raises RunError as `require`, and for a configuration that cannot be."""
-    record = require(Record, content, file)
-    try:
-        validated(CONFIGS[record.objective], record.config)
-    except SpelgenError as error:
-        raise RunError(f"config: {error}", file=file) from error
-    return content
-
-
-def recorded_config(record: Content, **changed: object) -> FitConfig:
-    """Return the configuration in config.json, with some options changed. Raises OptionError as `FitConfig`."""
-    return validated(CONFIGS[record["objective"]], record["config"] | changed)
-
-
-def require_same(started: Content, now: Content, folder: Path) -> None:
-    """Raise RunError where a run would be resumed with other data or settings than it was started with."""
-    if started["data_digest"] != now["data_digest"]:
-        raise RunError(
-            "other logs than the run was started with",
-            file=folder,
-            do="give the same --data or start a new run",
-        )
-    before, after = _settings(started), _settings(now)
-    changed = []
-    for name in before | after:
-        if name not in MAY_CHANGE and before.get(name) != after.get(name):
-            changed.append(f"{name} {after.get(name)} instead of {before.get(name)}")
-    if changed:
-        raise RunError(
-            ", ".join(changed),
-            file=folder,
-            expected="the settings the run was started with",
-            do="or start a new run",
-        )
-
-
-def _settings(record: Content) -> dict[str, object]:
-    settings = {name: record.get(name) for name in ("objective", "validation_fraction", "seed")}
-    return {**record["config"], **record["preprocessing"], **settings}

@@ -7,81 +7,111 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class DampingTuning:
-    """Damping of Gauss-Newton steps, relative to the curvature's diagonal (`fitting.levenberg_marquardt`)."""
+    """Damping of Gauss-Newton steps, relative to the diagonal of the curvature (`fitting.levenberg_marquardt`)."""
 
-    first: float = 1e-3  # [1] before the first step (Marquardt, J. SIAM 11:431, 1963: 1e-2)
-    least: float = 1e-9  # [1] smallest damping: below it steps are those of Gauss-Newton to nine digits
-    # [1] by which damping falls after a step that gains, and rises otherwise (Marquardt: 10)
+    # [1] Damping of the first step (Marquardt, J. SIAM 11:431, 1963: 1e-2).
+    first: float = 1e-3
+    # [1] Smallest damping: below it steps equal Gauss-Newton steps to nine digits.
+    least: float = 1e-9
+    # [1] Factor by which the damping is lowered after a step that decreases the cost, and raised otherwise
+    # (Marquardt: 10).
     factor: float = 10.0
-    tries: int = 15  # dampings tried for one step: from the least to 1e6, where steps are next to nothing
-    least_promise: float = 1e-10  # [1] of the cost: a step that promises less is rounding, and is not tried
-    # [1] of what a step promises: one that keeps less is tried along the second way, too
+    # [1] Dampings tried for one step: from the smallest to 1e6, at which steps are negligible.
+    tries: int = 15
+    # [1] Predicted reduction of the cost, as a fraction of the cost, below which a step is rounding and is not tried.
+    least_promise: float = 1e-10
+    # [1] Gain ratio (decrease divided by predicted reduction) below which the second way of a step is tried, too.
     kept_promise: float = 0.5
 
 
 @dataclass(frozen=True)
 class ValidationTuning:
-    """Windows that a fit is judged on (`fitting.dataset`)."""
+    """Windows on which a fit is validated (`fitting.dataset`)."""
 
-    windows: int = 2048  # at most: validation is a measurement, it needs no more
-    probe: int = 64  # training windows on which the integrator's error is watched
-    chunks: int = 16  # of logs larger than memory, which windows are taken from
+    # [1] Largest number of validation windows: validation is a measurement and needs no more.
+    windows: int = 2048
+    # [1] Training windows on which the integration error is monitored.
+    probe: int = 64
 
 
 @dataclass(frozen=True)
 class WindowTuning:
     """Steps on windows (`fitting.window.momentum`)."""
 
-    epoch_steps: int = 20  # at least; few windows are passed over several times between validations
-    warm_up: float = 0.02  # [1] of all steps, over which the learning rate rises
-    final_rate: float = 0.01  # [1] of the learning rate, where its cosine ends
-    momentum_fraction: float = 0.5  # [1] of the allowed time that the momentum steps may take
-    momentum_factor: float = 10.0  # [1] on the learning rate of the momentum steps, which are cheap and noisy
+    # [1] Smallest number of steps per epoch; few windows are passed several times between validations.
+    epoch_steps: int = 20
+    # [1] Fraction of all steps over which the learning rate rises.
+    warm_up: float = 0.02
+    # [1] Final value of the cosine schedule, as a fraction of the learning rate.
+    final_rate: float = 0.01
+    # [1] Fraction of the allowed time that momentum steps may take.
+    momentum_fraction: float = 0.5
+    # [1] Factor on the learning rate of momentum steps, which are cheap and noisy.
+    momentum_factor: float = 10.0
 
 
 @dataclass(frozen=True)
 class LoopTuning:
     """Epochs of predicted windows (`fitting.window.rollout`)."""
 
-    first_stage: float = 0.8  # [1] of all steps or minutes, at most, while residuals of rigid bodies rest
-    second_patience: int = 3  # epochs: residuals that belong to the arm soon help
-    probe_every: int = 5  # epochs: friction that is learned may be too stiff for the substeps so far
-    rollbacks: int = 8  # attempts at half the learning rate each, before a fit is given up
+    # [1] Largest fraction of all steps or minutes during which residual terms of rigid bodies are constant.
+    first_stage: float = 0.8
+    # [1] Epochs without improvement in the second stage: residual terms that belong to the arm improve the loss soon.
+    second_patience: int = 3
+    # [1] Epochs between choices of the integration step: trained friction may have become too stiff for it.
+    probe_every: int = 5
+    # [1] Attempts at half the learning rate each, before a fit is abandoned.
+    rollbacks: int = 8
 
 
 @dataclass(frozen=True)
 class IntegrationTuning:
-    """Steps of the integrator in rollouts (`fitting.rollout`)."""
+    """Integration step of rollouts (`fitting.rollout`)."""
 
-    most_substeps: int = 32  # of rk4 between samples
-    fraction: float = 0.03  # [1] of the model's own error, that the integrator may add
-    least_error: float = 1e-2  # [1] in units of the loss's scales: no model is expected to be better
+    # [1] Largest number of rk4 steps between samples.
+    most_substeps: int = 32
+    # [1] Allowed integration error, as a fraction of the model's error.
+    fraction: float = 0.03
+    # [1] Smallest expected error of a model, in units of the loss's scales.
+    least_error: float = 1e-2
 
 
 @dataclass(frozen=True)
 class AdaptiveTuning:
     """Rollouts by dopri5 (`fitting.rollout`)."""
 
-    relative: float = 1e-7  # [1] tolerance of a step
-    absolute: float = 1e-9  # [rad, m, and momenta] tolerance of a step
+    # [1] Relative tolerance of a step.
+    relative: float = 1e-7
+    # [rad, m, and momenta] Absolute tolerance of a step.
+    absolute: float = 1e-9
 
 
 @dataclass(frozen=True)
 class OptimizerTuning:
     """Optimizers of networks (`fitting.optimizers`)."""
 
-    number_factor: float = 5.0  # [1] on the learning rate of constants and biases
-    gradient_norm: float = 1.0  # of the scaled loss; larger gradients are shortened to it
-    history: int = 50  # steps that L-BFGS remembers
-    call: int = 20  # evaluations between looks at whether more would help
-    stalled: float = 1 - 1e-3  # [1] of the loss before a call: what ends above it gained next to nothing
-    too_large: float = 1e12  # given to the line search where a loss is not finite, so that it turns back
+    # [1] Factor on the learning rate of constants and biases.
+    number_factor: float = 5.0
+    # [1] Largest norm of the gradient of the scaled loss; larger gradients are scaled down to it.
+    gradient_norm: float = 1.0
+    # [1] Steps from which L-BFGS approximates the curvature.
+    history: int = 50
+    # [1] Evaluations of the loss between tests of convergence.
+    call: int = 20
+    # [1] A call of L-BFGS that ends above this fraction of the previous loss has made no progress.
+    stalled: float = 1 - 1e-3
+    # [1] Value of a loss that is not finite, so that the line search reverses.
+    too_large: float = 1e12
 
 
 @dataclass(frozen=True)
 class RegularizerTuning:
-    """The regularizer towards the URDF (`fitting.urdf_regularizer`)."""
+    """Regularizer towards the URDF (`fitting.urdf_regularizer`)."""
 
-    points: int = 200  # positions at which M and gravity are compared
-    widened: float = 0.5  # [1] of the logs' range, to both sides: a model is used a little beyond its logs
-    least_scale: float = 0.05  # [1] of the largest gravity torque, for joints that gravity hardly loads
+    # [1] Random positions at which M and gravity are compared.
+    points: int = 200
+    # [1] Margin on both sides of the range of the logs, as a fraction of it: a model is used slightly outside its
+    # logs.
+    widened: float = 0.5
+    # [1] Smallest scale of the gravity torque of a joint, as a fraction of the largest joint.
+    least_scale: float = 0.05

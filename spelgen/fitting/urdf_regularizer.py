@@ -16,7 +16,7 @@ from spelgen.fitting.tuning import RegularizerTuning
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = RegularizerTuning()
 
@@ -33,7 +33,7 @@ class UrdfRegularizer(NamedTuple):
     gravity: torch.Tensor  # (S, n)
     gravity_scale: torch.Tensor  # (n,)
 
-    def loss(self, model: EmittedModel) -> torch.Tensor:
+    def loss(self, model: ArmModel) -> torch.Tensor:
         """Mean squared deviation of the model, relative to the sizes of M and of the gravity torque; no unit."""
         variation = _variation(model.mass_matrix(self.q), self.whitening) - self.variation
         load = (model.gravity(self.q) - self.gravity) / self.gravity_scale
@@ -44,9 +44,7 @@ class UrdfRegularizer(NamedTuple):
         return UrdfRegularizer(*(x.to(device) for x in self))
 
 
-def urdf_regularizer(
-    urdf: Path, joints: Sequence[str], model: EmittedModel, windows: Windows
-) -> UrdfRegularizer:
+def urdf_regularizer(urdf: Path, joints: Sequence[str], model: ArmModel, windows: Windows) -> UrdfRegularizer:
     """Return the regularizer of a URDF around the positions of ``windows``.
 
     Raises what Pinocchio raises, and ImportError without it.

@@ -10,7 +10,7 @@ import numpy as np
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.regressor import body_chain, regressor
@@ -40,7 +40,7 @@ def identify(
     preprocessing: its filter and gap. Raises LogError for logs that cannot be used.
     """
     if not isinstance(arm, ConfiguredArm):
-        arm = ConfiguredArm.load(arm)
+        arm = load_arm(arm)
     logs = [logs] if isinstance(logs, Trajectory) else logs
     return identify_by(arm, logs, [method or LeastSquares()], preprocessing or Preprocessing())[0]
 

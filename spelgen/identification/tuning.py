@@ -7,45 +7,69 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class IdentificationTuning:
-    """Numbers that decide how least squares judges what it found."""
+    """Least squares on logs, and the assessment of its parameters."""
 
-    rounds: int = 4  # of weighing joints by what is left of their torque; later ones change no digit (UR10e)
-    least_noise: float = 0.02  # of a joint's torque range: few samples may be fitted better than deserved
-    largest_lag: int = 500  # [samples] over which residuals are followed in time: 5 s
-    negligible: float = 1e-10  # of the largest singular value: a direction in which the samples say nothing
-    regressor_bytes: float = 2e8  # [B] of regressors, up to which they are kept from pass to pass
-    well_posed: float = 30.0  # condition number up to which errors are hardly amplified
-    acceptable: float = 300.0  # condition number up to which parameters can be told apart
-    firm: float = 0.05  # of a value, the deviation up to which it is firm
-    fair: float = 0.2  # likewise fair; above, up to the value itself, weak
-    block: int = 2000  # samples in memory at a time
-    dependent: float = 1e-9  # of its own length: what is left of a column that others span
-    rounding: float = 1e-8  # of the largest coefficient of a base parameter: smaller ones are none
+    # [1] Iterations of the weights of joints from their torque residual; further ones change no printed digit
+    # (UR10e).
+    rounds: int = 4
+    # [1] Smallest noise as a fraction of a joint's torque range: few samples may be fitted better than they are
+    # determined.
+    least_noise: float = 0.02
+    # [1] Largest lag of the autocorrelation of residuals: 500 samples, 5 s.
+    largest_lag: int = 500
+    # [1] Fraction of the largest singular value below which the samples determine nothing in a direction.
+    negligible: float = 1e-10
+    # [B] Regressors of up to this size are kept from pass to pass.
+    regressor_bytes: float = 2e8
+    # [1] Condition number up to which errors are not amplified noticeably.
+    well_posed: float = 30.0
+    # [1] Condition number up to which parameters are distinguishable.
+    acceptable: float = 300.0
+    # [1] Relative standard deviation up to which a parameter is called firm.
+    firm: float = 0.05
+    # [1] Relative standard deviation up to which a parameter is called fair; up to 1 it is called weak.
+    fair: float = 0.2
+    # [1] Samples of one block of a pass.
+    block: int = 2000
+    # [1] A column is dependent if the part that other columns do not span is below this fraction of its length.
+    dependent: float = 1e-9
+    # [1] Coefficients of a base parameter below this fraction of the largest coefficient are 0.
+    rounding: float = 1e-8
 
 
 @dataclass(frozen=True)
 class DriveHintTuning:
-    """Numbers from which on logs are said to show late torques or coupled motors."""
+    """Detection of delayed torques, of coupled motors, and of torques of wrong sense or order."""
 
-    blocks: int = 10  # of time, each judged by what the others say
-    coarse: int = 4  # one of so many samples chooses among candidates
-    # of the squared error, and in each block of the torque's squares, what a coupling leaves at most; the TX40's wrist
-    # leaves 0.05 and 0.03
+    # [1] Blocks of time, each predicted from the others.
+    blocks: int = 10
+    # [1] Stride of the samples that select among candidates.
+    coarse: int = 4
+    # [1] Largest residual with a coupling, relative to the squared error and, per block, to the squared torque; the
+    # TX40's wrist has 0.05 and 0.03.
     coupling_gain: float = 0.5
-    # likewise of a swapped or negated torque; recorded arms lose a factor of 4 by either
+    # [1] The same for a swapped or negated torque; recorded arms have a quarter or less.
     wrong_gain: float = 0.25
-    chance: float = 1 / 400  # that any candidate is taken by luck, as of what enters a fit
-    simple_ratio: float = 0.02  # of the squared error, what a ratio of small numbers may cost
-    # that begin the search for couplings: each covers half of it to twice
+    # [1] Probability that any candidate is accepted by chance, as for terms of a fit.
+    chance: float = 1 / 400
+    # [1] Relative increase of the squared error that is accepted for a ratio of small integers.
+    simple_ratio: float = 0.02
+    # [1] Initial ratios of the search for couplings: each covers half to twice its value.
     ratios: tuple[float, ...] = (1.0, -1.0, 0.4, -0.4, 2.5, -2.5)
-    # [samples of 10 ms] by which torques are moved to find a delay: of loggers and field buses; more may be friction's
+    # [1] Shifts of the torque in samples of 10 ms: delays of loggers and field buses; longer ones may be due to
+    # friction.
     shifts: tuple[int, ...] = (-3, -2, -1, 0, 1, 2, 3)
-    # [1] of the squares without friction's memory: memory that leaves more does not count (recorded arms: 0.3 to 0.8)
+    # [1] The form with friction state is ignored if its squared residual exceeds that of the other form by this
+    # factor (recorded arms: 0.3 to 0.8).
     unlikely_form: float = 2.0
-    delay_chance: float = 0.01  # [1] outside a delay's interval: a log without delay must not get one
-    samples: int = 1500  # that are kept: six joints have some 70 parameters
-    fewest_samples: int = 400  # that hints and errors need
-    trajectories: int = 8  # of more, whole ones are left out
+    # [1] Probability outside a delay's interval: a log without delay must not get one.
+    delay_chance: float = 0.01
+    # [1] Samples that are kept: six joints have some 70 parameters.
+    samples: int = 1500
+    # [1] Smallest number of samples for hints and errors.
+    fewest_samples: int = 400
+    # [1] Largest number of trajectories; of more, whole ones are left out.
+    trajectories: int = 8
 
 
 TUNING, HINTS = IdentificationTuning(), DriveHintTuning()

@@ -27,7 +27,7 @@ from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
 
 if TYPE_CHECKING:
-    from spelgen.pipeline.loaded_arm import LoadedArm
+    from spelgen.arm.configured_arm import ConfiguredArm
     from spelgen.settings.log_mapping import LogMapping
 
 ORDER = replace(
@@ -38,7 +38,9 @@ WRONG_TORQUES = {"torque-sense": SENSE, "torque-order": ORDER}
 ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED}
 
 
-def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None) -> LogReport:
+def check_logs(
+    logs: Iterable[Trajectory], arm: ConfiguredArm, mapping: LogMapping | None = None
+) -> LogReport:
     """Report all about the logs of an arm, read once, one trajectory after another; nothing is repaired or raised.
 
     The report's `errors` prevent training. mapping: that of the logs, by default from the arm's settings; units that
@@ -83,7 +85,7 @@ def check_logs(logs: Iterable[Trajectory], arm: LoadedArm, mapping: LogMapping |
 
 
 def require_sound_logs(
-    logs: Sequence[Trajectory], arm: LoadedArm, mapping: LogMapping | None = None
+    logs: Sequence[Trajectory], arm: ConfiguredArm, mapping: LogMapping | None = None
 ) -> list[Diagnostic]:
     """Return what `check_logs` finds of logs beside their arm; raise LogError where they cannot be trained on."""
     # the same checks as the command, so that a fit refuses what `spelgen logs` refuses
@@ -96,7 +98,7 @@ def require_sound_logs(
 class TorqueLogs:
     """Check logs of torques beside their arm, from samples that are kept while the logs go by."""
 
-    def __init__(self, arm: LoadedArm, mapping: LogMapping) -> None:
+    def __init__(self, arm: ConfiguredArm, mapping: LogMapping) -> None:
         self._arm, self._mapping, self._drives = arm, mapping, arm.actuation.drives()
         self._samples: list[np.ndarray] = []
         self._moving = DriveLog(arm.arm.joint_types, self._drives, Preprocessing())
@@ -157,7 +159,7 @@ class TorqueLogs:
             summary.notes.extend(late.notes)
 
 
-def _coupling_hint(arm: LoadedArm, coupling: Coupling, remaining: float) -> Diagnostic:
+def _coupling_hint(arm: ConfiguredArm, coupling: Coupling, remaining: float) -> Diagnostic:
     """Return a coupling that the logs show, in the sidecar's words."""
     names = arm.arm.joint_names
     pair = [coupling.moved_by, coupling.joint]

@@ -20,7 +20,7 @@ from spelgen.logs.trajectory import Trajectory, require_commands, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, SIGNALS
 
 if TYPE_CHECKING:
-    from spelgen.pipeline.loaded_arm import LoadedArm
+    from spelgen.arm.configured_arm import ConfiguredArm
 
 MOVING = SAMPLES.moving
 DELAYS = np.arange(TUNING.earliest_delay, TUNING.latest_delay + 1e-9, TUNING.delay_step).round(9)
@@ -104,7 +104,7 @@ def _midpoints(x: np.ndarray) -> np.ndarray:
 class ServoLogs:
     """Check logs of commanded positions beside their arm."""
 
-    def __init__(self, arm: LoadedArm) -> None:
+    def __init__(self, arm: ConfiguredArm) -> None:
         self._arm = arm
         self._logs: list[Trajectory] = []
 

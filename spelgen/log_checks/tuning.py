@@ -7,38 +7,62 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class LogCheckTuning:
-    """Thresholds of notes and errors about logs."""
+    """Thresholds of notes and errors about logs beside their robot."""
 
-    limit_rounding: float = 1e-3  # [rad, m] a position limit overrun by less is rounding
-    one_way: float = 0.1  # of a joint's fastest velocity: that of a joint that never moves back is less
-    limit_noise: float = 0.01  # of a velocity or effort limit: overrun by less is noise of the signal
-    loaded: float = 0.2  # deviation of gravity's torque, of the torque's: from here it must be seen (UR10e)
-    # of inertial power that is negative beyond what is positive; +0.3 to +1 on recorded arms
+    # [rad, m] A position limit may be exceeded by this much: rounding.
+    limit_rounding: float = 1e-3
+    # [1] A joint moves one way only if its speed in the other direction stays below this fraction of its largest.
+    one_way: float = 0.1
+    # [1] A velocity or effort limit may be exceeded by this fraction: noise.
+    limit_noise: float = 0.01
+    # [1] Standard deviation of the gravity torque, as a fraction of the measured torque's, from which on gravity must
+    # be visible (UR10e).
+    loaded: float = 0.2
+    # [1] Negative net inertial power, divided by the sum of its magnitudes, from which on torques have the wrong
+    # sense; recorded arms have +0.3 to +1.
     opposed: float = 0.25
-    seen: float = 0.7  # correlation from which on gravity is in the torque; below what lacks to 1 it is not
-    unusual_factor: float = 5.0  # times the URDF's gravity torque: inertials are wrong, but not like this
-    impossible_factor: float = 10.0  # times the URDF's gravity torque, which only another unit has
-    beyond_drives: float = 20.0  # times its effort limit, which no drive gives in whatever unit
-    gravity_samples: int = 400  # of one trajectory; friction and gravity change slowly
-    levels: float = 10.0  # of a quantised signal: fewer say little of its size
-    step_tolerance: float = 0.05  # of a step, and of the levels of a signal, that may be off a quantised grid
-    all_gravity_samples: int = 6000  # of all trajectories together
-    dependent: float = 1e-8  # of its own size: what is left of a column that others span
-    examples: int = 2  # trajectories that a page draws
-    shown: int = 20  # trajectories that a terminal and a notebook show
+    # [1] Correlation from which on gravity is part of the torque; with a correlation below 1 - seen it is not.
+    seen: float = 0.7
+    # [1] Multiple of the URDF's gravity torque that wrong inertials do not explain.
+    unusual_factor: float = 5.0
+    # [1] Multiple of the URDF's gravity torque that only another unit explains.
+    impossible_factor: float = 10.0
+    # [1] Multiple of a drive's effort limit that no drive produces in any unit.
+    beyond_drives: float = 20.0
+    # [1] Samples per trajectory for gravity; gravity and friction change slowly.
+    gravity_samples: int = 400
+    # [1] A quantised signal with fewer levels gives no reliable magnitude.
+    levels: float = 10.0
+    # [1] Fraction of a step, and of the levels of a signal, that may be off a quantisation grid.
+    step_tolerance: float = 0.05
+    # [1] Samples of all trajectories together for gravity.
+    all_gravity_samples: int = 6000
+    # [1] A column is dependent if the part that other columns do not span is below this fraction of its length.
+    dependent: float = 1e-8
+    # [1] Trajectories that a page draws.
+    examples: int = 2
+    # [1] Trajectories that a terminal and a notebook list.
+    shown: int = 20
 
 
 @dataclass(frozen=True)
 class ServoLogTuning:
-    """Decide what the checks of logs of commanded positions report."""
+    """Thresholds of notes about logs of commanded positions."""
 
-    earliest_delay: float = -0.1  # [s] positions before commands: such rows are shifted
-    latest_delay: float = 0.4  # [s] of every delay that is searched; measured: cheap servos stay below 0.2
-    delay_step: float = 0.01  # [s] half a sample at 50 Hz
-    rest_time: float = 0.25  # [s] a command rests so long before its joint can rest; measured on an SO-101
-    idle_command: float = 1e-2  # [rad, m] standard deviation below which a command does not move
-    ignores: float = 0.5  # correlation below which a position does not follow its command
-    sparse_rate: float = 20.0  # [Hz] below it delays and friction are not seen
+    # [s] Smallest delay of positions after commands that is searched; a negative one means shifted rows.
+    earliest_delay: float = -0.1
+    # [s] Largest delay that is searched; measured delays of cheap servos are below 0.2 s.
+    latest_delay: float = 0.4
+    # [s] Step of the searched delays: half a sample at 50 Hz.
+    delay_step: float = 0.01
+    # [s] Time of constant command before a joint can be at rest; measured on an SO-101.
+    rest_time: float = 0.25
+    # [rad, m] Standard deviation below which a command is constant.
+    idle_command: float = 1e-2
+    # [1] Correlation below which a position does not track its command.
+    ignores: float = 0.5
+    # [Hz] Sample rate below which delays and friction are not visible.
+    sparse_rate: float = 20.0
 
 
 TUNING, SERVO_LOGS = LogCheckTuning(), ServoLogTuning()

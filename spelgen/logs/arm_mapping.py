@@ -11,7 +11,6 @@ from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.messages import validated
 from spelgen.settings.settings import Settings, load_mapping
 from spelgen.settings.yaml_document import Document
-from spelgen.spec import logged_joints
 from spelgen.urdf.robot import Robot
 
 GivenMapping = LogMapping | Mapping[str, object] | Path | str | None
@@ -57,6 +56,14 @@ class DescribedArm(Protocol):
     def settings(self) -> Settings: ...
 
 
+@runtime_checkable
+class DrivenModel(Protocol):
+    """A model, which states the quantity of its inputs: "torque" or "position"."""
+
+    @property
+    def input_quantity(self) -> str: ...
+
+
 LoggedArm = DescribedArm | JointNames | Sequence[str]
 
 
@@ -80,9 +87,9 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
         log_mapping = log_mapping.with_turns(turning)
         return LogSource(tuple(arm.arm.joint_names), tuple(arm.arm.joint_types), log_mapping)
     if isinstance(arm, JointNames):
-        joints = logged_joints(arm)
+        joints = tuple(arm.joint_names)
         log_mapping = _mapping(mapping, joints)
-        if hasattr(arm, "servo"):  # a model whose inputs are commands
+        if isinstance(arm, DrivenModel) and arm.input_quantity == "position":
             log_mapping = log_mapping.model_copy(update={"input": "position"})
         return LogSource(joints, tuple(arm.joint_types), log_mapping)
     if isinstance(arm, Sequence) and not isinstance(arm, str) and all(isinstance(x, str) for x in arm):

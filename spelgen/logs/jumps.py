@@ -162,10 +162,10 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     rows = np.flatnonzero(np.abs(steps) > limit)
     if not len(rows) or len(rows) > TUNING.most_words * len(values):
         return None
-    jump = float(np.median(np.abs(steps[rows])))
+    jump, usual = float(np.median(np.abs(steps[rows]))), _usual(np.abs(steps))
     # torques reverse, too: if values below 0 occur, only an overflow of the whole range is one
     is_signed = values.min() < -TUNING.finest_word * np.ptp(values)
-    if is_signed and jump < max(0.9 * np.ptp(values), TUNING.jump * _usual(np.abs(steps))):
+    if is_signed and jump < max(0.9 * np.ptp(values), TUNING.jump * usual):
         return None
     sizes = [x for x in _word_sizes(values, turn) if 0.75 < x / jump < 1.35]
     around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
@@ -179,6 +179,9 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
             readings.append(Word("sign_bit", size, len(rows), signed(values, size)))
         for reading in readings:
             left = np.abs(np.diff(reading.values))
+            # a fast motion, or one across a gap, only becomes smaller by a period
+            if np.median(left[rows]) > TUNING.jump * usual:
+                continue
             bends = np.abs(np.diff(reading.values, 2))
             score = (
                 float(np.count_nonzero(left > limit)),

@@ -29,7 +29,9 @@ def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list
     """Return the one table of a file. A file that spelgen wrote is read as such, whatever the mapping says."""
     schema = pa.parquet.read_schema(file)
     layout = table_layout(schema, joints, mapping, file)
-    return [(layout, pa.parquet.read_table(file, columns=stored_columns(layout, schema.names)))]
+    columns = stored_columns(layout, schema.names)
+    # pre-buffering would hold the compressed file in memory beside the table
+    return [(layout, pa.parquet.read_table(file, columns=columns, pre_buffer=False))]
 
 
 def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:

@@ -5,21 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
-from spelgen.errors import LogError, collect
+from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.files import replacing
-from spelgen.logs.arm_mapping import GivenMapping, LoggedArm, log_source
+from spelgen.logs.arm_mapping import GivenMapping, LoggedArm, LogSource, log_source
 from spelgen.logs.formats import log_files, read_tables
-from spelgen.logs.recording import in_time_order, make_trajectory
-from spelgen.logs.tables import UNITS, UNITS_KEY, Layout
+from spelgen.logs.segments import LogSegments
+from spelgen.logs.tables import UNITS, UNITS_KEY
 from spelgen.logs.trajectory import Trajectory, joined_column, require_joints
 from spelgen.logs.tuning import TUNING
-from spelgen.logs.values import clock_start, values_in_si
 
 
 def read_logs(
@@ -41,16 +40,64 @@ def read_logs(
     Raises LogError (or one error with several) naming file, row and column, and SettingsError where
     the mapping does not fit the joints.
     """
-    source = log_source(arm, mapping)
+    return _read(paths, log_source(arm, mapping), role, LogSegments(), joint_types)
+
+
+class BoundedLogs(NamedTuple):
+    """Logs within a bound of memory. notes: which part of the logs was kept, empty if all of them were."""
+
+    trajectories: list[Trajectory]
+    notes: list[Diagnostic]
+
+
+def read_bounded_logs(
+    paths: Path | str | Iterable[Path | str],
+    arm: LoggedArm,
+    mapping: GivenMapping = None,
+    role: str | None = None,
+) -> BoundedLogs:
+    """Return the logs as `read_logs` does; of logs of more than `LogTuning.kept_bytes` evenly spread segments.
+
+    Each file is read and reduced by itself, so that memory is bounded by the largest file and the kept samples. A
+    reduced recording has gaps between its segments. The same files give the same samples. Raises what `read_logs`
+    raises, for rows that are kept.
+    """
+    segments = LogSegments(TUNING.kept_bytes)
+    trajectories = _read(paths, log_source(arm, mapping), role, segments)
+    notes = []
+    if segments.every > 1:
+        message = (
+            f"{segments.rows} samples are more than {TUNING.kept_bytes / 1e6:.0f} MB of numbers: one of "
+            f"{segments.every} segments of up to {TUNING.segment_samples} samples was kept, "
+            f"{sum(map(len, trajectories))} samples; gaps between segments are not gaps of the files"
+        )
+        notes.append(Diagnostic("info", "subsampled", "logs", None, message))
+    return BoundedLogs(trajectories, notes)
+
+
+def _read(
+    paths: Path | str | Iterable[Path | str],
+    source: LogSource,
+    role: str | None,
+    segments: LogSegments,
+    joint_types: Sequence[str] | None = None,
+) -> list[Trajectory]:
+    """Return the trajectories of all files, through `segments`. Raises the first error of each file together."""
     collect(source.mapping.misfits(source.joints, source.joint_types or joint_types))
     files, errors = log_files(paths, role)
-    trajectories: list[Trajectory] = []
     for file in files:
         try:
-            for layout, table in read_tables(file, source.joints, source.mapping):
-                trajectories += _trajectories(layout, table)
-        except LogError as error:  # all files are told of at once
+            tables = read_tables(file, source.joints, source.mapping)
+            while tables:  # a table is released before the next one is read
+                segments.add(*tables.pop(0))
+        except LogError as error:
             errors.append(error)
+    trajectories = []
+    for recording in segments.trajectories():
+        if isinstance(recording, Trajectory):
+            trajectories.append(recording)
+        elif recording.file not in {error.file for error in errors}:
+            errors.append(recording)
     collect(errors)
     return _with_unique_names(trajectories)
 
@@ -80,34 +127,8 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
         if path.suffix == ".csv":
             pa.csv.write_csv(table, unfinished)
         else:
-            # as many rows together as a chunk of a log larger than memory has: a chunk then is one read
-            pa.parquet.write_table(table, unfinished, row_group_size=TUNING.chunk_samples)
+            pa.parquet.write_table(table, unfinished, row_group_size=TUNING.row_group)
     return path
-
-
-def _trajectories(layout: Layout, table: pa.Table) -> list[Trajectory]:
-    """Return the trajectories of one table."""
-    if not table.num_rows:
-        raise LogError("no rows", file=layout.file, expected="at least one window of samples")
-    data = values_in_si(table, layout, clock_start(table, layout))
-    trajectories = []
-    for name, rows in _recordings(layout, table):
-        values, repairs = in_time_order(data[rows], rows, layout)
-        trajectories.append(make_trajectory(values, layout, name, repairs))
-    return trajectories
-
-
-def _recordings(layout: Layout, table: pa.Table) -> list[tuple[str, np.ndarray]]:
-    """Return name and rows of each recording of a table, in order of their first rows."""
-    if layout.labels is None:
-        return [(layout.recording or layout.file.stem, np.arange(table.num_rows))]
-    # each label once: a name of a megabyte on a million rows is a small file
-    labels = table[layout.labels].dictionary_encode("encode").combine_chunks()
-    numbers = labels.indices.to_numpy()
-    # sorting keeps time and memory in proportion to the rows, however many recordings there are
-    rows = np.argsort(numbers, kind="stable")
-    ends = np.cumsum(np.bincount(numbers))
-    return list(zip(map(str, labels.dictionary.to_pylist()), np.split(rows, ends[:-1]), strict=True))
 
 
 def _with_unique_names(trajectories: Sequence[Trajectory]) -> list[Trajectory]:

@@ -7,81 +7,124 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class LogTuning:
-    """Numbers that decide how logs are read, cut, filtered and differentiated."""
+    """Reading, cutting, filtering and differentiation of logs."""
 
-    in_memory: int = 100_000_000  # [bytes] of numbers above which logs are streamed; windows take five times
-    chunk_samples: int = 2**16  # of a streamed log held at once: of 7 joints 12 MB, as windows 53 MB
-    npz_bytes: int = 2**30  # unpacked at most from one NPZ archive, which zeros pack a thousandfold
-    largest_value: float = 1e9  # [rad, rad/s, Nm; m, m/s, N] no arm has more: what is beyond is a wrong unit
-    # [usual steps] A larger step is a jump, and a 0 with neighbours farther away is a missing value.
+    # [B] Numbers that a fit keeps of all logs together: 25 minutes of seven joints at 1 kHz, or 76,000 samples of a
+    # torque fit, about as many as its last iterations use. Windows of five samples take five times the memory.
+    kept_bytes: int = 2**28
+    # [1] Largest number of samples of a segment of logs that exceed `kept_bytes`: 16 s at 1 kHz, long compared with
+    # filter transients.
+    segment_samples: int = 2**14
+    # [1] Rows of a row group of the Parquet files that are written.
+    row_group: int = 2**16
+    # [B] Largest unpacked size of an NPZ archive: zeros are packed a thousandfold.
+    npz_bytes: int = 2**30
+    # [rad, rad/s, Nm; m, m/s, N] Largest magnitude of a signal; larger ones have a wrong unit.
+    largest_value: float = 1e9
+    # [1] A step that exceeds this multiple of the typical step is a jump, and a 0 between samples whose magnitudes
+    # exceed it is a missing value: continuous signals approach 0 gradually.
     jump: float = 20.0
-    # [steps of the neighbours] An outlier's two steps are larger: a fast motion has large steps before and after, too.
+    # [1] An outlier's two steps exceed this multiple of the steps of its neighbours: a fast motion has large steps
+    # before and after, too.
     local_jump: float = 4.0
-    jump_window: int = 8  # [samples] of the neighbours on each side
-    excursion: int = (
-        5  # [samples] A signal that leaves and returns within these has outliers, later it has jumped.
-    )
-    most_jumps: float = 0.05  # of all steps: a signal with more is noise
-    most_words: float = 0.5  # of all steps: a signal around 0 changes its sign, and a sign bit, no more often
-    finest_word: float = 4e-6  # of the range of a signal: steps of words of 18 bits
-    word_rounding: float = 0.02  # [steps] by which values on a grid may be rounded
-    word_margin: float = 0.01  # of a period, by which the noise of an angle exceeds it
-    fastest: float = 40.0  # [rad/s, m/s] No arm moves faster, so a faster step is a jump.
-    limit_of_turn: float = 1e-6  # [rad] A period as close to a turn is one.
-    few_repeats: int = 10  # rows of one time, but different states, that are an accident
-    coarse_clock: float = 0.02  # of all rows: from here on the clock is too coarse
-    gap: float = 4.0  # [median steps] a longer step is a hole; jitter of USB loggers stays below 3
-    automatic_cutoff: float = 8.0  # [Hz] rigid-body motion lies below, ripple and quantisation above (UR10e)
-    # [Hz] slower logs are interpolated by cubics, and windows of them are not filtered
+    # [1] Samples on each side of an outlier that are its neighbours.
+    jump_window: int = 8
+    # [1] Samples within which a signal that has left returns, if they are outliers; later it has jumped.
+    excursion: int = 5
+    # [1] Fraction of steps that are jumps; a signal with more is noise.
+    most_jumps: float = 0.05
+    # [1] Fraction of steps at which a signal around 0, and so the sign bit of its words, changes its sign at most.
+    most_words: float = 0.5
+    # [1] Smallest step of words relative to the range of a signal: words of 18 bits.
+    finest_word: float = 4e-6
+    # [1] Rounding of values on a grid, relative to its step.
+    word_rounding: float = 0.02
+    # [1] Noise of a wrapped angle beyond its period, relative to the period.
+    word_margin: float = 0.01
+    # [rad/s, m/s] Largest velocity of an arm: a faster step is a jump.
+    fastest: float = 40.0
+    # [rad] Difference from one revolution within which a period is one revolution.
+    limit_of_turn: float = 1e-6
+    # [1] Rows of one time but different states that are an accident of a logger.
+    few_repeats: int = 10
+    # [1] Fraction of such rows from which on the clock is too coarse.
+    coarse_clock: float = 0.02
+    # [1] A step longer than this multiple of the median step is a gap; jitter of USB loggers stays below 3.
+    gap: float = 4.0
+    # [Hz] Cutoff of the low-pass filter by default: rigid-body motion lies below, ripple and quantisation above
+    # (UR10e).
+    automatic_cutoff: float = 8.0
+    # [Hz] Logs of a lower rate are interpolated by cubics, and their windows are not filtered.
     dense_rate: float = 50.0
-    clock_error: float = 0.002  # of a rate: nominal 50 Hz are 49.95 Hz of one logger, 50.1 Hz of another
-    filter_order: int = 4  # of the Butterworth low-pass, run both ways: as in the logs' published protocols
-    samples_per_period: int = 3  # of the cutoff's period that windows keep; two are Nyquist's bound
-    derivative_span: float = 0.18  # [s] of the cubic through encoder positions (SO-101: noise against lag)
-    longest_clock: float = 1e8  # in whatever unit of time: no recording begins so late on a clock of its own
-    bins: int = 24  # bars of a chart of what logs cover
-    csv_head: int = 2**16  # [bytes] from which encoding, delimiter and decimal point are detected
-    listed: int = 5  # columns that a message names: enough to see how they are named
-    shortest_step: float = 1e-15  # [s] that a log can have: fourth powers of it are still numbers
-    latest: float = 1e24  # [s] likewise, of a time
+    # [1] Relative error of a sample rate: nominal 50 Hz are 49.95 Hz with one logger and 50.1 Hz with another.
+    clock_error: float = 0.002
+    # [1] Order of the Butterworth low-pass, run forward and backward as in the logs' published protocols.
+    filter_order: int = 4
+    # [1] Samples of a window per period of the cutoff; two is Nyquist's bound.
+    samples_per_period: int = 3
+    # [s] Span of the cubic that differentiates encoder positions: a trade-off of noise and lag (SO-101).
+    derivative_span: float = 0.18
+    # [1] Largest first time of a clock that starts with the recording, in any unit of time; a larger one is a date.
+    longest_clock: float = 1e8
+    # [1] Bars of a chart of the coverage of logs.
+    bins: int = 24
+    # [B] Beginning of a CSV file from which encoding, delimiter and decimal point are detected.
+    csv_head: int = 2**16
+    # [1] Columns that a message lists: enough to see how they are named.
+    listed: int = 5
+    # [s] Shortest time between samples: its fourth power is a floating-point number.
+    shortest_step: float = 1e-15
+    # [s] Largest time, for the same reason.
+    latest: float = 1e24
 
 
 @dataclass(frozen=True)
 class SignalCheckTuning:
     """Thresholds of the checks of the signals of a log."""
 
-    increments: int = 10  # [samples] over which q and the integral of qd are compared: hides quantisation
-    drift: float = 0.05  # [rad, m] that qd must say a joint moved, before a constant q is called frozen
-    agreement: float = 0.9  # correlation from which two signals are one; their factor may differ by the rest
-    unit_factor: float = 1.25  # a factor this near to that of a unit is that of the unit
-    fastest_step: float = 1e-4  # [s] nor faster than at 10 kHz
-    slowest_step: float = 0.5  # [s] no arm is sampled more slowly than at 2 Hz
-    unsigned: float = 0.05  # of the fastest velocity: one that is the magnitude of another is hardly below 0
-    unsigned_agreement: float = 0.9  # correlation of a magnitude with |dq/dt|
-    repeats: float = (
-        0.01  # of all rows: fewer repeats are an oversight of the logger, without effect on a fit
-    )
-    near_position: float = (
-        0.3  # of the distance of commands from positions, that remains when words are read rightly
-    )
+    # [1] Samples over which q and the integral of qd are compared: quantisation is averaged out.
+    increments: int = 10
+    # [rad, m] Motion according to qd from which on a constant q is called frozen.
+    drift: float = 0.05
+    # [1] Correlation from which on two signals are equal up to a factor; the factor may differ from 1 by the
+    # remainder.
+    agreement: float = 0.9
+    # [1] A factor within this ratio of the factor of a unit is the factor of the unit.
+    unit_factor: float = 1.25
+    # [s] Smallest and largest median time between samples: no arm is sampled above 10 kHz or below 2 Hz.
+    fastest_step: float = 1e-4
+    slowest_step: float = 0.5
+    # [1] Velocity of the rarer sign relative to the fastest one, below which it may be the magnitude of a velocity.
+    unsigned: float = 0.05
+    # [1] Correlation from which on a magnitude is that of dq/dt.
+    unsigned_agreement: float = 0.9
+    # [1] Fraction of repeated rows that has no effect on a fit.
+    repeats: float = 0.02
+    # [1] Remaining distance of commands from positions, relative to the former one, if words are decoded correctly.
+    near_position: float = 0.3
 
 
 @dataclass(frozen=True)
 class SampleTuning:
-    """Constants of the samples of dynamics."""
+    """Samples of the dynamics: filtered, and on a common grid of time."""
 
-    sample_rate: float = 100.0  # [Hz] of the common grid: twelve times the low-pass, as is usual
-    moving: float = 0.02  # [rad/s, m/s] joints that are slower rest, and say nothing of dynamics
-    shortest_piece: float = 1.0  # [s] shorter pieces are all filter transient
-    # [periods of the filter's cutoff] at both ends of a piece, where the filter is off by 20 times what noise is
+    # [Hz] Rate of the common grid: twelve times the cutoff of the low-pass filter.
+    sample_rate: float = 100.0
+    # [rad/s, m/s] A joint is at rest below this speed; samples of an arm at rest determine no dynamics.
+    moving: float = 0.02
+    # [s] Shortest gap-free piece: shorter ones consist of filter transients.
+    shortest_piece: float = 1.0
+    # [1] Periods of the filter's cutoff at both ends of a piece that are left out: the filter's error there is 20
+    # times the noise.
     unsettled: float = 0.75
 
 
 @dataclass(frozen=True)
 class ServoRolloutTuning:
-    """Decide how finely motion under servos is integrated."""
+    """Integration of motion under position servos."""
 
-    step: float = 3.4e-3  # [s] at most; measured: longer steps bias armatures by a few percent
+    # [s] Largest step; longer ones bias armatures by a few per cent (measured).
+    step: float = 3.4e-3
 
 
 TUNING, SIGNALS, SAMPLES = LogTuning(), SignalCheckTuning(), SampleTuning()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import starmap
 from typing import TypeAlias
 
@@ -15,12 +16,12 @@ from spelgen.logs.tables import Layout, list_element
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import TIMES
 
-Table: TypeAlias = "pa.Table | pa.RecordBatch"
+Rows: TypeAlias = "Sequence[int] | np.ndarray"
 Column: TypeAlias = "pa.ChunkedArray | pa.Array"
 
 
-def values_in_si(table: Table, layout: Layout, start: pa.Scalar | None, row: int = 0) -> np.ndarray:
-    """Return the columns of a layout (T, C) in SI units, times from `start` on. row: of the table in its file.
+def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows: Rows) -> np.ndarray:
+    """Return the columns of a layout (T, C) in SI units, times from `start` on. rows: of the table in its file.
 
     Rows of another topic or publisher (see `foreign_rows`) contain NaN. Raises LogError naming row and column if a
     value is no number, or none that an arm can have.
@@ -29,9 +30,9 @@ def values_in_si(table: Table, layout: Layout, start: pa.Scalar | None, row: int
     if start is not None:
         # before they become floats: 1.7e18 ns keeps no microseconds as a double
         times = pa.compute.subtract(times, start)
-    logged = [_floats(times, layout.columns[0], layout, row)]
+    logged = [_floats(times, layout.columns[0], layout, rows)]
     for name in layout.columns[1:]:
-        logged.append(_floats(_column(table, name), name, layout, row))
+        logged.append(_floats(_column(table, name), name, layout, rows))
     mapping, signals = layout.mapping, layout.mapping.signals(layout.joints)
     for k, (quantity, joint) in enumerate(signals, start=1):
         sign_bit = mapping.word("sign_bit", quantity, joint)
@@ -50,16 +51,16 @@ def values_in_si(table: Table, layout: Layout, start: pa.Scalar | None, row: int
         bad &= ~foreign[:, None]
     if bad.any():
         first, k = np.argwhere(bad)[0]
-        value, rows = data[first, k], f"{bad.any(axis=1).sum()} of {len(data)} rows have such a"
-        got, expected = f"{value:.3g} in SI units ({rows} value", f"a number below {largest[k]:g}"
+        value, count = data[first, k], f"{bad.any(axis=1).sum()} of {len(data)} rows have such a"
+        got, expected = f"{value:.3g} in SI units ({count} value", f"a number below {largest[k]:g}"
         do = "check units and gains"
         if not np.isfinite(value):
-            got, expected = f"no finite number ({rows} gap", "a number"
+            got, expected = f"no finite number ({count} gap", "a number"
             do = "remove those rows; a gap in t is understood"
             if foreign.all():
                 do = "no row has all quantities: log them together, or resample them to the same times"
         got += ", this is the first)"
-        raise layout.row_error(got, row + first, layout.columns[k], expected, do)
+        raise layout.row_error(got, rows[first], layout.columns[k], expected, do)
     return data
 
 
@@ -69,7 +70,7 @@ def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
     return np.asarray(empty.all(axis=2).any(axis=1))
 
 
-def clock_start(table: Table, layout: Layout) -> pa.Scalar | None:
+def clock_start(table: pa.Table, layout: Layout) -> pa.Scalar | None:
     """Return from where times count: the first one of a clock that shows the date, else None."""
     first_row = table.slice(0, 1)
     times, _ = _clock(first_row, layout)
@@ -82,7 +83,7 @@ def clock_start(table: Table, layout: Layout) -> pa.Scalar | None:
     return None
 
 
-def _clock(table: Table, layout: Layout) -> tuple[Column, float]:
+def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
     """Return the times as plain numbers, and their unit [s]. Raises LogError for dates beyond what Arrow counts."""
     name = layout.columns[0]
     times = _column(table, name)
@@ -103,7 +104,7 @@ def _clock(table: Table, layout: Layout) -> tuple[Column, float]:
         ) from error  # fmt: skip
 
 
-def _column(table: Table, name: str) -> Column:
+def _column(table: pa.Table, name: str) -> Column:
     """Return a column, or of a name like `position[2]` that element of each of its lists, written as text maybe."""
     element = list_element(name, table.schema.names)
     if element is None:
@@ -120,7 +121,7 @@ def _column(table: Table, name: str) -> Column:
     return pa.compute.replace_substring_regex(elements, "^$", "nan") if is_text else elements
 
 
-def _floats(values: Column, name: str, layout: Layout, row: int) -> np.ndarray:
+def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray:
     """Return a column as float64 (T,)."""
     try:
         # integers beyond 2^53, times in nanoseconds, are rounded
@@ -131,7 +132,7 @@ def _floats(values: Column, name: str, layout: Layout, row: int) -> np.ndarray:
         texts = values.to_pylist() if pa.types.is_string(values.type) else []
         for index, text in enumerate(texts):
             if text and not is_number(text):
-                raise layout.row_error(repr(text[:60]), row + index, name, "a number") from error
+                raise layout.row_error(repr(text[:60]), rows[index], name, "a number") from error
         got = f"values of type {values.type}"
         raise LogError(got, file=layout.file, element=f"column {name}", expected="numbers") from error
 

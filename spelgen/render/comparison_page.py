@@ -1,77 +1,89 @@
-"""A comparison -> one self-contained HTML page: tables, losses while training, predictions and M against the truth."""
+"""Write a comparison as one self-contained HTML page: the result in a sentence and a table, then curves."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from spelgen.comparison.metrics import RunResult, true_mass
+from spelgen.comparison.figures import SimulatedFigures, true_mass
+from spelgen.comparison.inputs import ArmInputs
 from spelgen.comparison.study import Study
-from spelgen.evaluation.drawn_motions import PredictedMotion
+from spelgen.comparison.tables import ArmSection, comparison_sentence
 from spelgen.evaluation.plain import array
-from spelgen.evaluation.tables import Table
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.labels import named_joints
+from spelgen.labels import counted, named_joints
 from spelgen.render.charts import Chart, Line, line_chart
 from spelgen.render.page import render_page
 from spelgen.render.plots import Panel, mass_panels, trajectory_panels
-from spelgen.spec import read_facts
 
 STYLES = ("c1", "c2", "c3", "gravity", "c4", "c5", "c6")
 
 
-def write_comparison(study: Study, tables: Sequence[Table]) -> Path:
+@dataclass(frozen=True)
+class SimulatedCurves:
+    """Curves of the first run of each preset on a simulated arm; the curves of several seeds would overlap."""
+
+    losses: Chart
+    prediction: list[Panel]
+    mass: list[Panel]
+
+
+def write_comparison(study: Study, sections: Sequence[ArmSection]) -> Path:
     """Write comparison.html into the study's folder; return its path."""
-    # one seed stands for all: the lines of several would cover one another
-    results = [result for result in study.results() if result.seed == 0]
-    styles = dict(zip([result.variant for result in results], STYLES, strict=False))
-    facts = read_facts(study.module(study.variants[0]))
-    examples = {result.variant: result.example for result in results if result.example is not None}
-    panels, entries = [], []
-    if examples:
-        panels = trajectory_panels(examples, styles, named_joints(facts.joints, facts.joint_types))
-        entries = _mass_panels(study, examples, results, styles, facts.joint_types)
+    curves = {}
+    jobs = {job.arm: job for job in study.jobs}
+    for section in sections:
+        inputs = jobs[section.name].inputs
+        if inputs.truth is not None:
+            curves[section.name] = _curves(study, section, inputs, inputs.truth)
     text = render_page(
         "comparison.html.jinja",
-        study=study,
-        tables=tables,
-        losses=_losses(study, styles),
-        panels=panels,
-        entries=entries,
+        title=f"{', '.join(jobs)}: presets compared",
+        sentence=comparison_sentence(sections),
+        runs=counted(len(study.results), "run"),
+        sections=sections,
+        protocols={name: job.protocol for name, job in jobs.items() if name in curves},
+        widths={name: job.width for name, job in jobs.items()},
+        curves=curves,
+        failures=study.failures,
     )
     return write_text(study.folder / "comparison.html", text)
 
 
-def _losses(study: Study, styles: Mapping[str, str]) -> Chart:
-    """Return the validation loss of the first seed's runs by training step."""
+def _curves(study: Study, section: ArmSection, inputs: ArmInputs, truth: Path) -> SimulatedCurves:
+    first: dict[str, SimulatedFigures] = {}
+    for result in section.results:
+        if result.simulated is not None:
+            first.setdefault(result.preset, result.simulated)
+    styles = dict(zip(first, STYLES, strict=False))
+    folders = {job.preset: job.folder for job in reversed(study.jobs) if job.arm == section.name}
+    arm = inputs.load().arm
+    examples = {name: figures.example for name, figures in first.items() if figures.example is not None}
+    prediction, mass = [], []
+    if examples:
+        prediction = trajectory_panels(examples, styles, named_joints(arm.joint_names, arm.joint_types))
+        learned = {name: array(first[name].mass) for name in examples}
+        # all presets have the same test logs, and therefore the same example
+        along = next(iter(examples.values()))
+        true = true_mass(truth, torch.from_numpy(along.q)).numpy()
+        rows, columns = np.tril_indices(len(arm.joint_types))
+        entries = {name: m[:, rows, columns].T for name, m in {"true": true, **learned}.items()}
+        mass = mass_panels(along.t, entries, {"true": "truth", **styles}, arm.joint_types, width=400)
+    return SimulatedCurves(_losses(folders, styles), prediction, mass)
+
+
+def _losses(folders: Mapping[str, Path], styles: Mapping[str, str]) -> Chart:
+    """Return the validation loss of each preset by training step."""
     lines = []
-    for variant in study.variants:
-        records = RunFolder(study.run(variant, 0)).read_metrics()
-        if variant.name in styles and records:
+    for name, style in styles.items():
+        records = RunFolder(folders[name]).read_metrics()
+        if records:
             steps, losses = array([(record["step"], record["best"]) for record in records]).T
-            lines.append(Line(variant.name, steps, losses, styles[variant.name]))
+            lines.append(Line(name, steps, losses, style))
     title = "Best validation loss by step"
     return line_chart(lines, title, "training step", "loss", log=True, width=560, height=250)
-
-
-def _mass_panels(
-    study: Study,
-    examples: Mapping[str, PredictedMotion],
-    results: Sequence[RunResult],
-    styles: Mapping[str, str],
-    joint_types: Sequence[str],
-) -> list[Panel]:
-    """Return M's lower triangle along the first example: the true robot's, and what every variant learned."""
-    # the logs are the same for all, and so is their first motion
-    along = next(iter(examples.values()))
-    masses = {"true": true_mass(study.source, torch.from_numpy(along.q)).numpy()}
-    for result in results:
-        if result.variant in examples:
-            masses[result.variant] = array(result.mass)
-    rows, columns = np.tril_indices(len(joint_types))
-    entries = {name: mass[:, rows, columns].T for name, mass in masses.items()}
-    return mass_panels(along.t, entries, {"true": "truth", **styles}, joint_types, width=400)

@@ -15,12 +15,12 @@ from spelgen.render.plots import (
     torque_panels,
     trajectory_panels,
 )
-from spelgen.spec import Facts
+from spelgen.spec import ModelSpec
 
 
-def curves(traces: Traces, facts: Facts) -> dict[str, object]:
+def curves(traces: Traces, spec: ModelSpec) -> dict[str, object]:
     """Return by section of a page what is drawn there, or None; of torques and trajectories by their titles."""
-    joints = named_joints(facts.joints, facts.joint_types)
+    joints = named_joints(spec.joint_names, spec.joint_types)
     drawn: dict[str, object] = dict.fromkeys(("growth", "mass", "friction", "energy"))
     growth, mass = traces.growth, traces.mass
     if growth is not None:
@@ -29,7 +29,7 @@ def curves(traces: Traces, facts: Facts) -> dict[str, object]:
         drawn["growth"] = growth_panels(growths, STYLES, (MODEL, LEAST_SQUARES))
     if mass is not None and mass.by:
         entries = {name: curves.entries for name, curves in mass.by.items()}
-        drawn["mass"] = mass_panels(mass.t, entries, STYLES, facts.joint_types)
+        drawn["mass"] = mass_panels(mass.t, entries, STYLES, spec.joint_types)
     if traces.friction is not None:
         drawn["friction"] = friction_panels(traces.friction, traces.torques, joints)
     if traces.torques:  # one trajectory is enough to see where energy goes
@@ -42,7 +42,7 @@ def curves(traces: Traces, facts: Facts) -> dict[str, object]:
         which = example.which.capitalize()
         if example.start is None:
             distance = None if example.error is None else 1000 * example.error
-            off = f"{number(distance)} {thousandths(facts.joint_types)} off"
+            off = f"{number(distance)} {thousandths(spec.joint_types)} off"
             title = f"{which} log replayed: {example.trajectory}, {off}"
         else:
             start = f"{example.start:.3g} s into it"

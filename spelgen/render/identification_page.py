@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.identification.identification import Identification
-from spelgen.pipeline.loaded_arm import LoadedArm
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import render_page
 from spelgen.render.parameters import DETERMINED, base_table
 from spelgen.render.plots import Record
+from spelgen.structure.structure import derive
 
 
-def page(identification: Identification, arm: LoadedArm) -> str:
+def page(identification: Identification, arm: ConfiguredArm) -> str:
     """The page about an identification: what was determined and how surely, the arm, and the torque that is left."""
     record: Record = identification.to_dict()
     words = [parameter["determined"] for parameter in record["base_parameters"]]
@@ -24,7 +25,7 @@ def page(identification: Identification, arm: LoadedArm) -> str:
         never=never,
         residuals=identification.listings()[0],
         parameters=base_table(None, arm, record),
-        cells=matrix(arm.arm, arm.structure),
+        cells=matrix(arm.arm, derive(arm.arm)),
         arm=arm_section(arm.arm, arm.robot.path),
         heading=identification.heading(),
         notes=identification.diagnostics,

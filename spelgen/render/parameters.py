@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from spelgen.arm.configured_arm import ConfiguredArm
 from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.parameters import parameters_of_kind
-from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.dynamics.regressor import urdf_parameters
 from spelgen.dynamics.rigid_bodies import about_center
 from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.labels import UNITS, entry_name
 from spelgen.listing import Listing
-from spelgen.pipeline.loaded_arm import LoadedArm
 from spelgen.render.plots import Record
 from spelgen.render.tuning import TUNING
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 Rows = tuple[tuple[str, ...], ...]
 DETERMINED = ("firm", "fair")
@@ -38,7 +38,7 @@ class ParameterTable(Listing):
 
 
 def parameter_tables(
-    model: EmittedModel | None, arm: LoadedArm | None, identified: Record | None
+    model: ArmModel | None, arm: ConfiguredArm | None, identified: Record | None
 ) -> list[Listing]:
     """Return the tables of a run's parameters; `identified`: by least squares on the same logs."""
     tables: list[Listing] = []
@@ -54,15 +54,15 @@ def parameter_tables(
     return tables
 
 
-def body_parameters(model: EmittedModel | None) -> np.ndarray | None:
+def body_parameters(model: ArmModel | None) -> np.ndarray | None:
     """Return (bodies, 10) of a model of rigid bodies, as ``Body.inertia`` has them; None of another or of none."""
-    if model is None or not has_rigid_bodies(model):
+    if model is None or not isinstance(model, RigidBodyDynamics):
         return None
     values: np.ndarray = model.inertial_parameters.detach().numpy()
     return values
 
 
-def base_table(model: EmittedModel | None, arm: LoadedArm, identified: Record) -> ParameterTable:
+def base_table(model: ArmModel | None, arm: ConfiguredArm, identified: Record) -> ParameterTable:
     """Return what least squares found, beside the URDF and, where there is one, a model of rigid bodies."""
     effects = identified["method"]["effects"]
     friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
@@ -125,7 +125,7 @@ def _interval(parameter: Record) -> str:
     return value
 
 
-def _body_table(values: np.ndarray, arm: LoadedArm | None) -> Listing:
+def _body_table(values: np.ndarray, arm: ConfiguredArm | None) -> Listing:
     names = [f"body {k + 1}" for k in range(len(values))]
     nominal = None
     if arm is not None:
@@ -159,7 +159,7 @@ def _listed(values: np.ndarray) -> str:
     return ", ".join(f"{value:.3g}" for value in values)
 
 
-def _joint_table(model: EmittedModel, arm: LoadedArm | None) -> Listing:
+def _joint_table(model: ArmModel, arm: ConfiguredArm | None) -> Listing:
     """Return armature, friction and torque offset of each joint of a model that has an armature."""
     names, inertias, torques, slopes = [], [], [], []
     for number, kind in enumerate(model.joint_types, start=1):
@@ -173,7 +173,7 @@ def _joint_table(model: EmittedModel, arm: LoadedArm | None) -> Listing:
     if arm is not None:
         joints = arm.arm.coordinates
         columns["joint"] = list(arm.arm.joint_names)
-        if has_rigid_bodies(model):
+        if isinstance(model, RigidBodyDynamics):
             viscous, forward, backward, _ = nearest_friction(arm.arm, model, sampled_positions(arm.arm))
             note = "Viscous and Coulomb friction are fitted to the model's friction law, as in exports."
             # the damping of a drive's control contains its joint's viscous friction
@@ -183,7 +183,7 @@ def _joint_table(model: EmittedModel, arm: LoadedArm | None) -> Listing:
             columns["Coulomb, qd < 0"] = _with_units(backward, torques)
         columns["URDF: viscous"] = _with_units([joint.damping for joint in joints], slopes)
         columns["URDF: Coulomb"] = _with_units([joint.friction for joint in joints], torques)
-    if has_rigid_bodies(model):
+    if isinstance(model, RigidBodyDynamics):
         columns["torque offset"] = _with_units(model.torque_offset.tolist(), torques)
     return Listing("Drives and friction", tuple(columns), tuple(zip(*columns.values(), strict=True)), note)
 

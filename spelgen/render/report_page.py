@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,7 +9,9 @@ from typing import TYPE_CHECKING
 
 from jinja2 import TemplateError
 
-from spelgen.baselines.run_arm import run_arm
+from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.emission.build import arm_of_spec
+from spelgen.emission.text import header
 from spelgen.errors import RunError, SpelgenError, in_one_line
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import result_tables
@@ -18,14 +19,14 @@ from spelgen.evaluation.traces import Traces
 from spelgen.evaluation.verdict import Limits, Verdict, verdict
 from spelgen.files import write_json, write_text
 from spelgen.fitting.run_folder import RunFolder, trained_model
+from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.labels import UNITS, named_joints
-from spelgen.pipeline.loaded_arm import LoadedArm
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.curves import curves
 from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, parameter_tables
-from spelgen.render.plots import Record, coverage_panels, loss_chart
+from spelgen.render.plots import coverage_panels, loss_chart
 from spelgen.render.run_facts import (
     best_epoch,
     commands,
@@ -33,10 +34,11 @@ from spelgen.render.run_facts import (
     settings,
     training_facts,
 )
-from spelgen.spec import Facts, read_facts
+from spelgen.spec import ModelSpec
+from spelgen.structure.structure import derive
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 SCHEMA = 1
 """Of the page as data."""
@@ -44,24 +46,24 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class Run:
-    """Hold what lies in a run folder; None stands for what it lacks.
+    """The content of a run folder; None for files that it does not have.
 
-    config: how the run was trained. identified: what least squares found. arm: None also where its URDF is one that
-    this version refuses: the page stands without.
+    config: the record of the fit. baselines: content of least_squares.json, {} without one. arm: None also if its URDF
+    cannot be read: the page is written without it.
     """
 
     folder: RunFolder
-    facts: Facts
+    spec: ModelSpec
     config: Record | None
     results: Results | None
-    identified: Record | None
-    arm: LoadedArm | None
+    baselines: Content
+    arm: ConfiguredArm | None
 
     @property
     def limits(self) -> Limits:
         """Return the joints' limits, None of a joint without."""
         if self.arm is None:
-            return [None] * len(self.facts.joints)
+            return [None] * len(self.spec.joints)
         return [joint.limits for joint in self.arm.arm.coordinates]
 
     @property
@@ -69,7 +71,7 @@ class Run:
         """Return what the model is good for; None before it is evaluated."""
         if self.results is None:
             return None
-        return verdict(self.results, self.identified, self.limits)
+        return verdict(self.results, self.baselines, self.limits)
 
 
 def open_run(path: Path | str) -> Run:
@@ -77,19 +79,21 @@ def open_run(path: Path | str) -> Run:
     folder = RunFolder(path)
     evaluation = _record(folder, folder.evaluation)
     arm = None
-    with suppress(SpelgenError):
-        arm = run_arm(folder)
+    spec = folder.read_spec()
+    if folder.urdf.exists():
+        with suppress(SpelgenError):
+            arm = arm_of_spec(spec, folder.urdf)
     return Run(
         folder,
-        read_facts(folder.module),
-        folder.read_config() if folder.config.is_file() else None,
+        spec,
+        folder.read_record() if folder.config.is_file() else None,
         None if evaluation is None else Results.from_dict(evaluation),
-        _record(folder, folder.baseline),
+        folder.read_baselines(),
         arm,
     )
 
 
-def _record(folder: RunFolder, path: Path) -> Record | None:
+def _record(folder: RunFolder, path: Path) -> Content | None:
     return folder.read_json(path) if path.is_file() else None
 
 
@@ -109,7 +113,7 @@ def write_report(
     return write_text(path, render_report(folder, robot))
 
 
-def report_data(folder: Path | str) -> Record:
+def report_data(folder: Path | str) -> Content:
     """Return all that the page shows, for programs: the verdict, the evaluation, least squares, the parameters."""
     run = open_run(folder)
     model = _trained(run)
@@ -120,13 +124,13 @@ def report_data(folder: Path | str) -> Record:
         "schema": SCHEMA,
         "verdict": None if run.verdict is None else asdict(run.verdict),
         "bodies": bodies,
-        "tables": list(map(asdict, parameter_tables(model, run.arm, run.identified))),
+        "tables": list(map(asdict, parameter_tables(model, run.arm, run.baselines))),
         "evaluation": _record(run.folder, run.folder.evaluation),
-        "least_squares": run.identified,
+        "least_squares": run.baselines or None,
     }
 
 
-def _trained(run: Run) -> EmittedModel | None:
+def _trained(run: Run) -> ArmModel | None:
     """Return the trained model."""
     return trained_model(run.folder) if run.folder.weights.is_file() else None
 
@@ -134,11 +138,11 @@ def _trained(run: Run) -> EmittedModel | None:
 def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
     """Return the page about a run as HTML; the same folder gives the same text. robot: see ``write_report``."""
     folder = Path(folder)
-    if not RunFolder(folder).module.is_file():
+    if not RunFolder(folder).path.is_dir():
         raise RunError(
             "no run",
             file=folder,
-            expected="a folder with module.py",
+            expected="a folder with spec.json",
             do="make one with `spelgen train`",
         )
     # files of a run folder may come from anywhere and hold anything
@@ -153,38 +157,38 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
 
 
 def _rendered(run: Run, robot: Path | str | None) -> str:
-    facts, config, metrics = run.facts, run.config or {}, run.folder.read_metrics()
+    spec, record, metrics = run.spec, run.config, run.folder.read_metrics()
     model = _trained(run)
     traces, tables = Traces({}), []
     if run.results is not None:
         traces, tables = run.results.traces, result_tables(run.results)
-    sections = dict.fromkeys(("arm", "cells", "training", "settings", "losses")) | curves(traces, facts)
+    sections = dict.fromkeys(("arm", "cells", "training", "settings", "losses")) | curves(traces, spec)
     if run.arm is not None:
         sections["arm"] = arm_section(run.arm.arm, Path(robot or run.arm.robot.path), traces)
-        sections["cells"] = matrix(run.arm.arm, run.arm.structure_for(facts.options.assume))
-    if config:
-        sections["training"] = training_facts(config, metrics, run.identified, model)
-        sections["settings"] = settings(config)
+        sections["cells"] = matrix(run.arm.arm, derive(run.arm.arm, spec.options.assume))
+    if record is not None:
+        sections["training"] = training_facts(record, metrics, run.baselines, model)
+        sections["settings"] = settings(record)
     if metrics:
         sections["losses"] = loss_chart(metrics, best_epoch(metrics))
     # the sentences about the model
-    docstring = ast.get_docstring(ast.parse(run.folder.module.read_bytes())) or ""
-    joints = named_joints(facts.joints, facts.joint_types)
+    docstring = header(spec)
+    joints = named_joints(spec.joint_names, spec.joint_types)
     return render_page(
         "report.html.jinja",
         **sections,
-        facts=facts,
+        spec=spec,
         about=" ".join(docstring.split("\n\n")[1].split()),
         units=UNITS,
-        numbers=head_numbers(model, config, metrics, run.results),
+        numbers=head_numbers(model, record, metrics, run.results),
         verdict=run.verdict,
-        config=run.config,
+        config=record,
         evaluation=run.results,
         tables=tables,
-        coverage=coverage_panels(traces, run.identified, joints, run.limits),
+        coverage=coverage_panels(traces, run.baselines, joints, run.limits),
         trained=model is not None,
-        under_servos=config.get("mapping", {}).get("input") == "position",
-        summary=servo_summary(config),
-        parameters=parameter_tables(model, run.arm, run.identified),
-        commands=commands(run.folder, facts, run.config),
+        under_servos=record is not None and record.mapping.input == "position",
+        summary=None if record is None else servo_summary(record.servo),
+        parameters=parameter_tables(model, run.arm, run.baselines),
+        commands=commands(run.folder, spec, run.config),
     )

@@ -13,32 +13,35 @@ from spelgen.errors import shortened
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import figures
 from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.torque.report import terms_in_use
 from spelgen.labels import counted
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.render.plots import Record
 from spelgen.settings.fits import CONFIGS
 from spelgen.settings.training import TrainingSettings
-from spelgen.spec import Facts, Options
+from spelgen.spec import ModelSpec, Options
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 
 def head_numbers(
-    model: EmittedModel | None, config: Record, metrics: Sequence[Record], results: Results | None
+    model: ArmModel | None,
+    record: Record | None,
+    metrics: Sequence[Content],
+    results: Results | None,
 ) -> list[tuple[str, str]]:
-    """Return the figures a reader wants first, with what they are, as far as the run has come.
+    """Return the most important figures with their labels, as far as the run has come.
 
-    Records are empty where there are none.
+    record: None and metrics: [] if the run has none.
     """
     numbers = []
     if results is not None:
         for figure in figures(results):
             numbers.append((figure.text(), figure.label))
-    summary = servo_summary(config)
+    summary = None if record is None else servo_summary(record.servo)
     if summary is not None:
         numbers.append(summary.headline)
     elif model is not None:
@@ -49,26 +52,26 @@ def head_numbers(
     return numbers
 
 
-def best_epoch(metrics: Sequence[Record]) -> int:
+def best_epoch(metrics: Sequence[Content]) -> int:
     """Return the epoch of the model that was kept; 0: no epoch was better than the start."""
     best = metrics[-1]["best"]
-    return next((record["epoch"] for record in metrics if record["validation"] == best), 0)
+    return next((epoch["epoch"] for epoch in metrics if epoch["validation"] == best), 0)
 
 
 def training_facts(
-    config: Record, metrics: Sequence[Record], identified: Record | None, model: EmittedModel | None
+    record: Record, metrics: Sequence[Content], baselines: Content, model: ArmModel | None
 ) -> dict[str, str]:
-    """Return how the run was trained, from its config.json, metrics.jsonl and the model that came of it."""
-    preprocessing = Preprocessing(**config["preprocessing"])
+    """Return the logs, the preprocessing and the length of a fit, for people."""
+    preprocessing = record.preprocessing
     facts = {
-        "objective": config["objective"],
-        "training logs": _names(config["training"]),
-        "validation logs": _names(config["validation"]),
-        "windows": f"{config['training_windows']:,} for training, {config['validation_windows']:,} for validation",
+        "objective": record.objective,
+        "training logs": _names(record.training),
+        "validation logs": _names(record.validation),
+        "windows": f"{record.training_windows:,} for training, {record.validation_windows:,} for validation",
         "filter": f"{preprocessing.cutoff:g} Hz, zero phase" if preprocessing.filtered else "none",
     }
-    if identified and "samples" in identified:
-        count = f"{identified['samples']:,}"
+    if "samples" in baselines:
+        count = f"{baselines['samples']:,}"
         facts["dense samples"] = f"{count} that move, from which least squares is fitted as well"
     if model is not None and hasattr(model, "residuals"):
         facts["beside rigid bodies"] = "; ".join(terms_in_use(model)) or "nothing selected"
@@ -80,16 +83,16 @@ def training_facts(
             origin = "the start: no epoch was better"
         facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}"
         facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"
-        if config["config"].get("solver", "rk4") == "rk4":
+        if record.options.get("solver", "rk4") == "rk4":
             facts["integrator"] = f"rk4, {counted(last['substeps'], 'step')} between samples"
-    if config["config"].get("momentum_steps"):
-        facts["start"] = f"{config['config']['momentum_steps']:,} steps on the momentum along the logs"
+    if record.options.get("momentum_steps"):
+        facts["start"] = f"{record.options['momentum_steps']:,} steps on the momentum along the logs"
     return facts
 
 
-def settings(config: Record) -> dict[str, str]:
-    """Return what the objective was set to."""
-    options = config["config"].items()
+def settings(record: Record) -> dict[str, str]:
+    """Return the options of the fit, for people."""
+    options = record.options.items()
     return {key.replace("_", " "): str(value) for key, value in options if value is not None}
 
 
@@ -108,13 +111,13 @@ def _duration(seconds: float) -> str:
     return f"{minutes:.1f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
 
 
-def commands(run: RunFolder, facts: Facts, record: Record | None) -> list[str]:
-    """Return what makes a run again, from its module and its config.json; the logs' place is not known to the run."""
-    options = asdict(facts.options)
-    if facts.options.design is not None:  # of a file that the run does not keep
+def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str]:
+    """Return the commands that reproduce a run; LOGS stands for the logs, since a run does not keep their path."""
+    options = asdict(spec.options)
+    if spec.options.design is not None:  # of a file that the run does not keep
         options["preset"] += ".yaml"
     # the module may name a folder of another machine before its URDF
-    robot, option = shlex.quote(Path(facts.urdf).name), ""
+    robot, option = shlex.quote(Path(spec.urdf).name), ""
     if run.urdf.exists():
         robot = f"RUN/{run.urdf.name}"
         option = f" --robot {robot}"
@@ -124,11 +127,12 @@ def commands(run: RunFolder, facts: Facts, record: Record | None) -> list[str]:
         build += f" --{key.replace('_', '-')} {shlex.quote(words)}"
     lines = [f"{build} -o module.py"]
     if record:
-        objective, chosen = record["objective"], ("validation_fraction", "seed")
+        objective = record.objective
         train = f"spelgen train module.py{option} --data LOGS -o RUN2 --objective {objective}"
         defaults = CONFIGS[objective]().model_dump(mode="json") | asdict(Preprocessing())
-        defaults |= TrainingSettings().model_dump(include=set(chosen))
-        options = {key: record[key] for key in chosen} | record["config"] | record["preprocessing"]
+        defaults |= TrainingSettings().model_dump(include={"validation_fraction", "seed"})
+        options = {"validation_fraction": record.validation_fraction, "seed": record.seed}
+        options |= record.options | asdict(record.preprocessing)
         for key, value in _changed(options, defaults).items():
             train += f" --set {shlex.quote(f'{key}={value}')}"
         lines.append(train)

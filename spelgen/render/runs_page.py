@@ -1,4 +1,4 @@
-"""Several runs -> one self-contained page that sets them side by side: one evaluation in which runs are predictors."""
+"""Write a self-contained HTML page that compares the evaluations of several run folders."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STYLES = ("model", "train", "gravity", "coriolis", "friction", "hold")
 
 
 def write_runs(folders: Sequence[Path], output: Path) -> Path:
-    """Write the page about these runs; return its path. Raises RunError where one is no run, or not evaluated."""
+    """Write the page; return its path. Raises RunError for a folder that is not a run, or a run without evaluation."""
     return write_text(output, render_runs(folders))
 
 
@@ -29,7 +29,7 @@ def render_runs(folders: Sequence[Path]) -> str:
     runs: dict[str, Run] = {}
     results: dict[str, Results] = {}
     for name, folder in zip(_names(folders), folders, strict=True):
-        RunFolder(folder).read_config()  # where there is no run, this says so
+        RunFolder(folder).read_record()  # raises an error if there is no run
         run = open_run(folder)
         if run.results is None:
             raise RunError("a run that is not evaluated", file=folder, do="spelgen evaluate")
@@ -39,15 +39,15 @@ def render_runs(folders: Sequence[Path]) -> str:
         "runs.html.jinja",
         runs=runs,
         verdict=_verdict(results),
-        robots=sorted({run.facts.robot for run in runs.values()}),
+        robots=sorted({run.spec.robot for run in runs.values()}),
         tables=joined(results),
-        # a seventh run has the style of the first again
+        # more runs than styles repeat the styles
         growth=growth_panels(growths, dict(zip(runs, STYLES * len(runs), strict=False)), runs),
     )
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Return the folders' own names, with as many parents' as tell them apart: a page names no one's home."""
+    """Return the shortest distinct ends of the folders' paths; complete paths would show home folders on the page."""
     paths = list(map(Path.resolve, folders))
     names: list[str] = []
     for count in range(1, max(len(path.parts) for path in paths) + 1):
@@ -58,7 +58,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 
 def _verdict(runs: Mapping[str, Results]) -> str:
-    """Say which run misses least, by each of the figures that all have."""
+    """Return a sentence with the run that has the smallest error, for each figure that all runs have."""
     errors: dict[str, list[tuple[float, str, str]]] = {}
     for run, results in runs.items():
         for figure in figures(results):

@@ -7,18 +7,27 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class RenderTuning:
-    """Limits of what is drawn on a page."""
+    """Limits of the charts and the 3D view of a page."""
 
-    points: int = 300  # of a line: more cannot be seen at 400 pixels and only make the page heavy
-    decades: float = 8.0  # of a logarithmic axis, counted from the largest value
-    # times the model's error: baselines beyond it are cut off, else all others were flat
+    # [1] Points of a line: at 400 pixels more are not visible and only make the page larger.
+    points: int = 300
+    # [1] Decades of a logarithmic axis, counted from the largest value.
+    decades: float = 8.0
+    # [1] Baselines with an error beyond this multiple of the model's error are cut off, so that the others are
+    # distinguishable.
     outlier: float = 100.0
-    bulk: float = 0.995  # quantile of measured friction that sets the axis: its outliers are cut off
-    zero: float = 1e-9  # of the largest entry of M: a smaller one is what rounding leaves of zero
-    faces: int = 4000  # of all links together, so that a page stays below 1 MB
-    tube_radius: float = 0.028  # of a link without a mesh, relative to the arm's reach
-    worst_error: float = 0.5  # relative error that is drawn as the worst colour
-    interval: float = 2.0  # standard deviations, a 95 % interval
+    # [1] Quantile of the measured friction that sets the axis: outliers are cut off.
+    bulk: float = 0.995
+    # [1] An entry of M below this fraction of the largest entry is 0 with rounding.
+    zero: float = 1e-9
+    # [1] Faces of all links together, so that a page stays below 1 MB.
+    faces: int = 4000
+    # [1] Radius of the tube that represents a link without a mesh, relative to the extent of the arm.
+    tube_radius: float = 0.028
+    # [1] Relative error that has the last colour of the scale.
+    worst_error: float = 0.5
+    # [1] Standard deviations of an interval of 95 %.
+    interval: float = 2.0
 
 
 TUNING = RenderTuning()

@@ -2,51 +2,52 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
-from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.parts import Layout, Pairs
+from spelgen.runtime.parts import Entries
+from spelgen.runtime.rows import Constant, Joint, vector
 
 
 class ConstantMass(nn.Module):
-    """M, (..., n, n), with ``entries`` saying where the constants stand.
+    """M, (..., n, n): ``entries(*constants)`` and the armature.
 
-    A constant starts at the first of its two numbers, and is trained in units of the second. They
-    enter by their sizes, so that M stays positive definite.
+    The absolute values of the constants are used, so that M stays positive definite.
     """
 
-    kinds = (
+    parameter_groups = (
         ("raw_constants", "mass_constants", "kg m^2, kg m, kg"),
         ("raw_armature", "armature", "kg m^2, kg"),
     )
 
-    def __init__(self, joints: Joints, entries: Layout, constants: Pairs) -> None:
+    def __init__(self, joints: Sequence[Joint], entries: Entries, *, constants: Sequence[Constant]) -> None:
         super().__init__()
         self.entries = entries
-        self.constant_scale = nn.Buffer(vector(unit for _, unit in constants))
-        self.raw_constants = nn.Parameter(vector(start / unit for start, unit in constants))
-        self.nominal_armature = nn.Buffer(vector(joints.armature))
-        self.raw_armature = nn.Parameter(torch.zeros_like(self.nominal_armature))  # its logarithm
+        self.constant_scale = nn.Buffer(vector(x.scale for x in constants))
+        self.raw_constants = nn.Parameter(vector(x.initial / x.scale for x in constants))
+        self.nominal_armature = nn.Buffer(vector(joint.armature for joint in joints))
+        self.raw_armature = nn.Parameter(torch.zeros_like(self.nominal_armature))  # logarithm
 
     def armature(self) -> Tensor:
-        """Return the drives' part of M's diagonal, (n,) [kg m^2, kg]."""
+        """Return the rotor inertia on the joint side, part of the diagonal of M, (n,) [kg m^2, kg]."""
         return self.nominal_armature * self.raw_armature.exp()
 
     def constants(self) -> Tensor:
-        """Return the constants of M, (constants,), in their units."""
+        """Return the constants of M, (constants,) [kg m^2, kg m, kg]."""
         return self.constant_scale * (self.raw_constants.abs() + 1e-6)
 
     def prepare(self) -> Tensor:
         """Return M, (n, n)."""
-        return self.entries((), self.constants().unbind()) + torch.diag(self.armature())
+        return self.entries(*self.constants().unbind()) + torch.diag(self.armature())
 
-    def forward(self, encoded: Tensor, prepared: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, encoded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Return M for each state, and the encoding, which has the shape of its derivatives."""
-        return prepared.expand(*encoded.shape[:-1], *prepared.shape), encoded
+        return parameters.expand(*encoded.shape[:-1], *parameters.shape), encoded
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Tensor) -> Tensor:
-        """Return the derivative of 1/2 qd^T M qd by the encoding: zero."""
+        """Return the derivative of 1/2 qd^T M qd with respect to the encoding: zero."""
         return torch.zeros_like(intermediates)
 
     def jvp(self, rate: Tensor, intermediates: Tensor) -> Tensor:

@@ -1,95 +1,102 @@
-"""Friction of each joint by laws with trained constants."""
+"""Friction of each joint with trained constants and a hysteresis state."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from spelgen.runtime.joints import vector
-from spelgen.runtime.parts import Row, Rows
+from spelgen.runtime.parts import Row
+from spelgen.runtime.rows import Joint, vector
 
-# over which dry friction turns around without memory, by usual velocity: a wider turn looks like memory
+# Smoothing velocity of dry friction at joints without bristles, relative to the typical speed. A wider
+# transition between the directions would be confounded with hysteresis.
 SHARP_VELOCITY = 0.001
-# below this fraction of usual friction a gravity torque's size is rounded off: at right angles it passes
-# zero, where |x| has no derivative
-LEAST_LOAD = 0.01
+# Below this fraction of typical friction the magnitude of a gravity torque is rounded, because |x| has no
+# derivative at zero.
+MIN_LOAD = 0.01
 
 
 class FrictionConstants(NamedTuple):
-    """By joint, (n,), all positive."""
+    """The constants of all joints, (n,), positive."""
 
     viscous: Tensor  # [Nm s/rad, N s/m]
-    saturation: Tensor  # viscous friction that stops growing [Nm, N]
-    saturation_velocity: Tensor  # where it begins to [rad/s, m/s]
+    saturation: Tensor  # limit of the viscous friction that saturates [Nm, N]
+    saturation_velocity: Tensor  # [rad/s, m/s]
     coulomb: Tensor  # [Nm, N]
-    stribeck: Tensor  # dry friction that only slow motion has [Nm, N]
-    stribeck_velocity: Tensor  # where that has faded [rad/s, m/s]
-    load_dependence: Tensor  # dry friction by gravity torque
-    stribeck_rounding: Tensor  # by that velocity
-    coulomb_smoothing_velocity: Tensor  # over which dry friction turns around [rad/s, m/s]
-    least_load: Tensor  # [Nm, N]
-    bristle_fractions: Tensor  # of dry friction, (n, K); a joint's add up to one, or are zero
-    bristle_reach: Tensor  # (n, K) [rad, m]
-    memoryless: Tensor  # 1 where dry friction follows velocity alone, 0 where bristles
+    stribeck: Tensor  # additional dry friction at low velocity [Nm, N]
+    stribeck_velocity: Tensor  # [rad/s, m/s]
+    load_dependence: Tensor  # dry friction per gravity torque [1]
+    stribeck_rounding: Tensor  # relative to the Stribeck velocity [1]
+    coulomb_smoothing_velocity: Tensor  # of dry friction without bristles [rad/s, m/s]
+    min_load: Tensor  # [Nm, N]
+    bristle_fractions: (
+        Tensor  # of dry friction, (n, K); the sum over K is one, or zero at joints without bristles
+    )
+    bristle_reach: Tensor  # break-away displacements, (n, K) [rad, m]
+    memoryless: Tensor  # 1 if dry friction depends on velocity only, 0 if on bristles
 
     def viscosity(self, qd: Tensor) -> Tensor:
-        """Torque by velocity, (..., n)."""
+        """Return viscous torque per velocity, (..., n) [Nm s/rad, N s/m]."""
         return self.viscous + self.saturation * turning(qd, self.saturation_velocity)
 
     def dry(self, qd: Tensor, gravity: Tensor) -> Tensor:
-        """The size of dry friction, (..., n) [Nm, N]."""
+        """Return the magnitude of dry friction, (..., n) [Nm, N], under a gravity torque (..., n)."""
         speed = qd.abs() / self.stribeck_velocity
         rounding = self.stribeck_rounding
         slow = 1 / (1 + (1 + rounding) / 8 * speed.square() / (speed + rounding))
-        slow = slow.square().square().square()  # a power of 8 takes twice the time
-        load = (gravity.square() + self.least_load**2).sqrt()
+        slow = slow.square().square().square()  # ** 8 takes twice the time
+        load = (gravity.square() + self.min_load**2).sqrt()
         return self.coulomb + self.stribeck * slow + self.load_dependence * load
 
     def torque(
         self, qd: Tensor, gravity: Tensor, z: Tensor | None = None, direction: Tensor | None = None
     ) -> Tensor:
-        """The friction torque, (..., n) [Nm, N], under this gravity torque, of bristles at z, (..., n, K).
+        """Return the friction torque, (..., n) [Nm, N].
 
-        z: None where nothing is known of the way here; all joints are then without memory.
-        direction: (..., n) of joints without memory; None: that of qd.
+        Args:
+            qd: velocities, (..., n) [rad/s, m/s].
+            gravity: gravity torques, (..., n) [Nm, N].
+            z: bristle displacements, (..., n, K) [rad, m]; None: unknown, dry friction depends on velocity.
+            direction: direction of dry friction at joints without bristles, (..., n); None: that of qd.
         """
         if direction is None:
             direction = qd * turning(qd, self.coulomb_smoothing_velocity)
         if z is not None:
-            bent = (self.bristle_fractions / self.bristle_reach * z).sum(dim=-1)
-            direction = bent + self.memoryless * direction
+            deflection = (self.bristle_fractions / self.bristle_reach * z).sum(dim=-1)
+            direction = deflection + self.memoryless * direction
         return self.viscosity(qd) * qd + self.dry(qd, gravity) * direction
 
     def stored_energy(self, z: Tensor) -> Tensor:
-        """What the bristles of Coulomb friction give back, (...) [J]."""
+        """Return the elastic energy of the bristles of Coulomb friction, (...) [J]."""
         stored = self.bristle_fractions * z.square() / self.bristle_reach
         return 0.5 * (self.coulomb * stored.sum(dim=-1)).sum(dim=-1)
 
 
 class FrictionLaws(nn.Module):
-    """Friction which resists whatever the weights are: they are logarithms.
+    """A friction torque that opposes the motion for all parameters, which are logarithms:
 
-    viscous qd + saturation turned(qd, saturation_velocity)
+    viscous qd + saturation s(qd, saturation_velocity)
     + (coulomb + stribeck / (1 + (1 + r) v^2 / (v + r) / 8)^8 + load_dependence load) direction, with
-    v = |qd| / stribeck_velocity, r the rounding, load = sqrt(gravity torque^2 + least_load^2) and
-    turned(x, width) = x / sqrt(x^2 + width^2).
+    v = |qd| / stribeck_velocity, r the rounding, load = sqrt(gravity torque^2 + min_load^2) and
+    s(x, width) = x / sqrt(x^2 + width^2).
 
-    The direction, from -1 to 1, is that of the bristles, sum of fraction z / reach; at joints without
-    memory, or where nothing is known of the way here, turned(qd, coulomb_smoothing_velocity).
-    No law has an exponential: a control loop has them in a third of the time. The Stribeck effect is
-    nearly the Gaussian of Armstrong-Helouvry (Control of Machines with Friction, 1991) where r is large, and
-    the exponential of Bo and Pavelescu (Wear 82:277, 1982), without its corner at rest, where it is small.
+    The direction, from -1 to 1, is sum_k fraction_k z_k / breakaway_k over the bristles of a joint; at joints
+    without bristles, or if z is unknown, s(qd, coulomb_smoothing_velocity). There is no exponential, so that
+    a control loop takes a third of the time. For large r the Stribeck term is close to the Gaussian of
+    Armstrong-Helouvry (Control of Machines with Friction, 1991); for small r, to the exponential of Bo and
+    Pavelescu (Wear 82:277, 1982), without its corner at rest.
 
-    Bristles are K elements a joint, elastic up to their reach, sliding beyond; z is (..., n, K) [rad, m]
-    (Maxwell-slip elements: Lampaert, Al-Bender and Swevers, A Generalized Maxwell-Slip Friction Model, 2003).
-    What turns around within the reach closes its loop, so a joint that stiction stops does not creep where
-    its load oscillates.
+    Bristles are K elements per joint, elastic up to a break-away displacement and sliding beyond; z is
+    (..., n, K) [rad, m] (Maxwell-slip elements: Lampaert, Al-Bender and Swevers, A Generalized Maxwell-Slip
+    Friction Model, 2003). Reversals within the break-away displacement give closed hysteresis loops, so a
+    joint that stiction holds does not creep under an oscillating load.
     """
 
-    # weight, kind, unit, and the constant that a zero stands for, by usual friction and velocity
-    kinds: tuple[tuple[str, str, str, float], ...] = (
+    # parameter, group, unit, and the constant at zero, in units of typical friction and typical speed
+    parameter_groups: tuple[tuple[str, str, str, float], ...] = (
         ("raw_viscous", "sizes", "Nm s/rad, N s/m", 1.0),
         ("raw_saturation", "effects", "Nm, N", 1.0),
         ("raw_saturation_velocity", "velocities", "rad/s, m/s", 0.2),
@@ -100,29 +107,38 @@ class FrictionLaws(nn.Module):
         ("raw_bristle_fractions", "fractions", "1", 1.0),
     )
 
-    def __init__(self, friction: Row, speed: Row, reach: Rows) -> None:
+    def __init__(
+        self, joints: Sequence[Joint], *, breakaway: Mapping[str, Row], stribeck_rounding: float = 10.0
+    ) -> None:
+        """Take the break-away displacements, (K,) [rad, m], of each type of joint, shortest first."""
         super().__init__()
-        self.nominal, self.speed = nn.Buffer(vector(friction)), nn.Buffer(vector(speed))
-        self.reach = nn.Buffer(torch.tensor(reach, dtype=torch.float64))  # (n, K), a joint's shortest first
-        # no parameter: a fit to torques compares both forms
+        self.nominal = nn.Buffer(vector(joint.friction for joint in joints))
+        self.speed = nn.Buffer(vector(joint.speed for joint in joints))
+        rows = [breakaway[joint.joint_type] for joint in joints]
+        self.reach = nn.Buffer(torch.tensor(rows, dtype=torch.float64))  # break-away displacements, (n, K)
+        # a buffer: a fit to torques compares both forms
         self.memoryless = nn.Buffer(torch.zeros_like(self.speed))
-        self.stribeck_rounding = nn.Buffer(torch.full_like(self.speed, 10.0))
-        for name, *_ in FrictionLaws.kinds[:-1]:
+        self.stribeck_rounding = nn.Buffer(torch.full_like(self.speed, stribeck_rounding))
+        for name, *_ in FrictionLaws.parameter_groups[:-1]:
             self.register_parameter(name, nn.Parameter(torch.zeros_like(self.speed)))
         self.raw_bristle_fractions = nn.Parameter(torch.zeros_like(self.reach))
 
     def prepare(self) -> FrictionConstants:
-        """The constants, in their units."""
-        size, speed, laws = self.nominal, self.speed, []
-        units = {"Nm s/rad, N s/m": size / speed, "Nm, N": size, "rad/s, m/s": speed, "1": size.sign()}
-        for name, _, unit, start in FrictionLaws.kinds[:-1]:
-            laws.append(start * units[unit] * getattr(self, name).exp())
-        load = LEAST_LOAD * torch.where(size > 0, size, 1.0)
+        """Return the constants in SI units."""
+        friction, speed, constants = self.nominal, self.speed, []
+        units = {
+            "Nm s/rad, N s/m": friction / speed, "Nm, N": friction, "rad/s, m/s": speed, "1": friction.sign()
+        }  # fmt: skip
+        for name, _, unit, initial in FrictionLaws.parameter_groups[:-1]:
+            constants.append(initial * units[unit] * self.get_parameter(name).exp())
+        load = MIN_LOAD * torch.where(friction > 0, friction, 1.0)
         fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
         rounding, sharp = self.stribeck_rounding, SHARP_VELOCITY * speed
-        return FrictionConstants._make([*laws, rounding, sharp, load, fractions, self.reach, self.memoryless])
+        return FrictionConstants._make(
+            [*constants, rounding, sharp, load, fractions, self.reach, self.memoryless]
+        )
 
 
 def turning(velocity: Tensor, width: Tensor) -> Tensor:
-    """1 / sqrt(velocity^2 + width^2), (..., n): times the velocity it turns around over this width."""
+    """Return 1 / sqrt(velocity^2 + width^2), (..., n): times the velocity, a sign that is smooth over this width."""
     return torch.rsqrt(velocity * velocity + width**2)

@@ -1,4 +1,4 @@
-"""What a model needs of its parts; an emitted module has the class of its own part under each of these names."""
+"""The interfaces between a model and its parts."""
 
 from __future__ import annotations
 
@@ -9,53 +9,61 @@ from torch import Tensor
 
 Row = Sequence[float]
 Rows = Sequence[Sequence[float]]
-Pairs = Sequence[tuple[float, float]]
-Layout = Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]  # a matrix by functions and constants
-Units = Sequence[tuple[tuple[int, ...], int]]  # of a layer: which joints so many units may read
-Layers = tuple[tuple[Tensor, Tensor], ...]  # a network's weights and biases, ready for many states
-Intermediates = Any  # what a part's derivatives need of the work done for its values
-Prepared = Any  # all that depends on the weights alone
-# an emitted module has the type of its own dynamics under this name
-Pose = Any  # all that depends on q alone
+Entries = Callable[..., Tensor]  # a symmetric matrix (..., n, n) of its functions and constants (...)
+Layers = tuple[tuple[Tensor, Tensor], ...]  # weights and biases of a network, masked and scaled
+Intermediates = Any  # values of the forward pass that the derivatives of a part need
 
 
 class Network(Protocol):
-    """Learned functions y of an encoding, each of its own joints, with derivatives written out."""
+    """Learned functions y of the encoded positions, with explicit derivatives."""
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
-        """Return the weights made ready for many states, for offset + output_map y in place of y."""
+        """Return the layers that give offset + output_map y in place of y."""
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, Intermediates]:
-        """Return offset + output_map y, (..., rows), and intermediates, which ``vjp`` and ``jvp`` need."""
+        """Return offset + output_map y, (..., rows), and the intermediates of ``vjp`` and ``jvp``."""
 
     def vjp(self, intermediates: Intermediates, cotangent: Tensor) -> Tensor:
-        """Return cotangent, (..., rows), times d/d encoded."""
+        """Return cotangent, (..., rows), times the Jacobian with respect to the encoding."""
 
     def jvp(self, intermediates: Intermediates, tangent: Tensor) -> Tensor:
-        """Return d/d encoded times the encoding's tangent, (..., rows)."""
+        """Return the Jacobian with respect to the encoding times a tangent, (..., rows)."""
 
 
 class Mass(Protocol):
-    """What gives M(q) and its derivatives."""
+    """The mass matrix M(q) and its derivatives."""
 
-    def prepare(self) -> Prepared:
-        """Return all that depends on the weights alone."""
+    def prepare(self) -> Any:
+        """Return the parameter cache: all that depends on the parameters only."""
 
-    def forward(self, encoded: Tensor, prepared: Prepared) -> tuple[Tensor, Intermediates]:
-        """Return M(q), (..., n, n), and what its derivatives need."""
+    def forward(self, encoded: Tensor, parameters: Any) -> tuple[Tensor, Intermediates]:
+        """Return M(q), (..., n, n), and the intermediates of its derivatives."""
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Intermediates) -> Tensor:
-        """Return the derivative of 1/2 qd^T M(q) qd by the encoding."""
+        """Return the derivative of 1/2 qd^T M(q) qd with respect to the encoding."""
 
     def jvp(self, rate: Tensor, intermediates: Intermediates) -> Tensor:
-        """Return dM/dt, (..., n, n), where the encoding changes at this rate."""
+        """Return dM/dt, (..., n, n), for this rate of the encoding."""
 
 
 class Friction(Protocol):
-    """What gives D(q, qd)."""
+    """The dissipation matrix D(q, qd)."""
 
-    def prepare(self) -> Prepared:
-        """Return all that depends on the weights alone."""
+    def prepare(self) -> Any:
+        """Return the parameter cache: all that depends on the parameters only."""
 
-    def forward(self, encoded: Tensor, qd: Tensor, prepared: Prepared, right: Tensor) -> Tensor:
+    def forward(self, encoded: Tensor, qd: Tensor, parameters: Any, right: Tensor) -> Tensor:
         """Return D(q, qd) right, (..., n, k)."""
+
+
+class Inputs(Protocol):
+    """The input matrix G of motors that drive several joints, or none."""
+
+    def gains(self) -> Tensor:
+        """Return G, (n, n): joint torque per motor torque."""
+
+    def force(self, tau: Tensor) -> Tensor:
+        """Return G tau, (..., n) [Nm, N]."""
+
+    def torque(self, force: Tensor) -> Tensor:
+        """Return the inputs, (..., n), that give this force."""

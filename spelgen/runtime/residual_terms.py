@@ -1,4 +1,4 @@
-"""What logs show beside rigid bodies: functions of single joints, and networks of several."""
+"""Residual terms: functions of single joints, and networks of several joints, in addition to rigid bodies."""
 
 from __future__ import annotations
 
@@ -11,54 +11,60 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.encoding import JointEncoding
-from spelgen.runtime.joints import Joints, vector
-from spelgen.runtime.parts import Intermediates, Layers, Layout, Network
+from spelgen.runtime.parts import Entries, Intermediates, Layers, Network
 from spelgen.runtime.port_hamiltonian import applied
+from spelgen.runtime.rows import Joint, vector
 
-SPLINES = 34  # over the range of a joint
-HARMONICS = 64  # of a turn of the joint, and the first two of a turn of the motor: teeth and poles come again
-LARGEST = math.log(10.0)  # logarithm of friction's factor: it stays between a tenth and ten times
-PART = 0.9  # of the drives' inertia, which the residual may take away at most
-NEVER = 1e30  # how large a function may be by an entry where it does not stand
+# Number of B-splines over the range of a joint.
+SPLINES = 34
+# Harmonics of a revolution of the joint; two more are those of a revolution of the motor (teeth and poles).
+HARMONICS = 64
+# Bound of the logarithm of the friction factor: the factor stays between 0.1 and 10.
+LARGEST = math.log(10.0)
+# Fraction of the armature that the residual of M may subtract at most.
+PART = 0.9
+# Bound of a function in an entry of M that does not contain it.
+NEVER = 1e30
 
 
-class ResidualWeights(NamedTuple):
-    """What depends on the weights alone."""
+class ResidualParameters(NamedTuple):
+    """All that depends on the parameters only."""
 
-    splines: Tensor  # of the torque [Nm, N] and of friction, by cubes, (n, SPLINES, 2)
+    splines: Tensor  # coefficients of the torque [Nm, N] and of the friction factor, (n, SPLINES, 2)
     ripple: Tensor  # amplitudes [Nm], (n, 2 HARMONICS + 4)
-    constant: Tensor  # what the constants add to M, (n n,)
-    functions: Tensor  # what each function adds to M at its largest, (functions, n n)
+    constant: Tensor  # contribution of the constants to M, (n n,)
+    functions: Tensor  # largest contribution of each function to M, (functions, n n)
     mass: Layers | None
     potential: Layers | None
 
 
-class ResidualPose(NamedTuple):
-    """What the terms are at a position."""
+class ResidualConfiguration(NamedTuple):
+    """All that depends on q only."""
 
     q: Tensor
     encoded: Tensor
-    torque: Tensor  # dV/dq of the joints' own functions, (..., n) [Nm, N]
+    torque: Tensor  # dV/dq of the functions of single joints, (..., n) [Nm, N]
     friction: Tensor  # the factor on friction, (..., n)
     mass: Tensor  # R(q), (..., n, n)
-    slope: Tensor | None  # of R's functions by the network's outputs
-    intermediates: Intermediates  # what derivatives of these outputs need
-    weights: ResidualWeights
+    slope: Tensor | None  # derivative of the functions of R with respect to the outputs of the network
+    intermediates: Intermediates  # of the derivatives of these outputs
+    parameters: ResidualParameters
 
 
 class ResidualTerms(nn.Module):
-    """R(q) in M, terms of V, and a factor on friction; zero, and one, while the weights are zero.
+    """A residual R(q) of M, terms of V, and a factor on friction: zero, zero and one for zero parameters.
 
-    Of each joint alone: a torque dV/dq, a sum of cubic B-splines over its range and, if it is revolute, of
-    harmonics of its turns and of its motor's, ``gear`` times as many, in units of usual friction; and the
-    factor, the exponential of such a spline, between a tenth and ten. Splines vanish where the range ends.
+    For each joint: a torque dV/dq, the sum of cubic B-splines over its range and, if it is revolute, of
+    harmonics of a revolution of the joint and of its motor, in units of typical friction; and a factor on
+    friction, the exponential of such a spline, between 0.1 and 10. Splines are zero at the ends of the range.
 
-    R has functions and constants, where ``entries`` has them, and a network ``potential`` in units of
-    ``scale`` [J] adds to V. Each function is its bound times the tanh of a network's output, each constant
-    of a weight: ``bounds`` are such that armature + R is positive definite for all q and all weights.
+    R is ``entries(*functions, *constants)``; a network ``potential`` in units of ``potential_scale`` [J] is
+    added to V. Each function is a bound times the tanh of an output of ``network``, each constant a bound
+    times the tanh of a parameter: the ``bounds`` make armature + R positive definite for all q and all
+    parameters.
     """
 
-    kinds = (
+    parameter_groups = (
         ("raw_torque_splines", "torque_splines", "Nm, N"),
         ("raw_torque_ripple", "torque_ripple", "Nm"),
         ("raw_friction_splines", "friction_splines", "1"),
@@ -67,64 +73,65 @@ class ResidualTerms(nn.Module):
 
     def __init__(
         self,
-        joints: Joints,
-        gear: Sequence[float],
-        entries: Layout,
+        joints: Sequence[Joint],
+        entries: Entries,
+        *,
         functions: int,
         constants: int,
-        network: Network | None,
-        potential: Network | None,
-        scale: float,
+        network: Network | None = None,
+        potential: Network | None = None,
+        potential_scale: float = 1.0,
     ) -> None:
         super().__init__()
-        n = len(joints.speed)
+        n = len(joints)
         zeros = torch.zeros(n, SPLINES, dtype=torch.float64)
         self.encoding = JointEncoding(joints)
-        spacing = 2 * vector(joints.reach).unsqueeze(-1) / (SPLINES - 3)
+        spacing = 2 * vector(joint.half_range for joint in joints).unsqueeze(-1) / (SPLINES - 3)
         knots = torch.arange(SPLINES).double() - (SPLINES - 1) / 2
         self.spacing = nn.Buffer(spacing)
-        self.middles = nn.Buffer(vector(joints.center).unsqueeze(-1) + spacing * knots)
-        self.unit = nn.Buffer(vector(joints.friction).unsqueeze(-1))
-        self.revolute = nn.Buffer(vector(float(revolute) for revolute in joints.revolute).unsqueeze(-1))
-        # how often in a turn of the joint a ripple may come again, (n, HARMONICS + 2)
+        center = vector(joint.center for joint in joints).unsqueeze(-1)
+        self.middles = nn.Buffer(center + spacing * knots)
+        self.unit = nn.Buffer(vector(joint.friction for joint in joints).unsqueeze(-1))
+        self.revolute = nn.Buffer(vector(joint.joint_type == "revolute" for joint in joints).unsqueeze(-1))
+        # periods of the ripple per revolution of the joint, (n, HARMONICS + 2)
         frequencies = torch.arange(1.0, HARMONICS + 3).double().repeat(n, 1)
-        for joint, ratio in enumerate(gear):
-            if ratio > HARMONICS:
-                frequencies[joint, HARMONICS:] = vector((ratio, 2 * ratio))
+        for index, joint in enumerate(joints):
+            if joint.gear > HARMONICS:
+                frequencies[index, HARMONICS:] = vector((joint.gear, 2 * joint.gear))
         self.frequencies = nn.Buffer(frequencies)
         self.raw_torque_splines = nn.Parameter(zeros.clone())
         self.raw_torque_ripple = nn.Parameter(torch.zeros(n, 2 * (HARMONICS + 2), dtype=torch.float64))
         self.raw_friction_splines = nn.Parameter(zeros)
         self.n, self.functions, self.entries = n, functions, entries
         self.mass, self.potential = network, potential
-        self.scale = nn.Buffer(torch.full((1, 1), scale, dtype=torch.float64))
+        self.scale = nn.Buffer(torch.full((1, 1), potential_scale, dtype=torch.float64))
         size = self._by_entry(torch.ones(functions + constants, dtype=torch.float64)).abs()
-        # one by the size of each function and constant in an entry, NEVER where it has none
+        # one divided by the coefficient of each function and constant in an entry; NEVER if it is zero
         self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, NEVER))
-        self.part = PART / float((size > 0).sum(dim=(0, 2)).max())  # of all that meet in a row of M
+        self.part = PART / float((size > 0).sum(dim=(0, 2)).max())  # divided among all terms in a row of M
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
     def _by_entry(self, sizes: Tensor) -> Tensor:
-        """Return what functions and constants of these sizes add to M, (functions + constants, n, n)."""
+        """Return the contributions of functions and constants with these values to M, (functions + constants, n, n)."""
         rows = torch.diag(sizes).unbind()
-        return self.entries(rows[: self.functions], rows[self.functions :])
+        return self.entries(*rows)
 
     def bounds(self, armature: Tensor) -> Tensor:
-        """Return how large each function and constant may be, beside an armature matrix, (n, n).
+        """Return the bounds of the functions and constants, (functions + constants,), for an armature matrix (n, n).
 
         armature - diag(d) is positive semi-definite for d = 1 / (row sums of |armature^-1|), and so is
-        diag(d) - R where no row of |R| / sqrt(d d^T) adds up to more than one: by diagonal dominance both.
+        diag(d) - R if no row of |R| / sqrt(d d^T) has a sum above one: both by diagonal dominance.
         """
         root = torch.linalg.inv(armature).abs().sum(dim=-1).rsqrt()
         smallest: Tensor = (root.unsqueeze(-1) * root * self.inverse).amin(dim=(-2, -1))
         return self.part * smallest
 
     def friction_logarithms(self) -> Tensor:
-        """Return weights of the splines whose sum is the logarithm of friction's factor, (n, SPLINES)."""
+        """Return the spline coefficients of the logarithm of the friction factor, (n, SPLINES)."""
         return LARGEST * (self.raw_friction_splines / LARGEST).tanh()
 
-    def prepare(self, armature: Tensor) -> ResidualWeights:
-        """Return all that depends on the weights alone, beside an armature matrix, (n, n)."""
+    def prepare(self, armature: Tensor) -> ResidualParameters:
+        """Return the parameter cache, for an armature matrix (n, n)."""
         splines = [self.unit * self.raw_torque_splines, self.friction_logarithms()]
         rows = self._by_entry(self.bounds(armature)).flatten(1)
         functions, constants = rows.tensor_split((self.functions,))
@@ -134,7 +141,7 @@ class ResidualTerms(nn.Module):
             mass = self.mass.prepare(identity, rows.new_zeros(self.functions))
         if self.potential is not None:
             potential = self.potential.prepare(self.scale, 0 * self.scale[0])
-        return ResidualWeights(
+        return ResidualParameters(
             splines=torch.stack(splines, dim=-1),
             ripple=self.unit * self.revolute * self.raw_torque_ripple,
             constant=self.raw_constants.tanh() @ constants,
@@ -143,55 +150,58 @@ class ResidualTerms(nn.Module):
             potential=potential,
         )
 
-    def at(self, q: Tensor, weights: ResidualWeights) -> ResidualPose:
-        """Return what the terms are at q."""
+    def at(self, q: Tensor, parameters: ResidualParameters) -> ResidualConfiguration:
+        """Return all that depends on q only."""
         encoded = self.encoding.forward(q)
-        splines = torch.einsum("...ik,ikm->...im", self.splines(q), weights.splines)
+        splines = torch.einsum("...ik,ikm->...im", self.splines(q), parameters.splines)
         smooth, friction = splines.unbind(-1)
-        torque = smooth + (self.waves(q) * weights.ripple).sum(dim=-1)
-        mass, slope, intermediates = weights.constant.expand(*q.shape[:-1], -1), None, None
-        if self.mass is not None and weights.mass is not None:
-            y, intermediates = self.mass.forward(encoded, weights.mass)
-            height = y.tanh()
-            mass, slope = F.linear(height, weights.functions.mT, weights.constant), 1 - height * height
+        torque = smooth + (self.waves(q) * parameters.ripple).sum(dim=-1)
+        mass, slope, intermediates = parameters.constant.expand(*q.shape[:-1], -1), None, None
+        if self.mass is not None and parameters.mass is not None:
+            y, intermediates = self.mass.forward(encoded, parameters.mass)
+            output = y.tanh()
+            mass = F.linear(output, parameters.functions.mT, parameters.constant)
+            slope = 1 - output * output
         mass = mass.reshape(*q.shape, self.n)
-        return ResidualPose(q, encoded, torque, friction.exp(), mass, slope, intermediates, weights)
+        friction = friction.exp()
+        return ResidualConfiguration(q, encoded, torque, friction, mass, slope, intermediates, parameters)
 
-    def energy(self, pose: ResidualPose) -> Tensor:
-        """Return what is added to V, (...) [J]; a spline's part is zero in its middle."""
-        distance = self._places(pose.q)
-        away = distance.abs()
-        step = 0.5 - (2 - away).relu() ** 4 / 24 + (1 - away).relu() ** 4 / 6
-        smooth = (self.spacing * distance.sign() * step * pose.weights.splines[..., 0]).sum(dim=-1)
-        by_cos, by_sin = (self.waves(pose.q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
-        ripple = (torch.cat([by_sin, -by_cos], dim=-1) * pose.weights.ripple).sum(dim=-1)
+    def energy(self, at: ResidualConfiguration) -> Tensor:
+        """Return the residual of V, (...) [J]; that of a spline is zero in its middle."""
+        distance = self._distances(at.q)
+        size = distance.abs()
+        # integral of the B-spline from its middle
+        step = 0.5 - (2 - size).relu() ** 4 / 24 + (1 - size).relu() ** 4 / 6
+        smooth = (self.spacing * distance.sign() * step * at.parameters.splines[..., 0]).sum(dim=-1)
+        by_cos, by_sin = (self.waves(at.q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
+        ripple = (torch.cat([by_sin, -by_cos], dim=-1) * at.parameters.ripple).sum(dim=-1)
         energy = (smooth + ripple).sum(dim=-1)
-        if self.potential is not None and pose.weights.potential is not None:
-            energy = energy + self.potential.forward(pose.encoded, pose.weights.potential)[0].squeeze(-1)
+        if self.potential is not None and at.parameters.potential is not None:
+            energy = energy + self.potential.forward(at.encoded, at.parameters.potential)[0].squeeze(-1)
         return energy
 
-    def gradient(self, pose: ResidualPose, qd: Tensor) -> Tensor:
-        """Return d/dq of what is added to 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        by_encoded = torch.zeros_like(pose.encoded)
-        if self.mass is not None and pose.slope is not None:
-            kinetic = 0.5 * (qd.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2) @ pose.weights.functions.mT
-            by_encoded = self.mass.vjp(pose.intermediates, pose.slope * kinetic)
-        if self.potential is not None and pose.weights.potential is not None:
-            intermediates = self.potential.forward(pose.encoded, pose.weights.potential)[1]
+    def gradient(self, at: ResidualConfiguration, qd: Tensor) -> Tensor:
+        """Return d/dq of the residual of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        by_encoded = torch.zeros_like(at.encoded)
+        if self.mass is not None and at.slope is not None:
+            kinetic = 0.5 * (qd.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2) @ at.parameters.functions.mT
+            by_encoded = self.mass.vjp(at.intermediates, at.slope * kinetic)
+        if self.potential is not None and at.parameters.potential is not None:
+            intermediates = self.potential.forward(at.encoded, at.parameters.potential)[1]
             by_encoded = by_encoded - self.potential.vjp(intermediates, qd.new_ones(1))
-        return self.encoding.vjp(pose.encoded, by_encoded) - pose.torque
+        return self.encoding.vjp(at.encoded, by_encoded) - at.torque
 
-    def nonlinear(self, pose: ResidualPose, qd: Tensor) -> Tensor:
-        """Return dR/dt qd less ``gradient``, (..., n)."""
-        if self.mass is None or pose.slope is None:
-            return -self.gradient(pose, qd)
-        rate = self.mass.jvp(pose.intermediates, self.encoding.jvp(pose.encoded, qd))
-        mass_rate = ((pose.slope * rate) @ pose.weights.functions).reshape(*qd.shape, self.n)
-        return applied(mass_rate, qd) - self.gradient(pose, qd)
+    def nonlinear(self, at: ResidualConfiguration, qd: Tensor) -> Tensor:
+        """Return dR/dt qd - ``gradient``, (..., n)."""
+        if self.mass is None or at.slope is None:
+            return -self.gradient(at, qd)
+        rate = self.mass.jvp(at.intermediates, self.encoding.jvp(at.encoded, qd))
+        mass_rate = ((at.slope * rate) @ at.parameters.functions).reshape(*qd.shape, self.n)
+        return applied(mass_rate, qd) - self.gradient(at, qd)
 
     def splines(self, q: Tensor) -> Tensor:
         """Return the cubic B-splines at q, (..., n, SPLINES), each 2/3 high."""
-        wide = (2 - self._places(q).abs()).relu()
+        wide = (2 - self._distances(q).abs()).relu()
         return torch.sub(wide**3, (wide - 1).relu() ** 3, alpha=4) / 6
 
     def waves(self, q: Tensor) -> Tensor:
@@ -199,6 +209,6 @@ class ResidualTerms(nn.Module):
         phase = q.unsqueeze(-1) * self.frequencies
         return torch.cat([phase.cos(), phase.sin()], dim=-1)
 
-    def _places(self, q: Tensor) -> Tensor:
-        """Return how far q is from each spline's middle, in spacings, (..., n, SPLINES)."""
+    def _distances(self, q: Tensor) -> Tensor:
+        """Return the distance of q from the middle of each spline, in spacings, (..., n, SPLINES)."""
         return (q.unsqueeze(-1) - self.middles) / self.spacing

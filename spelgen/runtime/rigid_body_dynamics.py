@@ -1,71 +1,95 @@
-"""A port-Hamiltonian model of rigid bodies, each of which moves as four points do."""
+"""A port-Hamiltonian model of rigid bodies, whose inertia is that of four points per body."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from spelgen.runtime.body_chain import BodyChain, Chain
+from spelgen.runtime.body_chain import ChainConfiguration, chain_of_links
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws, turning
-from spelgen.runtime.joints import vector
-from spelgen.runtime.parts import Row
+from spelgen.runtime.parts import Inputs, Row, Rows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
+from spelgen.runtime.position_servo import PositionServo
 from spelgen.runtime.rigid_body import InertialParameters
+from spelgen.runtime.rows import Joint, Link, vector
 
 
-class RigidPrepared(NamedTuple):
-    """What depends on the weights alone, worked out once for many states."""
+class RigidParameters(NamedTuple):
+    """All that depends on the parameters only."""
 
-    points: Tensor  # of the bodies in their own frames, columns of blocks, (4 bodies, 4 bodies)
-    armature: Tensor  # what the rotors add to M, (n, n)
+    points: Tensor  # of the bodies in body frames, block diagonal, (4 bodies, 4 bodies)
+    armature: Tensor  # inertia of the rotors, part of M, (n, n)
     friction: FrictionConstants
-    residual: Any = None  # of what a model has beside rigid bodies
+    residual: Any = None  # of the residual terms
 
 
-class Motion(NamedTuple):
-    """What depends on q alone."""
+class RigidConfiguration(NamedTuple):
+    """All that depends on q only."""
 
-    chain: Chain
+    chain: ChainConfiguration
     mass: Tensor  # M(q), (..., n, n)
     gravity: Tensor  # dV/dq of the bodies, (..., n)
-    prepared: RigidPrepared
-    varied: Tensor | float = 1.0  # how much more friction there is than the laws', (..., n)
-    residual: Any = None  # of what a model has beside rigid bodies
+    prepared: RigidParameters
+    varied: Tensor | float = 1.0  # factor on friction, (..., n)
+    residual: Any = None  # of the residual terms
 
 
 class RigidBodyDynamics(PortHamiltonian):
-    """Rigid bodies with trained inertial parameters, friction by laws, a trained torque offset.
+    """Rigid bodies with trained inertial parameters, friction and a torque offset.
 
-    z, (..., n, K), is the state of friction's bristles [rad, m], and adds their energy to H; without it
-    friction is that of joints that slide the way they move. armature: nominal, of the drives [kg m^2, kg].
+    z, (..., n, K) [rad, m], is the state of the friction bristles; their energy is part of H. Without z,
+    dry friction depends on velocity. motor_speeds: rows of C, the motors rotate at C qd, and friction, its
+    state and the armature are those of the motors; None: every motor drives its own joint. servo: position
+    servos of the joints, if there are any.
     """
 
-    kinds = (
+    parameter_groups = (
         ("raw_armature", "armature", "kg m^2, kg"),
         ("raw_offset", "offset", "Nm, N"),
         ("raw_friction_compensation", "friction_compensation", "Nm s/rad, N s/m"),
     )
 
+    motors: Tensor | None
+    loads: Tensor | None
+
     def __init__(
-        self, chain: BodyChain, bodies: InertialParameters, friction: FrictionLaws, armature: Row
+        self,
+        *,
+        joints: Sequence[Joint],
+        links: Sequence[Link],
+        gravity: Row,  # acceleration in the base frame [m/s^2]
+        friction: FrictionLaws,
+        inputs: Inputs | None = None,
+        motor_speeds: Rows | None = None,
+        servo: PositionServo | None = None,
     ) -> None:
-        super().__init__()
-        self.chain, self.bodies, self.friction = chain, bodies, friction
+        super().__init__(joints, inputs)
+        self.chain, self.bodies = chain_of_links(joints, links, gravity), InertialParameters(links)
+        self.friction, self.servo = friction, servo
         self.elements = friction.reach.shape[1]
-        self.nominal_armature = nn.Buffer(vector(armature))
-        # 1 where the measured torque moves a joint, (n,)
+        self.nominal_armature = nn.Buffer(vector(joint.armature for joint in joints))
+        # 1 for a joint that an input drives, (n,)
         self.actuated = nn.Buffer(self.input_matrix(self.nominal_armature).any(dim=0).double())
-        self.raw_armature = nn.Parameter(torch.zeros_like(self.actuated))  # its logarithm
-        # of the measured torque, in units of the joints' usual friction
+        self.raw_armature = nn.Parameter(torch.zeros_like(self.actuated))  # logarithm of the ratio to nominal
+        # of the measured torque, in units of typical friction
         self.raw_offset = nn.Parameter(torch.zeros_like(self.actuated))
-        # in units of usual friction at usual speed; no parameter: only a fit to torques may find one
+        # in units of typical friction per typical speed; a buffer: only a fit to torques may set it
         self.raw_friction_compensation = nn.Buffer(torch.zeros_like(self.actuated))
+        motors = None if motor_speeds is None else torch.stack([vector(row) for row in motor_speeds])
+        self.register_buffer("motors", motors)  # C, (n, n), and its inverse
+        self.register_buffer("loads", None if motors is None else torch.linalg.inv(motors))
+
+    @property
+    def input_quantity(self) -> str:
+        """``torque``, or ``position`` for inputs that are commands of position servos."""
+        return "torque" if self.servo is None else "position"
 
     @property
     def inertial_parameters(self) -> Tensor:
-        """By body (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about its joint's frame, (bodies, 10)."""
+        """(m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of each body about the origin of its joint's frame, (bodies, 10)."""
         root = self.bodies.forward()
         row, column = torch.triu_indices(4, 4)
         xx, xy, xz, x, yy, yz, y, zz, z, m = (root @ root.mT)[..., row, column].unbind(dim=-1)
@@ -73,95 +97,112 @@ class RigidBodyDynamics(PortHamiltonian):
 
     @property
     def armature(self) -> Tensor:
-        """Armature, the drives' part of M's diagonal, (n,) [kg m^2, kg]."""
+        """Rotor inertia on the joint side, part of the diagonal of M, (n,) [kg m^2, kg]."""
         return self.nominal_armature * self.raw_armature.exp()
 
     @property
     def viscous(self) -> Tensor:
-        """Friction torque by velocity, (n,) [Nm s/rad, N s/m]."""
+        """Viscous friction coefficient, (n,) [Nm s/rad, N s/m]."""
         return self.friction.prepare().viscous
 
     @property
     def coulomb(self) -> Tensor:
-        """Dry friction, (n,) [Nm, N]."""
+        """Coulomb friction, (n,) [Nm, N]."""
         return self.friction.prepare().coulomb
 
     @property
     def torque_offset(self) -> Tensor:
-        """What the measured torque shows without any, (n,) [Nm, N]."""
+        """Measured torque at zero torque, (n,) [Nm, N]."""
         return self.raw_offset * self.friction.nominal * self.actuated
 
     @property
     def friction_compensation(self) -> Tensor:
-        """What the drives add by velocity, unseen in the measured torque, (n,) [Nm s/rad, N s/m]."""
+        """Torque per velocity that the drives add and that the measured torque does not contain, (n,)."""
         return self.raw_friction_compensation * self.friction.nominal / self.friction.speed * self.actuated
 
-    def prepare(self) -> RigidPrepared:
-        """Return all that depends on the weights alone; holds until they change."""
+    def prepare(self) -> RigidParameters:
+        """Return the parameter cache; valid until a parameter changes."""
         points = torch.ops.aten.block_diag([*self.bodies.forward()])
-        return RigidPrepared(points, torch.diag_embed(self.armature), self.friction.prepare())
+        armature = torch.diag_embed(self.armature)
+        if self.motors is not None:
+            armature = self.motors.mT @ armature @ self.motors
+        return RigidParameters(points, armature, self.friction.prepare())
 
-    def configuration(self, q: Tensor, prepared: RigidPrepared) -> Motion:
-        """Return what depends on q alone."""
+    def configuration(self, q: Tensor, prepared: RigidParameters) -> RigidConfiguration:
+        """Return all that depends on q only."""
         chain, ratios = self.chain.forward(q, prepared.points), self.chain.ratios
         mass = ratios.mT @ (chain.jacobian @ chain.jacobian.mT) @ ratios + prepared.armature
-        return Motion(chain, mass, applied(chain.jacobian, chain.weight) @ ratios, prepared)
+        return RigidConfiguration(chain, mass, applied(chain.jacobian, chain.weight) @ ratios, prepared)
 
-    def potential_energy(self, q: Tensor | Motion, z: Tensor | None = None) -> Tensor:
-        """Return V(q) and what bristles store, (...) [J]; zero for a mass at the base's origin."""
-        pose: Motion = self.at(q)
-        energy = (pose.chain.place.flatten(-3) * pose.chain.weight).sum(dim=-1)
-        return energy if z is None else energy + pose.prepared.friction.stored_energy(z)
+    def potential_energy(self, q: Tensor | RigidConfiguration, z: Tensor | None = None) -> Tensor:
+        """Return V(q) and the elastic energy of the bristles, (...) [J]; V is 0 at the origin of the base."""
+        at: RigidConfiguration = self.at(q)
+        energy = (at.chain.place.flatten(-3) * at.chain.weight).sum(dim=-1)
+        return energy if z is None else energy + at.prepared.friction.stored_energy(z)
 
-    def gravity(self, q: Tensor | Motion) -> Tensor:
+    def gravity(self, q: Tensor | RigidConfiguration) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
-        pose: Motion = self.at(q)
-        return pose.gravity
+        at: RigidConfiguration = self.at(q)
+        return at.gravity
 
-    def lagrangian_gradient(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
+    def lagrangian_gradient(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        pose: Motion = self.at(q, qd)
-        return self.chain.kinetic_gradient(pose.chain, qd) - pose.gravity
+        at: RigidConfiguration = self.at(q, qd)
+        return self.chain.kinetic_gradient(at.chain, qd) - at.gravity
 
-    def nonlinear_effects(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
-        """Return the torque that holds qd steady without friction, (..., n), by d'Alembert's principle."""
-        pose: Motion = self.at(q, qd)
-        return applied(pose.chain.jacobian, self.chain.accelerations(pose.chain, qd)) @ self.chain.ratios
+    def nonlinear_effects(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
+        """Return Coriolis, centrifugal and gravity torque, (..., n), by the principle of d'Alembert."""
+        at: RigidConfiguration = self.at(q, qd)
+        return applied(at.chain.jacobian, self.chain.accelerations(at.chain, qd)) @ self.chain.ratios
 
-    def friction_torque(self, q: Tensor | Motion, qd: Tensor, *state: Tensor | None) -> Tensor:
-        """Return the friction torque, (..., n) [Nm, N]; state: see ``FrictionConstants.torque``."""
-        pose: Motion = self.at(q, qd)
-        return pose.varied * pose.prepared.friction.torque(qd, pose.gravity, *state)
+    def _at_motors(self, at: RigidConfiguration, qd: Tensor) -> tuple[Tensor, Tensor]:
+        """Return velocities and gravity torques of the motors, C qd and C^-T g, each (..., n)."""
+        if self.motors is None or self.loads is None:
+            return qd, at.gravity
+        return qd @ self.motors.mT, at.gravity @ self.loads
 
-    def dissipation(self, q: Tensor | Motion, qd: Tensor) -> Tensor:
+    def friction_torque(self, q: Tensor | RigidConfiguration, qd: Tensor, *state: Tensor | None) -> Tensor:
+        """Return the friction torque, C^T f(C qd), (..., n) [Nm, N]; state: see ``FrictionConstants.torque``."""
+        at: RigidConfiguration = self.at(q, qd)
+        torque = at.varied * at.prepared.friction.torque(*self._at_motors(at, qd), *state)
+        return torque if self.motors is None else torque @ self.motors
+
+    def dissipation(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
         """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
-        pose: Motion = self.at(q, qd)
-        friction = pose.prepared.friction
-        dry = friction.dry(qd, pose.gravity) * turning(qd, friction.coulomb_smoothing_velocity)
-        return torch.diag_embed(pose.varied * (friction.viscosity(qd) + dry))
+        at: RigidConfiguration = self.at(q, qd)
+        friction = at.prepared.friction
+        qd, gravity = self._at_motors(at, qd)
+        dry = friction.dry(qd, gravity) * turning(qd, friction.coulomb_smoothing_velocity)
+        matrix = torch.diag_embed(at.varied * (friction.viscosity(qd) + dry))
+        return matrix if self.motors is None else self.motors.mT @ matrix @ self.motors
+
+    def _motor(self, qd: Tensor) -> Tensor:
+        """Return velocities or displacements of the motors, (..., n), for those of the joints."""
+        return qd if self.motors is None else qd @ self.motors.mT
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return z, (..., n, K), of drives that have long gone this way.
+        """Return the state z, (..., n, K), of drives that have moved at qd for a long time.
 
-        Near the smoothing velocity they bear up to 7.4 % more than friction without z, far above it the same.
+        Near the smoothing velocity friction is up to 7.4 % larger than without z, far above it the same.
         """
-        # bent as far as they go a few widths on: the rest of an algebraic turn would be a stiff transient
-        direction = (qd / self.friction.prepare().coulomb_smoothing_velocity).tanh()
+        # tanh reaches its limit within a few widths: the slow end of an algebraic sign would be a stiff transient
+        direction = (self._motor(qd) / self.friction.prepare().coulomb_smoothing_velocity).tanh()
         return direction.unsqueeze(-1) * self.friction.reach
 
     def memory_rate(self, z: Tensor, qd: Tensor) -> Tensor:
-        """Return z', (..., n, K): qd, and zero where |z| is the reach and would grow."""
-        qd = qd.unsqueeze(-1)
+        """Return z', (..., n, K): qd, or zero for a bristle that slides."""
+        qd = self._motor(qd).unsqueeze(-1)
         return qd * (qd.sign() * z < self.friction.reach)
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """Return z after joints went one way by (..., n), exactly."""
-        return (z + displacement.unsqueeze(-1)).clamp(-self.friction.reach, self.friction.reach)
+        """Return z, (..., n, K), after a monotonic displacement of the joints, (..., n): exact."""
+        moved = z + self._motor(displacement).unsqueeze(-1)
+        return moved.clamp(-self.friction.reach, self.friction.reach)
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
-        """Return the rate of (q, p, z), (..., 2 n + n K), or of (q, p, z, tau), where tau is held.
+        """Return the rate of (q, p, z), (..., 2 n + n K), or of (q, p, z, tau) with a constant tau.
 
-        A state that is too short for z has none: friction is then that of joints which slide.
+        A state without z, (..., 2 n), is that of friction without bristles.
         """
         n, size = self.n, self.n * self.elements
         if state.shape[-1] < 2 * n + size:
@@ -173,6 +214,6 @@ class RigidBodyDynamics(PortHamiltonian):
             flat = self.memory_rate(z, qd).flatten(-2)
         return torch.cat([qd, force, flat, torch.zeros_like(tau)], dim=-1)
 
-    def input_force(self, pose: Motion, qd: Tensor, tau: Tensor) -> Tensor:
+    def input_force(self, at: RigidConfiguration, qd: Tensor, tau: Tensor) -> Tensor:
         """Return G (tau - torque offset) + friction compensation qd, (..., n) [Nm, N]."""
-        return super().input_force(pose, qd, tau - self.torque_offset) + self.friction_compensation * qd
+        return super().input_force(at, qd, tau - self.torque_offset) + self.friction_compensation * qd

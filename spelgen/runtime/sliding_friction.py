@@ -1,29 +1,32 @@
-"""Friction by the same laws, without memory."""
+"""The same friction without bristles: dry friction depends on velocity only."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from torch import nn
 
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws
-from spelgen.runtime.parts import Row
+from spelgen.runtime.rows import Joint
 
-SMOOTHING_VELOCITY = 0.006  # over which dry friction turns around to start from, by usual velocity
+# Initial velocity over which dry friction changes its direction, relative to the typical speed.
+SMOOTHING_VELOCITY = 0.006
 
 
 class SlidingFriction(FrictionLaws):
-    """Friction that has no bristles: what is dry turns around over a velocity that is trained."""
+    """Friction without a state, with a trained smoothing velocity of dry friction."""
 
-    kinds = (("raw_coulomb_smoothing_velocity", "velocities", "rad/s, m/s", SMOOTHING_VELOCITY),)
+    parameter_groups = (("raw_coulomb_smoothing_velocity", "velocities", "rad/s, m/s", SMOOTHING_VELOCITY),)
 
-    def __init__(self, friction: Row, speed: Row) -> None:
-        super().__init__(friction, speed, [[]] * len(speed))
+    def __init__(self, joints: Sequence[Joint]) -> None:
+        super().__init__(joints, breakaway={"revolute": (), "prismatic": ()})
         self.memoryless.fill_(1.0)
         self.raw_coulomb_smoothing_velocity = nn.Parameter(torch.zeros_like(self.speed))
         del self.raw_bristle_fractions
-        self.register_buffer("raw_bristle_fractions", self.reach)  # none
+        self.register_buffer("raw_bristle_fractions", self.reach)  # (n, 0)
 
     def prepare(self) -> FrictionConstants:
-        """The constants, in their units."""
+        """Return the constants in SI units."""
         velocity = SMOOTHING_VELOCITY * self.speed * self.raw_coulomb_smoothing_velocity.exp()
         return super().prepare()._replace(coulomb_smoothing_velocity=velocity)

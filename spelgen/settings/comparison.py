@@ -1,4 +1,4 @@
-"""How `spelgen compare` trains on one robot's logs."""
+"""Settings of `spelgen compare` for one robot."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from spelgen.settings.values import Count, Group, NonNegative, Positive, Whole
 
 
 class PublishedFigures(Group):
-    """What a publication reports of one preset on this robot; None where it gives no figure.
+    """Figures of one preset on this robot in a publication; None: not published.
 
-    train_loss, test_loss, prediction_loss: squared errors of predicted windows, summed over the joints. velocity,
-    position: mean squared errors over 1 s, likewise. step_seconds: of a training step, on its authors' machine.
+    train_loss, test_loss, prediction_loss: squared errors of predicted windows, summed over joints [rad, m, s].
+    velocity, position: mean squared errors over 1 s, summed over joints. step_seconds: time of a training step on the
+    authors' machine [s].
     """
 
     parameters: Count | None = None
@@ -24,11 +25,12 @@ class PublishedFigures(Group):
 
 
 class ComparisonSettings(Group):
-    """How `spelgen compare` trains every preset on this robot's simulated logs.
+    """Training of all presets on simulated logs of this robot by `spelgen compare`.
 
-    first: only so much of each training trajectory is trained on [s]; None: all. steps: of training, at least.
-    momentum_steps: before these. weight_decay: of every preset; None: as in training. seeds: runs of each preset.
-    width, depth: of the hidden layers. published: figures to stand beside what is measured, by preset.
+    first: duration of the part of each training motion that is trained on [s]; None: all. steps: smallest number of
+    training steps on predicted windows. momentum_steps: steps on the weak form before them. weight_decay: of all
+    presets; None: as in `training`. seeds: number of runs of each preset. width, depth: of hidden layers. published:
+    published figures, by preset.
     """
 
     first: Positive | None = None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from math import floor, isqrt, log10, pi
 
 import numpy as np
@@ -109,9 +110,14 @@ def _gives_usable_mass(arm: Arm, q: np.ndarray) -> bool:
 
 
 def nominal_inertias(arm: Arm, from_urdf: bool) -> list[list[float]]:
-    """Return ten inertial parameters by body: the URDF's, or those of one-kilogram balls."""
+    """Return ``exact_inertias`` as floats."""
+    return [list(map(float, ten)) for ten in exact_inertias(arm, from_urdf)]
+
+
+def exact_inertias(arm: Arm, from_urdf: bool) -> Sequence[Sequence[Fraction | float]]:
+    """Return ten inertial parameters per body: those of the URDF, exact, or those of balls of 1 kg."""
     if from_urdf:
-        return [list(map(float, body.inertia or ())) for body in arm.bodies]
+        return [body.inertia or () for body in arm.bodies]
     return [_default_inertia(arm, index) for index in range(len(arm.bodies))]
 
 

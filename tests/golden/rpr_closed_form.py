@@ -28,9 +28,9 @@ from torch import Tensor, nn
 
 FACTS = r"""{"format": 8, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "c87c02253f66c01040a57660ed2e58d4674878791b038433bffa7c594b206c63",
+ "spec_sha256": "bf47000c6a84ed5c58cf9cc0ee8a15c236856db6162d87e4195dbc677f457af5",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
-  "net": null, "preset": "closed-form", "tip": null, "width": 64},
+  "preset": "closed-form", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
 
 

@@ -30,9 +30,9 @@ from torch import Tensor, nn
 
 FACTS = r"""{"format": 8, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "d6712053e8ba7bfe2ec89cb1882a3e0bd1c4c19a59e294ba174bb26d1d3de5e1",
+ "spec_sha256": "e060bb8e3fc078c752d60301d836bc1f8ac175da9aaa1e2dcf824fb402d2537b",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
-  "net": "mlp", "preset": "hybrid", "tip": null, "width": 64},
+  "preset": "hybrid", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
 
 

@@ -28,9 +28,9 @@ from torch import Tensor, nn
 
 FACTS = r"""{"format": 8, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "146b09931965e3ae2d9a3d682f864a1c6805907d909fc9580bc067c5ccdf832a",
+ "spec_sha256": "384ed242bd2040abcdccace69da8158a5b571533f36ae4dc3d68b08e30214e9b",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
-  "net": "mlp", "preset": "minimal", "tip": null, "width": 64},
+  "preset": "minimal", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
 
 

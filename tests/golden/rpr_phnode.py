@@ -29,9 +29,9 @@ from torch import Tensor, nn
 
 FACTS = r"""{"format": 8, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "a3178383c59411fcd1be26f55c056099de06bfe3983bfdf4c079e77e030c84ce",
+ "spec_sha256": "ff9f8c624e611d175366c0257bfed2191becdfef33f20d0062bafbb1d287fcf3",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
-  "net": "mlp", "preset": "phnode", "tip": null, "width": 64},
+  "preset": "phnode", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
 
 

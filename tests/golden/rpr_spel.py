@@ -28,9 +28,9 @@ from torch import Tensor, nn
 
 FACTS = r"""{"format": 8, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "83c253b456d357e1db84159b27c7c5cd54cc9ec0e5074273f980395919fbe118",
+ "spec_sha256": "bbc372eee9292f0163aba9ee21c945977097081202eba382eea5eb77c0a8a29e",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
-  "net": "mlp", "preset": "spel", "tip": null, "width": 64},
+  "preset": "spel", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
 
 

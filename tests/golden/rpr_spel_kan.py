@@ -28,9 +28,9 @@ from torch import Tensor, nn
 
 FACTS = r"""{"format": 8, "robot": "rpr", "urdf": "rpr.urdf",
  "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "d4511fddccd89dbc30682439e8daba284f7e9133a2c042b2cebd61ca8c300d24",
+ "spec_sha256": "b34ffe42189815605795657a6b69ae13a0a2197d9cd43de1cd541741dc6aed55",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
-  "net": "kan", "preset": "spel-kan", "tip": null, "width": 64},
+  "preset": "spel-kan", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
 
 

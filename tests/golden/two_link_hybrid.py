@@ -28,9 +28,9 @@ from torch import Tensor, nn
 
 FACTS = r"""{"format": 8, "robot": "two_link", "urdf": "two_link.urdf",
  "urdf_sha256": "d5393c842e189b72219c5ce02e115de571a94cd406b48898ea64b5431a395232",
- "spec_sha256": "922ed99538d67e20d08980eab05335e17aed1e85204bdab16872b4d82da8d46b",
+ "spec_sha256": "231d901ddafe1d0a943e789643a0f16797c6eb31653efc1ebba8377f99a82be3",
  "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
-  "net": "mlp", "preset": "hybrid", "tip": null, "width": 64},
+  "preset": "hybrid", "tip": null, "width": 64},
  "joints": {"joint1": "revolute", "joint2": "revolute"}}"""
 
 

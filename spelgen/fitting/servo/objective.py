@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from spelgen.dynamics.bristles import encoder_step
-from spelgen.errors import Diagnostic, LogError
+from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import digest
 from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
 from spelgen.fitting.levenberg_marquardt import levenberg_marquardt, start
@@ -31,7 +31,6 @@ from spelgen.fitting.servo.report import servo_record, solution
 from spelgen.fitting.servo.start import start_servos
 from spelgen.fitting.servo.tuning import ServoSolverTuning
 from spelgen.fitting.servo.windows import servo_windows
-from spelgen.fitting.streaming import LargeLogs
 from spelgen.logs.checks import check
 from spelgen.logs.trajectory import require_commands, require_joints
 
@@ -60,25 +59,20 @@ class ServoObjective(Objective):
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
         request, model = self.request, self.model
-        if isinstance(request.logs, LargeLogs):
-            expected = "fewer logs, for example every tenth file"
-            raise LogError("logs of positions larger than memory", expected=expected)
         self._logs = request.logs
         for log in self._logs:
-            require_joints(log, model.facts.joints)
+            require_joints(log, model.joint_names)
             require_commands(log)
-        notes = check(self._logs, model.facts.joints, model.joint_types)
+        notes = check(self._logs, model.joint_names, model.joint_types)
         self._windows = servo_windows(self._logs, request.preprocessing)
         return PreparedLogs(
             config=request.config,
             preprocessing=request.preprocessing,
-            record={
-                "data_digest": digest(self._logs),
-                "training": [log.name for log in self._logs],
-                "validation": [],
-                "training_windows": len(self._windows.q),
-                "validation_windows": 0,
-            },
+            digest=digest(self._logs),
+            training=[log.name for log in self._logs],
+            validation=[],
+            training_windows=len(self._windows.q),
+            validation_windows=0,
             notes=notes,
         )
 

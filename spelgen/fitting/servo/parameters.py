@@ -17,7 +17,7 @@ from spelgen.fitting.functional_model import under_weights
 from spelgen.fitting.servo.tuning import ServoPriorTuning
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = ServoPriorTuning()
 DEAD_ZONE = "servo.dead_zone"
@@ -61,7 +61,7 @@ class ParameterRows:
     names: of the rows; a parameter of several numbers a joint has as many rows.
     """
 
-    def __init__(self, model: EmittedModel) -> None:
+    def __init__(self, model: ArmModel) -> None:
         self._n = model.n
         tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         # a drive's viscous friction and kd are one number: kd has it all
@@ -110,13 +110,13 @@ class ParameterRows:
         return torch.cat([joints.flatten(), others]) ** -2
 
 
-def body_parameters(model: EmittedModel) -> torch.nn.Parameter:
+def body_parameters(model: ArmModel) -> torch.nn.Parameter:
     """Return what the bodies' inertial parameters are made of, (B, 10)."""
     (name,) = parameters_of_kind(model, "bodies")
     return model.get_parameter(name)
 
 
-def body_directions(model: EmittedModel, q: torch.Tensor) -> torch.Tensor:
+def body_directions(model: ArmModel, q: torch.Tensor) -> torch.Tensor:
     """Return directions of the bodies' parameters that change gravity at q (M, n) most, (10 B, r), each as long as its
     standard deviation.
     """
@@ -131,7 +131,7 @@ def body_directions(model: EmittedModel, q: torch.Tensor) -> torch.Tensor:
     return result
 
 
-def inertial_parameters(model: EmittedModel, raw: torch.Tensor) -> torch.Tensor:
+def inertial_parameters(model: ArmModel, raw: torch.Tensor) -> torch.Tensor:
     """Return the ten parameters of all bodies, (B, 10), made of trained ones (B, 10)."""
     (name,) = parameters_of_kind(model, "bodies")
     parameters: torch.Tensor = under_weights(model, {name: raw}, lambda x: x.inertial_parameters)

@@ -32,7 +32,7 @@ from spelgen.fitting.servo.tuning import ServoCostTuning
 from spelgen.fitting.servo.windows import Path, ServoWindows, body_load
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = ServoCostTuning()
 LONGEST_STEP = 1.0  # in any parameter: they are logarithms
@@ -76,7 +76,7 @@ class ServoProblem:
     nudge: of finite differences.
     """
 
-    def __init__(self, model: EmittedModel, windows: ServoWindows, noise: torch.Tensor) -> None:
+    def __init__(self, model: ArmModel, windows: ServoWindows, noise: torch.Tensor) -> None:
         self.model, self.windows, self._noise = model, windows, noise
         self.rows = ParameterRows(model)
         self.nudge = TUNING.nudge
@@ -231,5 +231,5 @@ class ServoProblem:
         return torch.stack(positions, dim=2), torch.stack(velocities, dim=2)
 
 
-def _drives(model: EmittedModel) -> tuple[ServoDrives, torch.Tensor]:
+def _drives(model: ArmModel) -> tuple[ServoDrives, torch.Tensor]:
     return servo_drives(model), model.armature

@@ -8,15 +8,15 @@ Cameron and Miller, J. Human Resources 50:317, 2015, CV3). What logs do not dete
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from scipy.special import stdtrit
 
 from spelgen.fitting.functional_model import under_weights
 from spelgen.fitting.levenberg_marquardt import NormalEquations
+from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.laws import sliding_friction
 from spelgen.fitting.servo.parameters import DEAD_ZONE, ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
@@ -24,7 +24,7 @@ from spelgen.fitting.servo.tuning import ServoIntervalTuning
 from spelgen.listing import Listing, number
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = ServoIntervalTuning()
 QUANTILE = 0.975  # of an interval of 95 %, of Student's t: windows are few
@@ -42,10 +42,6 @@ ABOUT = (
     "sum of kd and viscous friction, which such logs do not distinguish. dry: dry friction; open where it cannot be "
     "distinguished from a dead zone, as without gravity. static error: the sum of dry/kp and half the dead zone"
 )
-
-
-Record = dict[str, Any]
-"""What config.json holds of a fit of servos, or a part of it."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +128,7 @@ def identifiable(windows: NormalEquations, precision: torch.Tensor, unknowns: to
     return inflation < TUNING.variance_inflation
 
 
-def ratios(model: EmittedModel, qd: torch.Tensor, gravity: torch.Tensor) -> dict[str, torch.Tensor]:
+def ratios(model: ArmModel, qd: torch.Tensor, gravity: torch.Tensor) -> dict[str, torch.Tensor]:
     """Return the ratios to kp, each (n,), of a model that moved at qd under gravity's torques, (..., n)."""
     dead_zone = model.servo.dead_zone
     dry = sliding_friction(model.friction, qd, gravity) / model.kp
@@ -166,7 +162,7 @@ def ratios_with_deviations(
     return result
 
 
-def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Record:
+def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Content:
     """Return for config.json: delay [s], errors [rad, m], and by joint kp and the ratios to it with intervals of 95 %.
 
     determined: whether an interval is narrow enough to be of use.
@@ -179,14 +175,14 @@ def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParamet
     }
 
 
-def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Record]:
+def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Content]:
     model, records = problem.model, []
     values = ratios_with_deviations(problem, solution)
     dead_zones = problem.rows.row(DEAD_ZONE) * model.n + torch.arange(model.n)
     distinct = identifiable(solution.windows, solution.precision, dead_zones).tolist()
-    for joint, name in enumerate(model.facts.joints):
+    for joint, name in enumerate(model.joint_names):
         kp = {"value": float(model.kp[joint].detach()), "known": not float(model.servo.trained[joint])}
-        record: Record = {"joint": name, "kp": kp}
+        record: Content = {"joint": name, "kp": kp}
         for ratio, (of_joints, deviations) in values.items():
             value = float(of_joints[joint])
             if ratio == "dead_zone" and not value:  # a law that this joint has not
@@ -208,11 +204,10 @@ def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Recor
     return records
 
 
-def servo_summary(config: Mapping[str, Any]) -> FitSummary | None:
-    """Return what a fit determined; None for contents of config.json of a fit that is not over, or of no servos."""
-    if "servo" not in config:
+def servo_summary(record: Content | None) -> FitSummary | None:
+    """Return what a fit determined, from `servo_record`; None of a fit that is not over, or of no servos."""
+    if record is None:
         return None
-    record = config["servo"]
     listing = _listing(record)
     delay = f"{1000 * record['delay']['value']:.1f} ms, +- {1000 * record['delay']['half']:.1f} ms"
     errors = ", ".join(number(1000 * rms) for rms in record["rms"])
@@ -222,7 +217,7 @@ def servo_summary(config: Mapping[str, Any]) -> FitSummary | None:
     return FitSummary(text, listing, (delay, "delay of the commands"))
 
 
-def _listing(record: Record) -> Listing:
+def _listing(record: Content) -> Listing:
     """Return by joint kp, and the ratios to it with intervals; half dead zones too, where a joint has one."""
     columns = [ratio for ratio in RATIOS if any(ratio in joint for joint in record["joints"])]
     rows = []
@@ -233,7 +228,7 @@ def _listing(record: Record) -> Listing:
     return Listing("Servos", head, tuple(rows), f"All columns but kp are {ABOUT}.")
 
 
-def _undetermined(record: Record) -> str:
+def _undetermined(record: Content) -> str:
     """Return what the logs leave open, dead zones apart."""
     names = []
     for joint in record["joints"]:
@@ -245,7 +240,7 @@ def _undetermined(record: Record) -> str:
     return f"Not determined by these logs: {', '.join(names)}"
 
 
-def _shown(interval: Record | None) -> str:
+def _shown(interval: Content | None) -> str:
     if interval is None:
         return "none"
     if not interval["determined"]:

@@ -16,13 +16,13 @@ from spelgen.fitting.servo.tuning import ServoStartTuning
 from spelgen.fitting.servo.windows import ServoWindows, body_load
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = ServoStartTuning()
 NONE, FAINT = -6.0, -2.0  # logarithms, of the usual sizes
 
 
-def start_servos(model: EmittedModel, windows: ServoWindows) -> None:
+def start_servos(model: ArmModel, windows: ServoWindows) -> None:
     """Give kp, kd, armature, friction and offset of the model the values that explain the command error best."""
     delay = 1 / windows.rate
     model.servo.delay.fill_(delay)

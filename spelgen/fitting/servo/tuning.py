@@ -7,81 +7,106 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ServoWindowTuning:
-    """Decide which windows a fit of servos predicts."""
+    """Windows that a servo fit predicts."""
 
-    # [s] as long as gravity and friction need to show; longer ones diverge with the delay
+    # [s] Length of a window: gravity and friction need as long to become visible, and longer windows diverge with the
+    # delay.
     length: float = 4.0
-    settling: float = 1.0  # [s] of its beginning that is not judged: friction's state forms there
-    count: int = 200  # at most, evenly spread: ten minutes of motion
+    # [s] Burn-in at the beginning of a window, during which the friction state forms; its errors do not count.
+    settling: float = 1.0
+    # [1] Largest number of windows, evenly spread: ten minutes of motion.
+    count: int = 200
 
 
 @dataclass(frozen=True)
 class ServoPriorTuning:
-    """Standard deviations of the Gaussian prior of a fit of servos, from where its parameters start."""
+    """Standard deviations of the Gaussian prior of a servo fit, about the initial parameters."""
 
-    logarithm: float = 2.0  # [1] of a joint's gains, armature and friction: a factor of seven
-    # [1] of its logarithm: by more, friction that falls at any speed fits offsets
+    # [1] Logarithms of a joint's gains, armature and friction: a factor of seven.
+    logarithm: float = 2.0
+    # [1] Logarithm of the Stribeck velocity: with a wider prior friction that decreases at any speed absorbs offsets.
     stribeck_velocity: float = 1.0
-    dead_zone: float = 0.02  # [rad, m] half a dead zone: gears of hobby servos have a few mrad
-    delay: float = 0.1  # [s]
-    bodies: float = 0.3  # [1] of the bodies' log-Cholesky parameters: 30 % in mass
-    body_directions: int = 6  # that change gravity most; further ones move by less than their prior
+    # [rad, m] Half of a dead zone: gears of hobby servos have a few mrad.
+    dead_zone: float = 0.02
+    # [s] Delay of the commands.
+    delay: float = 0.1
+    # [1] Log-Cholesky parameters of the bodies: 30 % in mass.
+    bodies: float = 0.3
+    # [1] Directions of the body parameters that are fitted, those with the largest effect on gravity; further ones
+    # stay within their prior.
+    body_directions: int = 6
 
 
 @dataclass(frozen=True)
 class ServoCostTuning:
-    """Decide what errors of predicted windows count, and how their slopes are taken."""
+    """Cost of a servo fit and its derivatives."""
 
-    correlation_time: float = 0.5  # [s] at most, over which errors say the same; measured: most are over 0.2
-    nudge: float = 1e-4  # of parameters, in their units: rollouts in double precision lose half their digits
+    # [s] Largest correlation time of the errors; most measured ones are above 0.2 s.
+    correlation_time: float = 0.5
+    # [1] Finite-difference step of the parameters: rollouts in double precision lose half of their digits.
+    nudge: float = 1e-4
 
 
 @dataclass(frozen=True)
 class ServoSolverTuning:
-    """Decide when rounds of a fit of servos end."""
+    """Convergence of a servo fit."""
 
-    sparse_windows: int = 32  # at most, in all rounds but the last
-    steps: int = 12  # of a round at most
-    last_steps: int = 2  # of the last round, on all windows: it starts near the minimum of few
-    gain: float = 0.01  # [1] of the cost: a step that gains less ends a round, and a comparison of laws
-    relative_gain: float = 1e-4  # [1] likewise, of the cost: where a model's form is wrong costs are high
-    # [1] of the first step of a round, after the first round; by 1e-3 kd ends 0.3 % off
+    # [1] Largest number of windows in all outer iterations but the last.
+    sparse_windows: int = 32
+    # [1] Largest number of steps of an outer iteration.
+    steps: int = 12
+    # [1] Steps of the last outer iteration, on all windows: it starts near the minimum of few windows.
+    last_steps: int = 2
+    # [1] Decrease of the cost below which an outer iteration, or the fit of a joint with and without dead zone, ends.
+    gain: float = 0.01
+    # [1] The same, relative to the cost: costs are high if the form of the model is wrong.
+    relative_gain: float = 1e-4
+    # [1] Damping of the first step of all outer iterations but the first; with 1e-3 kd ends 0.3 % off.
     later_damping: float = 1e-5
-    # of parameters for the last slopes: by shorter ones a joint that just slips looks known
+    # [1] Finite-difference step of the last derivatives: with shorter steps a joint that is about to slip seems
+    # determined.
     last_nudge: float = 1e-3
 
 
 @dataclass(frozen=True)
 class ServoLawTuning:
-    """Decide which joints get a dead zone or friction that falls with velocity."""
+    """Selection of the joints that have a dead zone."""
 
-    dead_zone_fraction: float = 0.25  # [1] of the static error, that a dead zone makes up to begin with
-    steps: int = 6  # of joints by themselves
-    # [1] standard deviations that a law has to gain: other forms of friction gain 3
+    # [1] Initial dead zone, as a fraction of the static error.
+    dead_zone_fraction: float = 0.25
+    # [1] Steps of the fit of a single joint.
+    steps: int = 6
+    # [1] Standard deviations by which a dead zone must be more probable; other forms of friction gain 3.
     significance: float = 4.0
-    least_dead_zone: float = 1e-3  # [rad, m] smaller ones are none: a step of a 12-bit encoder is 1.5e-3
+    # [rad, m] Smallest dead zone: the step of a 12-bit encoder is 1.5e-3 rad.
+    least_dead_zone: float = 1e-3
 
 
 @dataclass(frozen=True)
 class ServoIntervalTuning:
-    """Decide what is reported as determined."""
+    """Intervals and identifiability of the fitted parameters."""
 
-    logs: int = 3  # [1] at least, each left out whole: half of a motion says what its other half does
-    stretches: int = 6  # [1] into which fewer logs are cut, at least
-    # [1] from which on two effects are one; measured on SO-101s: below 30, above 90
+    # [1] Smallest number of logs of which each is one block of the covariance: halves of one motion are not
+    # independent.
+    logs: int = 3
+    # [1] Smallest number of blocks into which fewer logs are divided.
+    stretches: int = 6
+    # [1] Variance inflation above which two effects are indistinguishable; on SO-101s it is below 30 or above 90.
     variance_inflation: float = 50.0
-    # [1] of ratios, by what friction's laws are not: benchmarks/servo_recovery.py
+    # [1] Standard deviation of ratios due to the form of the friction model: `benchmarks/servo_recovery.py`.
     law_deviation: float = 0.015
-    open_factor: float = 1.25  # [1] what may be larger by this factor within its interval is not determined
+    # [1] A value whose interval reaches beyond this factor is not determined.
+    open_factor: float = 1.25
 
 
 @dataclass(frozen=True)
 class ServoStartTuning:
-    """Decide where a fit of servos starts."""
+    """Initial parameters of a servo fit."""
 
-    # [1] standard deviations of kp by gravity: samples of neighbouring windows are alike
+    # [1] Standard deviations of kp from gravity: samples of neighbouring windows are correlated.
     significance: float = 8.0
-    # [1] factor on the kp of the settings, or 2 efforts a rad, beyond which it is not believed
+    # [1] Largest factor on the kp of the settings, or on 2 efforts per radian.
     kp_range: float = 20.0
-    # [1] of usual dry friction; squared of kd/kp, cubed of armature/kp: so that these have a log
+    # [1] Smallest dry friction as a fraction of the nominal one; squared the smallest kd/kp, cubed the smallest
+    # armature/kp, so that their logarithms exist.
     least: float = 0.05

@@ -22,7 +22,7 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = ServoWindowTuning()
 SHORTEST = 8  # samples, of which half are judged
@@ -145,7 +145,7 @@ class BodyLoad(NamedTuple):
     slopes: torch.Tensor
 
 
-def body_load(model: EmittedModel, path: Path) -> BodyLoad:
+def body_load(model: ArmModel, path: Path) -> BodyLoad:
     """Return that of the model as it is."""
     blocks: list[BodyLoad] = []
     with torch.no_grad():

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from spelgen.dynamics.protocol import has_residuals
+from spelgen.dynamics.protocol import residual_terms
 from spelgen.fitting.torque.jacobian import TUNING, TorqueJacobian
 from spelgen.fitting.torque.joint_functions import clear_functions, refit_residuals
 from spelgen.fitting.torque.problem import State, TorqueProblem
@@ -32,7 +32,7 @@ from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class TorqueSolution:
 
 
 def fit_torque(
-    model: EmittedModel,
+    model: ArmModel,
     samples: TorqueSamples | Sequence[DynamicsSamples],
     prior: GaussianPrior | None = None,
     adapt: Adaptation | None = None,
@@ -83,7 +83,7 @@ def fit_torque(
     if adapt is None:
         state = problem.select_effects(state)
     residuals: list[SelectedResidual] = []
-    if adapt is None and has_residuals(model):
+    if adapt is None and residual_terms(model) is not None:
         state, residuals = _with_residuals(problem, state, samples.thinned(TUNING.residual_samples))
     if problem.jacobian.samples is not samples:  # few samples came near, all of them finish
         state = problem.refine(state, samples)
@@ -100,7 +100,7 @@ def fit_torque(
     )
 
 
-def _most_samples(model: EmittedModel) -> int:
+def _most_samples(model: ArmModel) -> int:
     """Return how many samples there may be: their two regressors stay in memory from step to step."""
     numbers = 2 * model.n * model.inertial_parameters.numel()
     return max(TUNING.subset, int(TUNING.regressor_bytes / (8 * numbers)))

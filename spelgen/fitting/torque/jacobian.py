@@ -19,7 +19,7 @@ from spelgen.fitting.torque.tuning import TorqueTuning
 from spelgen.fitting.torque.weights import RigidWeights, joint_torque, moved_bodies
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = TorqueTuning()
 NO_FUNCTIONS: Mapping[int, FollowingFunctions] = {}
@@ -110,7 +110,7 @@ class TorqueJacobian:
 
     def __init__(
         self,
-        model: EmittedModel,
+        model: ArmModel,
         samples: TorqueSamples,
         functions: Mapping[int, FollowingFunctions] = NO_FUNCTIONS,
     ) -> None:

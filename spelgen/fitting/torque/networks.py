@@ -12,7 +12,7 @@ from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.settings.fits import DEFAULTS, Adaptation
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 MOVING: dict[Adaptation, tuple[str, ...]] = {
     "load": ("mass.", "potential."),
@@ -24,7 +24,7 @@ BLOCK = 2**16  # samples in memory with all that their gradient needs
 
 
 def fit_networks(
-    model: EmittedModel,
+    model: ArmModel,
     samples: TorqueSamples,
     weight_decay: float = DEFAULTS.lbfgs_decay,
     penalty: Callable[[], torch.Tensor | float] | None = None,
@@ -51,7 +51,7 @@ def fit_networks(
 
 
 def adapt_networks(
-    model: EmittedModel,
+    model: ArmModel,
     samples: TorqueSamples,
     adapt: Adaptation,
     weight_decay: float = DEFAULTS.lbfgs_decay,

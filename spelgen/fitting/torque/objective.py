@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from typing import TYPE_CHECKING, ClassVar
@@ -13,12 +13,11 @@ import torch
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.bristles import bristle_reach
-from spelgen.dynamics.protocol import has_rigid_bodies, known_past, motors_of
+from spelgen.dynamics.protocol import known_past, motors_of
 from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import TrainingData, Validation
-from spelgen.fitting.objective import Logs, PreparedLogs, TorqueLogObjective
-from spelgen.fitting.streaming import LargeLogs
+from spelgen.fitting.objective import PreparedLogs, TorqueLogObjective
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import TUNING
 from spelgen.fitting.torque.networks import BLOCK, adapt_networks, fit_networks
@@ -26,15 +25,16 @@ from spelgen.fitting.torque.report import torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay, find_torque_delay
-from spelgen.identification.tuning import HINTS
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
+from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import thinned
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import TorqueFit
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 SAMPLES = 5  # of a window that the model is measured on
 MOVED = {
@@ -53,13 +53,12 @@ class TorqueObjective(TorqueLogObjective):
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
         preprocessing, self._late = self.request.preprocessing, NO_DELAY
-        if preprocessing.torque_delay is None and has_rigid_bodies(self.model):
+        if preprocessing.torque_delay is None and isinstance(self.model, RigidBodyDynamics):
             self._late = torque_delay(self.model, self.request.logs, preprocessing)
             preprocessing = replace(preprocessing, torque_delay=self._late.delay)
             self.request = replace(self.request, preprocessing=preprocessing)
-        stride = 1
-        if not isinstance(self.request.logs, LargeLogs):  # windows only measure the model: few are enough
-            stride = -(-sum(map(len, self.request.logs)) // TUNING.windows)
+        # windows only measure the model: few are enough
+        stride = -(-sum(map(len, self.request.logs)) // TUNING.windows)
         self.data = self._cut_windows(SAMPLES, stride)
         return self._prepared(self.data, self.config)
 
@@ -76,7 +75,7 @@ class TorqueObjective(TorqueLogObjective):
                 do="fit windows: the objective rollout",
             )
         regularizer = None
-        if not has_rigid_bodies(model):  # the torques of rigid bodies have a prior of their own
+        if not isinstance(model, RigidBodyDynamics):  # the torques of rigid bodies have a prior of their own
             regularizer = self._regularizer(self.data, self.config.urdf_weight, notes)
         notes += fit_torques(model, samples, self.config, regularizer)
         # residuals that were not selected add nothing but time
@@ -96,7 +95,7 @@ class TorqueObjective(TorqueLogObjective):
         return notes
 
 
-def torque_nmse(model: EmittedModel, samples: TorqueSamples) -> list[float]:
+def torque_nmse(model: ArmModel, samples: TorqueSamples) -> list[float]:
     """Return the mean squared torque error of the samples by joint, relative to the variance of the torque."""
     tau = samples.columns.tau
     squares = torch.zeros(model.n, dtype=torch.float64)
@@ -109,30 +108,22 @@ def torque_nmse(model: EmittedModel, samples: TorqueSamples) -> list[float]:
     return nmse
 
 
-def torque_delay(model: EmittedModel, logs: Logs, preprocessing: Preprocessing) -> TorqueDelay:
+def torque_delay(model: ArmModel, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> TorqueDelay:
     """Return how much later than positions these logs show torques, by the bodies of a model."""
-    if isinstance(logs, LargeLogs):
-        chunks = logs.contents.chunks
-        logs = [chunk.load() for chunk in chunks[:: -(-len(chunks) // HINTS.trajectories)]]
     with torch.no_grad():
         inputs = model.input_matrix(torch.zeros(1, model.n).double())[0].numpy()
     drives = Drives(inputs, motors_of(model).numpy())
     return find_torque_delay(logs, model.joint_types, drives, model.chain, preprocessing)
 
 
-def torque_samples(model: EmittedModel, data: TrainingData) -> TorqueSamples | None:
-    """Return the samples of all logs, those of validation included; None: no log has samples that move, and densely.
-
-    Of logs larger than memory, of which a chunk is read at a time, they are as many as memory holds, evenly spread.
-    """
+def torque_samples(model: ArmModel, data: TrainingData) -> TorqueSamples | None:
+    """Return the samples of all logs, those of validation included; None: no log has samples that move, and densely."""
     decimation, reach = 1, bristle_reach(model)
-    if has_rigid_bodies(model):
+    if isinstance(model, RigidBodyDynamics):
         decimation = TUNING.decimation
-    rows = sum(chunk.stop - chunk.first for chunk in data.chunks)
-    decimation = max(decimation, -(-rows // TUNING.in_memory))
 
     def moving() -> Iterator[DynamicsSamples]:
-        for recording in chain(data.recordings, (chunk.load() for chunk in data.chunks)):
+        for recording in data.recordings:
             samples = dynamics_samples([recording], preprocessing=data.preprocessing, reach=reach)
             yield from (x for x in samples if len(x.q))
 
@@ -142,11 +133,11 @@ def torque_samples(model: EmittedModel, data: TrainingData) -> TorqueSamples | N
 
 
 def fit_torques(
-    model: EmittedModel, samples: TorqueSamples, config: TorqueFit, regularizer: UrdfRegularizer | None = None
+    model: ArmModel, samples: TorqueSamples, config: TorqueFit, regularizer: UrdfRegularizer | None = None
 ) -> list[Diagnostic]:
     """Fit the model to samples; return what there is to tell."""
     notes: list[Diagnostic] = []
-    if has_rigid_bodies(model):
+    if isinstance(model, RigidBodyDynamics):
         solution = fit_torque(model, samples, config.prior, config.adapt)
         steps = solution.steps
         if not config.adapt:

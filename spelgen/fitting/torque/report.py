@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch.autograd.functional import jacobian
 
-from spelgen.dynamics.protocol import has_residuals
+from spelgen.dynamics.protocol import residual_terms
 from spelgen.dynamics.residuals import idle_residuals
 from spelgen.errors import Diagnostic
 from spelgen.fitting.functional_model import under_weights
@@ -20,7 +20,7 @@ from spelgen.fitting.torque.tuning import TorqueReportTuning
 from spelgen.fitting.torque.weights import RigidWeights
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 TUNING = TorqueReportTuning()
 
@@ -33,9 +33,7 @@ EFFECTS = {
 }
 
 
-def torque_notes(
-    model: EmittedModel, samples: TorqueSamples, solution: TorqueSolution
-) -> Iterator[Diagnostic]:
+def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSolution) -> Iterator[Diagnostic]:
     """Yield what there is to tell of rigid bodies that were fitted to samples."""
     names = np.array(model.joint_names)
     # a body's weights are logarithms of its mass and of its sizes
@@ -44,7 +42,7 @@ def torque_notes(
     yield Diagnostic("info", "urdf-prior", "bodies", None, message)
     if solution.compensated.any():
         yield _compensation(model, solution, names)
-    if has_residuals(model):
+    if residual_terms(model) is not None:
         yield Diagnostic("info", "residuals", "model", None, _selected(solution, names))
     looked_at = samples.thinned(TUNING.positions).columns
     q, qdd = looked_at.q, looked_at.qdd
@@ -63,7 +61,7 @@ def torque_notes(
         yield Diagnostic("warning", "acceleration-unseen", "logs", None, message)
 
 
-def _compensation(model: EmittedModel, solution: TorqueSolution, names: np.ndarray) -> Diagnostic:
+def _compensation(model: ArmModel, solution: TorqueSolution, names: np.ndarray) -> Diagnostic:
     value = model.friction_compensation.detach().numpy()
     joints = ", ".join(f"{names[k]} {value[k]:.3g}" for k in np.flatnonzero(solution.compensated))
     message = (
@@ -89,14 +87,15 @@ def _selected(solution: TorqueSolution, names: np.ndarray) -> str:
     )
 
 
-def terms_in_use(model: EmittedModel) -> list[str]:
+def terms_in_use(model: ArmModel) -> list[str]:
     """Return what stands beside the rigid bodies of a model, by effect and joint."""
     names = model.joint_names
-    if not has_residuals(model):
+    residuals = residual_terms(model)
+    if residuals is None:
         return []
     idle = idle_residuals(model)
     terms: list[str] = []
-    for name, weights in model.residuals.named_parameters():
+    for name, weights in residuals.named_parameters():
         if f"residuals.{name}" in idle:
             continue
         if name in EFFECTS:
@@ -111,7 +110,7 @@ def terms_in_use(model: EmittedModel) -> list[str]:
     return terms
 
 
-def _inertia(model: EmittedModel, q: torch.Tensor, covariance: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+def _inertia(model: ArmModel, q: torch.Tensor, covariance: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean diagonal of M at q (n,) [kg m^2, kg], and the standard deviations of its logarithm (n,)."""
     weights = RigidWeights(model).start
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
+# [1] Standard deviations of the friction parameters (logarithms, fractions) of one arm from day to day.
 DAY_TO_DAY = {
     "sizes": 0.1,
     "velocities": 0.1,
@@ -22,50 +23,76 @@ DAY_TO_DAY = {
 class TorqueTuning:
     """Fits of rigid bodies to torques (`fitting.torque`)."""
 
-    decimation: int = 2  # samples at 100 Hz, filtered at 8 Hz: every second one says all that is to be said
-    # samples, 0.06 s: so many in a row err alike and count once, as white noise does after the filter. Of 5, M(q) of
-    # arms whose truth is known is 5 % worse, seconds of real logs do better (UR10e, 3 s: nMSE 0.0080 -> 0.0062).
-    # Estimates from what a fit misses drive themselves up: a joint that is missed counts less, and is missed more
-    # (Panda: 0.0015 -> 0.0030)
+    # [1] Stride of the samples at 100 Hz: after the filter at 8 Hz every second one contains all information.
+    decimation: int = 2
+    # [1] Residual correlation length after the filter, in samples of 20 ms (0.06 s): so many consecutive errors count
+    # as one. White noise has this length after the filter. With 5, M(q) of the arms of `benchmarks/truth.py` is 5 %
+    # worse, and three seconds of the UR10e of `benchmarks/ablation.py` are better (torque nMSE 0.0080 -> 0.0062).
+    # Lengths estimated from the residual are unstable: a joint with a large residual gets a small weight, and its
+    # residual grows (Panda: 0.0015 -> 0.0030).
     correlation_length: float = 3.1
-    lasting_errors: float = 5.0  # samples, 0.1 s: likewise where forms of friction and functions are judged
-    rounds: int = 5  # after the first ones, of finding noise and prior anew
-    # twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773, 1995)
+    # [1] The same for comparisons of friction models and for the selection of residual terms, in samples of 20 ms
+    # (0.1 s).
+    lasting_errors: float = 5.0
+    # [1] Outer iterations of noise and prior after the initial fit.
+    rounds: int = 5
+    # [1] Twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773,
+    # 1995).
     strong_evidence: float = 6.0
-    # likewise, which Stribeck effect, saturation and dependence on load of a joint have to gain (2 for a parameter:
-    # Akaike, IEEE Trans. Autom. Control 19:716, 1974)
+    # [1] The same for the Stribeck effect, saturation and load dependence of a joint (2 per parameter: Akaike, IEEE
+    # Trans. Autom. Control 19:716, 1974).
     effects_evidence: float = 2.0
-    first_steps: int = 60  # at most, before noise and prior are found
-    first_rounds: int = 12  # at most, while noise falls to that of least squares
-    # [1] of what is missed (a low_cost_robot from placeholders: M(q) 0.44 -> 0.005)
+    # [1] Largest number of steps before noise and prior are estimated.
+    first_steps: int = 60
+    # [1] Largest number of iterations in which the noise is lowered to that of least squares.
+    first_rounds: int = 12
+    # [1] Noise of these iterations, as a fraction of the torque residual (a low_cost_robot with placeholder
+    # inertials: error of M(q) 0.44 -> 0.005).
     first_noise: float = 0.03
-    last_rounds: int = 2  # where all but the last digits are fitted, and of least squares
-    longer: int = 4  # times as many rounds at most, while some joint's noise falls
-    noise_settled: float = 0.98  # [1] noise by that of the round before: what falls by less is settled
-    steps: int = 5  # at most in a round
-    gain: float = 1e-4  # [1] of the cost: a step that gains less ends a round
-    turns: int = 3  # of rigid bodies and what stands beside them
-    subset: int = 2**10  # samples, evenly spread, that come near; all of them finish
-    windows: int = 2**12  # at most, of 5 samples, that say how far joints move
-    measured_windows: int = 2**8  # at most, of validation, that the model is measured on after the fit
-    residual_samples: int = 2**14  # that what stands beside rigid bodies is selected on
-    seen: float = 1e-10  # [1] of the largest curvature: directions with less are not seen in the samples
-    # [1] of it: noise-free samples are fitted to four digits of their torque's range
+    # [1] Outer iterations of a final fit, and of unconstrained least squares.
+    last_rounds: int = 2
+    # [1] Factor on the number of outer iterations while the noise of a joint decreases.
+    longer: int = 4
+    # [1] Noise divided by the noise of the previous iteration, above which the noise has converged.
+    noise_settled: float = 0.98
+    # [1] Largest number of steps in an outer iteration.
+    steps: int = 5
+    # [1] Relative decrease of the cost below which an outer iteration ends.
+    gain: float = 1e-4
+    # [1] Alternations of rigid bodies and residual terms.
+    turns: int = 3
+    # [1] Evenly spread samples of the first outer iterations; the last ones use all samples.
+    subset: int = 2**10
+    # [1] Largest number of windows of 5 samples from which the scales of the motion are computed.
+    windows: int = 2**12
+    # [1] Largest number of validation windows on which the fitted model is measured.
+    measured_windows: int = 2**8
+    # [1] Samples for the selection of residual terms.
+    residual_samples: int = 2**14
+    # [1] Directions with less than this fraction of the largest curvature are not determined by the samples.
+    seen: float = 1e-10
+    # [1] Smallest noise, as a fraction of a torque's range: noise-free samples are fitted to four digits.
     least_noise: float = 1e-4
-    least_left: float = 0.1  # [1] of independent errors, however many weights a torque determines
-    # [1] of the missed squares, by a drive that adds torque with velocity
+    # [1] Smallest fraction of independent errors that remains, however many parameters are determined.
+    least_left: float = 0.1
+    # [1] Fraction of the squared residual that friction compensation by a drive (torque that increases with velocity)
+    # must explain.
     compensation_explained: float = 0.1
-    compensation_deviations: float = 4.0  # standard deviations that such a slope has to be away from zero
-    # [1] of the torque's deviation: delays of milliseconds look alike, but smaller
+    # [1] Standard deviations by which the coefficient of friction compensation must differ from zero.
+    compensation_deviations: float = 4.0
+    # [1] Smallest standard deviation of friction compensation, as a fraction of that of the torque: delays of
+    # milliseconds have a similar but smaller effect.
     compensation_visible: float = 0.05
-    block: int = 2**13  # samples at a time: of seven joints some 100 MB with their derivatives
-    regressor_bytes: float = 4e8  # [B] of regressors: 70,000 samples of six joints; of more, every so many
-    in_memory: int = 2**18  # samples of logs larger than memory: 140 MB of six joints
-    body_step: float = 0.3  # [1] of the way to the border of the possible bodies, at most in a step
-    # by what is adapted, about the run. Load: known to a factor of twenty in mass (10 in place of 3 let half a second
-    # of motion err by 27 times the variance of the torque, UR10e). Friction: warmth changes that of all joints by tens
-    # of per cent, of a joint by itself less (Bittencourt and Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012).
-    # Units of one make differ by a few per cent in mass, too
+    # [1] Samples of one block: some 100 MB for seven joints with their derivatives.
+    block: int = 2**13
+    # [B] Largest size of the regressors: 70,000 samples of six joints; of more samples a subset is used.
+    regressor_bytes: float = 4e8
+    # [1] Largest step of a body, as a fraction of the distance to physically inconsistent parameters.
+    body_step: float = 0.3
+    # [1] Priors about the run that is adapted, by what is adapted. load: mass known to a factor of twenty (with 10 in
+    # place of 3 half a second of motion has an error of 27 times the variance of the torque, UR10e). friction: warmth
+    # changes the friction of all joints by tens of per cent, of a single joint less (Bittencourt and Gunnarsson, J.
+    # Dyn. Sys. Meas. Control 134:051013, 2012). unit: units of one make also differ by a few per cent in mass.
     priors: Mapping[Adaptation, GaussianPrior] = field(
         default_factory=lambda: {
             "load": GaussianPrior(bodies=3.0),
@@ -77,28 +104,40 @@ class TorqueTuning:
 
 @dataclass(frozen=True)
 class ResidualTuning:
-    """Selection of what stands beside rigid bodies (`fitting.torque.selection`)."""
+    """Selection of residual terms (`fitting.torque.selection`)."""
 
-    folds: int = 10  # blocks of samples that are held out in turn
-    gap: float = 5.0  # [1] of the samples that err alike, 0.3 s: left out between fitted and held-out samples
-    # of a block's mean gain: 1 % of luck, by Student's t of nine degrees of freedom
+    # [1] Contiguous blocks of samples, each held out once.
+    folds: int = 10
+    # [1] Correlation lengths that are left out between fitted and held-out samples: 0.5 s with
+    # `TorqueTuning.lasting_errors`.
+    gap: float = 5.0
+    # [1] Standard errors that the mean error reduction over the blocks must exceed: p = 0.01 of Student's t with nine
+    # degrees of freedom.
     standard_errors: float = 2.82
-    least_gain: float = 1e-3  # [1] of the squares that are missed: what explains less is not worth a function
-    # [1] of what the best function so far leaves: a later one has to leave less than that
+    # [1] Smallest error reduction of a residual term.
+    least_gain: float = 1e-3
+    # [1] A later term is preferred to the best one so far only if its residual is below this fraction of the residual
+    # of the best one.
     clearly_less: float = 0.9
-    rounds: int = 30  # of the marginal likelihood's fixed point, at most
-    converged: float = 1e-3  # [1] relative change of the noise
-    network_samples: int = 2**12  # that networks are fitted to
-    network_first_look: int = 20  # evaluations of its loss: a network that then explains nothing is left out
-    network_evaluations: int = 100  # of its loss
+    # [1] Largest number of fixed-point iterations of the marginal likelihood.
+    rounds: int = 30
+    # [1] Relative change of the noise at which these iterations end.
+    converged: float = 1e-3
+    # [1] Samples to which networks are fitted.
+    network_samples: int = 2**12
+    # [1] Evaluations of the loss after which a network without error reduction is discarded.
+    network_first_look: int = 20
+    # [1] Evaluations of the loss of a network.
+    network_evaluations: int = 100
 
 
 @dataclass(frozen=True)
 class TorqueReportTuning:
-    """When a fit to torques warns (`fitting.torque.report`)."""
+    """Warnings of a torque fit (`fitting.torque.report`)."""
 
-    # [1] relative standard deviation from which on logs do not determine an inertia
+    # [1] Relative standard deviation above which logs do not determine an inertia.
     undetermined: float = 0.5
-    # [1] torque missed, by what accelerates a joint: beyond, motion is hardly predicted
+    # [1] Torque residual divided by the inertial torque of a joint, above which the predicted motion is unreliable.
     weak_acceleration: float = 2.0
-    positions: int = 50  # at which inertias are looked at
+    # [1] Positions at which inertias are evaluated.
+    positions: int = 50

@@ -16,7 +16,7 @@ from spelgen.runtime.rigid_body import body_factor
 from spelgen.settings.fits import Adaptation
 
 if TYPE_CHECKING:
-    from spelgen.emission.loading import EmittedModel
+    from spelgen.emission.assemble import ArmModel
 
 RIGID = (
     "bodies", "friction_compensation", "gains", "armature", "offset", "sizes", "effects", "velocities",
@@ -33,7 +33,7 @@ NONE = -30.0  # of a size that is none, the logarithm
 class RigidWeights:
     """The weights of bodies, drives and friction laws of a model, by name, and what they stand for."""
 
-    def __init__(self, model: EmittedModel) -> None:
+    def __init__(self, model: ArmModel) -> None:
         tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         self.kinds: dict[str, str] = {}
         self.tensors: dict[str, torch.Tensor] = {}  # parameters, and buffers that a fit may set
@@ -83,14 +83,14 @@ class RigidWeights:
         return free
 
 
-def joint_torque(model: EmittedModel, samples: Block) -> torch.Tensor:
+def joint_torque(model: ArmModel, samples: Block) -> torch.Tensor:
     """Return the measured torque (T, n), as the joints feel it."""
     with torch.no_grad():
         torque: torch.Tensor = samples.tau @ model.input_matrix(samples.q[:1])[0].mT
     return torque
 
 
-def bound_friction(model: EmittedModel, samples: Block) -> None:
+def bound_friction(model: ArmModel, samples: Block) -> None:
     """Let no usual friction of the model be larger than the deviation of its drive's torque.
 
     It is guessed from efforts, which many URDFs have as placeholders: offsets in its units would pass for weights.

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
-from spelgen.errors import Diagnostic, LogError
+from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import Measured, Validation
 from spelgen.fitting.objective import FitRequest, PreparedLogs, Status, TorqueLogObjective
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
 from spelgen.fitting.rollout import momentum_loss
 from spelgen.fitting.run_record import Content
-from spelgen.fitting.streaming import LargeLogs
 from spelgen.fitting.tuning import WindowTuning
 from spelgen.logs.windows import Windows
 from spelgen.settings.fits import DEFAULTS, Solver, WindowConfig
@@ -49,12 +48,6 @@ class MomentumObjective(TorqueLogObjective):
 
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
-        if isinstance(self.request.logs, LargeLogs):
-            raise LogError(
-                "logs larger than memory",
-                expected="fewer logs, for example every tenth file",
-                do="or fit torques, which read them in chunks: the objective torque",
-            )
         self.data = self._cut_windows(self.config.window, self.config.stride)
         self.config = self.config.resolved(len(self.data.training))
         # towards the URDF as the model has it before any fit, in a resumed run too

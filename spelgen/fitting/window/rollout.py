@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
-from spelgen.dynamics.protocol import has_rigid_bodies
 from spelgen.dynamics.residuals import idle_residuals
 from spelgen.errors import Diagnostic, RunError
 from spelgen.fitting.optimizers import WindowOptimizer
@@ -20,6 +19,7 @@ from spelgen.fitting.tuning import LoopTuning
 from spelgen.fitting.window.momentum import MomentumObjective
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.windows import Windows
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import Rollout, TorqueFit
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class RolloutObjective(MomentumObjective):
 
     def begin(self) -> list[Diagnostic]:
         """Fit torques, and measure the model then."""
-        if self.config.torque_first and has_rigid_bodies(self.model):
+        if self.config.torque_first and isinstance(self.model, RigidBodyDynamics):
             samples = torque_samples(self.model, self.data)
             if samples is not None:
                 self.notes += fit_torques(self.model, samples, TorqueFit())

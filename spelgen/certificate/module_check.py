@@ -1,0 +1,47 @@
+"""Whether a module is up to date with its URDF: the function ``check``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from spelgen.certificate.verification import Verification
+from spelgen.certificate.verify import verify
+from spelgen.emission.build import arm_of_spec, derive_spec, find_urdf
+from spelgen.emission.loading import parse_spec, read_source
+from spelgen.emission.text import module_text
+from spelgen.structure.structure import derive
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """Whether a module is up to date with its URDF; ``reasons`` state the differences."""
+
+    urdf: Path
+    fresh: bool
+    reasons: tuple[str, ...]
+    proof: Verification
+
+
+def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
+    """Derive the module at ``module`` again with its own options, compare it, and verify its structure numerically.
+
+    Without ``urdf``, the URDF is searched by its name in the folder of the module, the current folder and
+    ``robots/``. Raises ModuleError if there is none, or if the file is no module.
+    """
+    module = Path(module)
+    text = read_source(module)
+    stated = parse_spec(text, module)
+    path = Path(urdf) if urdf is not None else find_urdf(module, stated.urdf)
+    arm = arm_of_spec(stated, path)
+    spec = replace(derive_spec(arm, stated.options), urdf=stated.urdf)
+    reasons = []
+    if spec.urdf_sha256 != stated.urdf_sha256:
+        reasons.append(f"{path} has changed since the module was built")
+    if spec.sha256 != stated.sha256:
+        reasons.append("the derived model differs from the one in the module")
+    if text not in (module_text(spec, standalone=is_standalone) for is_standalone in (False, True)):
+        reasons.append("the text of the module differs from that of `spelgen build`")
+    proof = verify(arm.robot, arm.arm, derive(arm.arm, stated.options.assume))
+    reasons += [str(difference) for difference in proof.differences]
+    return CheckResult(path, not reasons, tuple(reasons), proof)

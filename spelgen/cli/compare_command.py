@@ -1,0 +1,112 @@
+"""The command `compare`: train presets on the same logs of one arm or of many, and rank them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from spelgen.cli import options
+from spelgen.cli.console import FAILED, note, progress_bar, say
+from spelgen.cli.options import Address, Data, MappingFile
+from spelgen.cli.train_settings import UsageError
+
+if TYPE_CHECKING:
+    from spelgen.comparison.arms import Comparison
+
+
+def compare(
+    target: Annotated[
+        Path,
+        typer.Argument(metavar="TARGET", help="URDF of an arm, or YAML file that lists arms and their logs."),
+    ],
+    data: Data = None,
+    mapping: MappingFile = None,
+    output: Annotated[
+        Path | None, options.output_option("FOLDER", "Output folder; default: comparisons/TARGET.")
+    ] = None,
+    presets: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A,B,C",
+            help="Presets or YAML files of designs; default: closed-form,hybrid on logs, else all presets.",
+        ),
+    ] = None,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Number of runs of each preset.")] = None,
+    splits: Annotated[
+        int | None, typer.Option(min=1, help="Folds of a cross-validation over trajectories; default: 1.")
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Training steps of each run on a simulated arm.")
+    ] = None,
+    ablation: Annotated[
+        bool,
+        typer.Option(
+            "--ablation", help="Compare designs from phnode to hybrid that differ by one change each."
+        ),
+    ] = False,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Number of parallel runs, one core each, by Ray; default: all cores if Ray is installed.",
+        ),
+    ] = None,
+    address: Address = None,
+) -> None:
+    """Train presets on the same logs and rank them.
+
+    An arm without logs is simulated by the protocol of its settings. The same command resumes an interrupted
+    comparison, and runs only what has changed.
+    """
+    from spelgen.comparison.arms import ablation_designs
+    from spelgen.comparison.study import prepare_study, run_study
+    from spelgen.comparison.tables import arm_sections
+    from spelgen.fitting.process import locked, termination_as_interrupt
+    from spelgen.render.comparison_page import write_comparison
+    from spelgen.tasks import default_jobs, workers
+
+    if ablation and presets is not None:
+        raise UsageError("--ablation: names the presets itself, omit --presets")
+    names = options.names(presets)
+    changes = {
+        "presets": tuple(ablation_designs()) if ablation else names and tuple(names),
+        "seeds": seeds, "splits": splits, "steps": steps,
+    }  # fmt: skip
+    given = {name: value for name, value in changes.items() if value is not None}
+    comparison = _comparison(target, data, mapping).model_copy(update=given)
+    name = target.stem + ("-logs" if data else "") + ("-ablation" if ablation else "")
+    # workers have working folders of their own, so paths must be absolute
+    folder = (output or Path("comparisons") / name).absolute()
+    parallel = jobs or default_jobs()
+    # two comparisons in one folder would overwrite the runs of one another
+    with locked(folder), termination_as_interrupt():
+        with progress_bar("simulating") as progress:
+            study = prepare_study(comparison, folder, progress)
+        note(study.announcement(parallel))
+        # the inputs exist before workers start, and each worker reads the same files
+        with workers(parallel, address) as run_tasks:
+            study = run_study(study, run_tasks, note)
+        sections = arm_sections(study)
+        for section in sections:
+            say(f"{section.name}: {section.sentence}\n")
+            for table in section.tables:
+                say(f"{table.text()}\n")
+        say(f"wrote {write_comparison(study, sections)}")
+    # the page is written in any case, with the runs that failed
+    if study.failures:
+        raise typer.Exit(FAILED)
+
+
+def _comparison(target: Path, data: list[Path] | None, mapping: Path | None) -> Comparison:
+    """Return the comparison of a URDF with these logs, or that of a YAML file."""
+    from spelgen.comparison.arms import YAML, ComparedArm, Comparison, load_comparison
+
+    if target.suffix not in YAML:
+        paths = tuple(path.absolute() for path in data or ())
+        arm = ComparedArm(urdf=target.absolute(), data=paths, mapping=mapping and mapping.absolute())
+        return Comparison.model_construct(arms={target.stem: arm})
+    if data or mapping:
+        raise UsageError("--data and --mapping: belong to a URDF; in a YAML file each arm has its own")
+    return load_comparison(target.absolute())

@@ -1,0 +1,202 @@
+"""Figures of a model trained on the paper's simulated protocol: losses, sizes, and the error of M.
+
+Source: Wang, Chen and Ding, Sci Rep 15:33179 (2025).
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from spelgen.arm.configured_arm import load_arm
+from spelgen.baselines.predictor import Predictor, of_dynamics
+from spelgen.comparison.tuning import ComparisonTuning
+from spelgen.dynamics.parameters import parameter_count
+from spelgen.dynamics.pinocchio_arm import arm_dynamics
+from spelgen.evaluation.drawn_motions import PredictedMotion, predicted_motion
+from spelgen.evaluation.invariants import Invariants, invariants
+from spelgen.evaluation.plain import array, finite, listed
+from spelgen.fitting.rollout import loss_scales, position_difference, roll_out, rollout_loss
+from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.windows import Windows, cut_windows
+from spelgen.settings.fits import DEFAULTS, Rollout
+from spelgen.structure.nominal import working_range
+
+if TYPE_CHECKING:
+    from spelgen.emission.assemble import ArmModel
+    from spelgen.fitting.fitted import Fit
+
+TUNING = ComparisonTuning()
+
+
+@dataclass(frozen=True)
+class PredictionLoss:
+    """Squared errors of predicted windows, summed over joints, mean over windows and samples; rad, m, s.
+
+    loss: position + velocity (eq. 8 of the paper). position: squared geodesic distance or distance. velocity: squared
+    velocity error. None: not finite.
+    """
+
+    loss: float | None
+    position: float | None
+    velocity: float | None
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of the networks. outputs: of M, D, G and V. inputs: of M. parameters: all trained numbers of the model."""
+
+    outputs: tuple[int, ...]
+    inputs: int
+    parameters: int
+
+
+@dataclass(frozen=True)
+class SimulatedFigures:
+    """Figures of a model of a simulated arm.
+
+    train, test: losses of windows as long as in training. prediction: loss over 1 s of the test motions. mass_error:
+    see `mass_error`. step_seconds: time of a training step, see `step_seconds` [s]. example: a test motion and its
+    prediction; None if no test motion lasts 1 s. mass: (T, n, n), learned M at the measured positions of the example.
+    """
+
+    sizes: Sizes
+    train: PredictionLoss
+    test: PredictionLoss
+    prediction: PredictionLoss
+    invariants: Invariants
+    mass_error: float
+    step_seconds: float
+    mass: list[list[list[float]]]
+    example: PredictedMotion | None
+
+
+def simulated_figures(
+    fit: Fit, training: Sequence[Trajectory], testing: Sequence[Trajectory], truth: Path
+) -> SimulatedFigures:
+    """Measure a fit on the simulated logs of the arm whose true parameters are in the URDF `truth` and its settings."""
+    model, substeps = fit.model, int(fit.substeps)
+    decimation = fit.preprocessing.decimation or 1
+    config = fit.config if isinstance(fit.config, Rollout) else Rollout()
+    steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))
+    far = spread_windows(testing, steps + 1, decimation)
+    # smallest eigenvalue of M: where the arm can be; error of M: where the arm has been
+    low, high = torch.tensor(list(map(working_range, load_arm(truth).arm.coordinates)), dtype=torch.float64).T
+    visited = far.q[:, 0]
+    example = predict_example(of_dynamics("", model, far), testing, steps, decimation)
+    mass: list[list[list[float]]] = []
+    if example is not None:
+        # at the rounded positions of result.json, so that the page shows M at the positions that are stored
+        mass = model.mass_matrix(torch.from_numpy(array(listed(example.q)))).tolist()
+    return SimulatedFigures(
+        sizes=sizes(model),
+        train=prediction_loss(model, spread_windows(training, config.window, decimation), substeps),
+        test=prediction_loss(model, spread_windows(testing, config.window, decimation), substeps),
+        prediction=prediction_loss(model, far, substeps),
+        invariants=invariants(model, far, low, high),
+        mass_error=mass_error(model.mass_matrix(visited), true_mass(truth, visited)),
+        step_seconds=step_seconds(model, training, config, decimation),
+        mass=mass,
+        example=example,
+    )
+
+
+def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, decimation: int) -> float:
+    """Return the median time of the loss of a batch and its gradient, without the optimizer [s]."""
+    windows = spread_windows(logs, config.window, decimation)[: config.batch or DEFAULTS.batch]
+    scales = loss_scales(windows, model.joint_types)
+    model.requires_grad_(True)
+    durations = []
+    for _ in range(TUNING.timed_steps):
+        start = time.perf_counter()
+        torch.autograd.backward(rollout_loss(model, windows, scales, 1))
+        durations.append(time.perf_counter() - start)
+    model.zero_grad()
+    return statistics.median(durations)
+
+
+def spread_windows(logs: Sequence[Trajectory], samples: int, decimation: int) -> Windows:
+    """Return about `TUNING.windows` windows at most, evenly spread, that start a multiple of `decimation` apart."""
+    starts = sum(max(0, len(log) - (samples - 1) * decimation) for log in logs)
+    stride = -(-max(1, -(-starts // TUNING.windows)) // decimation) * decimation
+    return cut_windows(logs, samples, stride, decimation, measured=False)
+
+
+def prediction_loss(model: ArmModel, windows: Windows, substeps: int) -> PredictionLoss:
+    """Return the loss of windows that are predicted from their first sample, with `substeps` steps per sample."""
+    with torch.no_grad():
+        q, qd = roll_out(model, windows, substeps)
+        difference = position_difference(q, windows.q[:, 1:], model.joint_types)
+        position = difference.square().sum(dim=-1).mean()
+        velocity = (qd - windows.qd[:, 1:]).square().sum(dim=-1).mean()
+    return PredictionLoss(*finite(torch.stack([position + velocity, position, velocity])))
+
+
+def sizes(model: ArmModel) -> Sizes:
+    """Return the number of outputs and inputs of the networks of M, D, G and V; residual networks included."""
+    outputs, inputs = [], 0
+    for quantity in ("mass", "friction", "input_network", "potential"):
+        count = 0
+        for name, module in model.named_modules():
+            masks = [x for key, x in module.named_buffers(recurse=False) if key.startswith("mask")]
+            if masks and quantity in name.split("."):
+                # the potential of an arm without gravity has one output that depends on no joint
+                count = int(masks[-1].flatten(1).any(dim=1).sum())
+                if quantity == "mass":
+                    inputs = int(masks[0].flatten(1).any(dim=0).sum())
+        outputs.append(count)
+    # friction without a network is one function of each joint
+    outputs[1] = outputs[1] or model.n
+    return Sizes(tuple(outputs), inputs, parameter_count(model))
+
+
+def true_mass(urdf: Path, q: torch.Tensor) -> torch.Tensor:
+    """Return M of a URDF and its settings by Pinocchio, rotor inertias included.
+
+    Args:
+        urdf: Path of the URDF; its settings are beside it.
+        q: (T, n) positions [rad, m].
+
+    Returns:
+        (T, n, n) mass matrices [kg m^2, kg m, kg].
+    """
+    loaded = load_arm(urdf)
+    mass: torch.Tensor = arm_dynamics(loaded.arm, loaded.settings).mass_matrix(q)
+    return mass
+
+
+def mass_error(learned: torch.Tensor, true: torch.Tensor) -> float:
+    """Return the relative error of M: root mean square of the entries of L^-1 (learned - true) L^-T.
+
+    L L^T is the mean of the true M, so the error of every entry is relative to the inertia of its own two joints and
+    has no unit.
+
+    Args:
+        learned: (T, n, n) mass matrices of the model.
+        true: (T, n, n) true mass matrices at the same positions.
+    """
+    factor = torch.linalg.cholesky(true.mean(dim=0))
+    half = torch.linalg.solve_triangular(factor, learned - true, upper=False)
+    relative = torch.linalg.solve_triangular(factor, half.mT, upper=False)
+    return float(relative.square().mean().sqrt())
+
+
+def predict_example(
+    predictor: Predictor, logs: Sequence[Trajectory], steps: int, decimation: int
+) -> PredictedMotion | None:
+    """Predict `steps` steps of `decimation` samples in the middle of the first log that is long enough."""
+    span = steps * decimation
+    for log in logs:
+        if len(log) > span:
+            # a multiple of the decimation: the controller holds its torque for `decimation` samples
+            start = (len(log) - 1 - span) // (2 * decimation) * decimation
+            piece = log[start : start + span + 1]
+            window = cut_windows([piece], steps + 1, decimation=decimation, measured=False)
+            return predicted_motion(log.name, window, predictor.solver(window))
+    return None

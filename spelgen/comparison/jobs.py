@@ -1,0 +1,214 @@
+"""One run of a comparison: build a preset for an arm, train it, measure it on the test logs."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import torch
+from pydantic import TypeAdapter, ValidationError
+
+from spelgen.baselines.names import MODEL, observed
+from spelgen.comparison.arms import ablation_designs
+from spelgen.comparison.figures import SimulatedFigures, simulated_figures
+from spelgen.comparison.inputs import ArmInputs
+from spelgen.design import Design, load_design
+from spelgen.emission.build import build
+from spelgen.errors import RunError
+from spelgen.evaluation.evaluate import evaluate
+from spelgen.evaluation.plain import record
+from spelgen.files import read_json, write_json
+from spelgen.fitting.fit import RunOptions, fit
+from spelgen.fitting.objectives import FitOptions
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.window.momentum import TUNING as WINDOWS
+from spelgen.labels import thousandths
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
+from spelgen.settings.comparison import ComparisonSettings
+from spelgen.settings.fits import Rollout, fit_config
+from spelgen.settings.training import TrainingSettings
+from spelgen.settings.values import Group
+from spelgen.version import __version__
+
+if TYPE_CHECKING:
+    from spelgen.emission.assemble import ArmModel
+    from spelgen.evaluation.results import Results
+    from spelgen.settings.fits import FitConfig
+
+Errors = dict[str, dict[str, float | None]]
+"""By measure, the one that ranks models first, and by predictor; None: not finite."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """Figures of a finished run.
+
+    key: digest of all that the run depends on. seconds: time of training [s]. parameters: number of trained values
+    that the model uses. simulated: further figures of an arm whose truth is known.
+    """
+
+    key: str
+    arm: str
+    preset: str
+    seed: int
+    split: int
+    seconds: float
+    parameters: int
+    errors: Errors
+    simulated: SimulatedFigures | None
+
+    @classmethod
+    def read(cls, path: Path) -> RunResult:
+        """Read result.json. Raises RunError."""
+        try:
+            return TypeAdapter(cls).validate_python(read_json(path, RunError))
+        except ValidationError as error:
+            raise RunError("not the values of a result", file=path, do="remove it") from error
+
+
+class Job(Group):
+    """A run of a comparison.
+
+    design: a preset, an ablation design, or a YAML file. protocol: settings of fits to simulated logs.
+    """
+
+    arm: str
+    inputs: ArmInputs
+    design: str
+    seed: int
+    split: int
+    splits: int
+    width: int
+    depth: int
+    training: TrainingSettings
+    protocol: ComparisonSettings
+    folder: Path
+
+    @property
+    def preset(self) -> str:
+        """Return the name of the design without folder and suffix."""
+        return Path(self.design).stem
+
+    @property
+    def name(self) -> str:
+        """Return the name of the run in messages."""
+        name = f"{self.arm}, {self.preset}, seed {self.seed}"
+        return f"{name}, split {self.split}" if self.splits > 1 else name
+
+    @property
+    def key(self) -> str:
+        """Return a digest of all that the result depends on; the places of files are not part of it."""
+        protocol = self.protocol.model_dump_json(exclude={"seeds", "published"})
+        options = self.model_dump_json(exclude={"design", "inputs", "protocol", "folder"})
+        sources = (__version__, load_design(self.named_design), self.inputs.digest, protocol, options)
+        return hashlib.sha256(repr(sources).encode()).hexdigest()[:16]
+
+    @property
+    def named_design(self) -> str | Design:
+        """Return the design as `build` takes it."""
+        return ablation_designs().get(self.design, self.design)
+
+    def build(self) -> ArmModel:
+        """Return the untrained model."""
+        arm = self.inputs.load()
+        return build(arm, self.named_design, width=self.width, depth=self.depth, seed=self.seed)
+
+    def result(self) -> RunResult | None:
+        """Return the result of exactly this run; None if it is not finished. Raises RunError."""
+        path = self.folder / "result.json"
+        if not path.is_file():
+            return None
+        result = RunResult.read(path)
+        return result if result.key == self.key else None
+
+    def config(self, model: ArmModel) -> FitConfig | FitOptions:
+        """Return the configuration of the fit, or its options."""
+        if self.inputs.truth is not None:
+            return self.equal_steps()
+        objective = self.training.objective
+        # a momentum fit is for networks: the other presets of the comparison have their default
+        if objective == "momentum" and isinstance(model, RigidBodyDynamics):
+            objective = None
+        return FitOptions(objective, {}, self.training.options)
+
+    def equal_steps(self) -> Rollout:
+        """Return the same number of steps for all models, without the regularizer towards the URDF."""
+        epochs, decay = -(-self.protocol.steps // WINDOWS.epoch_steps), self.protocol.weight_decay
+        options = self.training.options | {"urdf_weight": 0.0, "epochs": epochs, "patience": epochs}
+        options |= {"momentum_steps": self.protocol.momentum_steps}
+        if decay is not None:
+            options["weight_decay"] = decay
+        return cast("Rollout", fit_config("rollout", rigid_bodies=False, defaults=options))
+
+    def preprocessing(self) -> Preprocessing:
+        """Return the preprocessing of the logs; simulated states have no noise and are not filtered."""
+        unfiltered = {} if self.inputs.truth is None else {"cutoff": 0.0}
+        return Preprocessing(**(self.training.preprocessing | unfiltered))
+
+
+def run_job(job: Job) -> RunResult:
+    """Train and measure, or resume from the checkpoint of an interrupted run; write result.json.
+
+    Raises what `fit` and `evaluate` raise, and KeyboardInterrupt if the process is asked to end.
+    """
+    finished = job.result()
+    if finished is not None:
+        return finished
+    # one worker per core: more threads would wait for one another
+    torch.set_num_threads(1)
+    run = RunFolder(job.folder)
+    resume = _own_checkpoint(job, run)
+    training, testing = job.inputs.split(job.split, job.splits)
+    model, start = job.build(), time.monotonic()
+    trained = fit(
+        model, training, job.config(model), preprocessing=job.preprocessing(),
+        validation=job.training.validation_fraction, seed=job.seed, arm=job.inputs.urdf, folder=job.folder,
+        options=RunOptions(mapping=job.inputs.log_mapping(), resume=resume, force=not resume),
+    )  # fmt: skip
+    if trained.status == "interrupted":
+        raise KeyboardInterrupt
+    seconds = time.monotonic() - start
+    model.requires_grad_(False).eval()
+    simulated = None
+    if job.inputs.truth is None:
+        results = evaluate(trained, testing)
+        write_json(run.evaluation, results.to_dict())
+        errors = _errors(results)
+    else:
+        simulated = simulated_figures(trained, training, testing, job.inputs.truth)
+        errors = {"prediction loss, 1 s": {MODEL: simulated.prediction.loss}}
+    result = RunResult(
+        key=job.key, arm=job.arm, preset=job.preset, seed=job.seed, split=job.split, seconds=seconds,
+        parameters=trained.parameters, errors=errors, simulated=simulated,
+    )  # fmt: skip
+    write_json(job.folder / "result.json", record(result))
+    return result
+
+
+def _own_checkpoint(job: Job, run: RunFolder) -> bool:
+    """Return whether the folder has a checkpoint of exactly this run; that of another run is discarded."""
+    owner = job.folder / "job.json"
+    if owner.is_file() and read_json(owner, RunError) == {"key": job.key}:
+        return run.config.exists()
+    run.config.unlink(missing_ok=True)  # without config.json the folder is not a run
+    write_json(owner, {"key": job.key})
+    return False
+
+
+def _errors(results: Results) -> Errors:
+    """Return the errors of all predictors, by measure: replays, horizons from the longest on, torque."""
+    errors: Errors = {}
+    for replay in results.replays:
+        measure = f"position RMS, {replay.name} [{thousandths(results.joint_types)}]"
+        errors[measure] = {name: 1000 * error.mean for name, error in replay.errors.items()}
+    for horizon in reversed(results.horizons):
+        open_loop = {name: error for name, error in horizon.errors.items() if not name.endswith(observed(""))}
+        measure = f"relative RMS, {horizon.name}"
+        errors[measure] = {name: error.mean_relative_rms for name, error in open_loop.items()}
+    if results.torque:
+        errors["torque nMSE"] = {name: error.mean_nmse for name, error in results.torque.items()}
+    return errors

@@ -1,0 +1,203 @@
+"""Tables and sentences of a comparison: medians over seeds and splits, beside published figures."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from spelgen.baselines.names import MODEL
+from spelgen.comparison.figures import SimulatedFigures
+from spelgen.comparison.jobs import RunResult
+from spelgen.comparison.study import Study
+from spelgen.evaluation.tables import Row, Table, table
+from spelgen.labels import counted, listed
+from spelgen.listing import number
+from spelgen.settings.comparison import PublishedFigures
+
+BASELINE = "phnode"
+Runs = Mapping[str, Sequence[RunResult]]
+"""Runs of all seeds and splits of an arm, by preset."""
+Numbers = dict[str, float | None]
+Figure = Callable[[SimulatedFigures], float | None]
+
+LOSSES: dict[str, Figure] = {
+    "prediction loss, 1 s": lambda run: run.prediction.loss,
+    "velocity, 1 s": lambda run: run.prediction.velocity,
+    "position, 1 s": lambda run: run.prediction.position,
+    "M, relative error": lambda run: run.mass_error,
+    "training loss": lambda run: run.train.loss,
+    "test loss": lambda run: run.test.loss,
+}
+SIZES: dict[str, Figure] = {
+    "outputs of M": lambda run: run.sizes.outputs[0],
+    "outputs of D": lambda run: run.sizes.outputs[1],
+    "outputs of G": lambda run: run.sizes.outputs[2],
+    "outputs of V": lambda run: run.sizes.outputs[3],
+    "inputs of M": lambda run: run.sizes.inputs,
+    "parameters": lambda run: run.sizes.parameters,
+    "training step [ms]": lambda run: 1e3 * run.step_seconds,
+    "smallest eigenvalue of M / mean": lambda run: run.invariants.least_eigenvalue,
+}
+RATIO = {"prediction loss, 1 s": "prediction loss", "velocity, 1 s": "velocity"}
+"""Rows that are followed by the baseline's figure divided by the figure of each model."""
+
+
+@dataclass(frozen=True)
+class ArmSection:
+    """The results of one arm: a sentence, tables of which the first shows the result, and the results themselves."""
+
+    name: str
+    sentence: str
+    tables: tuple[Table, ...]
+    results: tuple[RunResult, ...]
+
+
+def arm_sections(study: Study) -> list[ArmSection]:
+    """Return a section for each arm with finished runs."""
+    sections = []
+    for name, results in study.arms.items():
+        published = next(job.protocol.published for job in study.jobs if job.arm == name)
+        tables = tuple(arm_tables(results, published))
+        sections.append(ArmSection(name, arm_sentence(results), tables, tuple(results)))
+    return sections
+
+
+def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFigures]) -> list[Table]:
+    """Return the tables of an arm, the one with the result first. published: figures of a publication, by preset."""
+    runs = _by_preset(results)
+    figures = {
+        name: [run.simulated for run in of_preset if run.simulated] for name, of_preset in runs.items()
+    }
+    if not all(figures.values()):
+        return [_ranking(runs)]
+    losses: dict[str, Numbers] = {}
+    for result in sorted(results, key=lambda result: (result.seed, result.split)):
+        split = f", split {result.split}" if any(x.split for x in results) else ""
+        loss = next(iter(result.errors.values()))[MODEL]
+        losses.setdefault(f"seed {result.seed}{split}", {})[result.preset] = loss
+    sizes = {label: _summary(figures, figure, min) for label, figure in SIZES.items()}
+    rise = _summary(figures, lambda run: run.invariants.energy_rise, max)
+    rows = [
+        Row(label, values, label in ("parameters", "training step [ms]")) for label, values in sizes.items()
+    ]
+    rows.append(Row("rise of energy, no input", rise, ranked=False))
+    title = (
+        "Sizes, time of a training step, and invariants, the worst over seeds; a negative rise is a decrease"
+    )
+    return [
+        _losses(figures, published),
+        Table(title, tuple(rows)),
+        table("Prediction loss over 1 s of every run", losses),
+    ]
+
+
+def arm_sentence(results: Sequence[RunResult]) -> str:
+    """Return one sentence: the best model of an arm, and by which factor its error is smaller than those of others."""
+    runs, measure = _by_preset(results), next(iter(results[0].errors))
+    errors = {name: error for name, error in _medians(runs, measure).items() if error is not None}
+    models = [name for name in errors if name in runs]
+    if not models:
+        return f"No model has a finite {measure}."
+    best = errors[models[0]]
+    # equal to three digits: in effect the same model, as closed-form and hybrid without residual terms
+    equal = [name for name in models if number(errors[name]) == number(best)]
+    sentence = f"{listed(equal)} {'have' if len(equal) > 1 else 'has'} the smallest {measure}: {number(best)}"
+    smaller, larger = [], []
+    for name, error in errors.items():
+        if name not in equal and error < best:
+            smaller.append(f"{name} ({number(error)})")
+        elif name not in equal and best:
+            larger.append(f"{number(error / best)} times smaller than with {name}")
+    if larger:
+        sentence += f", {listed(larger)}"
+    if smaller:
+        sentence += f"; but these baselines have a smaller one: {listed(smaller)}"
+    return f"{sentence}."
+
+
+def comparison_sentence(sections: Sequence[ArmSection]) -> str:
+    """Return one sentence about all arms: the number of arms on which each preset is best."""
+    if not sections:
+        return "No run is finished."
+    if len(sections) == 1:
+        return sections[0].sentence
+    wins: dict[str, int] = {}
+    for section in sections:
+        runs, measure = _by_preset(section.results), next(iter(section.results[0].errors))
+        best = next(name for name in _medians(runs, measure) if name in runs)
+        wins[best] = wins.get(best, 0) + 1
+    best_first = sorted(wins.items(), key=lambda item: -item[1])
+    counts = [f"{name} on {counted(count, 'arm')}" for name, count in best_first]
+    return f"The preset with the smallest error is {listed(counts)}."
+
+
+def _by_preset(results: Sequence[RunResult]) -> dict[str, list[RunResult]]:
+    runs: dict[str, list[RunResult]] = {}
+    for result in results:
+        runs.setdefault(result.preset, []).append(result)
+    return runs
+
+
+def _ranking(runs: Runs) -> Table:
+    """Return the errors of models and baselines on the user's logs, the best one first."""
+    rows = [Row(measure, _medians(runs, measure)) for measure in next(iter(runs.values()))[0].errors]
+    figures: dict[str, Callable[[Sequence[RunResult]], float]] = {
+        "parameters": lambda of_preset: of_preset[0].parameters,
+        "runs": len,
+        "training time [s]": lambda of_preset: statistics.median(run.seconds for run in of_preset),
+    }
+    for label, figure in figures.items():
+        rows.append(Row(label, {name: figure(of_preset) for name, of_preset in runs.items()}, ranked=False))
+    title = "Errors on the test logs, best first; medians over seeds and splits"
+    note = "relative RMS: 0: no error, 1: as if the arm had stood still; columns without parameters are baselines"
+    return Table(title, tuple(rows), note)
+
+
+def _medians(runs: Runs, measure: str) -> Numbers:
+    """Return the median error of each model and baseline, the smallest first; an error that is not finite is last."""
+    values: dict[str, list[float | None]] = {}
+    for preset, of_preset in runs.items():
+        for run in of_preset:
+            for predictor, error in run.errors.get(measure, {}).items():
+                values.setdefault(preset if predictor == MODEL else predictor, []).append(error)
+    medians = {name: _combined(errors, statistics.median) for name, errors in values.items()}
+    return dict(sorted(medians.items(), key=lambda item: math.inf if item[1] is None else item[1]))
+
+
+def _losses(
+    figures: Mapping[str, Sequence[SimulatedFigures]], published: Mapping[str, PublishedFigures]
+) -> Table:
+    rows = []
+    for label, figure in LOSSES.items():
+        medians = _summary(figures, figure, statistics.median)
+        rows.append(Row(label, medians))
+        baseline = medians.get(BASELINE)
+        if baseline is not None and label in RATIO:
+            ratios = {name: baseline / median if median else None for name, median in medians.items()}
+            rows.append(Row(f"{BASELINE}'s {RATIO[label]} / this", ratios, ranked=False))
+    records = {name: published[name].model_dump(exclude_none=True) for name in figures if name in published}
+    for field in PublishedFigures.model_fields:
+        values = {name: record[field] for name, record in records.items() if field in record}
+        if values:
+            rows.append(Row(f"published: {field.replace('_', ' ')}", values, ranked=False))
+    title = (
+        "Squared errors summed over joints [rad, m, s], mean over samples and windows, and the relative error of M; "
+        "median over seeds; below, published figures"
+    )
+    return Table(title, tuple(rows))
+
+
+def _summary(
+    figures: Mapping[str, Sequence[SimulatedFigures]], figure: Figure, combine: Callable[[list[float]], float]
+) -> Numbers:
+    """Return a figure of each preset, combined over its runs."""
+    return {name: _combined(list(map(figure, of_preset)), combine) for name, of_preset in figures.items()}
+
+
+def _combined(values: Sequence[float | None], combine: Callable[[list[float]], float]) -> float | None:
+    """Return the combined value; None if it is not finite."""
+    # infinite and not left out: a model that diverges with one seed of two must not rank by the other
+    combined = combine([math.inf if value is None else value for value in values])
+    return combined if math.isfinite(combined) else None

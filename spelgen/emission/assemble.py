@@ -1,0 +1,116 @@
+"""ModelSpec -> a model in memory, of the classes of ``spelgen.runtime``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from html import escape
+from typing import TYPE_CHECKING, Any, cast
+
+import torch
+from torch import Tensor
+
+from spelgen import runtime
+from spelgen.dynamics.parameters import parameter_count
+from spelgen.dynamics.prepared import PreparedModel
+from spelgen.emission.entry_sums import Sums, entry_sums
+from spelgen.emission.parts import base_class, model_parts
+from spelgen.emission.source import Call, Code
+from spelgen.emission.text import header
+from spelgen.errors import ModuleError
+from spelgen.labels import printable
+from spelgen.runtime.port_hamiltonian import PortHamiltonian
+from spelgen.spec import ModelSpec
+
+if TYPE_CHECKING:
+    from spelgen.dynamics.tip import TipKinematics
+
+
+class ArmModel(PortHamiltonian):
+    """The model of an arm, assembled from its specification; it is one of the runtime's classes as well."""
+
+    spec: ModelSpec
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
+
+    def prepared(
+        self, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
+    ) -> PreparedModel:
+        """Return a copy with constant parameters for many calls; see ``PreparedModel``."""
+        return PreparedModel(self, tip, dtype=dtype)
+
+    def __repr__(self) -> str:
+        sizes = f"{self.n} joints, {parameter_count(self)} parameters"
+        return f"<Model of {printable(self.spec.robot)!r} ({self.spec.options.preset}): {sizes}>"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(header(self.spec))}</pre>"
+
+
+def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
+    """Return the model that ``spec`` describes, with the initial weights of ``seed``.
+
+    Raises ModuleError for a specification of no model, such as a mass that is not positive.
+    """
+    parts = model_parts(spec)
+    names: dict[str, Any] = {"generator": torch.Generator().manual_seed(seed)}
+    names["mass_entries"] = MassEntries(entry_sums(spec))
+    try:
+        for name, rows in parts.rows.items():
+            names[name] = tuple(_value(row, names) for row in rows)
+        arguments = {str(name): _value(item, names) for name, item in parts.model.arguments}
+        model = _model_class(base_class(spec))(**arguments)
+    except (RuntimeError, ValueError, ArithmeticError, LookupError, TypeError) as problem:
+        reason = " ".join(str(problem).split())[:200]
+        raise ModuleError(f"a specification of no model ({reason})", do="build it again") from problem
+    model.spec = spec
+    return model
+
+
+def spec_of(model: object) -> ModelSpec | None:
+    """Return the specification that a model was assembled from; None of another model."""
+    return model.spec if isinstance(model, ArmModel) else None
+
+
+class MassEntries:
+    """M, (..., n, n), as a function of its functions and constants: what ``mass_entries`` of a module computes."""
+
+    def __init__(self, rows: list[list[Sums]]) -> None:
+        self.rows = rows
+
+    def __call__(self, *terms: Tensor) -> Tensor:
+        """Return the symmetric matrix of these functions and constants, (...) each."""
+        return runtime.symmetric(*([_sum(sums, terms) for sums in row] for row in self.rows))
+
+
+def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
+    """Return the linear combination in the order in which a module writes it, so that both round alike."""
+    total: Tensor | float = 0
+    for position, (factor, index) in enumerate(sums):
+        size = terms[index] if abs(factor) == 1 else abs(factor) * terms[index]
+        if position == 0:
+            total = -size if factor < 0 else size
+        else:
+            total = total - size if factor < 0 else total + size
+    return total
+
+
+@cache
+def _model_class(base: str) -> Callable[..., ArmModel]:
+    """Return the class ``Model`` of models whose dynamics are a class of the runtime."""
+    return cast("Callable[..., ArmModel]", type("Model", (ArmModel, vars(runtime)[base]), {}))
+
+
+def _value(item: object, names: dict[str, Any]) -> Any:
+    """Return the value of an argument: calls are made, and names looked up."""
+    if isinstance(item, Code):
+        return names[item.text]
+    if isinstance(item, tuple):
+        return tuple(_value(each, names) for each in item)
+    if not isinstance(item, Call):
+        return item
+    positional = [_value(value, names) for name, value in item.arguments if name is None]
+    keywords = {name: _value(value, names) for name, value in item.arguments if name is not None}
+    return dict(**keywords) if item.callee == "dict" else vars(runtime)[item.callee](*positional, **keywords)

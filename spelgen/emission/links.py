@@ -1,0 +1,116 @@
+"""The links of a model of rigid bodies: geometry of the arm and initial inertial parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from fractions import Fraction
+
+import numpy as np
+
+from spelgen.arm.arm import Arm
+from spelgen.arm.rational import Vector
+from spelgen.spec import LinkSpec, Triple
+from spelgen.structure.pseudo_inertia import parameters_of, pseudo_inertia, reference_factor
+
+# Significant digits of inertial parameters: more than any URDF is accurate to, and few enough that the decimals of a
+# URDF come out as they are written there.
+DIGITS = 12
+# Smallest second moment of mass about the center of mass, relative to the largest: above the error of rounding.
+THIN = 1e-10
+# Mass of a link without mass, relative to the heaviest link.
+LIGHT = 0.01
+
+
+def link_specs(arm: Arm, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[LinkSpec, ...]:
+    """Return the links of ``arm`` with these inertial parameters, the nearest physically consistent ones if necessary.
+
+    Args:
+        arm: the arm.
+        inertias: (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of each body about the origin of its joint's frame, (10,).
+    """
+    heaviest = max(float(ten[0]) for ten in inertias)
+    names = _unique([body.link for body in arm.bodies])
+    specs = []
+    for index, (body, ten) in enumerate(zip(arm.bodies, inertias, strict=True)):
+        mass, center, inertia = _about_center(_consistent(arm, index, ten, heaviest))
+        first, second, third = map(_floats, body.rotation)
+        spec = LinkSpec(
+            name=names[index],
+            parent=body.parent,
+            joint=body.coordinate,
+            joint_type=body.kind,
+            ratio=float(body.multiplier),
+            offset=body.offset,
+            position=_floats(body.translation),
+            rotation=(first, second, third),
+            mass=mass,
+            center_of_mass=center,
+            inertia=inertia,
+        )
+        specs.append(spec)
+    return tuple(specs)
+
+
+def _unique(names: Sequence[str]) -> list[str]:
+    """Return the names, repeated ones with a number."""
+    return [name if name not in names[:k] else f"{name} ({k})" for k, name in enumerate(names)]
+
+
+def _consistent(
+    arm: Arm, index: int, ten: Sequence[Fraction | float], heaviest: float
+) -> Sequence[Fraction | float]:
+    """Return physically consistent inertial parameters, (10,)."""
+    if ten[0] <= 0:
+        ten = _light_ball(_length(arm, index), LIGHT * heaviest)
+    factor, is_consistent = reference_factor(np.array(ten, dtype=float))
+    if is_consistent and _smallest_moment(np.array(ten, dtype=float)) > THIN:
+        return ten
+    pseudo = factor @ factor.T
+    mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
+    moments = pseudo[:3, :3] - mass * np.outer(center, center)
+    # below it, rounding of the digits could make the body inconsistent
+    values, vectors = np.linalg.eigh(moments)
+    pseudo[:3, :3] += (vectors * (np.maximum(values, 2 * THIN * values[-1]) - values)) @ vectors.T
+    return _rounded(parameters_of(pseudo), DIGITS)
+
+
+def _smallest_moment(ten: np.ndarray) -> float:
+    """Return the smallest second moment of mass about the center of mass, relative to the largest."""
+    center = ten[1:4] / ten[0]
+    moments = np.linalg.eigvalsh(pseudo_inertia(ten)[:3, :3] - ten[0] * np.outer(center, center))
+    return float(moments[0] / moments[-1]) if moments[-1] > 0 else 0.0
+
+
+def _about_center(
+    ten: Sequence[Fraction | float],
+) -> tuple[float, Triple, tuple[float, float, float, float, float, float]]:
+    """Return mass, center of mass, and inertia about the center of mass, rounded; exact before."""
+    m, hx, hy, hz, *tensor = [Fraction(value) for value in ten]
+    x, y, z = hx / m, hy / m, hz / m
+    steiner = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
+    inertia = [value - m * part for value, part in zip(tensor, steiner, strict=True)]
+    cx, cy, cz = _rounded((x, y, z), DIGITS)
+    xx, xy, xz, yy, yz, zz = _rounded(inertia, DIGITS)
+    return _rounded([m], DIGITS)[0], (cx, cy, cz), (xx, xy, xz, yy, yz, zz)
+
+
+def _rounded(values: Iterable[Fraction | float], digits: int) -> list[float]:
+    return [float(f"{float(value):.{digits}g}") + 0.0 for value in values]  # no -0.0
+
+
+def _light_ball(radius: float, mass: float) -> list[float]:
+    moment = 0.4 * mass * radius**2
+    return [mass, 0, 0, 0, moment, 0, 0, moment, 0, moment]
+
+
+def _length(arm: Arm, index: int) -> float:
+    """Return the distance to the next joint, at least 0.1 [m]."""
+    distances = [
+        float(np.linalg.norm(_floats(body.translation))) for body in arm.bodies if body.parent == index
+    ]
+    return max([0.1, *distances])
+
+
+def _floats(values: Vector) -> Triple:
+    x, y, z = map(float, values)
+    return x, y, z

@@ -1,0 +1,269 @@
+"""ModelSpec -> the parts of a model: one table, from which a model is assembled and a module is written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from spelgen.design import BRISTLE_REACH, SERVO_STRIBECK_ROUNDING
+from spelgen.emission.entry_sums import mean_mass
+from spelgen.emission.source import Call, Code, call
+from spelgen.emission.tuning import TUNING
+from spelgen.runtime.rows import Joint
+from spelgen.spec import JointSpec, LinkSpec, ModelSpec
+
+GENERATOR, JOINTS, LINKS = Code("generator"), Code("JOINTS"), Code("LINKS")
+FUNCTIONS, CONSTANTS, MASS_ENTRIES = Code("FUNCTIONS"), Code("CONSTANTS"), Code("mass_entries")
+_FRICTION_AXES = {"dense-n": 1, "dense-3n": 3}
+_IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class ModelParts:
+    """The rows of an arm by their name, and the call that makes its model from them.
+
+    Classes are those of ``spelgen.runtime``. Arguments are numbers, texts, tuples, calls and names: of the rows,
+    of ``mass_entries``, and of ``generator``, which draws the initial weights of networks in the order of the calls.
+    """
+
+    rows: dict[str, tuple[Call, ...]]
+    model: Call
+
+    @property
+    def has_networks(self) -> bool:
+        """Whether initial weights are drawn."""
+        return _names(self.model, GENERATOR)
+
+    @property
+    def has_mass_entries(self) -> bool:
+        """Whether M is made of functions and constants."""
+        return _names(self.model, MASS_ENTRIES)
+
+
+def model_parts(spec: ModelSpec) -> ModelParts:
+    """Return the parts of the model that ``spec`` describes."""
+    rows = {"JOINTS": tuple(map(_joint, spec.joints))}
+    if spec.links:
+        rows["LINKS"] = tuple(_link(spec, link) for link in spec.links)
+    is_residual = bool(spec.links)
+    if spec.design.mass == "derived" or (is_residual and spec.design.net != "none"):
+        if spec.outputs:
+            rows["FUNCTIONS"] = tuple(
+                call("Function", _joint_names(spec, x.joints))
+                if is_residual
+                else call("Function", _joint_names(spec, x.joints), mean=x.mean, scale=x.scale)
+                for x in spec.outputs
+            )
+        if spec.constants and not is_residual:
+            rows["CONSTANTS"] = tuple(
+                call("Constant", initial=x.start, scale=x.scale) for x in spec.constants
+            )
+    arguments = _rigid_bodies(spec) if spec.links else _networks(spec)
+    if spec.inputs:
+        arguments["inputs"] = _inputs(spec)
+    return ModelParts(rows, call(base_class(spec), joints=JOINTS, **arguments))
+
+
+def _inputs(spec: ModelSpec) -> Call:
+    n = range(len(spec.joints))
+    values = {(x.joint, x.motor): x.value for x in spec.inputs}
+    trained = {(x.joint, x.motor) for x in spec.inputs if x.trained}
+    matrix = tuple(tuple(values.get((joint, motor), 0.0) for motor in n) for joint in n)
+    if not trained:
+        return call("MotorInputs", matrix)
+    return call(
+        "MotorInputs", matrix, trained=tuple(tuple((joint, motor) in trained for motor in n) for joint in n)
+    )
+
+
+def base_class(spec: ModelSpec) -> str:
+    """Return the name of the runtime's class that the model is."""
+    if spec.links:
+        return "RigidBodyDynamics" if spec.design.net == "none" else "ResidualDynamics"
+    return "DenseInputDynamics" if spec.design.input == "dense-3n" else "NetworkDynamics"
+
+
+def _names(value: object, name: Code) -> bool:
+    """Return whether a value refers to a name."""
+    if isinstance(value, Call):
+        return any(_names(item, name) for _, item in value.arguments)
+    if isinstance(value, tuple):
+        return any(_names(item, name) for item in value)
+    return value == name
+
+
+def _joint(joint: JointSpec) -> Call:
+    fields: dict[str, object] = {"lower": joint.lower, "upper": joint.upper, "speed": joint.speed}
+    fields |= {"friction": joint.friction, "armature": joint.armature}
+    if joint.gear != 1:
+        fields["gear"] = joint.gear
+    limits = Joint(joint.name, joint.joint_type, joint.lower, joint.upper, 1.0, 1.0, 1.0)
+    if (limits.center, limits.half_range) != (joint.center, joint.half_range):
+        fields["typical_range"] = (joint.center, joint.half_range)
+    return call("Joint", joint.name, joint.joint_type, **fields)
+
+
+def _link(spec: ModelSpec, link: LinkSpec) -> Call:
+    joint = spec.joints[link.joint]
+    fields: dict[str, object] = {
+        "parent": None if link.parent < 0 else spec.links[link.parent].name,
+        "joint": joint.name,
+        "position": link.position,
+    }
+    if link.rotation != _IDENTITY:
+        fields["rotation"] = link.rotation
+    fields |= {"mass": link.mass, "center_of_mass": link.center_of_mass, "inertia": link.inertia}
+    if link.ratio != 1:
+        fields["ratio"] = link.ratio
+    if link.offset != 0:
+        fields["offset"] = link.offset
+    if link.joint_type != joint.joint_type:
+        fields["joint_type"] = link.joint_type
+    return call("Link", link.name, **fields)
+
+
+def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
+    """Return the arguments of a model of rigid bodies."""
+    parts: dict[str, object] = {"links": LINKS, "gravity": spec.gravity, "friction": _friction_laws(spec)}
+    if spec.motor_speeds:
+        parts["motor_speeds"] = spec.motor_speeds
+    if spec.servos:
+        parts["servo"] = call(
+            "PositionServo",
+            kp=tuple(servo.kp for servo in spec.servos),
+            kd=tuple(servo.kd for servo in spec.servos),
+            limit=tuple(servo.limit for servo in spec.servos),
+            known=tuple(servo.known for servo in spec.servos),
+        )
+    if spec.design.net != "none":
+        networks: dict[str, object] = {}
+        if spec.outputs:
+            networks["network"] = _mass_network(spec)
+        if spec.potential:
+            networks["potential"] = _potential(spec)
+        scale = {"potential_scale": spec.potential_scale} if spec.potential else {}
+        parts["residuals"] = call(
+            "ResidualTerms",
+            JOINTS,
+            MASS_ENTRIES,
+            functions=len(spec.outputs),
+            constants=len(spec.constants),
+            **scale,
+            **networks,
+        )
+    return parts
+
+
+def _friction_laws(spec: ModelSpec) -> Call:
+    if spec.design.memory == "none":
+        return call("SlidingFriction", JOINTS)
+    # of the types of the arm's joints, in the order of the table
+    types = [name for name in BRISTLE_REACH if name in spec.joint_types]
+    breakaway = call("dict", **{name: BRISTLE_REACH[name] for name in types})
+    rounding = {"stribeck_rounding": SERVO_STRIBECK_ROUNDING} if spec.servos else {}
+    return call("FrictionLaws", JOINTS, breakaway=breakaway, **rounding)
+
+
+def _networks(spec: ModelSpec) -> dict[str, object]:
+    """Return the arguments of a model of networks, in the order in which their weights are drawn."""
+    parts: dict[str, object] = {"mass": _mass(spec)}
+    if spec.potential:
+        parts |= {"potential": _potential(spec), "potential_scale": spec.potential_scale}
+    else:
+        # one output that depends on no joint
+        ones = (1.0,) * len(spec.joints)
+        parts |= {
+            "potential": _network(spec, ((),), (ones, ones), width=1, depth=0),
+            "potential_scale": 1.0,
+        }
+    parts["friction"] = _friction(spec)
+    if spec.design.input == "dense-3n":
+        n = len(spec.joints)
+        ones = (1.0,) * n
+        parts["input_network"] = _network(spec, (spec.joint_names,) * (3 * n), (ones, ones))
+    return parts
+
+
+def _mass(spec: ModelSpec) -> Call:
+    if spec.design.mass == "dense-3n":
+        rows = 3 * len(spec.joints)
+        outputs = (spec.joint_names,) * (rows * (rows + 1) // 2)
+        mean = mean_mass(len(spec.joints), spec.outputs, spec.constants)
+        triangle = tuple(tuple(row[: k + 1]) for k, row in enumerate(mean.tolist()))
+        return call("DenseMass", JOINTS, mean=triangle, network=_network(spec, outputs, _mass_scales(spec)))
+    constants = CONSTANTS if spec.constants else ()
+    if not spec.outputs:
+        return call("ConstantMass", JOINTS, MASS_ENTRIES, constants=constants)
+    return call(
+        "DerivedMass",
+        JOINTS,
+        MASS_ENTRIES,
+        functions=FUNCTIONS,
+        constants=constants,
+        margin=spec.margin,
+        network=_mass_network(spec),
+    )
+
+
+def _mass_network(spec: ModelSpec) -> Call:
+    """Return the network of the functions of M."""
+    min_units = TUNING.least_kan_units if spec.design.net == "kan" else TUNING.least_units
+    return _network(spec, call("joints_of", FUNCTIONS), _mass_scales(spec), min_units=min_units)
+
+
+def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
+    """Return the scales of cos q, or the scaled q, and of sin q."""
+    return (tuple(joint.mass_sensitivity for joint in spec.joints),) * 2
+
+
+def _potential(spec: ModelSpec) -> Call:
+    scales = (tuple(joint.potential_sensitivity for joint in spec.joints),) * 2
+    width = max(TUNING.least_units, round(TUNING.potential_fraction * units(spec)))
+    return _network(spec, (_joint_names(spec, spec.potential),), scales, width=width)
+
+
+def _friction(spec: ModelSpec) -> Call:
+    n = len(spec.joints)
+    scale, ones = (TUNING.position_sensitivity,) * n, (1.0,) * n
+    if spec.design.dissipation == "per-joint":
+        own = tuple((name,) for name in spec.joint_names)
+        speeds = tuple(float(f"{1 / joint.speed:.4g}") for joint in spec.joints)
+        width = TUNING.friction_units * n
+        network = _network(spec, own, (scale, scale, speeds, ones), width=width, depth=1)
+        return call("JointFriction", JOINTS, network=network)
+    axes = _FRICTION_AXES[spec.design.dissipation]
+    rows = axes * n
+    outputs = (spec.joint_names,) * (rows * (rows + 1) // 2)
+    return call("DenseFriction", JOINTS, axes=axes, network=_network(spec, outputs, (scale, scale, ones)))
+
+
+def _network(
+    spec: ModelSpec,
+    outputs: object,
+    scales: tuple[tuple[float, ...], ...],
+    *,
+    width: int | None = None,
+    depth: int | None = None,
+    min_units: int = 1,
+) -> Call:
+    """Return a network with these outputs: for each, the names of the joints that it depends on."""
+    return call(
+        "MaskedKAN" if spec.design.net == "kan" else "MaskedMLP",
+        GENERATOR,
+        JOINTS,
+        scales=scales,
+        outputs=outputs,
+        width=units(spec) if width is None else width,
+        depth=spec.options.depth if depth is None else depth,
+        **({} if min_units == 1 else {"min_units": min_units}),
+    )
+
+
+def units(spec: ModelSpec) -> int:
+    """Return the units of a hidden layer: fewer of a Kolmogorov-Arnold network, which has a grid on every edge."""
+    width = spec.options.width
+    return width if spec.design.net == "mlp" else max(TUNING.least_units, round(TUNING.kan_fraction * width))
+
+
+def _joint_names(spec: ModelSpec, joints: Sequence[int]) -> tuple[str, ...]:
+    return tuple(spec.joints[joint].name for joint in joints)

@@ -1,0 +1,210 @@
+"""ModelSpec -> the text of a module. Pure: the same specification gives the same bytes.
+
+Text from a URDF becomes string literals and JSON strings in docstrings, never code.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from textwrap import wrap
+
+from spelgen.emission.entry_sums import Sums, entry_sums, term_names
+from spelgen.emission.parts import ModelParts, model_parts
+from spelgen.emission.source import SKIP, WIDTH, Call, filled, listed_call
+from spelgen.emission.standalone import bundle, load_runtime
+from spelgen.labels import counted, entry_name, joint_ranges, joints_in_ranges
+from spelgen.spec import ModelSpec
+from spelgen.templates import render
+
+_UNITS = {"revolute": ("rad", "Nm"), "prismatic": ("m", "N")}
+_COMMENTS = {
+    "JOINTS": ["Positions [rad, m], speed [rad/s, m/s], friction [Nm, N], armature [kg m^2, kg]."],
+    "LINKS": [
+        "In the frame of the joint, z along its axis; position and rotation: of this frame in the parent's [m].",
+        "mass [kg], center_of_mass [m], inertia about it: xx, xy, xz, yy, yz, zz [kg m^2].",
+    ],
+    "FUNCTIONS": ["The learned functions of q, and the joints that each depends on."],
+    "CONSTANTS": ["The trained constants, in units of scale."],
+}
+_EXAMPLE = """\
+    import torch
+    from {module} import Model
+
+    model = Model()  # trained: model.load_state_dict(torch.load("run/model.pt"))
+    q, qd, tau = torch.zeros(3, 100, {n}, dtype=torch.float64)  # any batch, joints last
+    M = model.mass_matrix(q)  # (100, {n}, {n})
+    qdd = model.forward_dynamics(q, qd, tau)  # (100, {n})
+    tau = model.inverse_dynamics(q, qd, qdd)
+    V = model.potential_energy(q)  # (100,) [J]
+    H = model.hamiltonian(q, model.momentum(q, qd))"""
+
+
+def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
+    """Return the Python source of the module that ``spec`` describes.
+
+    It imports torch and ``spelgen.runtime``; a standalone one imports torch only and contains the runtime.
+    """
+    parts = model_parts(spec)
+    arm = "\n\n\n".join(x for x in ("\n\n".join(_rows(spec, parts)), _mass_entries(spec, parts)) if x)
+    model = render(
+        "model.py.jinja",
+        base=parts.model.callee,
+        summary=class_summary(spec),
+        has_networks=parts.has_networks,
+        call=listed_call("super().__init__", Call("", parts.model.arguments), 8) + SKIP,
+    )
+    title = f"Port-Hamiltonian model of an arm with {counted(len(spec.joints), 'joint')}, by `spelgen build`."
+    context = {"title": title, "header": header(spec), "arm": arm, "model": model, "spec": spec.to_json()}
+    if standalone:
+        return render("standalone.py.jinja", **bundle(arm, model)._asdict(), **context)
+    used = set(re.findall(r"\w+", f"{arm}\n{model}")) & load_runtime().public
+    ordered = sorted(used, key=lambda name: (not name[0].isupper(), name))
+    return render("module.py.jinja", names=ordered, has_tensor=parts.has_mass_entries, **context)
+
+
+def class_summary(spec: ModelSpec) -> str:
+    """Return the model in a line."""
+    if spec.links:
+        residual = ", and residual terms" if spec.design.net != "none" else ""
+        return (
+            f"{counted(len(spec.links), 'rigid body')} with trained inertial parameters, friction{residual}."
+        )
+    if spec.design.mass == "dense-3n":
+        return "Networks of the whole M^-1 over three axes per joint, V, D and G."
+    return f"{_functions(spec)} make M; networks of V and D."
+
+
+def _functions(spec: ModelSpec) -> str:
+    functions = counted(len(spec.outputs), "learned function")
+    return f"{functions} of q and {counted(len(spec.constants), 'constant')}"
+
+
+def header(spec: ModelSpec) -> str:
+    """Return the documentation of the module: the arm, an example, the structure of M, and the joints."""
+    kind = class_summary(spec)
+    lines = [f"Robot {_quoted(spec.robot)}. {kind[0].upper()}{kind[1:]}"]
+    if spec.links and spec.design.net != "none":
+        lines.append(f"Residual terms are zero until a fit selects them; in M: {_functions(spec)}.")
+    if spec.potential:
+        lines.append(f"V depends on {joints_in_ranges(spec.potential)}.")
+    else:
+        lines.append("Gravity does no work.")
+    if spec.servos:
+        lines.append("Inputs are commanded positions u of servos: tau = clip(kp (u - q) - kd qd).")
+    if not spec.started_from_urdf:
+        lines.append("The URDF has no physically consistent inertials: initial links have 1 kg each.")
+    example = _EXAMPLE.format(module=module_name(spec), n=len(spec.joints))
+    return "\n\n".join(["\n".join(lines), example, _picture(spec), _joint_table(spec)])
+
+
+def module_name(spec: ModelSpec) -> str:
+    """Return the name of the module that `spelgen build` writes by default, without its folder."""
+    stem = spec.urdf.rpartition("/")[2].rpartition(".")[0]
+    name = re.sub(r"[^0-9A-Za-z_]+", "_", stem) or "arm"
+    return f"{'_' if name[0].isdigit() else ''}{name}_spel"
+
+
+def _picture(spec: ModelSpec) -> str:
+    """Return the lower triangle of M as text: the joints that each entry depends on."""
+    cells, width = {}, 2
+    for row, column, kind, joints in spec.entries:
+        cell = {"varying": joint_ranges(joints), "constant": "C", "zero": "0"}[kind]
+        cells[row, column] = cell
+        width = max(width, len(cell))
+    lines = ["Mass matrix: numbers of the joints that each entry depends on; C constant, 0 always zero", ""]
+    for row in range(len(spec.joints)):
+        line = "  ".join(cells[row, column].ljust(width) for column in range(row + 1))
+        lines.append(f"    {row + 1:2}  {line}".rstrip())
+    return "\n".join(lines)
+
+
+def _joint_table(spec: ModelSpec) -> str:
+    """Return numbers, names, types, units and limits of the joints."""
+    lines = ["Joints, in the order of q, qd and tau", ""]
+    names = [_quoted(joint.name) for joint in spec.joints]
+    width = max(map(len, names))
+    for number, (joint, name) in enumerate(zip(spec.joints, names, strict=True), start=1):
+        limits = "unlimited"
+        if joint.lower is not None and joint.upper is not None:
+            limits = f"{joint.lower:g} .. {joint.upper:g}"
+        unit, torque = _UNITS[joint.joint_type]
+        lines.append(f"    {number:2}  {name.ljust(width)}  {joint.joint_type:9}  {limits} {unit}, {torque}")
+    return "\n".join(lines)
+
+
+def _quoted(name: str) -> str:
+    """Return a name as a JSON string, which ends no docstring."""
+    return json.dumps(name)
+
+
+def _rows(spec: ModelSpec, parts: ModelParts) -> list[str]:
+    """Return the statements that define the rows, with their units above them."""
+    statements = []
+    for name, rows in parts.rows.items():
+        about = _terms_told(spec) if name in ("FUNCTIONS", "CONSTANTS") else {}
+        letter = name[0].lower()
+        lines = [*(f"# {line}" for line in _COMMENTS[name]), f"{name} = ("]
+        for number, row in enumerate(rows, start=1):
+            end = f"  # {letter}{number}: {about[f'{letter}{number}']}" if about else ""
+            lines.append(f"    {filled('', row, 4)},{end}")
+        statements.append("\n".join([*lines, f"){SKIP}"]))
+    return statements
+
+
+def _terms_told(spec: ModelSpec) -> dict[str, str]:
+    """Return the entries of M that each function and constant is part of, with the unit of the first."""
+    told = {}
+    bases = [x.basis for x in spec.outputs] + [x.basis for x in spec.constants]
+    for name, basis in zip(term_names(spec), bases, strict=True):
+        entries = [entry_name(row, column) for row, column, _ in basis]
+        row, column, _ = basis[0]
+        slides = [spec.joints[joint].joint_type for joint in (row, column)].count("prismatic")
+        more = f" and {len(entries) - 2} more" if len(entries) > 2 else ""
+        told[name] = f"{', '.join(entries[:2])}{more} [{('kg m^2', 'kg m', 'kg')[slides]}]"
+    return told
+
+
+def _mass_entries(spec: ModelSpec, parts: ModelParts) -> str:
+    """Return the function that makes M from its functions and constants; empty if M is made in another way."""
+    if not parts.has_mass_entries:
+        return ""
+    names = term_names(spec)
+    arguments = ", ".join(f"{name}: Tensor" for name in names)
+    start = f"def mass_entries({arguments}) -> Tensor:"
+    if len(start) > WIDTH:
+        lines = wrap(f"{arguments},", WIDTH - 4, initial_indent=" " * 4, subsequent_indent=" " * 4)
+        start = "\n".join(["def mass_entries(", *lines, f") -> Tensor:{SKIP}"])
+    result = "the residual of M" if spec.links else "M without armature"
+    about = f'    """Return {result}, (..., n, n), from functions of q and constants."""'
+    body, rows = [], []
+    for row, cells in enumerate(entry_sums(spec)):
+        texts = [_sum(sums, names) for sums in cells]
+        for column, text in enumerate(texts):
+            if " " in text or text.startswith("-"):
+                texts[column] = entry_name(row, column).lower().replace(",", "_")
+                body.append(f"    {texts[column]} = {text}")
+        rows.append(f"[{', '.join(texts)}]")
+    end = f"    return symmetric({', '.join(rows)})"
+    if len(end) > WIDTH:
+        lines = [f"        {row}," for row in rows]
+        end = "\n".join(["    return symmetric(", *lines, f"    ){SKIP}"])
+    return "\n".join([start, about, *body, end])
+
+
+def _sum(sums: Sums, names: list[str]) -> str:
+    """Return a linear combination as an expression; ``0`` for none."""
+    text = ""
+    for factor, index in sums:
+        term = names[index] if abs(factor) == 1 else f"{_number(abs(factor))} * {names[index]}"
+        if text:
+            text += f" - {term}" if factor < 0 else f" + {term}"
+        else:
+            text = f"-{term}" if factor < 0 else term
+    return text or "0"
+
+
+def _number(value: float) -> str:
+    """Return the shortest text of a number."""
+    short = f"{value:g}"
+    return short if float(short) == value else repr(value)

@@ -1,0 +1,120 @@
+"""Collect the recordings of log tables, whole or as evenly spread segments within a bound of memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+import pyarrow as pa
+
+from spelgen.errors import LogError
+from spelgen.logs.recording import in_time_order, make_trajectory
+from spelgen.logs.tables import Layout
+from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.tuning import TUNING
+from spelgen.logs.values import clock_start, values_in_si
+
+Piece = tuple[int, str, np.ndarray]
+"""Number and name of a recording, and rows of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """Consecutive rows of one recording.
+
+    Attributes:
+        recording: number of the recording among all recordings.
+        name: name of the recording.
+        rows: (T,) row numbers in the file, from 0.
+        values: (T, C) columns of the layout in SI units.
+    """
+
+    recording: int
+    name: str
+    layout: Layout
+    rows: np.ndarray
+    values: np.ndarray
+
+
+class LogSegments:
+    """Segments of all recordings, numbered in the order of the files; one of `every` segments is kept.
+
+    `every` is doubled whenever the kept segments would exceed `kept_bytes`, so that the kept segments are evenly
+    spread over all files, and the selection depends only on the files. Without a bound each recording is one segment.
+    """
+
+    def __init__(self, kept_bytes: float = inf) -> None:
+        self.every = 1
+        self.rows = 0
+        self._kept_bytes = kept_bytes
+        self._segments: list[Segment] = []
+        self._bytes = self._recordings = self._count = 0
+
+    def add(self, layout: Layout, table: pa.Table) -> None:
+        """Add the recordings of a table. Raises LogError for values that are no numbers in the kept rows."""
+        if not table.num_rows:
+            raise LogError("no rows", file=layout.file, expected="at least one window of samples")
+        start, pieces = clock_start(table, layout), []
+        for name, rows in _recordings(layout, table):
+            parts = 1 if self._kept_bytes == inf else -(-len(rows) // TUNING.segment_samples)
+            pieces += [(self._recordings, name, part) for part in np.array_split(rows, parts)]
+            self._recordings += 1
+        pieces = self._selected(pieces, 8 * len(layout.columns))
+        # the whole table at once if all of it is kept: it takes less time, and errors count its rows
+        data = values_in_si(table, layout, start, range(table.num_rows)) if self.every == 1 else None
+        for recording, name, rows in pieces:
+            values = values_in_si(_taken(table, rows), layout, start, rows) if data is None else data[rows]
+            self._segments.append(Segment(recording, name, layout, rows, values))
+            self._bytes += values.nbytes
+        self.rows += table.num_rows
+
+    def trajectories(self) -> Iterator[Trajectory | LogError]:
+        """Yield each kept recording, or the error that its times have; no segments remain."""
+        segments, self._segments = self._segments[::-1], []
+        while segments:
+            group = [segments.pop()]
+            while segments and segments[-1].recording == group[0].recording:
+                group.append(segments.pop())
+            first = group[0]
+            values, rows = first.values, first.rows
+            if len(group) > 1:
+                values = np.concatenate([x.values for x in group])
+                rows = np.concatenate([x.rows for x in group])
+            try:
+                values, repairs = in_time_order(values, rows, first.layout)
+                yield make_trajectory(values, first.layout, first.name, repairs)
+            except LogError as error:
+                yield error
+
+    def _selected(self, pieces: list[Piece], row_bytes: int) -> list[Piece]:
+        """Return the pieces to keep of a table, after segments were left out so that all fit into the bound."""
+        while True:
+            kept = pieces[-self._count % self.every :: self.every]
+            size = self._bytes + row_bytes * sum(len(rows) for _, _, rows in kept)
+            if size <= self._kept_bytes or len(self._segments) + len(kept) <= 1:
+                self._count += len(pieces)
+                return kept
+            self.every *= 2
+            self._segments = self._segments[::2]
+            self._bytes = sum(x.values.nbytes for x in self._segments)
+
+
+def _taken(table: pa.Table, rows: np.ndarray) -> pa.Table:
+    """Return these rows of a table; without a copy if they lie together."""
+    first, count = int(rows[0]), len(rows)
+    return table.slice(first, count) if int(rows[-1]) - first + 1 == count else table.take(rows)
+
+
+def _recordings(layout: Layout, table: pa.Table) -> list[tuple[str, np.ndarray]]:
+    """Return name and rows of each recording of a table, in order of their first rows."""
+    if layout.labels is None:
+        return [(layout.recording or layout.file.stem, np.arange(table.num_rows))]
+    # each label once: a name of a megabyte on a million rows is a small file
+    labels = table[layout.labels].dictionary_encode("encode").combine_chunks()
+    numbers = labels.indices.to_numpy()
+    # sorting keeps time and memory in proportion to the rows, however many recordings there are
+    rows = np.argsort(numbers, kind="stable")
+    ends = np.cumsum(np.bincount(numbers))
+    return list(zip(map(str, labels.dictionary.to_pylist()), np.split(rows, ends[:-1]), strict=True))

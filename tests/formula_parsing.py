@@ -1,0 +1,77 @@
+"""Closed forms parsed from the written text and compared with Pinocchio."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pinocchio as pin
+
+from spelgen.arm.arm import Arm
+from spelgen.dynamics.pinocchio_arm import arm_dynamics
+from spelgen.settings.settings import Settings
+from spelgen.structure.base_parameters import base_parameters
+
+CLOSE = 1e-10
+
+
+def assert_equal_to_pinocchio(arm: Arm, rows: dict[str, str], tolerance: float = CLOSE) -> None:
+    """Every expression at random positions, with the base parameters of ``arm``."""
+    engine = arm_dynamics(arm, Settings())
+    n = len(arm.coordinates)
+    names = {"cos": np.cos, "sin": np.sin}
+    names |= {each.name: float(each.value) for each in base_parameters(arm)}
+    origin = dict.fromkeys((f"q{k + 1}" for k in range(n)), 0.0)
+    points = np.random.default_rng(3).uniform(-2, 2, (3, n))
+    for q in points:
+        at = names | {f"q{k + 1}": value for k, value in enumerate(q)}
+        mass = engine.mass_matrix(q)
+        size = np.sqrt(np.outer(mass.diagonal(), mass.diagonal()))
+        for name, expression in rows.items():
+            value = eval(expression, {}, at)
+            if name == "V":
+                value -= eval(expression, {}, names | origin)
+                true = potential_energy(engine, q) - potential_energy(engine, np.zeros(n))
+                assert abs(value - true) < tolerance * max(1.0, abs(true)), name
+            else:
+                row, column = (int(digit) - 1 for digit in name[1:])
+                assert abs(value - mass[row, column]) < tolerance * size[row, column], name
+
+
+def potential_energy(engine, q):
+    return pin.computePotentialEnergy(engine.model, engine.data, engine.jacobian @ q + engine.offset)
+
+
+def assert_close(found, true) -> None:
+    assert np.abs(np.subtract(found, true)).max() < CLOSE * max(1.0, np.abs(true).max())
+
+
+def read_back(told: str) -> dict[str, str]:
+    """The expressions of the text, by name; their lines go on where they are indented."""
+    found: dict[str, str] = {}
+    for line in told.partition("\nBase parameters")[0].splitlines():
+        name, is_row, expression = line.partition(" = ")
+        if is_row and re.fullmatch(r"M\d+|V", name):
+            found[name] = expression
+        elif line.startswith("    "):
+            found[list(found)[-1]] += line
+    return found
+
+
+def without_latex(told: str) -> dict[str, str]:
+    """The same of the first ``align*``."""
+    body = told.partition(r"\begin{align*}")[2].partition(r"\end{align*}")[0]
+    for pattern, plain in (
+        (r"\\\\\n\s*&\\quad", " "),
+        (r" \\cdot 10\^\{(-?\d+)\}", r"e\1"),
+        (r"\\[,]|\\\\", lambda match: "*" if match[0] == r"\," else ""),
+        (r"\\(cos|sin)(?:\^\{(\d)\})?\{\\bigl(\([^()]*)\\bigr\)\}", lambda m: f"{m[1]}{m[3]})**{m[2] or 1}"),
+        (r"\\(?:bigl|bigr)", ""),
+        (r"([mhI])_\{(?:([xyz]+),)?(\w+)\}", r"\1\2\3"),
+        (r"([Mq])_\{(\d+)\}", r"\1\2"),
+        (r"\^\{(\d)\}", r"**\1"),
+    ):
+        body = re.sub(pattern, plain, body)
+    assert "\\" not in body
+    rows = [line.split("&=") for line in body.strip().splitlines()]
+    return {name.strip(): expression.strip() for name, expression in rows}

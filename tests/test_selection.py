@@ -1,0 +1,375 @@
+"""Acceptance of residual terms, friction effects and figures: each test fails without its criterion."""
+
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from spelgen.arm.configured_arm import load_arm
+from spelgen.emission.build import build
+from spelgen.evaluation import invariants
+from spelgen.evaluation.horizons import end_errors
+from spelgen.exporting.mjcf_file import mjcf_text
+from spelgen.exporting.rigid_body_projection import rigid_body_projection
+from spelgen.fitting.levenberg_marquardt import NormalEquations
+from spelgen.fitting.servo import laws
+from spelgen.fitting.servo.parameters import ServoParameters
+from spelgen.fitting.torque import jacobian as torque_jacobian
+from spelgen.fitting.torque import joint_functions, selection
+from spelgen.fitting.torque import objective as torque_objective
+from spelgen.fitting.torque import problem as torque_problem
+from spelgen.fitting.torque.jacobian import ResidualSamples
+from spelgen.fitting.torque.objective import fit_torques
+from spelgen.fitting.torque.selection import select_functions
+from spelgen.fitting.urdf_regularizer import UrdfRegularizer
+from spelgen.fitting.window.momentum import MomentumObjective
+from spelgen.identification.least_squares import deviations
+from spelgen.logs.windows import Windows
+from spelgen.settings.fits import Rollout, TorqueFit
+
+
+class Alone:
+    """Rigid bodies and a friction model that absorb none of the added torque."""
+
+    @staticmethod
+    def remaining(joint, torque):
+        return torque
+
+
+ALONE = Alone()
+
+
+@pytest.fixture
+def hybrid(robots):
+    """A model of bodies with functions of joints, and no networks: these take longer."""
+    model = build(robots / "two_link.urdf", "hybrid", width=8)
+    model.residuals.potential = model.residuals.mass = None
+    return model
+
+
+def samples(missing: torch.Tensor, q: torch.Tensor) -> ResidualSamples:
+    still = torch.zeros_like(q)
+    return ResidualSamples(q, still, still, missing, torch.ones_like(q))
+
+
+def test_what_the_samples_of_one_stretch_say_is_judged_on_others(hybrid):
+    """The first joint moves slowly through its range, and what is missed is another constant on each way."""
+    levels = torch.randn(10, 1, generator=torch.Generator().manual_seed(3)).double()
+    missing = levels.repeat_interleave(200, dim=0) * torch.tensor([[1.0, 0.0]]).double()
+    q = torch.stack([torch.linspace(-2, 2, 2000), torch.zeros(2000)], dim=1).double()
+    # a function of q explains nearly all of it, and nothing where it was not fitted
+    assert select_functions(hybrid, samples(missing, q), ALONE, [], 1.0) == []
+
+
+def test_neighbours_of_what_is_held_out_are_not_fitted_to(hybrid):
+    """As above, but each constant lasts over the border of two tenths: the half on one side tells of the other."""
+    levels = torch.randn(11, 1, generator=torch.Generator().manual_seed(3)).double()
+    missing = levels.repeat_interleave(200, dim=0)[100:2100] * torch.tensor([[1.0, 0.0]]).double()
+    q = torch.stack([torch.linspace(-2, 2, 2000), torch.zeros(2000)], dim=1).double()
+    missed = samples(missing, q)
+    spline = next(joint_functions.joint_functions(hybrid, missed, ALONE))
+    errors, _ = selection._held_out_errors(spline, missing[:, 0], 20.0)
+    assert errors.square().sum() > missing.square().sum()
+    assert select_functions(hybrid, missed, ALONE, [], 20.0) == []
+
+
+def test_what_the_first_half_shows_has_to_hold_in_the_last(hybrid):
+    """All tenths gain by the mean of both halves; the last loses by what the first half shows."""
+    t = torch.linspace(0, 200, 4000).double()
+    q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
+    missing = torch.stack([torch.sin(q[:, 0]), torch.zeros_like(t)], dim=1)
+    for later, selected in ((0.45, 0), (0.75, 1)):
+        missing[2000:] = later * torch.sin(q[2000:])
+        found = select_functions(hybrid, samples(missing, q), ALONE, [], 1.0)
+        assert len(found) == selected
+
+
+def test_the_first_half_is_judged_where_it_has_been(hybrid):
+    """Beyond, splines fitted to it are far off, which says nothing against them."""
+    t = torch.linspace(0, 100, 4000).double()
+    early, late = 1.0 + 0.7 * torch.sin(t[:2000]), -0.7 + 1.2 * torch.sin(t[2000:])
+    q = torch.stack([torch.cat([early, late]), torch.zeros_like(t)], dim=1)
+    torque = torch.stack([q[:, 0].square(), torch.zeros_like(t)], dim=1)
+    noise = 0.02 * torch.randn(4000, 2, generator=torch.Generator().manual_seed(0)).double()
+    missed = samples(torque + noise, q)
+    spline = next(joint_functions.joint_functions(hybrid, missed, ALONE))
+    first, last = selection.halves(4000, 1.0)
+    weights, _ = joint_functions.fit_function(spline, missed.missing[:, 0], 1.0, first)
+    error = missed.missing[last, 0] - spline.torque(weights, last)
+    assert error.square().sum() > missed.missing[last, 0].square().sum()
+    selected = select_functions(hybrid, missed, ALONE, [], 1.0)
+    assert [(residual.name, residual.joint) for residual in selected] == [("raw_torque_splines", 0)]
+
+
+def test_a_gain_in_one_of_ten_stretches_is_luck(hybrid):
+    t = torch.linspace(0, 200, 4000).double()
+    q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
+    everywhere = torch.stack([torch.sin(q[:, 0]), torch.zeros_like(t)], dim=1)
+    noise = torch.randn(4000, 2, generator=torch.Generator().manual_seed(0)).double()
+    noise[:, 1] = 0.0
+    found = select_functions(hybrid, samples(everywhere + 0.1 * noise, q), ALONE, [], 1.0)
+    # of the functions that explain it the best one is selected, and none of the joint that misses nothing
+    assert [(residual.name, residual.joint) for residual in found] == [("raw_torque_splines", 0)]
+    # in one stretch it is so, in the others the torque is nearly nothing: held out it gains in one at most
+    once = everywhere * (torch.arange(4000) < 400).unsqueeze(-1)
+    assert select_functions(hybrid, samples(0.3 * once + noise, q), ALONE, [], 1.0) == []
+
+
+def test_a_stretch_without_torque_hides_no_gain():
+    """Where a joint rests with no torque at all, a function may err by next to nothing."""
+    squares, missed = torch.full((10,), 100.0), torch.full((10,), 10.0)
+    squares[3], missed[3] = 0.0, 1e-9
+    # nine of ten stretches fall to a tenth
+    assert selection._significant_gain(squares, missed) == pytest.approx(0.85, abs=0.01)
+
+
+def test_a_stretch_that_goes_farther_than_all_others_hides_no_gain():
+    """Splines of a spring know nothing of where a joint has been once, and that is where its torque is largest."""
+    squares, missed = torch.full((10,), 50.0), torch.full((10,), 1.0)
+    squares[0], missed[0] = 400.0, 2e6
+    assert selection._significant_gain(squares, missed) > 0.8
+
+
+def test_a_network_is_fitted_to_what_functions_of_joints_leave(robots, monkeypatch):
+    """Both networks are to give what is missed, beside the torque that functions of joints give already."""
+    model = build(robots / "two_link.urdf", "hybrid", width=8)
+    torch.nn.init.constant_(model.residuals.raw_torque_splines, 3.0)
+    left = []
+
+    def fitted(model, network, samples, *_):
+        left.append(selection._still_missing(model, samples))
+        return 0.5
+
+    monkeypatch.setattr(selection, "_fit_network", fitted)
+    q = torch.linspace(-1, 1, 2000).double().unsqueeze(-1).expand(-1, 2)
+    assert len(list(selection.select_networks(model, samples(q.sin(), q), 1.0))) == 2
+    for missing in left:
+        torch.testing.assert_close(missing, q.sin())
+
+
+def test_gains_have_to_be_beyond_their_own_scatter():
+    squares = torch.ones(10).double()
+    steady = torch.full((10,), 0.9).double()
+    assert selection._significant_gain(squares, steady + 0.001 * torch.arange(10)) == pytest.approx(
+        0.0955, rel=2e-3
+    )
+    # as sure as can be, and next to nothing: no function is worth that
+    assert selection._significant_gain(squares, 0.9999 * squares) is None
+    lucky = torch.tensor([0.1] + [1.0] * 9).double()
+    assert selection._significant_gain(squares, lucky) is None
+
+
+def test_samples_that_err_alike_count_once():
+    """Each sample twenty times, with errors that are the same, says what it says once."""
+    draw = torch.Generator().manual_seed(0)
+    x = torch.randn(300, 4, generator=draw).double()
+    y = x @ torch.tensor([0.1, 0.0, -0.2, 0.3]).double() + torch.randn(300, generator=draw).double()
+    groups = torch.zeros(4)
+
+    def weights(times: int) -> torch.Tensor:
+        rows = joint_functions.beside(x, y).repeat_interleave(times, dim=0)
+        return joint_functions.most_probable(rows.mT @ rows, len(rows), groups, float(times))[0]
+
+    torch.testing.assert_close(weights(20), weights(1), rtol=1e-6, atol=1e-9)
+    assert (
+        weights(1) - torch.linalg.lstsq(x, y).solution
+    ).abs().max() > 1e-3  # drawn to nothing by the prior
+
+
+def test_intervals_of_errors_that_last_are_wider():
+    """White errors, each of which stays for ten samples: the standard deviation counts as sqrt(10) times that."""
+    white = np.random.default_rng(0).normal(size=(4000, 2))
+    lasting = white.repeat(10, axis=0)
+    np.testing.assert_allclose(deviations([white], 2), 1.0, rtol=0.15)
+    np.testing.assert_allclose(deviations([lasting], 2), np.sqrt(10), rtol=0.15)
+
+
+@pytest.mark.parametrize("correlation", [1.0, 5.0])
+def test_the_first_noise_is_that_of_least_squares(correlation):
+    """Of two joints, one with three weights of its own: what is missed, with a sample fewer for every weight, and with
+    more where errors last.
+    """
+    draw = torch.Generator().manual_seed(0)
+    count, deviations = 400, torch.tensor([0.5, 0.01]).double()
+    x = torch.randn(count, 3, generator=draw).double()
+    measured = deviations * torch.randn(count, 2, generator=draw).double()
+    measured[:, 0] += 7.0 * x[:, 1]  # nothing of it is missed
+    jacobian = object.__new__(torque_jacobian.TorqueJacobian)
+    slopes = ((0, torch.arange(3), x, measured[:, 0]), (1, torch.arange(0), x[:, :0], measured[:, 1]))
+    jacobian.slopes = lambda _: slopes
+    problem = object.__new__(torque_problem.TorqueProblem)
+    problem.jacobian, problem.count, problem.correlation = jacobian, count, correlation
+    problem.range, problem.start = torch.ones(2).double(), torch.zeros(3).double()
+    jacobian.rigid = SimpleNamespace(free=lambda *_: torch.ones(3, dtype=torch.bool))
+    problem.adapt = problem.compensated = None
+    problem._set_least_squares_noise(problem.start)
+    solution = torch.linalg.lstsq(x, measured[:, :1]).solution
+    missed = [(measured[:, 0] - (x @ solution)[:, 0]).square().sum(), measured[:, 1].square().sum()]
+    expected = torch.stack(missed) / (count - correlation * torch.tensor([3.0, 0.0]).double())
+    torch.testing.assert_close(problem.noise, (correlation * expected).sqrt(), rtol=1e-6, atol=0)
+
+
+def test_a_dead_zone_of_a_servo_is_worth_more_than_luck(monkeypatch):
+    """A dead zone that lowers the cost by 1, which a chance does once in six times, is not selected; one of 10 is."""
+    without = ServoParameters(torch.ones(1, 1), torch.zeros(0), 0.0, torch.zeros(1, 1, dtype=torch.bool))
+    problem = SimpleNamespace(
+        rows=SimpleNamespace(row=lambda name: 0),
+        residuals=lambda x: None,
+        weigh=lambda errors: None,
+    )
+    with_zone = replace(without, joints=2 * torch.ones(1, 1))
+    monkeypatch.setattr(laws, "divided", lambda problem, x, fraction: with_zone)
+    for gain, selected in ((1.0, False), (10.0, True)):
+        costs = {without: torch.tensor([100.0]), with_zone: torch.tensor([100.0 - gain])}
+        monkeypatch.setattr(laws, "_joint_minima", lambda problem, x, costs=costs: (x, costs[x]))
+        assert bool(laws.select_dead_zones(problem, without).active.any()) == selected
+
+
+def test_straying_from_the_urdf_costs_what_the_docs_say(robots, monkeypatch):
+    """Mean squared deviations of M's variation and of gravity, relative to their sizes, times the weight: once."""
+    draw = torch.Generator().manual_seed(0)
+    mass = torch.randn(50, 2, 2, generator=draw).double()
+    gravity = torch.randn(50, 2, generator=draw).double()
+    regularizer = UrdfRegularizer(
+        torch.zeros(50, 2), torch.eye(2).double(), torch.zeros(50, 2, 2).double(), torch.zeros(50, 2).double(),
+        torch.full((2,), 2.0).double(),
+    )  # fmt: skip
+    model = SimpleNamespace(mass_matrix=lambda q: mass, gravity=lambda q: gravity)
+    varied = (mass - mass.mean(dim=0)).numpy()
+    expected = np.square(varied).sum() / 50 / 2 + np.square(gravity.numpy() / 2).mean()
+    assert float(regularizer.loss(model)) == pytest.approx(expected)
+    windows = SimpleNamespace(regularizer=regularizer, model=model, config=Rollout(urdf_weight=0.7))
+    assert float(MomentumObjective.penalty(windows)) == pytest.approx(0.7 * expected)
+    penalties = []
+
+    def fit_networks(model, samples, decay, penalty, evaluations):
+        penalties.append(float(penalty()))
+        return 0
+
+    monkeypatch.setattr(torque_objective, "fit_networks", fit_networks)
+    networks = SimpleNamespace(mass_matrix=model.mass_matrix, gravity=model.gravity, named_modules=lambda: [])
+    monkeypatch.setattr(torque_objective, "has_rigid_bodies", lambda model: False)
+    fit_torques(networks, SimpleNamespace(seen=1, count=1), TorqueFit(urdf_weight=0.7), regularizer)
+    assert penalties == [pytest.approx(0.7 * expected)]
+
+
+def test_the_cost_of_a_torque_fit_has_the_prior_in_it():
+    precision = torch.tensor([[2.0, 0.5], [0.5, 1.0]]).double()
+    problem = SimpleNamespace(
+        start=torch.tensor([1.0, 0.0]).double(), noise=torch.tensor([0.5, 2.0]).double(), precision=precision
+    )
+    x, squares = torch.tensor([2.0, 3.0]).double(), torch.tensor([1.0, 8.0]).double()
+    expected = (1.0 / 0.25 + 8.0 / 4.0 + (2.0 * 1 + 2 * 0.5 * 3 + 1.0 * 9)) / 2
+    assert torque_problem.TorqueProblem.cost(problem, x, squares) == pytest.approx(expected)
+
+
+def test_noise_is_what_each_joint_misses():
+    """Ten times the squares are sqrt(10) times the noise, and no joint's noise is another's."""
+    problem = SimpleNamespace(count=50, correlation=5.0, range=torch.ones(2).double())
+    noise = []
+    for squares in ([2.0, 8.0], [20.0, 80.0]):
+        torque_problem.TorqueProblem.set_noise(problem, torch.tensor(squares).double())
+        noise.append(problem.noise)
+    torch.testing.assert_close(noise[0][1], 2 * noise[0][0])
+    torch.testing.assert_close(noise[1], 10**0.5 * noise[0])
+
+
+def test_weights_that_samples_determine_leave_fewer_errors():
+    """Of ten independent errors four weights leave six, and twenty leave one."""
+    problem, noise = SimpleNamespace(count=50, correlation=5.0, range=torch.ones(2).double()), []
+    for determined in (0.0, 4.0, 20.0):
+        torque_problem.TorqueProblem.set_noise(problem, torch.tensor([2.0, 8.0]).double(), determined)
+        noise.append(problem.noise.square())
+    torch.testing.assert_close(noise[1], noise[0] * 10 / 6)
+    torch.testing.assert_close(noise[2], noise[0] * 10)
+
+
+def test_a_joint_of_servos_goes_no_step_uphill():
+    """Residuals arctan 10 x of two joints: a step from 0.3 goes far beyond zero, and is not taken."""
+    seen = []
+
+    def residuals(x):
+        seen.append(x.joints)
+        return (10 * x.joints).atan()
+
+    def normal_equations(x, errors):
+        slope = 10 / (1 + (10 * x.joints).square()).flatten()
+        return NormalEquations(torch.diag(slope.square()), -slope * errors.flatten())
+
+    problem = SimpleNamespace(
+        residuals=residuals,
+        normal_equations=normal_equations,
+        joint_costs=lambda x, errors: errors.square().sum(dim=0) / 2,
+    )
+    start = ServoParameters(
+        torch.tensor([[0.3, 0.05]]).double(), torch.zeros(0), 0.0, torch.ones(1, 2, dtype=torch.bool)
+    )
+    found, costs = laws._joint_minima(problem, start)
+    tried = (10 * torch.cat(seen)).atan().square() / 2
+    assert (tried[1:] > tried[0]).any()  # such steps were tried
+    torch.testing.assert_close(costs, (10 * found.joints[0]).atan().square() / 2)
+    assert (costs < 1e-3).all()
+
+
+def test_friction_of_two_directions_is_their_mean_in_mujoco(robots):
+    """1 Nm forward and 3 Nm backward: a file that has one figure for both says 2."""
+    arm = load_arm(robots / "two_link.urdf")
+    learned = rigid_body_projection(build(arm, "closed-form"), arm)
+    friction = learned.friction._replace(forward=np.array([1.0, 0.5]), backward=np.array([-3.0, -0.5]))
+    learned = replace(learned, friction=friction)
+    text = mjcf_text(learned).decode()
+    assert re.findall(r'frictionloss="([^"]*)"', text) == ["2", "0.5"]
+
+
+def test_the_tip_is_missed_by_millimetres():
+    """A joint is predicted 0.003 rad too far, at a radius of 2 m."""
+    q = torch.zeros(4, 3, 1).double()
+    windows = Windows(torch.full((4, 2), 0.01).double(), q, q, torch.zeros(4, 2, 1).double())
+    predicted = torch.full((4, 2, 1), 0.003).double()
+
+    def tip(angle: torch.Tensor) -> torch.Tensor:
+        return 2.0 * torch.cat([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=-1)
+
+    errors = end_errors((predicted, predicted), windows, ["revolute"], tip)
+    assert errors.tip_mm == pytest.approx(6.0, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("evidence", "unlikely"),
+    [((-1.0, -20.0), [True, True]), ((-1.0, 20.0), [False, False]), ((9.0, -20.0), [False, True])],
+)
+def test_weak_evidence_of_a_joint_yields_to_that_of_all(evidence, unlikely):
+    assert torque_problem._unlikely(torch.tensor(evidence)).tolist() == unlikely
+
+
+def test_freedom_that_samples_narrow_speaks_against_memory():
+    """Of two joints with two elements each: samples narrow one fraction of the second to a tenth."""
+    rigid = SimpleNamespace(
+        of_kind=lambda kind: ["fractions"],
+        named=lambda x: {"sizes": x[:1], "fractions": x[1:].view(2, 2)},
+    )
+    covariance = torch.diag(torch.tensor([0.5, 4.0, 4.0, 4.0, 0.04])).double()
+    problem = SimpleNamespace(
+        jacobian=SimpleNamespace(rigid=rigid),
+        start=torch.zeros(5),
+        precision=torch.eye(5).double() / 4.0,
+        covariance=covariance,
+    )
+    narrowed = torque_problem.TorqueProblem._fractions_narrowed(problem)
+    torch.testing.assert_close(narrowed, torch.tensor([0.0, 2 * np.log(10)]).double())
+
+
+def test_energy_that_only_changes_its_kind_is_no_rise(robots, monkeypatch):
+    """Links that swing upwards gain height and lose speed; with friction the sum falls."""
+    # of the ten seconds one shows it: speed and height alone rise by a thousandth in a step
+    monkeypatch.setattr(invariants, "TUNING", replace(invariants.TUNING, free_steps=1000))
+    model = build(robots / "two_link.urdf", "closed-form")
+    q, qd = torch.full((4, 2, 2), 0.3).double(), torch.full((4, 2, 2), 2.0).double()
+    windows = Windows(
+        torch.full((4, 1), 0.01).double(), q, torch.cat([qd, -qd])[::2], torch.zeros(4, 1, 2).double()
+    )
+    with torch.no_grad():
+        assert invariants._energy_rise(model, windows) < 1e-5
