@@ -9,12 +9,12 @@ import pyarrow.parquet
 import pytest
 import yaml
 
+from spelgen.arm.configured_arm import load_arm
 from spelgen.errors import LogError, SpelgenError
 from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.checks import check
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.pipeline.loaded_arm import load_arm
 from spelgen.settings.log_mapping import LogMapping
 
 ROBOTS = ("two_link", "scara", "six_dof")

@@ -390,7 +390,7 @@ def test_pipes_among_logs_are_not_waited_for(tmp_path, suffix):
     os.mkfifo(tmp_path / f"live{suffix}")
     with pytest.raises(LogError) as caught:
         read_logs(tmp_path / f"live{suffix}", JOINTS)
-    kinds = ".parquet, .csv, .npz, .mcap, .db3, the folder of a ROS 2 bag or of a LeRobot data set"
+    kinds = ".parquet, .csv, .npz, .mcap, .db3, .bag, the folder of a ROS 2 bag or of a LeRobot data set"
     assert str(caught.value) == f"{tmp_path}/live{suffix}: got no regular file, expected a file: {kinds}"
     parquet(tmp_path / "x.parquet", columns())
     check(read_logs(tmp_path, JOINTS)[0], "x")
@@ -529,8 +529,8 @@ def test_a_broken_bag_is_refused(tmp_path):
     with pytest.raises(SpelgenErrors) as caught:
         read_logs([tmp_path], JOINTS)
     first, second = str(caught.value).splitlines()
-    assert first.startswith(f"{tmp_path}/x.mcap: an unreadable ROS 2 bag (")
-    assert second.startswith(f"{tmp_path}/y.db3: an unreadable ROS 2 bag (")
+    assert first.startswith(f"{tmp_path}/x.mcap: an unreadable ROS bag (")
+    assert second.startswith(f"{tmp_path}/y.db3: an unreadable ROS bag (")
 
 
 def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch):
@@ -539,7 +539,7 @@ def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch):
     with pytest.raises(LogError) as caught:
         read_logs([tmp_path], JOINTS)
     assert str(caught.value) == (
-        f"{tmp_path}/x.mcap: got a ROS 2 bag, expected the package rosbags to read it; "
+        f"{tmp_path}/x.mcap: got a ROS bag, expected the package rosbags to read it; "
         "pip install 'spelgen[ros]'"
     )
 
@@ -641,7 +641,7 @@ def test_places_of_lists_are_columns(tmp_path, form):
     parquet(tmp_path / "y.parquet", {"time": T} | nested)
     for name in ("x.csv", "y.parquet"):
         check(read_logs(tmp_path / name, JOINTS, mapping)[0], name[0])
-    texts["effort"][2] = "[]"
+    texts["effort"][2] = "[0.5]"  # one value for two joints
     with (tmp_path / "x.csv").open("w", newline="") as file:
         csv.writer(file).writerows([["time", *texts], *zip(T, *texts.values(), strict=True)])
     with pytest.raises(LogError, match=r"x\.csv:4: row 3, column effort\[1\]: got no finite number"):

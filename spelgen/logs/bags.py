@@ -108,16 +108,17 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
     bag are not looked at.
     """
     try:
-        from rosbags import rosbag1, rosbag2
+        from rosbags.rosbag1 import Reader as Ros1Reader
+        from rosbags.rosbag2 import Reader as Ros2Reader
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError as error:
         expected, do = "the package rosbags to read it", "pip install 'spelgen[ros]'"
-        raise LogError("a bag of ROS", file=path, expected=expected, do=do) from error
+        raise LogError("a ROS bag", file=path, expected=expected, do=do) from error
     size = path.stat().st_size
     for file in path.rglob("*"):
         if not file.is_dir():
             # rosbags opens whatever the folder holds
-            require_regular_file(file, LogError, "files in the folder of a bag")
+            require_regular_file(file, LogError, "files in the folder of a ROS 2 bag")
             size += file.stat().st_size
     is_ros1 = path.suffix == ROS1
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
@@ -129,7 +130,7 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
             if unfinished:
                 messages = _without_end(unfinished, topic, path, remarks)
             else:
-                messages = _read_by(rosbag1.Reader if is_ros1 else rosbag2.Reader, topic, path)
+                messages = _read_by(Ros1Reader if is_ros1 else Ros2Reader, topic, path)
             for recorded, raw in messages:
                 state: Any = decode(raw, MESSAGE)
                 clock = state.header.stamp
@@ -139,7 +140,7 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
     except Exception as error:  # rosbags, its storages and their decompressors raise many kinds
         reason = in_one_line(error).rstrip(".")
         do = "a recording that was not closed may be repaired by `ros2 bag reindex` or `rosbag reindex`"
-        raise LogError(f"an unreadable bag of ROS ({reason})", file=path, do=do) from error
+        raise LogError(f"an unreadable ROS bag ({reason})", file=path, do=do) from error
 
 
 def _read_by(open_bag: Callable[[Path], Any], topic: str | None, path: Path) -> Iterator[tuple[int, bytes]]:
@@ -158,10 +159,10 @@ def _unfinished(path: Path) -> list[Path]:
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     for file in files:
         with file.open("rb") as source:
-            is_mcap = source.read(len(MAGIC)) == MAGIC
-            source.seek(-len(MAGIC), 2)
-            if is_mcap and source.read() != MAGIC:
-                return files
+            if source.read(len(MAGIC)) == MAGIC:
+                source.seek(-len(MAGIC), 2)
+                if source.read() != MAGIC:
+                    return files
     return []
 
 
@@ -201,4 +202,4 @@ def _chosen_topic(topics: set[str], present: set[str], topic: str | None, path: 
     raise LogError(got, file=path, expected=expected, do=do)
 
 
-BAG = LogFormat(read_bag, suffixes=(".mcap", ".db3", ROS1), marker="metadata.yaml", folder="a bag of ROS 2")
+BAG = LogFormat(read_bag, suffixes=(".mcap", ".db3", ROS1), marker="metadata.yaml", folder="a ROS 2 bag")
