@@ -25,8 +25,8 @@ LARGEST_STATE = 2**29  # bytes of model.pt or checkpoint.pt, unpacked
 class RunFolder:
     """The files of one training run.
 
-    spec: specification of the model. urdf, settings: of its robot, where known. config: how it was trained. metrics:
-    a line per epoch. checkpoint: everything needed to resume. weights: the best state_dict so far. evaluation: what
+    spec: specification of the model. urdf, settings: of its robot, where known. mapping: of logs with names and units
+    of their own, as --mapping takes it. config: how it was trained. metrics: a line per epoch. checkpoint: everything needed to resume. weights: the best state_dict so far. evaluation: what
     `evaluate` found. baseline: baselines fitted to the training logs, and the coverage of these.
     """
 
@@ -35,6 +35,7 @@ class RunFolder:
         self.spec = self.path / "spec.json"
         self.urdf = self.path / "robot.urdf"
         self.settings = self.path / "robot.yaml"
+        self.mapping = self.path / "mapping.yaml"
         self.config = self.path / "config.json"
         self.metrics = self.path / "metrics.jsonl"
         self.checkpoint = self.path / "checkpoint.pt"
@@ -62,8 +63,8 @@ class RunFolder:
         robot = self._robot_files(urdf)  # before anything is removed: they may be this very run's copies
         # first what makes it a run
         old_files = (
-            self.config, self.urdf, self.settings, self.metrics, self.checkpoint, self.weights, self.evaluation,
-            self.baseline,
+            self.config, self.urdf, self.settings, self.mapping, self.metrics, self.checkpoint, self.weights,
+            self.evaluation, self.baseline,
         )  # fmt: skip
         for old in old_files:
             remove(old)

@@ -142,9 +142,10 @@ def missing_columns(
         if set(names) <= set(missing):
             unlogged.append(joint)
     if unlogged and len(unlogged) < len(joints):
+        logged = ", ".join(joint for joint in joints if joint not in unlogged)
         do = (
-            f"nothing was logged of {', '.join(unlogged)}: say which joints are the arm's, by --tip, --joints, or "
-            "'tip' or 'moving_joints' in the robot's YAML, or map its columns under 'logs'"
+            f"nothing was logged of {', '.join(unlogged)}: write 'moving_joints: [{logged}]' into the robot's YAML if "
+            "the others do not move, or map its columns under 'logs'"
         )
     elif mapping.input == "torque" and _are_commands(columns, mapping, joints):
         do = "write 'input: position' into the YAML beside the URDF if these are commands of position servos"
