@@ -19,15 +19,25 @@ export PIP_ROOT_USER_ACTION := ignore
 help: ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
 
-demo: $(STAMP) ## the whole way on robots/rpr.urdf: inspect, build, simulate, train, evaluate, report
+demo: $(STAMP) ## robots/rpr.urdf from URDF to C: train on a simulated arm that differs from it; a minute
 	@rm -rf $(DEMO)
 	@mkdir -p $(DEMO)
 	$(BIN)/spelgen inspect robots/rpr.urdf
 	$(BIN)/spelgen build robots/rpr.urdf -o $(DEMO)/rpr_spel.py
-	$(BIN)/spelgen simulate robots/rpr.urdf -o $(DEMO)/logs
-	$(BIN)/spelgen train $(DEMO)/rpr_spel.py --robot robots/rpr.urdf --data $(DEMO)/logs -o $(DEMO)/run --set max_minutes=3
-	$(BIN)/spelgen evaluate $(DEMO)/run --data $(DEMO)/logs
-	$(BIN)/spelgen report $(DEMO)/run
+	$(BIN)/spelgen excite robots/rpr.urdf -o $(DEMO)/train.csv \
+	    --duration 15 --sample-rate 200
+	$(BIN)/spelgen excite robots/rpr.urdf -o $(DEMO)/test.csv \
+	    --duration 15 --sample-rate 200 --seed 1
+	$(BIN)/spelgen simulate robots/rpr.urdf -o $(DEMO)/logs --as-built 3 \
+	    --motion $(DEMO)/train.csv --motion $(DEMO)/test.csv
+	$(BIN)/spelgen logs $(DEMO)/logs --robot robots/rpr.urdf
+	$(BIN)/spelgen train $(DEMO)/rpr_spel.py --robot robots/rpr.urdf \
+	    --data $(DEMO)/logs -o $(DEMO)/run
+	$(BIN)/spelgen evaluate $(DEMO)/run --data $(DEMO)/logs \
+	    --truth $(DEMO)/logs/as_built.urdf
+	$(BIN)/spelgen report $(DEMO)/run > $(DEMO)/summary.txt
+	$(BIN)/spelgen export $(DEMO)/run --to c -o $(DEMO)/rpr_c
+	@echo && cat $(DEMO)/summary.txt
 
 test: lint ## format and lint, then all tests on all cores, among them types and import direction
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder

@@ -1,6 +1,6 @@
 """Switch off each mechanism of the torque fits, one after the other, and print what it is worth.
 
-    python benchmarks/ablation.py [--logs ../shared/logs] [--only NAME] [--case NAME]
+    python benchmarks/ablation.py [--recordings FOLDER] [--arms-folder URDFS] [--only NAME] [--case NAME]
 
 Cases: the real logs of benchmarks/arms.py (torque nMSE of `hybrid` on the test logs), three seconds of the UR10e, and
 simulated arms of benchmarks/truth.py (error of M(q), too). A cell is the error without the mechanism by the
@@ -28,17 +28,19 @@ sys.path.insert(0, str(Path(__file__).parent))
 import arms
 import truth
 from real_logs import first, mean, samples_of, torque_of, trained
+from recordings import folder_of
 
 import spelgen
 from spelgen.dynamics.residuals import residual_torque
-from spelgen.fitting import levenberg_marquardt
+from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
 from spelgen.fitting.torque import fit as torque_fit
-from spelgen.fitting.torque import jacobian as torque_jacobian
-from spelgen.fitting.torque import joint_functions, selection
+from spelgen.fitting.torque import joint_functions, residual_stage, stages
 from spelgen.fitting.torque import prior as torque_prior
 from spelgen.fitting.torque import problem as torque_problem
 from spelgen.fitting.torque.fit import fit_torque
-from spelgen.logs import dynamics_samples
+from spelgen.fitting.torque.linearization import RigidProjection
+from spelgen.fitting.torque.tuning import SELECTION, TUNING
+from spelgen.logs.tuning import SAMPLES
 
 NEVER = float("inf")
 SIMULATED = (
@@ -63,9 +65,9 @@ class Mechanism:
     switches: tuple[tuple[Any, str, Any], ...]
 
 
-def tuned(module: Any, **changes: Any) -> tuple[tuple[Any, str, Any], ...]:
-    """Switches that change fields of a module's table of tuned numbers, wherever that table is read."""
-    table, changed = module.TUNING, replace(module.TUNING, **changes)
+def tuned(table: Any, **changes: Any) -> tuple[tuple[Any, str, Any], ...]:
+    """Return the switches that change fields of a table of constants, in all modules that read it."""
+    changed = replace(table, **changes)
     readers = [x for name, x in sys.modules.items() if name.startswith("spelgen.")]
     return tuple(
         (reader, name, changed) for reader in readers for name, x in vars(reader).items() if x is table
@@ -73,81 +75,80 @@ def tuned(module: Any, **changes: Any) -> tuple[tuple[Any, str, Any], ...]:
 
 
 def keep_prior(prior: Any, *_: Any) -> Any:
-    """Stand in for `most_probable`: the prior stays as it is."""
+    """Replace `update_widths`: the prior's standard deviations are the initial ones."""
     return prior
 
 
-def remember_always(problem: Any, state: Any) -> Any:
-    """Stand in for `select_memory`: friction of every joint has memory."""
-    problem.jacobian.model.friction.memoryless.fill_(0.0)
-    return problem.solve(problem._first_fit(state.x, state.steps), torque_jacobian.TUNING.rounds)
+def always_hysteretic(estimate: Any) -> Any:
+    """Replace `choose_friction_state`: friction of every joint has bristle states."""
+    estimate.problem.jacobian.model.friction.memoryless.fill_(0.0)
+    problem, state = stages._least_squares_noise_fit(estimate.problem, estimate.state)
+    return torque_problem.alternate(problem, state, TUNING.iterations)
 
 
-def keep_all(problem: Any, state: Any) -> Any:
-    """Stand in for `select_effects`: friction has all effects at every joint."""
-    return state
+def keep_all(estimate: Any) -> Any:
+    """Replace `choose_friction_effects`: friction has all effects at every joint."""
+    return estimate
 
 
-def freedom_is_free(problem: Any) -> float:
-    """Stand in for `_fractions_narrowed`: memory is likely by what it explains alone."""
+def no_occam_factor(estimate: Any) -> float:
+    """Replace `fraction_occam_factor`: the friction state is chosen by its likelihood only."""
     return 0.0
 
 
-def leave(model: Any, samples: Any) -> None:
-    """Stand in for `bound_friction`: friction is guessed by efforts alone."""
+def no_limit(model: Any, samples: Any) -> None:
+    """Replace `limit_friction`: nominal friction depends on effort limits only."""
 
 
-def nothing(response: Any, joint: int, torque: Any) -> Any:
-    """Stand in for `remaining`: bodies take over nothing of a torque by position."""
+def not_orthogonalized(projection: Any, joint: int, torque: Any) -> Any:
+    """Replace `orthogonalize`: rigid bodies absorb no torque of position."""
     return torque
 
 
-def in_turns(model: Any, samples: Any, *rest: Any) -> joint_functions.FollowingResiduals:
-    """Stand in for `refit_residuals`: functions are fitted to what bodies leave, and then bodies beside them."""
+def alternately(model: Any, samples: Any, *rest: Any) -> joint_functions.ProjectedTerms:
+    """Replace `refit_terms`: residual terms and rigid bodies are fitted alternately, without variable projection."""
     with torch.no_grad():
         torque = residual_torque(model, *samples[:3])
-        following = joint_functions.refit_residuals(model, samples, *rest)
+        projected = joint_functions.refit_terms(model, samples, *rest)
         torque = torque - residual_torque(model, *samples[:3])
-    following.write(model, samples.missing + torque)
-    return joint_functions.FollowingResiduals({}, ())
+    projected.write(model, samples.torque_residual + torque)
+    return joint_functions.ProjectedTerms({}, ())
 
 
 def mechanisms() -> list[Mechanism]:
-    """All that are switched off."""
+    """Return all mechanisms."""
     return [
-        Mechanism("ends of recordings left out", tuned(dynamics_samples, unsettled=0.0)),
-        Mechanism("correlated errors (3 samples)", tuned(torque_jacobian, correlation_length=1.0)),
-        Mechanism("steps under the noise of least squares", tuned(torque_jacobian, first_steps=0)),
-        Mechanism("noise that falls with what is missed", tuned(torque_jacobian, first_rounds=0)),
-        Mechanism("more rounds while noise falls", tuned(torque_jacobian, longer=1)),
-        Mechanism("priors that yield", ((torque_problem, "most_probable", keep_prior),)),
-        Mechanism("that of armatures", ((torque_prior, "ADAPTED", ("bodies", "offset")),)),
-        Mechanism("memory by evidence", ((torque_problem.TorqueProblem, "select_memory", remember_always),)),
+        Mechanism("filter transients excluded", tuned(SAMPLES, unsettled=0.0)),
+        Mechanism("correlated errors (3 samples)", tuned(TUNING, correlation_length=1.0)),
+        Mechanism("steps at the least-squares noise", tuned(TUNING, initial_steps=0)),
+        Mechanism("noise annealing", tuned(TUNING, annealing_iterations=0)),
+        Mechanism("more iterations if noise decreases", tuned(TUNING, max_extension=1)),
+        Mechanism("estimated prior widths", ((torque_problem, "update_widths", keep_prior),)),
         Mechanism(
-            "less what its freedom explains",
-            ((torque_problem.TorqueProblem, "_fractions_narrowed", freedom_is_free),),
+            "estimated prior width of armatures", ((torque_prior, "ESTIMATED_GROUPS", ("bodies", "offset")),)
         ),
-        Mechanism("weak evidence yields to all joints'", tuned(torque_jacobian, strong_evidence=0.0)),
+        Mechanism("friction state by evidence", ((torque_fit, "choose_friction_state", always_hysteretic),)),
         Mechanism(
-            "effects of friction by evidence", ((torque_problem.TorqueProblem, "select_effects", keep_all),)
+            "Occam factor of bristle fractions",
+            ((stages, "fraction_occam_factor", no_occam_factor),),
         ),
-        Mechanism("bristles that joints share", ((torque_prior, "SHARED", OWN_BRISTLES),)),
-        Mechanism("errors that weights take", tuned(torque_jacobian, least_left=1.0)),
-        Mechanism("no more friction than torque", ((torque_fit, "bound_friction", leave),)),
-        Mechanism("friction compensated unseen", tuned(torque_jacobian, compensation_explained=NEVER)),
-        Mechanism("every second sample alone", tuned(torque_jacobian, decimation=1)),
-        Mechanism("few samples first", tuned(torque_jacobian, subset=2**40)),
-        Mechanism("steps in the bodies' parameters", tuned(levenberg_marquardt, kept_promise=-NEVER)),
-        Mechanism("turns of bodies and residuals", tuned(torque_jacobian, turns=1)),
-        Mechanism("functions that follow bodies", ((torque_fit, "refit_residuals", in_turns),)),
-        Mechanism("residuals beside rigid bodies", tuned(selection, standard_errors=NEVER)),
-        Mechanism(
-            "what bodies take over of springs", ((torque_jacobian.RigidResponse, "remaining", nothing),)
-        ),
-        Mechanism("significance of residuals", tuned(selection, standard_errors=0.0)),
-        Mechanism("gaps between blocks", tuned(selection, gap=0.0)),
-        Mechanism("least gain of residuals", tuned(selection, least_gain=0.0)),
-        Mechanism("networks among residuals", ((torque_fit, "select_networks", lambda *_: iter(())),)),
+        Mechanism("weak evidence yields to all joints", tuned(TUNING, strong_evidence=0.0)),
+        Mechanism("friction effects by evidence", ((torque_fit, "choose_friction_effects", keep_all),)),
+        Mechanism("common factor of bristle fractions", ((torque_prior, "SHARED", OWN_BRISTLES),)),
+        Mechanism("degrees of freedom of the noise", tuned(TUNING, min_error_fraction=1.0)),
+        Mechanism("friction limited to the torque", ((torque_fit, "limit_friction", no_limit),)),
+        Mechanism("friction compensation of drives", tuned(TUNING, min_explained=NEVER)),
+        Mechanism("every second sample", tuned(TUNING, decimation=1)),
+        Mechanism("subset of samples first", tuned(TUNING, initial_samples=2**40)),
+        Mechanism("steps in inertial parameters", tuned(DAMPING, min_gain_ratio=-NEVER)),
+        Mechanism("alternations with residual terms", tuned(TUNING, alternations=1)),
+        Mechanism("variable projection", ((residual_stage, "refit_terms", alternately),)),
+        Mechanism("residual terms", tuned(SELECTION, standard_errors=NEVER)),
+        Mechanism("orthogonalization of terms", ((RigidProjection, "orthogonalize", not_orthogonalized),)),
+        Mechanism("significance of residual terms", tuned(SELECTION, standard_errors=0.0)),
+        Mechanism("gaps between blocks", tuned(SELECTION, gap=0.0)),
+        Mechanism("minimum error reduction", tuned(SELECTION, min_reduction=0.0)),
+        Mechanism("networks in residual terms", ((residual_stage, "select_networks", lambda *_: iter(())),)),
     ]
 
 
@@ -182,6 +183,8 @@ def fit_and_judge(urdf: Path, training: Any, tests: Any) -> Callable[[], dict[st
 def simulated_cases(folder: Path) -> Iterator[tuple[str, Callable[[], dict[str, float]]]]:
     """Fits to arms whose truth is known."""
     for case in SIMULATED:
+        if case.arm != "random" and not (folder / f"{case.arm}.urdf").exists():
+            continue
         springs = ", springs" * case.springs
         yield f"{case.arm}, {case.friction}{springs}", lambda case=case: fit_truth(case, folder)
 
@@ -217,14 +220,16 @@ def fit_truth(case: truth.Case, folder: Path) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--logs", type=Path, default=Path(__file__).parents[2] / "shared" / "logs")
+    parser.add_argument("--recordings", type=Path, help="folder of benchmarks/recordings.py")
+    parser.add_argument("--arms-folder", type=Path, default=truth.ARMS, help="URDFs of the simulated arms")
     parser.add_argument("--only", default="", help="mechanisms whose names hold this")
     parser.add_argument("--case", default="", help="robots whose names hold this")
     options = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     chosen = [each for each in mechanisms() if options.only in each.name]
-    cases = [*real_cases(options.logs), *effect_cases(), *simulated_cases(options.logs.parent / "arms")]
+    recordings = folder_of(options.recordings)
+    cases = [*real_cases(recordings), *effect_cases(), *simulated_cases(options.arms_folder)]
     for name, run in cases:
         if options.case not in name:
             continue

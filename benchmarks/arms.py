@@ -1,14 +1,14 @@
 """Arm by baseline by preset: torques and states ahead on real logs, and torques of an arm with what rigid bodies miss.
 
-    python benchmarks/arms.py [LOGS]
+    python benchmarks/arms.py [FOLDER]
 
-LOGS is ../shared/logs beside the checkout by default. nMSE: mean squared torque error by the torque's variance, mean of
-the joints, pauses included. The presets are fitted as `spelgen train` does, everything else to the same samples.
-Networks have two hidden layers of 64 units: one of q, qd and qdd; the same for what least squares leaves; and a Deep
-Lagrangian network (Lutter, Ritter and Peters, ICLR 2019: a factor of M, and V) with viscous and Coulomb friction of
-each joint beside it. They are stopped, and the ridge is chosen, by a fifth of those samples, as a careful user would.
-States 0.1, 0.5 and 1 s ahead: error relative to the motion, as `spelgen evaluate` has it, open loop and with the
-disturbance held that a momentum observer finds.
+FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. nMSE: mean squared torque
+error by the torque's variance, mean of the joints, pauses included. The presets are fitted as `spelgen train` does,
+everything else to the same samples. Networks have two hidden layers of 64 units: one of q, qd and qdd; the same for
+what least squares leaves; and a Deep Lagrangian network (Lutter, Ritter and Peters, ICLR 2019: a factor of M, and V)
+with viscous and Coulomb friction of each joint beside it. They are stopped, and the ridge is chosen, by a fifth of
+those samples, as a careful user would. States 0.1, 0.5 and 1 s ahead: error relative to the motion, as `spelgen
+evaluate` has it, open loop and with the disturbance held that a momentum observer finds.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ from real_logs import (
     torque_of,
     trained,
 )
+from recordings import folder_of, panda_urdf
 from torch import Tensor, nn
 from torch.func import grad, jvp
 
@@ -51,7 +52,7 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.linear_friction import FrictionModel
-from spelgen.dynamics.pinocchio_urdf import has_drives, urdf_dynamics
+from spelgen.dynamics.pinocchio_urdf import drives_known, urdf_dynamics
 from spelgen.emission.build import build
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.logs.dynamics_samples import DynamicsSamples
@@ -88,7 +89,7 @@ EFFECTS = {
 
 def main() -> None:
     torch.set_num_threads(1)
-    logs = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[2] / "shared" / "logs"
+    logs = folder_of(sys.argv[1] if len(sys.argv) > 1 else None)
     print("Torque nMSE on real logs\n")
     table(real(logs))
     print("\nStates ahead on real logs, error relative to the motion\n")
@@ -147,7 +148,7 @@ def splits(folder: Path) -> Iterator[Split]:
     arm = load_arm(urdf).arm
     logs = {x: read(folder / "ur10e" / f"{x}.parquet", arm) for x in (*TRAINING, *TESTS)}
     yield "UR10e, nine", urdf, [logs[x] for x in TRAINING], [logs[x] for x in TESTS]
-    urdf = folder.parent / "arms" / "panda_erd.urdf"
+    urdf = panda_urdf(folder)
     whole = read(folder / "panda" / "exciting_traj1.parquet", load_arm(urdf).arm)
     yield "Panda", urdf, [first(whole, 12.0)], [after(whole, 12.0)]
     for name, seconds in SPLITS.items():
@@ -222,7 +223,7 @@ def recorded(model: Any, effects: Sequence[str], seed: int, noise: float = 0.0) 
 def of_the_urdf(urdf: Path, arm: Arm) -> Torque:
     """The URDF as it is, with the settings' drives where there are any."""
     names = [x.name for x in arm.coordinates]
-    dynamics = urdf_dynamics(urdf, names, drives=has_drives(urdf, names))
+    dynamics = urdf_dynamics(urdf, names, drives=drives_known(urdf, names))
     return torque_of(dynamics)
 
 

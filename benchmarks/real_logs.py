@@ -1,11 +1,12 @@
 """Real logs beside published baselines: every figure of docs/real_logs.md in one command.
 
-    python benchmarks/real_logs.py [LOGS]
+    python benchmarks/real_logs.py [FOLDER]
 
-LOGS is ../shared/logs beside the checkout by default. Torque errors are nMSE (mean squared error by the torque's
-variance, mean of the joints), once over the samples that move and once with the pauses between motions; the second is
-how the baselines' published figures were made. Nothing is chosen here: the settings are the defaults of spelgen, and
-fits are those of `spelgen train`, with the delay of torques that it finds; least squares has the same samples.
+FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. Torque errors are nMSE (mean
+squared error by the torque's variance, mean of the joints), once over the samples that move and once with the pauses
+between motions; the second is how the baselines' published figures were made. Nothing is chosen here: the settings are
+the defaults of spelgen, and fits are those of `spelgen train`, with the delay of torques that it finds; least squares
+has the same samples.
 """
 
 from __future__ import annotations
@@ -22,10 +23,12 @@ from typing import Any
 import numpy as np
 import torch
 
+sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from delan_characters import TESTS as CHARACTERS
 from delan_characters import read_characters, write_arm
+from recordings import folder_of, panda_urdf
 
 import spelgen
 from spelgen.arm.arm import Arm
@@ -66,10 +69,10 @@ SUBSTEPS = 4
 
 def main() -> None:
     torch.set_num_threads(1)
-    logs = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[2] / "shared" / "logs"
+    logs = folder_of(sys.argv[1] if len(sys.argv) > 1 else None)
     with tempfile.TemporaryDirectory() as scratch:
         ur10e(logs / "ur10e")
-        panda(logs / "panda", logs.parent / "arms" / "panda_erd.urdf")
+        panda(logs / "panda", panda_urdf(logs))
         characters(logs / "delan_characters", Path(scratch))
 
 

@@ -1,8 +1,9 @@
 """Processor time of the commands, as ratios to `identify --friction memory` in the same run: medians of five.
 
-    python benchmarks/seconds.py [LOGS] [--repeats 5]
+    python benchmarks/seconds.py [FOLDER] [--repeats 5]
 
-LOGS is ../shared/logs beside the checkout by default; the arm is its UR10e, 100 s of training logs and three tests.
+FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings; the
+arm is its UR10e, 100 s of training logs and three tests.
 """
 
 from __future__ import annotations
@@ -15,6 +16,10 @@ import sys
 import tempfile
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parent))
+
+from recordings import folder_of
+
 TRAINING = ("20_02_10_30sec_12harm", "20_02_12_50sec_12harm", "20_02_05_20sec_8harm")
 TESTS = ("19_12_23_free", "20_01_31_unload", "20_02_05_20sec_12harm")
 GOALS = {"train closed-form": 2.0, "train hybrid": 4.0, "evaluate": 3.0, "report": 1.0}
@@ -23,10 +28,10 @@ GOALS = {"train closed-form": 2.0, "train hybrid": 4.0, "evaluate": 3.0, "report
 def main() -> None:
     """Print each ratio beside its goal."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("logs", nargs="?", type=Path, default=Path(__file__).parents[2] / "shared" / "logs")
+    parser.add_argument("folder", nargs="?", type=Path)
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
-    folder = arguments.logs / "ur10e"
+    folder = folder_of(arguments.folder) / "ur10e"
     urdf = folder / "ur10e.urdf"
     training, tests = ([folder / f"{name}.parquet" for name in names] for names in (TRAINING, TESTS))
     seconds: dict[str, list[float]] = {name: [] for name in ("identify", *GOALS)}

@@ -50,6 +50,7 @@ from spelgen.fitting.torque.objective import torque_delay
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.logs.dynamics_samples import dynamics_samples
 
+ARMS = Path(__file__).parents[2] / "shared" / "arms"  # a folder of URDFs beside the checkout, if there is one
 FRICTIONS = ("none", "coulomb", "stribeck", "bristles", "load", "asymmetric")
 FINE = 1000.0  # Hz: the grid on which truth is computed; logs take samples of it
 POSITION_NOISE = 1e-5  # rad, m: of an encoder of 18 bits
@@ -481,8 +482,9 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--out", type=Path, default=Path("runs/truth.jsonl"))
-    default = Path(__file__).parents[2] / "shared" / "arms"
-    parser.add_argument("--arms-folder", type=Path, default=default)
+    parser.add_argument(
+        "--arms-folder", type=Path, default=ARMS, help="URDFs; without them all arms are random"
+    )
     parser.add_argument("--panda", action="store_true")
     options = parser.parse_args()
     rows = [json.loads(x) for x in options.out.read_text().splitlines()] if options.out.exists() else []

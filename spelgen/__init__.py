@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from spelgen.logs.read import read_logs, write_logs
     from spelgen.logs.trajectory import Trajectory
     from spelgen.settings.fits import GaussianPrior, MomentumFit, Rollout, TorqueFit
+    from spelgen.simulation.as_built import as_built
     from spelgen.simulation.simulate import simulate
 
 
@@ -47,6 +48,7 @@ _HOME = {
     "check_logs": "log_checks.check_logs",
     "Preprocessing": "logs.preprocessing",
     "simulate": "simulation.simulate",
+    "as_built": "simulation.as_built",
     "excite": "excitation.design",
     "identify": "identification.identify",
     "LeastSquares": "identification.identification",
@@ -87,6 +89,7 @@ __all__ = [
     "TorqueFit",
     "Trajectory",
     "__version__",
+    "as_built",
     "build",
     "check",
     "check_logs",

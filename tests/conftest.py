@@ -114,8 +114,11 @@ def short_torque_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fits to torques take two steps a round and few rounds: for tests of what stands around a fit."""
     from spelgen.fitting.torque.tuning import TorqueTuning
 
-    tuning = TorqueTuning(rounds=1, first_steps=2, last_rounds=1, longer=1, steps=2)
-    monkeypatch.setattr("spelgen.fitting.torque.problem.TUNING", tuning)
+    tuning = TorqueTuning(
+        iterations=1, initial_steps=2, final_iterations=1, max_extension=1, iteration_steps=2
+    )
+    for module in ("problem", "stages"):
+        monkeypatch.setattr(f"spelgen.fitting.torque.{module}.TUNING", tuning)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -19,6 +19,7 @@ def body(name="a", kind="revolute", **changes):
     """A point of mass 1 in the origin of its joint, on the root."""
     known = {
         "parent": -1,
+        "link": name,
         "coordinate": 0,
         "multiplier": Fraction(1),
         "offset": 0.0,

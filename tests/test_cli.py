@@ -255,7 +255,7 @@ def test_unexpected_errors_are_named(spelgen, robots, monkeypatch):
     def broken(*arguments, **options):
         raise ZeroDivisionError("division\nby zero")
 
-    monkeypatch.setattr("spelgen.pipeline.loaded_arm.load_arm", broken)
+    monkeypatch.setattr("spelgen.arm.configured_arm.load_arm", broken)
     line = refused(spelgen("inspect", robots / "rpr.urdf"))
     assert line == "spelgen: unexpected ZeroDivisionError: division by zero; --debug shows where"
 
@@ -327,7 +327,7 @@ def test_interrupt_exits_130(spelgen, robots, monkeypatch):
     def interrupted(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("spelgen.pipeline.loaded_arm.load_arm", interrupted)
+    monkeypatch.setattr("spelgen.arm.configured_arm.load_arm", interrupted)
     result = spelgen("inspect", robots / "rpr.urdf")
     assert (result.exit_code, result.stderr) == (130, "interrupted\n")
 

@@ -123,13 +123,15 @@ def test_the_fit_knows_that_a_motor_moves_both_joints(wrist):
     z = bristles_along(moved(module, 4.0)[0], bristle_reach(model))[::40]
     jacobian = TorqueJacobian(model, TorqueSamples.of([DynamicsSamples("x", *motion, tau, z)]))
     noise = torch.ones(6).double()
-    start = jacobian.rigid.flattened(jacobian.rigid.start)
+    start = jacobian.rigid.flatten(jacobian.rigid.initial)
     x = start + 0.1 * torch.randn(len(start), generator=torch.Generator().manual_seed(0))
     _, slope = jacobian.normal_equations(x, noise)
     for k in range(len(x)):
         step = torch.zeros_like(x)
         step[k] = 1e-5
-        change = (jacobian.squares(x + step).sum() - jacobian.squares(x - step).sum()) / 2e-5
+        change = (
+            jacobian.squared_residual(x + step).sum() - jacobian.squared_residual(x - step).sum()
+        ) / 2e-5
         assert change.item() == pytest.approx(
             -2 * slope[k].item(), rel=1e-4, abs=1e-4 * float(slope.abs().max())
         )

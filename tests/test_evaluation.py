@@ -210,7 +210,7 @@ def test_the_same_run_and_logs_give_the_same_file(run):
     assert files[0] == files[1]
     assert "stand_in on 4 test trajectories; * marks the best of a row" in shown.stdout
     found = json.loads(files[0], parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
-    assert found["schema"] == 9
+    assert found["schema"] == 10
     shown = found["traces"]["trajectories"]
     assert [x["which"] for x in shown] == ["typical", "worst"]
     assert len(shown[0]["q"]) == len(shown[0]["t"]) == 21 and len(shown[0]["q"][0]) == 2
@@ -257,7 +257,7 @@ def test_what_is_no_run_is_refused(run, tmp_path):
 @pytest.mark.usefixtures("short_epochs")
 def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
     """End to end on a URDF: its own dynamics made the logs, so the URDF baseline is perfect."""
-    from spelgen.pipeline import generate as pipeline
+    from spelgen.emission import build as pipeline
 
     module = cart.with_name("cart_model.py")
     module.write_text(pipeline.generate(cart))

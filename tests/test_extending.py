@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from spelgen.pipeline import generate as pipeline
 
 import spelgen
 from spelgen import design
@@ -17,6 +16,7 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines import registry
 from spelgen.baselines.baseline import Baseline
 from spelgen.baselines.predictor import Predictor
+from spelgen.emission import build as pipeline
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
 from spelgen.exporting import exported

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from fuzzing import FEW, MINUTES, fuzz
 from hypothesis import strategies as st
-from spelgen.pipeline import generate as pipeline
 
+from spelgen.certificate import inspection as pipeline
 from spelgen.errors import SpelgenError
 
 ROOT = Path(__file__).parents[1]

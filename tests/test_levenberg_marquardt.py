@@ -1,50 +1,79 @@
-"""Damped Gauss-Newton steps: known ends, batches of systems, and the second way of a step."""
+"""Levenberg-Marquardt steps lead to known minima, and every run states why it ended."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 import torch
 
-from spelgen.fitting.levenberg_marquardt import NormalEquations, levenberg_marquardt, start
+from spelgen.fitting.levenberg_marquardt import (
+    NormalEquations,
+    Termination,
+    initial_state,
+    levenberg_marquardt,
+)
 from spelgen.fitting.objectives import OBJECTIVES
 from spelgen.settings.fits import CONFIGS
 
 
 class Rosenbrock:
-    """10 (y - x^2) and 1 - x, whose squares are least at (1, 1)."""
+    """10 (y - x^2) and 1 - x, whose sum of squares has its minimum at (1, 1)."""
 
-    def residuals(self, x):
+    def residual(self, x):
         return torch.stack([10 * (x[1] - x[0] ** 2), 1 - x[0]])
 
-    def cost(self, x, residuals):
-        return float(residuals.square().sum() / 2)
+    def cost(self, x, residual):
+        return float(residual.square().sum() / 2)
 
-    def normal_equations(self, x, residuals):
-        slope = torch.tensor([[-20 * x[0], 10.0], [-1.0, 0.0]]).double()
-        return NormalEquations(slope.mT @ slope, -slope.mT @ residuals)
+    def normal_equations(self, x, residual):
+        jacobian = torch.tensor([[-20 * x[0], 10.0], [-1.0, 0.0]]).double()
+        return NormalEquations(jacobian.mT @ jacobian, -jacobian.mT @ residual)
 
-    def moved(self, x, step):
+    def candidates(self, x, step):
         yield x + step
 
 
-def test_the_valley_is_followed_to_its_end():
-    problem = Rosenbrock()
-    first = start(problem, torch.tensor([-1.2, 1.0]).double())
-    states = list(levenberg_marquardt(problem, first, max_steps=100, least_gain=1e-20))
-    costs = [first.cost, *(state.cost for state in states)]
-    assert all(after <= before for before, after in pairwise(costs))
-    torch.testing.assert_close(states[-1].x, torch.ones(2).double(), rtol=0, atol=1e-8)
-    assert states[-1].converged
-    assert list(levenberg_marquardt(problem, states[-1], max_steps=5)) == []
+def first_state(problem):
+    return initial_state(problem, torch.tensor([-1.2, 1.0]).double())
 
 
-def test_a_fit_goes_on_from_any_of_its_states():
-    problem = Rosenbrock()
-    whole = list(
-        levenberg_marquardt(problem, start(problem, torch.tensor([-1.2, 1.0]).double()), max_steps=9)
+def test_the_minimum_of_the_rosenbrock_function_is_found():
+    """No step raises the cost, the log has every step, and a run from the minimum takes none."""
+    problem, states = Rosenbrock(), [first_state(Rosenbrock())]
+    result = levenberg_marquardt(
+        problem, states[0], max_steps=100, min_decrease=1e-20, callback=states.append
     )
-    again = list(levenberg_marquardt(problem, whole[3], max_steps=5))
-    assert torch.equal(again[-1].x, whole[-1].x) and again[-1].steps == whole[-1].steps
+    costs = [state.cost for state in states]
+    assert all(after <= before for before, after in pairwise(costs))
+    assert [entry.cost for entry in result.log] == costs[1:]
+    assert result.state is states[-1] and result.state.steps == len(result.log)
+    torch.testing.assert_close(result.state.x, torch.ones(2).double(), rtol=0, atol=1e-8)
+    assert result.termination in (Termination.SMALL_DECREASE, Termination.SMALL_PREDICTION)
+    again = levenberg_marquardt(problem, result.state, max_steps=5, min_decrease=1e-20)
+    assert (again.termination, again.log) == (Termination.SMALL_PREDICTION, ())
+    assert again.state is result.state
+
+
+def test_a_fit_is_resumed_from_any_of_its_states():
+    problem, states = Rosenbrock(), []
+    whole = levenberg_marquardt(problem, first_state(problem), max_steps=9, callback=states.append)
+    again = levenberg_marquardt(problem, states[3], max_steps=5)
+    assert whole.termination is again.termination is Termination.MAX_STEPS
+    assert torch.equal(again.state.x, whole.state.x) and again.state.steps == whole.state.steps
+
+
+def test_an_ascent_direction_ends_the_solver():
+    """With the sign of the step wrong no damping lowers the cost, until it is so large that no step is left."""
+
+    class Ascending(Rosenbrock):
+        def candidates(self, x, step):
+            yield x - step
+
+    problem = Ascending()
+    for damping, termination in ((1e-9, Termination.NO_DECREASE), (1.0, Termination.SMALL_PREDICTION)):
+        first = replace(first_state(problem), damping=damping)
+        result = levenberg_marquardt(problem, first, max_steps=5)
+        assert result.termination is termination and result.state is first and result.log == ()
 
 
 def test_systems_of_a_batch_have_their_own_damping():
@@ -58,16 +87,18 @@ def test_systems_of_a_batch_have_their_own_damping():
         torch.testing.assert_close(damped @ steps[k], descent)
 
 
-def test_the_second_way_is_taken_where_the_first_keeps_little():
-    class Curved(Rosenbrock):
-        def moved(self, x, step):
+def test_the_second_candidate_is_taken_if_the_gain_ratio_of_the_first_is_low():
+    class Short(Rosenbrock):
+        def candidates(self, x, step):
             yield x + 1e-3 * step
             yield x + step
 
-    problem, x = Curved(), torch.tensor([0.9, 0.8]).double()
-    (state,) = levenberg_marquardt(problem, start(problem, x, damping=1e-9), max_steps=1)
-    (direct,) = levenberg_marquardt(Rosenbrock(), start(Rosenbrock(), x, damping=1e-9), max_steps=1)
-    assert torch.equal(state.x, direct.x)
+    problem, x = Short(), torch.tensor([0.9, 0.8]).double()
+    found, direct = (
+        levenberg_marquardt(each, initial_state(each, x, damping=1e-9), max_steps=1)
+        for each in (problem, Rosenbrock())
+    )
+    assert torch.equal(found.state.x, direct.state.x)
 
 
 @pytest.mark.parametrize("name", CONFIGS)

@@ -1,6 +1,7 @@
 """Meshes are drawn or replaced by tubes within bounds of time and memory; pipes are never opened."""
 
 import base64
+import contextlib
 import json
 import os
 import resource
@@ -8,6 +9,7 @@ import struct
 import subprocess
 import time
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +43,7 @@ def test_triangles_without_common_corners_stay_one_surface(tmp_path):
     assert drawn.area == pytest.approx(ball.area, rel=0.02)
 
 
+@pytest.mark.timed  # the process that reads meshes is stopped after a minute
 def test_an_arm_of_fine_meshes_is_drawn(tmp_path):
     trimesh.creation.icosphere(subdivisions=7, radius=0.1).export(tmp_path / "m.stl")  # 327,680 faces
     visual = '<visual><geometry><mesh filename="m.stl"/></geometry></visual>'
@@ -165,27 +168,52 @@ def box_without_size(folder: Path) -> str:
 
 
 DRAWN = (box_without_size, plain_obj, plain_gltf, gltf_with_a_file, obj_whose_material_is_a_pipe)
-LEFT_OUT = (
+OMITTED = (
     pipe, gltf_whose_buffer_is_a_pipe, gltf_whose_buffer_lies_elsewhere, gltf_of_gigabytes, archive_of_gigabytes,
     stl_that_states_more_than_it_has, ply_that_states_more_than_it_has, corners_that_are_no_numbers,
     gltf_of_triangles_without_corners, triangle_beyond_all_areas,
 )  # fmt: skip
 
 
-@pytest.mark.timed
-@pytest.mark.parametrize("make", DRAWN + LEFT_OUT)
-def test_meshes_are_drawn_or_omitted_within_bounds(tmp_path, make):
-    pytest.importorskip("trimesh")
-    path = tmp_path / "r.urdf"
-    path.write_text(ARM.replace("FILE", make(tmp_path)))
+@contextlib.contextmanager
+def bounds() -> Iterator[None]:
+    """Check the time and the memory of the child processes that the block runs."""
     begin, used = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
-    assert scene(path, ["j"]).has_meshes == (make in DRAWN)
+    yield
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert in_time(after.ru_utime + after.ru_stime - used.ru_utime - used.ru_stime, 10)
     # kB, of the largest process so far: another test's may have been larger, and each begins as a copy of this one
     copied = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert after.ru_maxrss <= max(used.ru_maxrss, copied, 1_100_000)
     assert time.monotonic() - begin < 60  # a process that waits for a pipe uses no processor time
+
+
+@pytest.mark.timed
+def test_meshes_of_all_formats_are_drawn_within_bounds(tmp_path):
+    """One arm has a link per format, as an arm is drawn only if all of its meshes can be read."""
+    links, joints = [], []
+    for make in DRAWN:
+        name = make.__name__
+        (tmp_path / name).mkdir()
+        mesh = f'<mesh filename="{name}/{make(tmp_path / name)}"/>'
+        links.append(f'<link name="{name}"><visual><geometry>{mesh}</geometry></visual></link>')
+        joints.append(f'<joint name="{name}" type="fixed"><parent link="b"/><child link="{name}"/></joint>')
+    path = tmp_path / "r.urdf"
+    arm = ARM.replace("FILE", plain_obj(tmp_path))
+    path.write_text(arm.replace("</robot>", f"{''.join(links + joints)}</robot>"))
+    with bounds():
+        found = scene(path, ["j"])
+    assert found.has_meshes
+    assert {link.name for link in found.links if len(link.shape.faces)} >= {make.__name__ for make in DRAWN}
+
+
+@pytest.mark.timed
+@pytest.mark.parametrize("make", OMITTED)
+def test_hostile_meshes_are_omitted_within_bounds(tmp_path, make):
+    path = tmp_path / "r.urdf"
+    path.write_text(ARM.replace("FILE", make(tmp_path)))
+    with bounds():
+        assert not scene(path, ["j"]).has_meshes
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,9 @@ from importlib.metadata import PackageNotFoundError, metadata, requires
 from pathlib import Path
 
 import pytest
-from spelgen.pipeline import generate as pipeline
 
 import spelgen
+from spelgen.emission import build as pipeline
 
 ROOT = Path(__file__).parents[1]
 

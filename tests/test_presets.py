@@ -106,7 +106,7 @@ def test_networks_read_rotation_matrices(net, part, tmp_path):
     near(outputs_alone(model, network_inputs(owner, q)), layer)
 
 
-@each
+@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("robot", ["rpr", "six_dof"])
 def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset, tmp_path):
     """Eq. 15 and 18 over three axes a joint, all derivatives automatic, against the n x n module."""

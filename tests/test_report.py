@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 from html_page import Page
-from spelgen.pipeline import generate as pipeline
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.design import PRESETS
+from spelgen.emission import build as pipeline
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
 from spelgen.fitting.run_folder import RunFolder

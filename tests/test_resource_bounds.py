@@ -26,8 +26,7 @@ SECONDS, MEGABYTES = 10, 1000
 # line of what it tells, its processor time is that of the fork and of the imports.
 SERVER = """
 import json, os, resource, signal, sys
-import spelgen.emission.emit
-import spelgen.pipeline.generate
+import spelgen.emission.build
 from spelgen.cli.main import main
 
 def run(folder, told, *arguments):

@@ -23,7 +23,7 @@ from spelgen.design import PRESET_NAMES, load_design
 from spelgen.dynamics.body_regressor import pseudo_inertia
 from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
 from spelgen.emission.build import build, make_spec
-from spelgen.fitting.torque.weights import body_weights, upper_cholesky
+from spelgen.fitting.torque.parameters import log_cholesky_parameters, upper_cholesky
 from spelgen.runtime.derived_mass import DerivedMass
 from spelgen.runtime.encoding import JointEncoding
 from spelgen.runtime.friction_laws import turning
@@ -299,7 +299,7 @@ def weights_of_first_stage(bodies):
     entries = 0.01 * torch.ones(4, 4).double().tril(-1)
     root = torch.linalg.cholesky(nominal) @ (entries + math.exp(0.01) * torch.eye(4).double())
     relative = torch.linalg.solve(bodies.factors, root)
-    return body_weights(upper_cholesky(relative @ relative.mT))
+    return log_cholesky_parameters(upper_cholesky(relative @ relative.mT))
 
 
 def rotation_inputs(joint_types, axes):

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import minimize
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.emission.build import build
@@ -18,9 +19,10 @@ from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo import laws
 from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.torque import jacobian as torque_jacobian
-from spelgen.fitting.torque import joint_functions, selection
+from spelgen.fitting.torque import joint_functions, network_selection, selection, stages
 from spelgen.fitting.torque import objective as torque_objective
 from spelgen.fitting.torque import problem as torque_problem
+from spelgen.fitting.torque.bayesian_ridge import append_target, bayesian_ridge
 from spelgen.fitting.torque.jacobian import ResidualSamples
 from spelgen.fitting.torque.objective import fit_torques
 from spelgen.fitting.torque.selection import select_functions
@@ -35,7 +37,7 @@ class Alone:
     """Rigid bodies and a friction model that absorb none of the added torque."""
 
     @staticmethod
-    def remaining(joint, torque):
+    def orthogonalize(joint, torque):
         return torque
 
 
@@ -71,7 +73,7 @@ def test_neighbours_of_what_is_held_out_are_not_fitted_to(hybrid):
     q = torch.stack([torch.linspace(-2, 2, 2000), torch.zeros(2000)], dim=1).double()
     missed = samples(missing, q)
     spline = next(joint_functions.joint_functions(hybrid, missed, ALONE))
-    errors, _ = selection._held_out_errors(spline, missing[:, 0], 20.0)
+    errors, _ = selection._cross_validate(spline, missing[:, 0], 20.0)
     assert errors.square().sum() > missing.square().sum()
     assert select_functions(hybrid, missed, ALONE, [], 20.0) == []
 
@@ -96,10 +98,10 @@ def test_the_first_half_is_judged_where_it_has_been(hybrid):
     noise = 0.02 * torch.randn(4000, 2, generator=torch.Generator().manual_seed(0)).double()
     missed = samples(torque + noise, q)
     spline = next(joint_functions.joint_functions(hybrid, missed, ALONE))
-    first, last = selection.halves(4000, 1.0)
-    weights, _ = joint_functions.fit_function(spline, missed.missing[:, 0], 1.0, first)
-    error = missed.missing[last, 0] - spline.torque(weights, last)
-    assert error.square().sum() > missed.missing[last, 0].square().sum()
+    first, last = selection.split_halves(4000, 1.0)
+    weights = spline.fit(missed.torque_residual[:, 0], 1.0, first).coef
+    error = missed.torque_residual[last, 0] - spline.torque(weights, last)
+    assert error.square().sum() > missed.torque_residual[last, 0].square().sum()
     selected = select_functions(hybrid, missed, ALONE, [], 1.0)
     assert [(residual.name, residual.joint) for residual in selected] == [("raw_torque_splines", 0)]
 
@@ -123,14 +125,14 @@ def test_a_stretch_without_torque_hides_no_gain():
     squares, missed = torch.full((10,), 100.0), torch.full((10,), 10.0)
     squares[3], missed[3] = 0.0, 1e-9
     # nine of ten stretches fall to a tenth
-    assert selection._significant_gain(squares, missed) == pytest.approx(0.85, abs=0.01)
+    assert selection.significant_reduction(squares, missed) == pytest.approx(0.85, abs=0.01)
 
 
 def test_a_stretch_that_goes_farther_than_all_others_hides_no_gain():
     """Splines of a spring know nothing of where a joint has been once, and that is where its torque is largest."""
     squares, missed = torch.full((10,), 50.0), torch.full((10,), 1.0)
     squares[0], missed[0] = 400.0, 2e6
-    assert selection._significant_gain(squares, missed) > 0.8
+    assert selection.significant_reduction(squares, missed) > 0.8
 
 
 def test_a_network_is_fitted_to_what_functions_of_joints_leave(robots, monkeypatch):
@@ -140,12 +142,12 @@ def test_a_network_is_fitted_to_what_functions_of_joints_leave(robots, monkeypat
     left = []
 
     def fitted(model, network, samples, *_):
-        left.append(selection._still_missing(model, samples))
+        left.append(network_selection._remaining_residual(model, samples))
         return 0.5
 
-    monkeypatch.setattr(selection, "_fit_network", fitted)
+    monkeypatch.setattr(network_selection, "_fit_network", fitted)
     q = torch.linspace(-1, 1, 2000).double().unsqueeze(-1).expand(-1, 2)
-    assert len(list(selection.select_networks(model, samples(q.sin(), q), 1.0))) == 2
+    assert len(list(network_selection.select_networks(model, samples(q.sin(), q), 1.0))) == 2
     for missing in left:
         torch.testing.assert_close(missing, q.sin())
 
@@ -153,13 +155,13 @@ def test_a_network_is_fitted_to_what_functions_of_joints_leave(robots, monkeypat
 def test_gains_have_to_be_beyond_their_own_scatter():
     squares = torch.ones(10).double()
     steady = torch.full((10,), 0.9).double()
-    assert selection._significant_gain(squares, steady + 0.001 * torch.arange(10)) == pytest.approx(
+    assert selection.significant_reduction(squares, steady + 0.001 * torch.arange(10)) == pytest.approx(
         0.0955, rel=2e-3
     )
     # as sure as can be, and next to nothing: no function is worth that
-    assert selection._significant_gain(squares, 0.9999 * squares) is None
+    assert selection.significant_reduction(squares, 0.9999 * squares) is None
     lucky = torch.tensor([0.1] + [1.0] * 9).double()
-    assert selection._significant_gain(squares, lucky) is None
+    assert selection.significant_reduction(squares, lucky) is None
 
 
 def test_samples_that_err_alike_count_once():
@@ -170,13 +172,41 @@ def test_samples_that_err_alike_count_once():
     groups = torch.zeros(4)
 
     def weights(times: int) -> torch.Tensor:
-        rows = joint_functions.beside(x, y).repeat_interleave(times, dim=0)
-        return joint_functions.most_probable(rows.mT @ rows, len(rows), groups, float(times))[0]
+        rows = append_target(x, y).repeat_interleave(times, dim=0)
+        return bayesian_ridge(rows.mT @ rows, len(rows), groups, float(times)).coef
 
     torch.testing.assert_close(weights(20), weights(1), rtol=1e-6, atol=1e-9)
     assert (
         weights(1) - torch.linalg.lstsq(x, y).solution
     ).abs().max() > 1e-3  # drawn to nothing by the prior
+
+
+def test_bayesian_ridge_maximizes_the_marginal_likelihood():
+    """Two groups of weights, one of them without effect, against a numerical maximum over the prior's precisions."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(2000, 12))
+    y = x[:, :6] @ rng.normal(scale=0.3, size=6) + 0.5 * rng.normal(size=2000)
+    groups = torch.tensor([0] * 6 + [1] * 6)
+    rows = append_target(torch.from_numpy(x), torch.from_numpy(y))
+    found = bayesian_ridge(rows.mT @ rows, len(rows), groups, 1.0)
+
+    def minus_log_evidence(logarithms: np.ndarray) -> float:
+        alpha, *precisions = np.exp(logarithms)
+        prior = np.repeat(precisions, 6)
+        hessian = alpha * x.T @ x + np.diag(prior)
+        coef = alpha * np.linalg.solve(hessian, x.T @ y)
+        energy = alpha * np.square(y - x @ coef).sum() + prior @ np.square(coef)
+        likelihood = len(y) * np.log(alpha) + np.log(prior).sum() - np.linalg.slogdet(hessian)[1]
+        return float(energy - likelihood) / 2
+
+    best = minimize(minus_log_evidence, np.zeros(3), method="Nelder-Mead", options={"maxiter": 2000})
+    assert found.converged and found.n_iter > 1
+    assert found.alpha == pytest.approx(np.exp(best.x[0]), rel=0.01)
+    assert float(found.lambda_[0]) == pytest.approx(np.exp(best.x[1]), rel=0.01)
+    # of the group without effect only a lower bound is known: its weights are near zero
+    assert found.gamma[0] > 5.9 and found.gamma[1] < 2.0
+    expected = np.linalg.solve(x.T @ x + np.diag(found.penalty.numpy()), x.T @ y)
+    np.testing.assert_allclose(found.coef.numpy(), expected, rtol=1e-9)
 
 
 def test_intervals_of_errors_that_last_are_wider():
@@ -199,13 +229,14 @@ def test_the_first_noise_is_that_of_least_squares(correlation):
     measured[:, 0] += 7.0 * x[:, 1]  # nothing of it is missed
     jacobian = object.__new__(torque_jacobian.TorqueJacobian)
     slopes = ((0, torch.arange(3), x, measured[:, 0]), (1, torch.arange(0), x[:, :0], measured[:, 1]))
-    jacobian.slopes = lambda _: slopes
-    problem = object.__new__(torque_problem.TorqueProblem)
-    problem.jacobian, problem.count, problem.correlation = jacobian, count, correlation
-    problem.range, problem.start = torch.ones(2).double(), torch.zeros(3).double()
-    jacobian.rigid = SimpleNamespace(free=lambda *_: torch.ones(3, dtype=torch.bool))
-    problem.adapt = problem.compensated = None
-    problem._set_least_squares_noise(problem.start)
+    jacobian.joint_rows = lambda _: slopes
+    jacobian.torque_std = torch.ones(2).double()
+    jacobian.samples = SimpleNamespace(
+        count=count, stride=torque_problem.TUNING.correlation_length / correlation
+    )
+    jacobian.rigid = SimpleNamespace(free_mask=lambda *_: torch.ones(3, dtype=torch.bool))
+    problem = torque_problem.TorqueProblem(jacobian, torch.ones(2), None, None, torch.zeros(2))
+    problem = problem.with_least_squares_noise(torch.zeros(3).double())
     solution = torch.linalg.lstsq(x, measured[:, :1]).solution
     missed = [(measured[:, 0] - (x @ solution)[:, 0]).square().sum(), measured[:, 1].square().sum()]
     expected = torch.stack(missed) / (count - correlation * torch.tensor([3.0, 0.0]).double())
@@ -217,7 +248,7 @@ def test_a_dead_zone_of_a_servo_is_worth_more_than_luck(monkeypatch):
     without = ServoParameters(torch.ones(1, 1), torch.zeros(0), 0.0, torch.zeros(1, 1, dtype=torch.bool))
     problem = SimpleNamespace(
         rows=SimpleNamespace(row=lambda name: 0),
-        residuals=lambda x: None,
+        residual=lambda x: None,
         weigh=lambda errors: None,
     )
     with_zone = replace(without, joints=2 * torch.ones(1, 1))
@@ -251,16 +282,14 @@ def test_straying_from_the_urdf_costs_what_the_docs_say(robots, monkeypatch):
 
     monkeypatch.setattr(torque_objective, "fit_networks", fit_networks)
     networks = SimpleNamespace(mass_matrix=model.mass_matrix, gravity=model.gravity, named_modules=lambda: [])
-    monkeypatch.setattr(torque_objective, "has_rigid_bodies", lambda model: False)
-    fit_torques(networks, SimpleNamespace(seen=1, count=1), TorqueFit(urdf_weight=0.7), regularizer)
+    fit_torques(networks, SimpleNamespace(original_count=1, count=1), TorqueFit(urdf_weight=0.7), regularizer)
     assert penalties == [pytest.approx(0.7 * expected)]
 
 
 def test_the_cost_of_a_torque_fit_has_the_prior_in_it():
     precision = torch.tensor([[2.0, 0.5], [0.5, 1.0]]).double()
-    problem = SimpleNamespace(
-        start=torch.tensor([1.0, 0.0]).double(), noise=torch.tensor([0.5, 2.0]).double(), precision=precision
-    )
+    prior = SimpleNamespace(mean=torch.tensor([1.0, 0.0]).double(), precision=precision)
+    problem = SimpleNamespace(prior=prior, noise=torch.tensor([0.5, 2.0]).double())
     x, squares = torch.tensor([2.0, 3.0]).double(), torch.tensor([1.0, 8.0]).double()
     expected = (1.0 / 0.25 + 8.0 / 4.0 + (2.0 * 1 + 2 * 0.5 * 3 + 1.0 * 9)) / 2
     assert torque_problem.TorqueProblem.cost(problem, x, squares) == pytest.approx(expected)
@@ -268,21 +297,19 @@ def test_the_cost_of_a_torque_fit_has_the_prior_in_it():
 
 def test_noise_is_what_each_joint_misses():
     """Ten times the squares are sqrt(10) times the noise, and no joint's noise is another's."""
-    problem = SimpleNamespace(count=50, correlation=5.0, range=torch.ones(2).double())
-    noise = []
-    for squares in ([2.0, 8.0], [20.0, 80.0]):
-        torque_problem.TorqueProblem.set_noise(problem, torch.tensor(squares).double())
-        noise.append(problem.noise)
+    estimator = torque_problem.NoiseEstimator(50, 5.0, torch.ones(2).double())
+    noise = [estimator.estimate(torch.tensor(x).double()) for x in ([2.0, 8.0], [20.0, 80.0])]
     torch.testing.assert_close(noise[0][1], 2 * noise[0][0])
     torch.testing.assert_close(noise[1], 10**0.5 * noise[0])
 
 
 def test_weights_that_samples_determine_leave_fewer_errors():
     """Of ten independent errors four weights leave six, and twenty leave one."""
-    problem, noise = SimpleNamespace(count=50, correlation=5.0, range=torch.ones(2).double()), []
-    for determined in (0.0, 4.0, 20.0):
-        torque_problem.TorqueProblem.set_noise(problem, torch.tensor([2.0, 8.0]).double(), determined)
-        noise.append(problem.noise.square())
+    estimator, squares = (
+        torque_problem.NoiseEstimator(50, 5.0, torch.ones(2).double()),
+        torch.tensor([2.0, 8.0]),
+    )
+    noise = [estimator.estimate(squares.double(), determined).square() for determined in (0.0, 4.0, 20.0)]
     torch.testing.assert_close(noise[1], noise[0] * 10 / 6)
     torch.testing.assert_close(noise[2], noise[0] * 10)
 
@@ -291,7 +318,7 @@ def test_a_joint_of_servos_goes_no_step_uphill():
     """Residuals arctan 10 x of two joints: a step from 0.3 goes far beyond zero, and is not taken."""
     seen = []
 
-    def residuals(x):
+    def residual(x):
         seen.append(x.joints)
         return (10 * x.joints).atan()
 
@@ -300,7 +327,7 @@ def test_a_joint_of_servos_goes_no_step_uphill():
         return NormalEquations(torch.diag(slope.square()), -slope * errors.flatten())
 
     problem = SimpleNamespace(
-        residuals=residuals,
+        residual=residual,
         normal_equations=normal_equations,
         joint_costs=lambda x, errors: errors.square().sum(dim=0) / 2,
     )
@@ -342,23 +369,23 @@ def test_the_tip_is_missed_by_millimetres():
     [((-1.0, -20.0), [True, True]), ((-1.0, 20.0), [False, False]), ((9.0, -20.0), [False, True])],
 )
 def test_weak_evidence_of_a_joint_yields_to_that_of_all(evidence, unlikely):
-    assert torque_problem._unlikely(torch.tensor(evidence)).tolist() == unlikely
+    assert stages._rejected(torch.tensor(evidence)).tolist() == unlikely
 
 
 def test_freedom_that_samples_narrow_speaks_against_memory():
     """Of two joints with two elements each: samples narrow one fraction of the second to a tenth."""
     rigid = SimpleNamespace(
-        of_kind=lambda kind: ["fractions"],
-        named=lambda x: {"sizes": x[:1], "fractions": x[1:].view(2, 2)},
+        names=lambda group: ["fractions"],
+        unflatten=lambda x: {"sizes": x[:1], "fractions": x[1:].view(2, 2)},
     )
     covariance = torch.diag(torch.tensor([0.5, 4.0, 4.0, 4.0, 0.04])).double()
     problem = SimpleNamespace(
-        jacobian=SimpleNamespace(rigid=rigid),
-        start=torch.zeros(5),
-        precision=torch.eye(5).double() / 4.0,
-        covariance=covariance,
+        jacobian=SimpleNamespace(rigid=rigid), prior=SimpleNamespace(precision=torch.eye(5).double() / 4.0)
     )
-    narrowed = torque_problem.TorqueProblem._fractions_narrowed(problem)
+    estimate = SimpleNamespace(
+        problem=problem, covariance=covariance, state=SimpleNamespace(x=torch.zeros(5))
+    )
+    narrowed = stages.fraction_occam_factor(estimate)
     torch.testing.assert_close(narrowed, torch.tensor([0.0, 2 * np.log(10)]).double())
 
 

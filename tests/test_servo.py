@@ -337,5 +337,5 @@ def test_joints_by_themselves_move_as_the_arm_does(arm):
     start = replace(problem.start, active=torch.ones_like(problem.start.active))
     for _ in range(2):
         problem.linearise(start, problem.predicted_path(start))
-    errors = problem.residuals(start).square().mean(dim=(0, 1)).sqrt()
+    errors = problem.residual(start).square().mean(dim=(0, 1)).sqrt()
     assert errors.max() < 6e-4

@@ -110,7 +110,7 @@ def test_settings_do_not_change(urdf):
         ),
         (
             "simulation:\n  protocol: pid",
-            "arm.yaml:2: simulation.protocol: got 'pid', expected 'random-inputs' or 'tracking'",
+            "arm.yaml:2: simulation.protocol: got 'pid', expected 'random-inputs', 'tracking' or 'prescribed'",
         ),
         (
             "joints:\n  a: {coulomb: [0.4, 0.5]}",

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,16 +24,23 @@ from spelgen.fitting.objectives import default_objective
 from spelgen.fitting.torque import fit as torque_fit
 from spelgen.fitting.torque import jacobian as torque_jacobian
 from spelgen.fitting.torque.fit import fit_torque
-from spelgen.fitting.torque.jacobian import ResidualSamples, RigidResponse, TorqueJacobian
+from spelgen.fitting.torque.jacobian import ResidualSamples, TorqueJacobian
 from spelgen.fitting.torque.joint_functions import FRICTION
+from spelgen.fitting.torque.linearization import RigidProjection
 from spelgen.fitting.torque.networks import adapt_networks
-from spelgen.fitting.torque.prior import ADAPTED, covariance, most_probable
-from spelgen.fitting.torque.problem import TorqueProblem
+from spelgen.fitting.torque.parameters import (
+    NEGLIGIBLE,
+    RIGID_GROUPS,
+    RigidParameters,
+    step_in_inertial_parameters,
+)
+from spelgen.fitting.torque.prior import ESTIMATED_GROUPS, ParameterPrior, prior_covariance, update_widths
+from spelgen.fitting.torque.problem import NoiseEstimator, TorqueProblem
 from spelgen.fitting.torque.report import terms_in_use, torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.selection import select_functions
+from spelgen.fitting.torque.stages import initial_fit
 from spelgen.fitting.torque.tuning import TorqueTuning
-from spelgen.fitting.torque.weights import NONE, RIGID, RigidWeights, moved_bodies
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
@@ -111,7 +119,7 @@ def test_the_prior_shares_what_joints_share():
     kinds = {"rotors": "armature", "viscous": "sizes", "coulomb": "sizes"}
     weights = {name: torch.zeros(2) for name in kinds}
     prior = GaussianPrior(armature=0.5, shared_armature=2.0, sizes=0.3, shared_sizes=1.0, shared_friction=3.0)
-    found = covariance(prior, weights, kinds)
+    found = prior_covariance(prior, weights, kinds)
     assert found[0, 0] == 0.25 + 4.0
     assert found[0, 1] == 4.0
     assert found[2, 2] == pytest.approx(0.09 + 1.0 + 9.0)
@@ -124,7 +132,7 @@ def test_the_prior_shares_what_joints_share():
 def test_the_prior_shares_each_element_of_bristles():
     """Of three elements at two joints: what an element has at one joint it has at the other, and no other element."""
     prior = GaussianPrior(fractions=0.5, shared_fractions=2.0)
-    found = covariance(prior, {"fractions": torch.zeros(2, 3)}, {"fractions": "fractions"})
+    found = prior_covariance(prior, {"fractions": torch.zeros(2, 3)}, {"fractions": "fractions"})
     expected = 0.25 * torch.eye(6) + 4.0 * torch.eye(3).repeat(2, 2)
     torch.testing.assert_close(found, expected.double())
 
@@ -133,10 +141,10 @@ def test_the_prior_knows_every_weight(emitted):
     """What it knows nothing of would be taken for something else in silence."""
     module = emitted["six_dof"][0]
     model = module.Model()
-    rigid = RigidWeights(model)
-    assert set(rigid.kinds) == {*dict(model.named_parameters()), "raw_friction_compensation"}
-    assert set(rigid.kinds.values()) == set(RIGID) - {"gains"}
-    assert covariance(GaussianPrior(), rigid.start, rigid.kinds).diagonal().min() > 0
+    rigid = RigidParameters(model)
+    assert set(rigid.groups) == {*dict(model.named_parameters()), "raw_friction_compensation"}
+    assert set(rigid.groups.values()) == set(RIGID_GROUPS) - {"gains"}
+    assert prior_covariance(GaussianPrior(), rigid.initial, rigid.groups).diagonal().min() > 0
 
 
 def test_deviations_are_those_of_the_largest_marginal_likelihood():
@@ -151,21 +159,27 @@ def test_deviations_are_those_of_the_largest_marginal_likelihood():
 
     best = np.exp(minimize_scalar(minus_log_likelihood, bounds=(-4, 3), method="bounded").x)
     order = torch.arange(25)
-    masks = dict(zip(ADAPTED, (order < 3, (order >= 3) & (order < 23), order >= 23), strict=True))
+    masks = dict(zip(ESTIMATED_GROUPS, (order < 3, (order >= 3) & (order < 23), order >= 23), strict=True))
+    rigid = SimpleNamespace(mask=masks.get)
+
+    def updated(widths, hyperprior, x, covariance):
+        prior = ParameterPrior(rigid, widths, hyperprior, torch.zeros(25).double())
+        return update_widths(prior, x, covariance).widths
+
     guess = prior = GaussianPrior(armature=0.1, bodies=0.1, offset=0.1, degrees_of_freedom=1e-9)
     for _ in range(200):
         posterior = np.linalg.inv(rows.T @ rows / noise**2 + np.eye(20) / prior.bodies**2)
         away, covariance = torch.full((25,), 0.1).double(), torch.zeros(25, 25).double()
         away[3:23] = torch.from_numpy(posterior @ rows.T @ y / noise**2)
         covariance[3:23, 3:23] = torch.from_numpy(posterior)
-        prior = most_probable(prior, guess, masks, away, covariance)
+        prior = updated(prior, guess, away, covariance)
     assert prior.bodies == pytest.approx(best, rel=1e-4)
     # all three armatures are off together, which the prior allows for
     assert prior.armature < 1e-4
     away[:3] = torch.tensor([0.3, -0.3, 0.0])
-    assert most_probable(prior, guess, masks, away, covariance).armature == pytest.approx(0.3)
+    assert updated(prior, guess, away, covariance).armature == pytest.approx(0.3)
     certain = prior.model_copy(update={"degrees_of_freedom": 1e12})
-    assert most_probable(certain, guess, masks, away, covariance).bodies == pytest.approx(guess.bodies)
+    assert updated(certain, guess, away, covariance).bodies == pytest.approx(guess.bodies)
 
 
 def test_a_urdf_that_is_wrong_is_given_up_and_that_is_said(emitted):
@@ -216,7 +230,7 @@ def test_steps_of_bodies_are_straight_in_their_parameters_and_stay_possible(emit
         return root @ root.mT
 
     def parameters(size):
-        return pseudo_inertias(moved_bodies(raw, size * step))
+        return pseudo_inertias(step_in_inertial_parameters(raw, size * step))
 
     small = parameters(0.01) - parameters(0.0)
     torch.testing.assert_close(parameters(0.02) - parameters(0.0), 2 * small, rtol=1e-9, atol=1e-12)
@@ -260,7 +274,7 @@ def test_friction_has_the_effects_that_samples_show(emitted, shown):
     true, found = drawn(module, seed=2, deviation=0.3), module.Model()
     effects = ("raw_stribeck", "raw_saturation", "raw_load_dependence")
     for name in effects:
-        getattr(true.friction, name).data += 1.0 if shown else NONE
+        getattr(true.friction, name).data += 1.0 if shown else NEGLIGIBLE
     fit_torque(found, [recorded(true, 20.0, 0.02)])
     sizes = torch.stack([getattr(found.friction, name).detach().exp() for name in effects])
     assert (sizes > 0.1).any(dim=0).all() if shown else (sizes < 1e-12).all()
@@ -313,11 +327,11 @@ def test_blocks_give_what_all_at_once_gives(emitted, at_once, monkeypatch):
     (samples, whole, expected), parts = at_once, emitted["rpr"][0].Model()
     monkeypatch.setattr(torque_jacobian, "TUNING", TorqueTuning(block=64))
     table = TorqueSamples.of(iter(samples), 2)
-    assert (table.count, table.seen, len(list(table.blocks(64)))) == (450, 900, 8)
+    assert (table.count, table.original_count, len(list(table.blocks(64)))) == (450, 900, 8)
     found = fit_torque(parts, table)
     assert found.steps == expected.steps
     assert found.cost == pytest.approx(expected.cost, rel=1e-9)
-    np.testing.assert_allclose(found.residual, expected.residual, rtol=1e-9)
+    np.testing.assert_allclose(found.rms_residual, expected.rms_residual, rtol=1e-9)
     for name, value in whole.state_dict().items():
         torch.testing.assert_close(parts.state_dict()[name], value, rtol=1e-6, atol=1e-8)
 
@@ -540,12 +554,13 @@ def test_few_of_very_many_samples_come_near_first(emitted, monkeypatch):
     samples = [recorded(drawn(module, seed=2, deviation=0.3), 6.0, 0.05, seed=seed) for seed in range(3)]
     plain, quick = module.Model(), module.Model()
     expected = fit_torque(plain, samples)
-    monkeypatch.setattr(torque_fit, "TUNING", TorqueTuning(subset=200))
+    monkeypatch.setattr(torque_fit, "TUNING", TorqueTuning(initial_samples=200))
     found = fit_torque(quick, samples)
     assert found.steps != expected.steps
     assert found.cost == pytest.approx(expected.cost, rel=1e-3)
-    np.testing.assert_allclose(found.residual, expected.residual, rtol=1e-3)
-    few = TorqueSamples.of(samples, 2).thinned(300)
+    np.testing.assert_allclose(found.rms_residual, expected.rms_residual, rtol=1e-3)
+    assert [stage.name for stage in found.stages][-1] == "final fit"
+    few = TorqueSamples.of(samples, 2).subsampled(300)
     assert (few.count, len(next(few.blocks(1000))[0])) == (300, 300)
 
 
@@ -559,9 +574,9 @@ def test_friction_that_is_nearly_nothing_does_not_vary(robots):
         model = build(robots / "two_link.urdf", "hybrid")
         samples = ResidualSamples(q, qd, 0 * q, missing, friction * qd.sign())
         still = (torch.zeros(0, 0).double(),) * 2
-        bodies = RigidResponse((torch.zeros(len(q), 0).double(),) * 2, still)
+        bodies = RigidProjection((torch.zeros(len(q), 0).double(),) * 2, still)
         found = select_functions(model, samples, bodies, [], 5.0)
-        varied = [x.gain for x in found if x.name == FRICTION]
+        varied = [x.error_reduction for x in found if x.name == FRICTION]
         assert varied == [] if gain is None else min(varied) > gain and len(varied) == 2
 
 
@@ -582,7 +597,11 @@ def test_a_spring_is_found_that_bodies_pass_for(emitted, robots):
     model = build(robots / "six_dof.urdf", "hybrid", width=8)
     model.residuals.potential = model.residuals.mass = None
     solution = fit_torque(model, logs)
-    assert {residual.joint for residual in solution.residuals} == {joint}
+    names = ["initial fit", "friction state", "friction effects", "residual terms"]
+    assert [stage.name for stage in solution.stages] == names
+    steps = [stage.steps for stage in solution.stages]
+    assert steps == sorted(steps) and (steps[-1], solution.stages[-1].cost) == (solution.steps, solution.cost)
+    assert {residual.joint for residual in solution.selected_terms} == {joint}
     assert nmse(model, test) < 1e-3
     assert nmse(bodies, test) > 0.05
 
@@ -591,12 +610,13 @@ def test_bodies_follow_a_torque_no_further_than_it_goes(emitted):
     """What they follow is a part of it: under a noise that changed since, they could be taken to go beyond."""
     model = emitted["two_link"][0].Model()
     samples = TorqueSamples.of([recorded(model, 6.0, 0.05)])
-    problem = TorqueProblem(TorqueJacobian(model, samples), GaussianPrior(), None)
-    state = problem.solve_from_start()
-    problem.set_noise(0.5 * state.residuals)
-    _, response = problem.around(state)
-    for joint, slope in enumerate(response.slopes):
-        followed = torch.linalg.eigvals(response.gains[joint] @ slope.mT @ slope)
+    jacobian = TorqueJacobian(model, samples)
+    estimate = initial_fit(TorqueProblem.of(jacobian, GaussianPrior()))
+    noise = NoiseEstimator.of(jacobian).estimate(0.5 * estimate.state.residual)
+    estimate = replace(estimate, problem=replace(estimate.problem, noise=noise)).with_current_covariance()
+    _, projection = estimate.linearize()
+    for joint, slope in enumerate(projection.jacobian):
+        followed = torch.linalg.eigvals(projection.posterior_gain[joint] @ slope.mT @ slope)
         assert 0.9 < followed.real.max() < 1 + 1e-9
 
 
@@ -612,7 +632,7 @@ def test_a_spring_as_strong_as_gravity_does_not_drive_bodies_away(emitted, robot
     model = build(robots / "two_link.urdf", "hybrid", width=8)
     model.residuals.potential = model.residuals.mass = None
     solution = fit_torque(model, [sprung(0.01, seed=0), sprung(0.01, seed=1)])
-    assert {residual.joint for residual in solution.residuals} == {0}
+    assert {residual.joint for residual in solution.selected_terms} == {0}
     assert nmse(model, sprung(0.0, seed=9)) < 1e-4
 
 

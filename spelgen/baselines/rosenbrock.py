@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from spelgen.baselines.tuning import TUNING
-from spelgen.dynamics.equations import Pose, poses
+from spelgen.dynamics.equations import MotionEquations, equations_of
 from spelgen.dynamics.protocol import is_stateful, memory_after, sliding_memory
 from spelgen.logs.windows import Windows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
@@ -62,10 +62,10 @@ def _stepper(dynamics: Any, width: Tensor, disturbance: Tensor) -> Callable[[Sta
 
     width: (n,) finite-difference steps of velocity. disturbance: a force if the state has momenta, else acceleration.
     """
-    pose_at = poses(dynamics)
+    pose_at = equations_of(dynamics)
     is_force = isinstance(dynamics, PortHamiltonian)
 
-    def forces(pose: Pose, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
+    def forces(pose: MotionEquations, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
         """Return M qdd, (W, n)."""
         added = disturbance if is_force else (pose.mass @ disturbance.unsqueeze(-1)).squeeze(-1)
         return pose.force(qd, tau, z) + added
@@ -104,7 +104,7 @@ def _stepper(dynamics: Any, width: Tensor, disturbance: Tensor) -> Callable[[Sta
 
 
 def _friction_slopes(
-    dynamics: Any, pose: Pose, qd: Tensor, z: Tensor, width: Tensor
+    dynamics: Any, pose: MotionEquations, qd: Tensor, z: Tensor, width: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return D and K, (W, n): the friction of a joint depends on its own motion only."""
     # central differences: dry friction jumps at standstill

@@ -20,11 +20,11 @@ class UrdfValues(Baseline):
             arm.notes.append(_missing("robot.urdf", "no arm is known"))
             return []
         try:
-            from spelgen.dynamics.pinocchio_urdf import has_drives, urdf_dynamics  # an extra
+            from spelgen.dynamics.pinocchio_urdf import drives_known, urdf_dynamics  # an extra
 
             plain = urdf_dynamics(arm.urdf, arm.joints)
             predictors = [of_dynamics(URDF, plain, arm.probe)]
-            if has_drives(arm.urdf, arm.joints):
+            if drives_known(arm.urdf, arm.joints):
                 driven = urdf_dynamics(arm.urdf, arm.joints, drives=True)
                 predictors.append(of_dynamics(URDF_WITH_DRIVES, driven, arm.probe))
         except (

@@ -11,7 +11,9 @@ import typer
 from spelgen.cli import options
 from spelgen.cli.console import note, progress_bar, say
 from spelgen.cli.options import Data, Filter, MappingFile, MoreData, Output, Run
-from spelgen.evaluation.tables import LIMITS, csv_text, figures
+from spelgen.errors import RunError
+from spelgen.evaluation.tables import LIMITS, csv_text, figures, summary
+from spelgen.files import read_json
 
 Format = Literal["text", "json", "csv"]
 MISSED = 3  # exit code: usage errors are 2
@@ -31,6 +33,10 @@ def evaluate(
             metavar="FIGURE=MAX",
             help=f"Exit with {MISSED} if a figure is larger: {', '.join(LIMITS)}; once for each.",
         ),
+    ] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(metavar="URDF", help="The true arm of simulated logs: state the error of M(q)."),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Torque errors only, without rollouts.")] = False,
 ) -> None:
@@ -55,7 +61,13 @@ def evaluate(
     steps, seconds = ((), ()) if quick else (STEPS, SECONDS)
     with progress_bar("evaluating") as progress:
         results = evaluate_model(
-            model, logs, preprocessing=preprocessing, steps=steps, seconds=seconds, progress=progress
+            model,
+            logs,
+            preprocessing=preprocessing,
+            steps=steps,
+            seconds=seconds,
+            truth=truth,
+            progress=progress,
         )
     record = results.to_dict()
     # before anything is printed: a closed pipe must not lose the result
@@ -110,9 +122,15 @@ def report(
     if robot is not None and len(runs) > 1:
         raise typer.BadParameter("belongs to the page of one run", param_hint="'--robot'")
     if len(runs) == 1:
+        from spelgen.evaluation.results import Results
+        from spelgen.fitting.run_folder import RunFolder
         from spelgen.render.report_page import write_report
 
-        say(f"wrote {write_report(runs[0], output, robot)}")
+        path, evaluation = write_report(runs[0], output, robot), RunFolder(runs[0]).evaluation
+        found = summary(Results.from_dict(read_json(evaluation, RunError))) if evaluation.exists() else None
+        if found is not None:
+            say(found.text() + "\n")
+        say(f"wrote {path}: the report, for any browser")
     else:
         from spelgen.render.runs_page import write_runs
 

@@ -83,22 +83,46 @@ def simulate(
     tip: Tip = None,
     angle_tolerance: AngleTolerance = 2e-3,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Random seed; default: that of the robot's settings.")
+        int | None, typer.Option(min=0, help="Random seed; default: the seed in the robot's settings.")
+    ] = None,
+    as_built: Annotated[
+        int | None,
+        typer.Option(
+            min=0, metavar="SEED", help="Simulate an arm that differs from its URDF, drawn from this seed."
+        ),
+    ] = None,
+    motion: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE.csv",
+            help="A motion of `spelgen excite` to perform; repeatable. The last half is for testing.",
+        ),
     ] = None,
     force: Force = False,
 ) -> None:
-    """Simulate training and test logs with Pinocchio."""
+    """Simulate training and test logs with Pinocchio.
+
+    With --as-built, masses, centres of mass, friction and armature differ from the URDF as those of a real arm do;
+    LOGS/as_built.urdf and .yaml are the truth, for `spelgen evaluate --truth`.
+    """
     from spelgen.logs.read import write_logs
+    from spelgen.simulation.as_built import as_built as make_as_built
+    from spelgen.simulation.motion_file import read_motion
     from spelgen.simulation.simulate import simulate as simulate_arm
 
     arm = options.load(robot, joints, tip, angle_tolerance)
-    paths = {role: output / f"{role}.parquet" for role in ("train", "test")}
-    for path in paths.values():
-        options.require_free(path, force=force)
-    with progress_bar("simulating") as progress:
-        logs = simulate_arm(arm, seed=seed, progress=progress)
-    # logs are written in SI units under the URDF names: no mapping is needed to read them
     names = arm.arm.joint_names
+    motions = [read_motion(file, names) for file in motion or ()]
+    truth = output / "as_built.urdf"
+    paths = {role: output / f"{role}.parquet" for role in ("train", "test")}
+    for path in [*paths.values(), *([] if as_built is None else [truth, truth.with_suffix(".yaml")])]:
+        options.require_free(path, force=force)
+    if as_built is not None:
+        arm = make_as_built(arm, as_built, truth)
+        say(f"wrote {truth} and as_built.yaml, the true arm")
+    with progress_bar("simulating") as progress:
+        logs = simulate_arm(arm, seed=seed, motions=motions, progress=progress)
+    # logs are written in SI units with the URDF's joint names: no mapping is needed to read them
     for path, trajectories in zip(paths.values(), (logs.train, logs.test), strict=True):
         if trajectories:
             write_logs(path, trajectories, names)

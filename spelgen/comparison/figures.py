@@ -18,10 +18,10 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.comparison.tuning import ComparisonTuning
 from spelgen.dynamics.parameters import parameter_count
-from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.evaluation.drawn_motions import PredictedMotion, predicted_motion
 from spelgen.evaluation.invariants import Invariants, invariants
 from spelgen.evaluation.plain import array, finite, listed
+from spelgen.evaluation.truth import mass_error, true_mass
 from spelgen.fitting.rollout import loss_scales, position_difference, roll_out, rollout_loss
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
@@ -154,37 +154,6 @@ def sizes(model: ArmModel) -> Sizes:
     # friction without a network is one function of each joint
     outputs[1] = outputs[1] or model.n
     return Sizes(tuple(outputs), inputs, parameter_count(model))
-
-
-def true_mass(urdf: Path, q: torch.Tensor) -> torch.Tensor:
-    """Return M of a URDF and its settings by Pinocchio, rotor inertias included.
-
-    Args:
-        urdf: Path of the URDF; its settings are beside it.
-        q: (T, n) positions [rad, m].
-
-    Returns:
-        (T, n, n) mass matrices [kg m^2, kg m, kg].
-    """
-    loaded = load_arm(urdf)
-    mass: torch.Tensor = arm_dynamics(loaded.arm, loaded.settings).mass_matrix(q)
-    return mass
-
-
-def mass_error(learned: torch.Tensor, true: torch.Tensor) -> float:
-    """Return the relative error of M: root mean square of the entries of L^-1 (learned - true) L^-T.
-
-    L L^T is the mean of the true M, so the error of every entry is relative to the inertia of its own two joints and
-    has no unit.
-
-    Args:
-        learned: (T, n, n) mass matrices of the model.
-        true: (T, n, n) true mass matrices at the same positions.
-    """
-    factor = torch.linalg.cholesky(true.mean(dim=0))
-    half = torch.linalg.solve_triangular(factor, learned - true, upper=False)
-    relative = torch.linalg.solve_triangular(factor, half.mT, upper=False)
-    return float(relative.square().mean().sqrt())
 
 
 def predict_example(

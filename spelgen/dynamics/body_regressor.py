@@ -1,4 +1,4 @@
-"""The matrix that makes torques of the inertial parameters of a chain of bodies, as fits to torques need it."""
+"""Regressor of a chain of bodies: joint torques are linear in the inertial parameters."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from spelgen.runtime.port_hamiltonian import applied
 
 
 def pseudo_inertia(ten: Tensor) -> Tensor:
-    """[[tr(I)/2 - I, m c], [(m c)^T, m]], (..., 4, 4), of (m, m c, I), (..., 10).
+    """Return [[tr(I)/2 - I, m c], [(m c)^T, m]], (..., 4, 4), of inertial parameters (m, m c, I), (..., 10).
 
-    It is positive definite exactly where some distribution of mass has these parameters (Wensing,
-    Kim and Slotine, IEEE RA-L 3:60, 2018).
+    It is positive definite if and only if the parameters are physically consistent (Wensing, Kim and Slotine,
+    IEEE RA-L 3:60, 2018).
     """
     m, x, y, z, xx, xy, xz, yy, yz, zz = ten.unbind(dim=-1)
     half = (xx + yy + zz) / 2
@@ -23,12 +23,14 @@ def pseudo_inertia(ten: Tensor) -> Tensor:
 
 
 def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-    """Return Y, (..., n, 10 bodies): Y @ inertial parameters is the bodies' torque.
+    """Return Y, (..., n, 10 bodies): joint torques [Nm, N] are Y @ inertial parameters.
 
-    ``chain`` is that of this package or of an emitted module.
+    Args:
+        chain: kinematics of the bodies.
+        q, qd, qdd: motion of the joints, (..., n) [rad, m], per s, per s^2.
     """
     count = len(chain.parents)
-    # the frames themselves in place of points: a pseudo-inertia weighs products of their columns
+    # with the columns of the frames in place of points, kinetic energy is linear in the pseudo-inertias
     pose = chain.forward(q, torch.eye(4 * count).to(q))
     rises = chain.accelerations(pose, qd) + applied(pose.jacobian.mT, qdd @ chain.ratios.mT)
     rises = torch.unflatten(rises, -1, (3, count, 4))
@@ -39,8 +41,8 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
 
 
 def chain_regressor(chain: BodyChain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-    """Return the same (T, n, 10 bodies) of arrays (T, n)."""
-    # copies: torch takes no views that run backwards, as filters give them
+    """Return Y, (T, n, 10 bodies), for arrays q, qd, qdd (T, n); see ``regressor_of``."""
+    # copies: torch does not accept arrays with negative strides, which filters return
     states = [torch.from_numpy(np.array(x, dtype=float)) for x in (q, qd, qdd)]
     with torch.no_grad():
         return np.asarray(regressor_of(chain, *states))

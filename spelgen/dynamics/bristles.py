@@ -1,4 +1,4 @@
-"""The memory of friction along a measured path: the state z of its bristles at every sample, in one pass."""
+"""The friction state z along a measured path: deflections of the bristles at every sample, in one pass."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 @dataclass(frozen=True, eq=False)
 class BristleReach:
-    """How far the bristles of an arm's drives reach: values, (n, K) [rad, m]; K is 0 where there are none.
+    """Break-away displacements of the bristles of all drives: values, (n, K) [rad, m]; K is 0 without bristles.
 
-    motors: C, (n, n), the drives turn by C times what the joints do (see ``Actuation.motor_speeds``); None: each moves
-    its own joint alone. smoothing_velocity: (n,) [rad/s, m/s], over which dry friction without memory turns around.
+    motors: C, (n, n), the drives rotate at C qd (see ``Actuation.motor_speeds``); None: each drive moves its own joint.
+    smoothing_velocity: of dry friction without bristles, (n,) [rad/s, m/s]; None: unknown.
     """
 
     values: np.ndarray
@@ -28,21 +28,22 @@ class BristleReach:
 
     @property
     def elements(self) -> int:
-        """K."""
+        """Bristles per joint, K."""
         return int(self.values.shape[1])
 
 
 NO_BRISTLES = BristleReach(np.zeros((0, 0)))
-BLOCK = 2**14  # samples moved at a time: several arrays of a block's size are in memory
+# Samples that are computed at a time: several arrays of this size are in memory.
+BLOCK = 2**14
 
 
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
-    """Of joints of these kinds."""
+    """Return the typical break-away displacements of joints of these types."""
     return BristleReach(np.array([BRISTLE_REACH[kind] for kind in kinds]), motors)
 
 
 def bristle_reach(model: PortHamiltonian) -> BristleReach:
-    """Of a model."""
+    """Return the break-away displacements of a model."""
     if not isinstance(model, RigidBodyDynamics) or not model.elements:
         return BristleReach(np.zeros((model.n, 0)))
     width = model.friction.prepare().coulomb_smoothing_velocity
@@ -52,14 +53,15 @@ def bristle_reach(model: PortHamiltonian) -> BristleReach:
 
 
 def moved_bristles(z: torch.Tensor, displacement: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
-    """Return z after drives went one way by a displacement, exactly; shapes as z, or broadcast to it."""
+    """Return z after a monotonic displacement of the drives: exact; shapes as z, or broadcast to it."""
     return (z + displacement).clamp(-reach, reach)
 
 
 def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
-    """z, (T, n, K) [rad, m], along the path q (T, n), straight at its start.
+    """Return z, (T, n, K) [rad, m], along the path q (T, n) [rad, m]; z is zero at its start.
 
-    While a drive goes one way, z follows from where it turned around: only turns come one after another.
+    Between two reversals of a drive, z is a function of the displacement since the first, so that only the reversals
+    are computed one after the other.
     """
     path = encoded(q)
     if bristles.motors is not None:
@@ -80,18 +82,18 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
 
 
 def turning_points(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the samples (R, n) at which the columns of a path (T, n) begin and turn around.
+    """Return the samples (R, n) at which the columns of a path (T, n) begin and reverse.
 
-    The second array says which of these is the latest, (T, n), at each sample.
+    The second array is the index of the latest reversal at each sample, (T, n).
     """
     steps = np.diff(path, axis=0, prepend=path[:1])
-    # where a drive stands still it goes on as it went
+    # at rest, the direction is that of the motion before
     moving = np.where(steps != 0, np.arange(len(path))[:, None], 0)
     direction = np.sign(np.take_along_axis(steps, np.maximum.accumulate(moving, axis=0), axis=0))
     turns = np.zeros(path.shape, dtype=bool)
     turns[1:] = direction[1:] * direction[:-1] < 0
     latest = turns.cumsum(axis=0)
-    # drives that turn around less often than others have zeros at the end, which are the latest of no sample
+    # drives with fewer reversals than others have zeros at the end, which no sample refers to
     corners = np.zeros((latest.max(initial=0) + 1, path.shape[1]), dtype=int)
     samples, drives = np.nonzero(turns)
     corners[latest[samples, drives], drives] = samples - 1
@@ -99,7 +101,7 @@ def turning_points(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None:
-    """Return the direction (T, n) of dry friction without memory at these velocities; None: its width is not known."""
+    """Return the direction (T, n) of dry friction without bristles at qd (T, n); None: its smoothing is unknown."""
     if bristles.smoothing_velocity is None:
         return None
     speed = qd if bristles.motors is None else qd @ bristles.motors.T
@@ -107,11 +109,14 @@ def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None
 
 
 def encoded(q: np.ndarray) -> np.ndarray:
-    """The path (T, n) without the jitter of encoders: it follows q out of a band of a step to both sides."""
+    """Return the path (T, n) without jitter of the encoder: a dead band of one encoder step to both sides."""
     step = encoder_step(q)
     if not step.any():
         return q
-    low, high = q - step, q + step  # clamping to a band after a band is clamping to one
+    low, high = (
+        q - step,
+        q + step,
+    )  # the composition of two clamps is a clamp: log2(T) passes over all samples in place of T
     shift = 1
     while shift < len(q):
         earlier, later = slice(None, -shift), slice(shift, None)
@@ -122,10 +127,10 @@ def encoded(q: np.ndarray) -> np.ndarray:
 
 
 def encoder_step(q: np.ndarray) -> np.ndarray:
-    """The step (n,) in which positions (T, n) come; 0 where they come in none."""
+    """Return the encoder step (n,) of positions (T, n); 0 if they are not quantised."""
     steps = np.zeros(q.shape[1])
     for joint, values in enumerate(q.T):
         levels = np.unique(values)
-        if len(levels) > 1 and len(levels) < len(values) / 4:  # values that come again and again
+        if len(levels) > 1 and len(levels) < len(values) / 4:  # repeated values
             steps[joint] = np.diff(levels).min()
     return steps

@@ -1,4 +1,4 @@
-"""Mimic joints folded in: all joints of a robot stand at K q + offset, with q the coordinates of an arm."""
+"""Mimic joints: the positions of all joints of a robot are K q + offset, with q the coordinates of an arm."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from spelgen.urdf.robot import Robot
 
 @dataclass(frozen=True, eq=False)
 class Constraint:
-    """b joints that move with n coordinates: they stand at jacobian @ q + offset.
+    """Positions of b joints as a function of n coordinates: jacobian @ q + offset.
 
-    names: of the joints. jacobian: K, (b, n). offset: (b,) [rad; m].
+    names: of the joints. jacobian: K, (b, n). offset: (b,) [rad, m].
     """
 
     names: tuple[str, ...]
@@ -23,12 +23,12 @@ class Constraint:
 
 
 def mimic_constraint(robot: Robot, coordinates: Sequence[str]) -> Constraint:
-    """All moving joints of ``robot``: the coordinates, what follows them, and the others locked at 0."""
+    """Return the constraint of all joints of ``robot``: coordinates, mimic joints, and locked joints (0)."""
     columns = {name: k for k, name in enumerate(coordinates)}
     moving = [joint.name for joint in robot.joints if joint.moves]
     jacobian, offset = np.zeros((len(moving), len(columns))), np.zeros(len(moving))
     for row, name in enumerate(moving):
-        # what a joint follows in the end
+        # the leader at the end of a chain of mimic joints
         multiplier, leader = 1.0, name
         while (mimic := robot.joint[leader].mimic) is not None:
             offset[row] += multiplier * mimic.offset

@@ -1,4 +1,4 @@
-"""Equations of motion M qdd = force: at a position, with M as a network gives it, and one step of them in time."""
+"""Equations of motion M qdd = force at given positions, and one step of their integration."""
 
 from __future__ import annotations
 
@@ -6,21 +6,23 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
 from spelgen.dynamics.protocol import known_past, memory_after
+from spelgen.runtime.derived_mass import DerivedMass
+from spelgen.runtime.network_dynamics import NetworkDynamics
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 
 @dataclass(frozen=True, eq=False)
-class Pose:
-    """Hold dynamics at positions (W, n).
+class MotionEquations:
+    """Equations of motion at positions (W, n).
 
-    mass: M, (W, n, n). force: of (qd, tau, z), what M qdd is, (W, n). friction: of (qd, z), what friction takes,
-    (W, n).
+    mass: M, (W, n, n). force: M qdd as a function of (qd, tau, z), (W, n). friction: friction torque as a function of
+    (qd, z), (W, n).
     """
 
     mass: Tensor
@@ -28,20 +30,26 @@ class Pose:
     friction: Callable[[Tensor, Tensor | None], Tensor]
 
 
-PoseAt = Callable[[Tensor], Pose]
+EquationsAt = Callable[[Tensor], MotionEquations]
 
 
-def poses(dynamics: object) -> PoseAt:
-    """Return what gives these dynamics at positions; weights must not change meanwhile."""
+@runtime_checkable
+class OwnEquations(Protocol):
+    """Dynamics that give their own equations, in fewer operations."""
+
+    def equations_at(self, q: Tensor) -> MotionEquations:
+        """Return the equations at q, (W, n)."""
+
+
+def equations_of(dynamics: object) -> EquationsAt:
+    """Return the equations of motion as a function of q, (W, n); the parameters must not change meanwhile."""
     if isinstance(dynamics, PortHamiltonian):
-        return partial(_of_weights, dynamics, dynamics.prepare())
-    # dynamics by a regressor have their own
-    pose_at: PoseAt = getattr(dynamics, "pose_at", partial(_of_any, dynamics))
-    return pose_at
+        return partial(_of_model, dynamics, dynamics.prepare())
+    return dynamics.equations_at if isinstance(dynamics, OwnEquations) else partial(_of_any, dynamics)
 
 
-def _of_weights(model: PortHamiltonian, prepared: object, q: Tensor) -> Pose:
-    """Return the pose of an emitted model."""
+def _of_model(model: PortHamiltonian, prepared: object, q: Tensor) -> MotionEquations:
+    """Return the equations of an assembled model."""
     pose = model.configuration(q, prepared)
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
@@ -50,10 +58,11 @@ def _of_weights(model: PortHamiltonian, prepared: object, q: Tensor) -> Pose:
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
         return model.input_force(pose, qd, tau) - model.nonlinear_effects(pose, qd) - friction(qd, z)
 
-    return Pose(pose.mass, force, friction)
+    return MotionEquations(pose.mass, force, friction)
 
 
-def _of_any(dynamics: Any, q: Tensor) -> Pose:
+def _of_any(dynamics: Any, q: Tensor) -> MotionEquations:
+    """Return the equations of other dynamics, from their forward dynamics."""
     mass = torch.as_tensor(dynamics.mass_matrix(q))
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
@@ -63,7 +72,7 @@ def _of_any(dynamics: Any, q: Tensor) -> Pose:
         qdd = torch.as_tensor(dynamics.forward_dynamics(q, qd, tau, *known_past(dynamics, z)))
         return (mass @ qdd.unsqueeze(-1)).squeeze(-1)
 
-    return Pose(mass, force, friction)
+    return MotionEquations(mass, force, friction)
 
 
 def runge_kutta(
@@ -76,13 +85,13 @@ def runge_kutta(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return q, p and z after one `step` [s], and q' at its start (Hairer et al., Solving ODEs I, II.1).
 
-    rhs: q' and p' of these dynamics by q, p and z. p: momenta, or velocities. Friction's memory z, (..., n, K), follows
-    the displacement exactly, so it needs no stages of its own.
+    rhs: q' and p' as a function of q, p and z. p: momenta, or velocities. The friction state z, (..., n, K), is exact
+    in the displacement, so that it needs no stages.
     """
 
     qd1 = qd = pd = torch.zeros_like(p)
     moved = pushed = torch.zeros_like(p)
-    # where in the step a stage is, and its weight
+    # position of each stage in the step, and its weight
     for fraction, weight in ((0.0, 1), (0.5, 2), (0.5, 2), (1.0, 1)):
         stage = fraction * step
         qd, pd = rhs(q + stage * qd, p + stage * pd, memory_after(dynamics, z, stage * qd))
@@ -94,19 +103,19 @@ def runge_kutta(
 
 
 def unbounded(mass: Tensor) -> Tensor:
-    """Return one for every matrix: all of M's changes stand, see ``DerivedMass.fraction``."""
+    """Return ones, (...): M, (..., n, n), is not corrected; see ``DerivedMass.fraction``."""
     return mass.new_ones(mass.shape[:-2])
 
 
 @contextmanager
 def mass_as_learned(model: nn.Module) -> Iterator[None]:
-    """Let the model's M be indefinite where its network says so; a model that bounds nothing stays as it is."""
-    mass = getattr(model, "mass", None)
-    if mass is None or not hasattr(mass, "fraction"):
+    """Do not correct an indefinite M of a network; other models are unchanged."""
+    mass = model.mass if isinstance(model, NetworkDynamics) else None
+    if not isinstance(mass, DerivedMass):
         yield
         return
-    mass.fraction = unbounded
+    vars(mass)["fraction"] = unbounded
     try:
         yield
     finally:
-        del mass.fraction
+        del vars(mass)["fraction"]

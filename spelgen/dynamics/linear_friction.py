@@ -1,4 +1,4 @@
-"""Describe what friction and drives add to the torque: linear in constants, one column a joint and effect."""
+"""Friction and drive torque that is linear in its constants: a column per joint and effect."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ STRIBECK_VELOCITY = 0.1
 
 @dataclass(frozen=True)
 class FrictionModel:
-    """Say which effects have a column: armature, viscous, Coulomb and offset always.
+    """The effects that have a column, in addition to armature, viscous and Coulomb friction and offset.
 
-    coulomb_smoothing_velocity [rad/s, m/s]: width of the tanh in place of Coulomb friction's jump. stribeck: dry
-    friction of slow motion (Gaussian, Armstrong-Helouvry 1991). polynomial: qd |qd| and qd^3. memory: dry friction by
-    how far each bristle is bent (see ``runtime.friction_laws``), one column each, in place of the tanh.
+    coulomb_smoothing_velocity [rad/s, m/s]: width of the tanh in place of the sign of the velocity. stribeck: dry
+    friction at low velocity (Gaussian, Armstrong-Helouvry 1991). polynomial: qd |qd| and qd^3. memory: dry friction as
+    a function of the deflection of bristles (see ``runtime.friction_laws``), a column each, in place of the tanh.
     """
 
     coulomb_smoothing_velocity: float = 0.01
@@ -30,7 +30,7 @@ class FrictionModel:
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Names, in the columns' order."""
+        """Names of the effects, in the order of the columns."""
         names = ["armature", "viscous", *(BRISTLES if self.memory else ("coulomb",)), "offset"]
         if self.stribeck:
             names.append("stribeck")
@@ -45,10 +45,12 @@ class FrictionModel:
         bent: np.ndarray | None = None,
         motors: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return (T, n, effects n): effect e of drive j is column e n + j, which only the joints that it moves read.
+        """Return the columns, (T, n, effects n): effect e of drive j is column e n + j.
 
-        bent: (T, n, K), how far the bristles are bent, relative to their reach; None: not known. motors: (n, n), takes
-        joints' velocities to the drives' (see ``motor_speeds``); None: each drive moves its own joint alone.
+        Args:
+            qd, qdd: motion of the joints, (T, n).
+            bent: deflections of the bristles relative to their break-away displacements, (T, n, K); None: unknown.
+            motors: C, (n, n), the drives rotate at C qd; None: each drive moves its own joint.
         """
         motors = np.eye(qd.shape[-1]) if motors is None else motors
         effects = self._effects(qd @ motors.T, qdd @ motors.T, bent)
@@ -58,7 +60,7 @@ class FrictionModel:
     def torque(
         self, constants: np.ndarray, qd: np.ndarray, bent: np.ndarray | None, motors: np.ndarray
     ) -> np.ndarray:
-        """Return all but the armature's part, (..., n), of ``constants`` by effect and drive, (effects, n)."""
+        """Return the torque without that of the armature, (..., n) [Nm, N], for ``constants`` (effects, n)."""
         speed = qd @ motors.T
         torque: np.ndarray = (self._effects(speed, np.zeros_like(speed), bent) * constants).sum(
             axis=-2
@@ -66,11 +68,11 @@ class FrictionModel:
         return torque
 
     def _effects(self, speed: np.ndarray, rise: np.ndarray, bent: np.ndarray | None) -> np.ndarray:
-        """Return what each constant is multiplied with, (..., effects, n), by the drives' motion."""
+        """Return the factor of each constant, (..., effects, n), from velocity and acceleration of the drives."""
         sign = np.tanh(speed / self.coulomb_smoothing_velocity)
         dry = [sign]
         if self.memory:
-            # where the motion before is not known: as of a joint that has long moved the way it does
+            # if the history is unknown: bristles of a joint that has moved in this direction for a long time
             dry = [sign] * len(BRISTLES) if bent is None else list(np.moveaxis(bent, -1, 0))
         effects = [rise, speed, *dry, np.ones_like(speed)]
         if self.stribeck:

@@ -1,4 +1,4 @@
-"""Arm + Settings -> its rigid-body dynamics by Pinocchio, reflected rotor inertia included."""
+"""Rigid-body dynamics of an arm by Pinocchio, with the rotor inertia of its settings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from spelgen.settings.settings import Settings
 def arm_dynamics(
     arm: Arm, settings: Settings, friction: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> PinocchioDynamics:
-    """The arm's dynamics, by its joints' own torques; raises ArmError when a body has no inertial."""
+    """Return the dynamics of the arm with joint torques as inputs. Raises ArmError if a body has no inertial."""
     jacobian = np.zeros((len(arm.bodies), len(arm.coordinates)))
     for row, body in enumerate(arm.bodies):
         jacobian[row, body.coordinate] = float(body.multiplier)
@@ -27,19 +27,19 @@ def arm_dynamics(
 
 
 def pinocchio_model(arm: Arm, settings: Settings) -> pin.Model:
-    """A model with, for each body in its order, a joint about or along its own z.
+    """Return a model with a joint about or along z for each body, in the order of the bodies.
 
-    Reflected rotor inertia is the model's armature. Raises ArmError when a body has no inertial.
+    The rotor inertia on the joint side is the armature of the model. Raises ArmError if a body has no inertial.
     """
     errors = []
     for body in arm.bodies:
         if body.inertia is None:
-            what, do = (
+            got, do = (
                 "a link without <inertial>",
                 "write estimates into the URDF; a model that is trained on logs needs none",
             )
-            expected = "mass, centre of mass and inertia of all that moves"
-            errors.append(ArmError(what, element=f"joint {body.name!r}", expected=expected, do=do))
+            expected = "mass, center of mass and inertia of each moving body"
+            errors.append(ArmError(got, element=f"joint {body.name!r}", expected=expected, do=do))
     collect(errors)
     model = pin.Model()
     model.name = arm.name

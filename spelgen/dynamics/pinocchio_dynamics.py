@@ -2,7 +2,7 @@
 
     M(q) qdd + h(q, qd) + friction(qd) = G tau        with  M = K^T M_joints(K q + offset) K
 
-K is constant, so it adds no velocity terms; it is a permutation unless joints follow others or are locked.
+K is constant, so it adds no velocity terms; it is a permutation unless there are mimic or locked joints.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from spelgen.dynamics.constraint import Constraint
 
 
 def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
-    """Return a method of states (..., n) that takes batches which go together, and tensors, for which it gives one."""
+    """Return the method for states (..., n) that are arrays or tensors; their batches are broadcast."""
 
     @wraps(method)
     def on_arrays(self: PinocchioDynamics, *states: Any) -> object:
@@ -28,17 +28,17 @@ def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
         result = method(self, *np.broadcast_arrays(*map(np.asarray, states)))
         if isinstance(first, np.ndarray):
             return result
-        # what imports this knows no torch
+        # importers of this file do not depend on torch
         return first.new_tensor(result)
 
     return on_arrays
 
 
 class PinocchioDynamics:
-    """An arm of n coordinates (see ``RigidDynamics``); the model has b joints, the reflected rotors as armature.
+    """An arm of n coordinates (see ``RigidDynamics``); the model has b joints, with rotor inertia as armature.
 
-    constraint: what its names leave out stands still. friction: torque (..., n) by velocity (..., n); without, none.
-    inputs: G, (n, n); without, each input is its own joint's torque.
+    constraint: joints that it does not name are locked. friction: torque (..., n) as a function of velocity (..., n);
+    None: no friction. inputs: G, (n, n); None: each input is the torque of its joint.
     """
 
     def __init__(
@@ -54,49 +54,49 @@ class PinocchioDynamics:
         order = [model.joints[model.getJointId(name)].idx_v for name in constraint.names]
         self.jacobian, self.offset = np.zeros((model.nv, len(self.inputs))), np.zeros(model.nv)
         self.jacobian[order], self.offset[order] = constraint.jacobian, constraint.offset
-        # coordinates are the model's joints in its order: products with the identity took longer than `aba` itself
+        # without mimic or locked joints: products with the identity would take longer than `aba` itself
         self._same = np.array_equal(self.jacobian, np.eye(self.n)) and not self.offset.any()
 
     @property
     def n(self) -> int:
-        """How many coordinates."""
+        """Number of coordinates."""
         return int(self.jacobian.shape[1])
 
     @_takes_tensors
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
-        """M, (..., n, n) [kg m^2, kg m, kg]."""
+        """Return M, (..., n, n) [kg m^2, kg m, kg]."""
         upper = np.triu(self._by_joint(pin.crba, self.configuration(q)))
-        joints = upper + np.triu(upper, 1).swapaxes(-1, -2)  # Pinocchio promises the upper triangle only
+        joints = upper + np.triu(upper, 1).swapaxes(-1, -2)  # Pinocchio guarantees the upper triangle only
         return np.asarray(self.jacobian.T @ joints @ self.jacobian)
 
     @_takes_tensors
     def nonlinear_effects(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-        """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
+        """Return Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
         effects = self._by_joint(pin.nle, self.configuration(q), qd @ self.jacobian.T)
         return effects @ self.jacobian
 
     @_takes_tensors
     def gravity(self, q: np.ndarray) -> np.ndarray:
-        """dV/dq, (..., n) [Nm, N]."""
+        """Return dV/dq, (..., n) [Nm, N]."""
         return np.asarray(self.nonlinear_effects(q, np.zeros_like(q)))
 
     @_takes_tensors
     def friction_torque(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-        """What friction takes, (..., n) [Nm, N]."""
+        """Return the friction torque, (..., n) [Nm, N]."""
         return self.friction(qd)
 
     @_takes_tensors
     def forward_dynamics(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """qdd, (..., n), under the inputs tau."""
+        """Return qdd, (..., n), under the inputs tau (..., n)."""
         force = tau @ self.inputs.T - self.friction(qd)
-        if self._same:  # a copy, for Pinocchio writes over what it gave
+        if self._same:  # a copy: Pinocchio overwrites its result in the next call
             return np.array(self._by_joint(pin.aba, self.configuration(q), qd, force))
         force = force - self.nonlinear_effects(q, qd)
         return np.linalg.solve(self.mass_matrix(q), force[..., None])[..., 0]
 
     @_takes_tensors
     def inverse_dynamics(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
+        """Return the inputs, (..., n), that give qdd; of a passive joint, the torque that it lacks."""
         speeds, rates = qd @ self.jacobian.T, qdd @ self.jacobian.T
         torque = self._by_joint(pin.rnea, self.configuration(q), speeds, rates) @ self.jacobian
         torque = torque + self.friction(qd)
@@ -104,12 +104,12 @@ class PinocchioDynamics:
         return np.linalg.solve(self.inputs + passive, torque[..., None])[..., 0]
 
     def configuration(self, q: np.ndarray) -> np.ndarray:
-        """Pinocchio's configuration (..., nq) at q (..., n)."""
+        """Return the configuration of Pinocchio, (..., nq), at q (..., n)."""
         if not self._same:
             q = q @ self.jacobian.T + self.offset
         if self.model.nq == self.model.nv:
             return q
-        # planar and floating joints, which no coordinate moves, stay there
+        # planar and floating joints, which no coordinate moves, remain at the neutral configuration
         configuration = np.tile(pin.neutral(self.model), (*q.shape[:-1], 1))
         for joint in self.model.joints[1:]:
             position = q[..., joint.idx_v]
@@ -119,7 +119,7 @@ class PinocchioDynamics:
         return configuration
 
     def _by_joint(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
-        """What the algorithm gives of states (..., nq), (..., nv), ...; it takes one at a time."""
+        """Return the results of an algorithm for a batch of states (..., nq), (..., nv), ...; it accepts one state."""
         batch = states[0].shape[:-1]
         if not batch:
             return algorithm(self.model, self.data, *states)

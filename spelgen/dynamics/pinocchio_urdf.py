@@ -1,4 +1,4 @@
-"""A URDF -> its rigid-body dynamics as Pinocchio reads the file, by itself: a second reading beside spelgen's own."""
+"""Rigid-body dynamics of a URDF as Pinocchio reads it: independent of the reader of this package."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from spelgen.settings.settings import load_settings
 from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.read import read_urdf
 
-# [rad/s, m/s] width of the tanh in place of the jump of a URDF's Coulomb friction
+# Width of the tanh in place of the sign of the velocity, for Coulomb friction of a URDF [rad/s, m/s].
 COULOMB_SMOOTHING_VELOCITY = 0.05
 
 
 def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) -> PinocchioDynamics:
-    """The dynamics of these joints of a URDF and what follows them, all others locked at zero.
+    """Return the dynamics of these joints of a URDF and of their mimic joints; all other joints are locked at zero.
 
-    Inertials, damping and friction are the URDF's; gravity and inputs the settings' beside it. drives: with the
-    settings' rotors, and their friction in place of the URDF's where a joint has any. Raises what Pinocchio raises
-    where it cannot read the file.
+    Inertials, damping and friction are those of the URDF; gravity and inputs those of the settings. drives: with rotors
+    of the settings, and their friction, if there is any, in place of that of the URDF. Raises the errors of Pinocchio
+    if it cannot read the file.
     """
     robot, settings = read_urdf(urdf), load_settings(urdf)
     model = pin.buildModelFromXML(urdf_bytes(urdf).decode(errors="replace"))
@@ -35,7 +35,10 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
     if missing:
         raise ValueError(f"Pinocchio sees no joint {', '.join(missing)}")
     motors = derive_actuation(robot, settings, joints).drives()
-    by_joint, speeds = {}, None  # a file's own friction is the joints', that of drives the motors'
+    by_joint, speeds = (
+        {},
+        None,
+    )  # friction of the URDF acts at the joints, friction of the settings at the motors
     if drives:
         by_joint, speeds = settings.joints, motors.speeds
     for name in joints:
@@ -46,7 +49,7 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
     return PinocchioDynamics(model, constraint, friction, motors.inputs)
 
 
-def has_drives(urdf: Path, joints: Sequence[str]) -> bool:
-    """Whether the settings beside a URDF tell of rotors or friction of these joints."""
+def drives_known(urdf: Path, joints: Sequence[str]) -> bool:
+    """Return whether the settings of a URDF specify rotors or friction of these joints."""
     drives = load_settings(urdf).joints
     return any(x.rotor_inertia or x.viscous or any(x.coulomb) for k, x in drives.items() if k in joints)

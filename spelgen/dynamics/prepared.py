@@ -1,4 +1,4 @@
-"""A trained model ready to be asked many times: nothing that depends on the weights alone is worked out again."""
+"""A trained model for many calls: all that depends on the parameters only is computed once."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from spelgen.dynamics.equations import runge_kutta
 from spelgen.dynamics.protocol import known_past, sliding_memory
 from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
     from spelgen.dynamics.tip import TipKinematics
 
 
 class State(NamedTuple):
-    """q and qd, (..., n), and friction's memory z, (..., n, K)."""
+    """q and qd, (..., n), and the friction state z, (..., n, K)."""
 
     q: Tensor
     qd: Tensor
@@ -27,11 +28,11 @@ class State(NamedTuple):
 
 
 class PreparedModel:
-    """An emitted model with its weights as they were, without gradients by them.
+    """A copy of a model with constant parameters.
 
-    q, qd, qdd and tau are (..., n); units are rad and Nm, or m and N. z, (..., n, K), is friction's memory; without it
-    friction is that of joints which have long gone the way of qd. tip: what gives ``pose(q)`` and ``jacobian(q)``, as
-    ``tip_kinematics`` does. elements: K, of friction's memory at a joint.
+    q, qd, qdd and tau are (..., n); units are rad and Nm, or m and N. z, (..., n, K), is the friction state; without it
+    friction is that of joints that have moved at qd for a long time. tip: kinematics of the tip, see
+    ``tip_kinematics``. elements: bristles per joint, K.
     """
 
     def __init__(
@@ -41,48 +42,48 @@ class PreparedModel:
         *,
         dtype: torch.dtype = torch.float64,
     ) -> None:
-        # networks that give nothing would take most of the time
+        # networks that are zero would take most of the time
         reduced = without_idle_residuals(model)
         reduced.to(dtype=dtype).requires_grad_(False)
         self._model = reduced
         self._weights, self._tip = reduced.prepare(), tip
         self.n: int = reduced.n
-        self.elements: int = getattr(reduced, "elements", 0)
+        self.elements: int = reduced.elements if isinstance(reduced, RigidBodyDynamics) else 0
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """M(q), (..., n, n) [kg m^2, kg m, kg]."""
+        """Return M(q), (..., n, n) [kg m^2, kg m, kg]."""
         return self._model.mass_matrix(self._at(q))
 
     def gravity(self, q: Tensor) -> Tensor:
-        """dV/dq, (..., n) [Nm, N]."""
+        """Return dV/dq, (..., n) [Nm, N]."""
         return self._model.gravity(self._at(q))
 
     def bias(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
+        """Return Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
         return self._model.nonlinear_effects(self._at(q, qd), qd)
 
     def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
-        """What friction takes, (..., n) [Nm, N]."""
+        """Return the friction torque, (..., n) [Nm, N]."""
         return self._model.friction_torque(self._at(q, qd), qd, *known_past(self._model, z))
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Friction's memory z, (..., n, K), of joints that have long gone the way of qd: zero at rest."""
+        """Return the friction state z, (..., n, K), of joints that have moved at qd for a long time: zero at rest."""
         return sliding_memory(self._model, qd)
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
-        """qdd, (..., n), under the input tau."""
+        """Return qdd, (..., n), under the input tau."""
         return self._model.forward_dynamics(self._at(q, qd, tau), qd, tau, *known_past(self._model, z))
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
-        """The input, (..., n), that gives qdd."""
+        """Return the input, (..., n), that gives qdd."""
         return self._model.inverse_dynamics(self._at(q, qd, qdd), qd, qdd, *known_past(self._model, z))
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
-        """p = M(q) qd, (..., n) [Nm s, N s]."""
+        """Return p = M(q) qd, (..., n) [Nm s, N s]."""
         return self._model.momentum(self._at(q, qd), qd)
 
     def momentum_rate(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
-        """p', (..., n) [Nm, N], under the input tau: what a momentum observer compares with."""
+        """Return p', (..., n) [Nm, N], under the input tau, for a momentum observer."""
         past = known_past(self._model, z)
         p = self.momentum(q, qd)
         return self._model.port_hamiltonian_rhs(q, p, tau, self._weights, *past)[1]
@@ -90,9 +91,9 @@ class PreparedModel:
     def step(
         self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, z: Tensor | None = None, *, substeps: int = 1
     ) -> State:
-        """q, qd and z after dt [s] under a tau that is held, by so many steps of the classical Runge-Kutta method.
+        """Return q, qd and z after dt [s] under a constant tau, by ``substeps`` steps of the classical Runge-Kutta.
 
-        z follows the displacements exactly; by default it starts as ``memory`` says.
+        z is exact in the displacements; its initial value is ``memory(qd)`` by default.
         """
         z = self.memory(qd) if z is None else z
 
@@ -106,7 +107,7 @@ class PreparedModel:
     def rollout(
         self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, z: Tensor | None = None, *, substeps: int = 1
     ) -> State:
-        """q and qd, (steps + 1, ..., n), and z from a state on; tau, (steps, ..., n), is held for dt [s] each."""
+        """Return q and qd, (steps + 1, ..., n), and z; each tau of (steps, ..., n) is constant for dt [s]."""
         states = [State(q, qd, self.memory(qd) if z is None else z)]
         for held_tau in tau:
             q, qd, z = states[-1]
@@ -123,13 +124,13 @@ class PreparedModel:
         *,
         substeps: int = 1,
     ) -> tuple[Tensor, Tensor]:
-        """A, (..., 2 n, 2 n), and B, (..., 2 n, n), of the state (q, qd) and the input tau.
+        """Return A, (..., 2 n, 2 n), and B, (..., 2 n, n): derivatives with respect to (q, qd) and tau.
 
-        Of its rate, (qd, qdd), with z held; with dt [s], of what ``step`` makes of it.
+        They are those of the rate (qd, qdd) for constant z; with dt [s], those of the result of ``step``.
         """
         n = self.n
         z = self.memory(qd) if z is None else z
-        # compiled functions take no derivative from outside
+        # torch.func cannot differentiate compiled functions
         plain = copy.copy(self)
         vars(plain).pop("forward_dynamics", None)
 
@@ -146,24 +147,24 @@ class PreparedModel:
         return by_state.reshape(*batch, 2 * n, 2 * n), by_input.reshape(*batch, 2 * n, n)
 
     def pose(self, q: Tensor) -> Tensor:
-        """The tip's homogeneous transform in the root link's frame, (..., 4, 4). Raises ValueError without a tip."""
+        """Return the pose of the tip in the root frame, (..., 4, 4). Raises ValueError without a tip."""
         return self._kinematics().pose(q)
 
     def jacobian(self, q: Tensor) -> Tensor:
-        """The tip's linear, then angular velocity by qd, (..., 6, n). Raises ValueError without a tip."""
+        """Return the Jacobian of the tip, (..., 6, n), linear rows first. Raises ValueError without a tip."""
         return self._kinematics().jacobian(q)
 
     def compile(self) -> PreparedModel:
-        """Itself, its forward and inverse dynamics compiled by ``torch.compile`` at their first calls."""
+        """Return a copy whose forward and inverse dynamics are compiled by ``torch.compile`` at their first calls."""
         result = copy.copy(self)
-        for name in ("forward_dynamics", "inverse_dynamics"):
+        for method in (self.forward_dynamics, self.inverse_dynamics):
             # asserts between the kernels would take a tenth of the time
-            compiled = torch.compile(getattr(self, name), fullgraph=True, options={"size_asserts": False})
-            setattr(result, name, compiled)
+            compiled = torch.compile(method, fullgraph=True, options={"size_asserts": False})
+            vars(result)[method.__name__] = compiled
         return result
 
     def _at(self, q: Tensor, *others: Tensor) -> object:
-        """Return the model's pose at q, vectors of the state checked."""
+        """Return the configuration of the model at q; shapes of the other vectors are checked."""
         return self._model.at(q, *others, prepared=self._weights)
 
     def _kinematics(self) -> TipKinematics:
@@ -173,10 +174,10 @@ class PreparedModel:
 
 
 def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: Tensor) -> tuple[Tensor, ...]:
-    """Return a state's function's derivatives by its first inputs, for a batch of states."""
+    """Return the derivatives of a function with respect to its first ``variables`` inputs, for a batch of states."""
     if not torch.is_grad_enabled():
         states = tuple(x.detach() for x in states)
-    # vmap of a derivative of linalg.solve is wrong in torch 2.13 if it is forward, or without autograd
+    # torch 2.13: vmap of a derivative of linalg.solve is wrong in forward mode, or without autograd
     with torch.inference_mode(False), torch.enable_grad():
         jacobian = torch.func.vmap(torch.func.jacrev(function, argnums=tuple(range(variables))))
         derivatives: tuple[Tensor, ...] = jacobian(*(x.clone() for x in states))

@@ -23,25 +23,25 @@ class RigidDynamics(Protocol):
 
     @property
     def n(self) -> int:
-        """How many joints."""
+        """Number of joints."""
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """M, (..., n, n), armature included."""
+        """Return M, (..., n, n), with armature."""
 
     def gravity(self, q: Tensor) -> Tensor:
-        """dV/dq, (..., n)."""
+        """Return dV/dq, (..., n)."""
 
     def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
-        """h: Coriolis, centrifugal and gravity torques without friction, (..., n)."""
+        """Return h, (..., n): Coriolis, centrifugal and gravity torques without friction."""
 
     def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
-        """What friction takes, (..., n)."""
+        """Return the friction torque, (..., n)."""
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
-        """qdd, (..., n), under the inputs tau."""
+        """Return qdd, (..., n), under the inputs tau."""
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
+        """Return the inputs, (..., n), that give qdd; of a passive joint, the torque that it lacks."""
 
 
 @runtime_checkable
@@ -80,23 +80,23 @@ def input_of(model: object) -> Literal["torque", "position"]:
 
 
 def sliding_memory(dynamics: object, qd: Tensor) -> Tensor:
-    """z, (..., n, K), of joints that have long gone the way of qd."""
+    """Return z, (..., n, K), of joints that have moved at qd for a long time; K = 0 for friction without a state."""
     if not is_stateful(dynamics):
         return qd.unsqueeze(-1)[..., :0]
     return dynamics.memory(qd)
 
 
 def memory_after(dynamics: object, z: Tensor, displacement: Tensor) -> Tensor:
-    """z after joints went one way by (..., n)."""
+    """Return z after a monotonic displacement of the joints, (..., n)."""
     if not z.shape[-1] or not is_stateful(dynamics):
         return z
     return dynamics.memory_after(z, displacement)
 
 
 def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
-    """z, (W, K, n, elements), along the samples q and qd, (W, K, n), each straight to the next.
+    """Return z, (W, K, n, elements), along the samples q and qd, (W, K, n), which are connected by straight lines.
 
-    It starts at z, (W, n, elements), by default as of joints that have long gone the way of the first qd.
+    z: initial state, (W, n, elements); None: of joints that have moved at the first qd for a long time.
     """
     states = [sliding_memory(dynamics, qd[:, 0]) if z is None else z]
     for moved in q.diff(dim=1).unbind(1):
@@ -105,9 +105,9 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
 
 
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
-    """z as what to give to these dynamics last, where they have a use for it.
+    """Return the last arguments of calls of these dynamics: z, if friction has a state, and the direction.
 
-    direction: (..., n) of dry friction without memory, where tau was filtered: its steps must be, too.
+    direction: of dry friction without bristles, (..., n); it is given for a filtered tau, as it must be filtered, too.
     """
     if z is None or not is_stateful(dynamics):
         return ()
@@ -117,7 +117,7 @@ def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = No
 
 
 class VelocityState:
-    """Any dynamics where momenta are asked for: velocities take their place."""
+    """Any dynamics with velocities in place of momenta, for rollouts."""
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
@@ -127,28 +127,28 @@ class VelocityState:
             self.memory, self.memory_after = dynamics.memory, dynamics.memory_after
 
     def prepare(self) -> None:
-        """Nothing."""
+        """Return None: there is no parameter cache."""
 
     def at(self, q: Tensor, prepared: None = None) -> Tensor:
-        """Return q."""
+        """Return q: there is no configuration cache."""
         return q
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
-        """qd."""
+        """Return qd."""
         return qd
 
     def velocity(self, q: Tensor, p: Tensor) -> Tensor:
-        """qd."""
+        """Return qd."""
         return p
 
     def port_hamiltonian_rhs(
         self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: None, z: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """qd and qdd."""
+        """Return qd and qdd, (..., n) each."""
         past = known_past(self.dynamics, z)
         return p, self.dynamics.forward_dynamics(q, p, torch.zeros_like(q) if tau is None else tau, *past)
 
 
 def integrable(dynamics: RigidDynamics) -> Any:
-    """What a rollout integrates: the dynamics in momenta where they have these, else in velocities."""
+    """Return the dynamics that a rollout integrates: in momenta if they have them, else in velocities."""
     return dynamics if isinstance(dynamics, PortHamiltonian) else VelocityState(dynamics)

@@ -1,4 +1,4 @@
-"""The bodies of an arm as the runtime's own chain, and their regressor: joint torques are Y times their parameters."""
+"""Kinematics and regressor of the bodies of an arm: joint torques are Y times their inertial parameters."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from spelgen.runtime.parts import Row
 
 
 def body_chain(arm: Arm) -> BodyChain:
-    """Return how the arm's bodies may move, for q (..., n) [rad; m]."""
+    """Return the kinematics of the bodies of an arm."""
     rows: list[tuple[Any, ...]] = []
     for body in arm.bodies:
         placement = [(*_row(row), float(x)) for row, x in zip(body.rotation, body.translation, strict=True)]
@@ -31,7 +31,7 @@ def regressor(arm: Arm, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.nd
 
 
 def urdf_parameters(arm: Arm) -> np.ndarray:
-    """The URDF's own inertial parameters, (10 B,); zero for a body without."""
+    """Return the inertial parameters of the URDF, (10 B,); zero for a body without inertial."""
     return np.array([body.inertia or (0,) * 10 for body in arm.bodies], dtype=float).ravel()
 
 

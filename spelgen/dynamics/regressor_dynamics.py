@@ -1,4 +1,4 @@
-"""Rigid bodies by their regressor: the dynamics of inertial parameters that least squares found, possible or not."""
+"""Dynamics of inertial parameters that need not be physically consistent, such as those of least squares."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
 from spelgen.dynamics.body_regressor import pseudo_inertia
 from spelgen.dynamics.bristles import moved_bristles
-from spelgen.dynamics.equations import Pose
+from spelgen.dynamics.equations import MotionEquations
 from spelgen.dynamics.regressor import body_chain
 from spelgen.runtime.body_chain import ChainConfiguration
 from spelgen.runtime.port_hamiltonian import applied
@@ -22,9 +22,9 @@ from spelgen.runtime.port_hamiltonian import applied
 class RegressorDynamics:
     """An arm of n coordinates with these parameters (see ``RigidDynamics``).
 
-    parameters: (10 B,), as ``regressor`` has them. armature: of the drives, (n,) [kg m^2, kg]. friction: torques (T, n)
-    by velocities (T, n) and its memory z (T, n, K), or None. bristle_reach: (n, K) [rad, m], where it has one.
-    drives: without, each input is its own joint's torque.
+    parameters: (10 B,), in the order of ``regressor``. armature: of the drives, (n,) [kg m^2, kg]. friction: function
+    of velocities (T, n) and of the state z (T, n, K), or None, that returns torques (T, n). bristle_reach: break-away
+    displacements, (n, K) [rad, m]; None: no state. drives: None: each input is the torque of its joint.
     """
 
     def __init__(
@@ -48,58 +48,58 @@ class RegressorDynamics:
 
     @property
     def n(self) -> int:
-        """How many coordinates."""
+        """Number of coordinates."""
         return len(self.armature)
 
     @property
     def elements(self) -> int:
-        """K, of friction's memory at a joint."""
+        """Bristles per joint, K."""
         return self.bristle_reach.shape[1]
 
     def mass_matrix(self, q: Tensor) -> Tensor:
-        """M, (..., n, n) [kg m^2, kg m, kg]."""
-        return self.pose_at(q).mass
+        """Return M, (..., n, n) [kg m^2, kg m, kg]."""
+        return self.equations_at(q).mass
 
     def gravity(self, q: Tensor) -> Tensor:
-        """dV/dq, (..., n) [Nm, N]."""
+        """Return dV/dq, (..., n) [Nm, N]."""
         return self.nonlinear_effects(q, torch.zeros_like(q))
 
     def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
+        """Return Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
         chain, momenta = self._bodies(q)
         return applied(momenta, self.chain.accelerations(chain, qd))
 
     def _bodies(self, q: Tensor) -> tuple[ChainConfiguration, Tensor]:
-        """Return the bodies' frames as points, and their momenta by joint velocity, (..., n, 12 bodies)."""
+        """Return the frames of the bodies, and their momenta per joint velocity, (..., n, 12 bodies)."""
         chain = self.chain.forward(q, torch.eye(len(self.inertia)).to(q))
         jacobian = torch.unflatten(self.chain.ratios.mT @ chain.jacobian, -1, (3, -1))
         return chain, (jacobian @ self.inertia).flatten(-2)
 
     def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
-        """What friction takes, and what the measured torque shows without any, (..., n) [Nm, N]."""
+        """Return friction torque and torque offset, (..., n) [Nm, N]."""
         past = z.numpy() if z is not None and self.elements else None
         return torch.from_numpy(self.friction(qd.numpy(), past))
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
-        """qdd, (..., n), under the inputs tau."""
-        pose = self.pose_at(q)
-        force = pose.force(qd, tau, z).unsqueeze(-1)  # one column: vectors would need the same batch
-        qdd: Tensor = torch.linalg.solve(pose.mass, force)
+        """Return qdd, (..., n), under the inputs tau (..., n)."""
+        at = self.equations_at(q)
+        force = at.force(qd, tau, z).unsqueeze(-1)  # one column: vectors would need the same batch
+        qdd: Tensor = torch.linalg.solve(at.mass, force)
         return qdd.squeeze(-1)
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
-        """The inputs, (..., n), that make qdd; those of a passive joint are the torques that it lacks."""
+        """Return the inputs, (..., n), that give qdd; of a passive joint, the torque that it lacks."""
         passive = (self.inputs == 0).all(dim=1).double()
         inverse: Tensor = torch.linalg.inv(self.inputs + torch.diag(passive))
         return self.joint_torque(q, qd, qdd, z) @ inverse.mT
 
     def joint_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
-        """What all joints, passive ones too, need for qdd, (..., n) [Nm, N]."""
-        pose = self.pose_at(q)
-        return applied(pose.mass, qdd) - pose.force(qd, torch.zeros_like(qdd), z)
+        """Return the torque of all joints, passive ones included, for qdd, (..., n) [Nm, N]."""
+        at = self.equations_at(q)
+        return applied(at.mass, qdd) - at.force(qd, torch.zeros_like(qdd), z)
 
-    def pose_at(self, q: Tensor) -> Pose:
-        """Return the equations of motion at q, (T, n), see `equations.poses`."""
+    def equations_at(self, q: Tensor) -> MotionEquations:
+        """Return the equations of motion at q, (T, n); see `equations.equations_of`."""
         chain, momenta = self._bodies(q)
 
         def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
@@ -108,13 +108,13 @@ class RegressorDynamics:
 
         rotors = self.motors.mT @ torch.diag(self.armature) @ self.motors
         mass = momenta @ chain.jacobian.mT @ self.chain.ratios + rotors
-        return Pose(mass, force, partial(self.friction_torque, q))
+        return MotionEquations(mass, force, partial(self.friction_torque, q))
 
     def memory(self, qd: Tensor) -> Tensor:
-        """z, (..., n, K), of drives that have long gone this way."""
+        """Return z, (..., n, K), of drives that have moved at qd for a long time."""
         return (qd @ self.motors.mT.to(qd)).sign().unsqueeze(-1) * self.bristle_reach
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """z after joints went one way by (..., n)."""
+        """Return z, (..., n, K), after a monotonic displacement of the joints, (..., n)."""
         moved = displacement @ self.motors.mT.to(displacement)
         return moved_bristles(z, moved.unsqueeze(-1), self.bristle_reach)

@@ -1,44 +1,44 @@
-"""Roll out arms that position servos hold under their commands.
+"""Rollouts of arms with position servos under their commands.
 
-Springs and dry friction are stiff, so both are taken implicitly, springs linearised at the start of a step (Rosenbrock;
-Hairer and Wanner, Solving ODEs II, IV.7, with the weights of the theta method): a few steps between samples are
-stable for any gain. Theta is such that motion which fades does so as fast as it would, to third order (Liniger and
-Willoughby, SIAM J. Numerical Analysis 7:47, 1970): 1/2 for what is slow, which adds no damping of its own, and towards
-1 for what is too fast for a step. Friction's bristles follow the displacement exactly, also where they begin to slide.
+Springs and dry friction are stiff, so both are integrated implicitly, with springs linearised at the start of a step
+(Rosenbrock; Hairer and Wanner, Solving ODEs II, IV.7, with the weights of the theta method): a few steps between
+samples are stable for any gain. Theta is fitted exponentially, so that decaying motion decays at its true rate to third
+order (Liniger and Willoughby, SIAM J. Numerical Analysis 7:47, 1970): 1/2 for slow motion, without numerical damping,
+and towards 1 for motion that is too fast for a step. The friction state is exact in the displacement of a step.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from spelgen.dynamics.bristles import moved_bristles
 from spelgen.runtime.friction_laws import FrictionConstants
-from spelgen.runtime.port_hamiltonian import applied
+from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
 from spelgen.runtime.position_servo import ServoConstants, beyond
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
-COUPLED_PASSES = 2  # by which joints that move one another agree on which bristles slide
-ServoArm = Any  # an emitted model with servos: emission comes after this room
+# Passes over the joints, which influence one another through M, to find which bristles slide.
+COUPLED_PASSES = 2
 
 
 class ServoDrives(NamedTuple):
-    """Hold what servos and friction do at joints: their constants, (..., n).
+    """Constants of the servos and of friction, (..., n).
 
-    Bristles are (K, ..., n) here, so that numbers of an element lie side by side in memory: with (..., n, K) a step
-    takes half as long again.
+    Bristles are (K, ..., n) here: contiguous memory of each element takes two thirds of the time of (..., n, K).
     """
 
     servo: ServoConstants
     friction: FrictionConstants
-    offset: Tensor  # torque that the drives lack [Nm, N]
-    reach: Tensor  # of bristles, (K, ..., n) [rad, m]
-    steepness: Tensor  # of dry friction's direction by displacement, (K, ..., n) [1/rad, 1/m]
+    offset: Tensor  # torque offset [Nm, N]
+    reach: Tensor  # break-away displacements, (K, ..., n) [rad, m]
+    steepness: Tensor  # change of the direction of dry friction per displacement, (K, ..., n) [1/rad, 1/m]
 
 
 class ServoState(NamedTuple):
-    """Hold q and qd, (..., n), and the state z of friction's bristles, (K, ..., n)."""
+    """q and qd, (..., n), and the friction state z, (K, ..., n)."""
 
     q: Tensor
     qd: Tensor
@@ -46,10 +46,10 @@ class ServoState(NamedTuple):
 
 
 class Load(NamedTuple):
-    """Hold what the bodies are to the drives.
+    """The load of the drives.
 
-    inertia: (..., n, n), or where not ``coupled`` (..., n), of each joint by itself. bias: the torque (..., n) that all
-    but it takes. gravity: the part of it that gravity is.
+    inertia: M, (..., n, n), or its diagonal, (..., n), if not ``coupled``. bias: Coriolis, centrifugal and gravity
+    torque, (..., n). gravity: gravity torque, (..., n).
     """
 
     inertia: Tensor
@@ -58,8 +58,9 @@ class Load(NamedTuple):
     coupled: bool
 
 
-def servo_drives(model: ServoArm) -> ServoDrives:
-    """Return those of a model with servos."""
+def servo_drives(model: PortHamiltonian) -> ServoDrives:
+    """Return the constants of a model with servos."""
+    assert isinstance(model, RigidBodyDynamics) and model.servo is not None
     constants = model.friction.prepare()
     reach = constants.bristle_reach.T.contiguous()
     steepness = (constants.bristle_fractions / constants.bristle_reach).movedim(-1, 0).contiguous()
@@ -70,10 +71,7 @@ def servo_drives(model: ServoArm) -> ServoDrives:
 
 
 def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
-    """Return the state at rest, or of steady motion.
-
-    Its friction makes up, as far as it can, for what the servos' torque is not.
-    """
+    """Return the state at rest, or of steady motion, in which friction balances the other torques as far as it can."""
     servo = drives.servo
     torque = servo.kp * beyond(u - q, servo.dead_zone) - servo.kd * qd
     torque = torque.clamp(-servo.limit, servo.limit) - drives.offset
@@ -97,15 +95,15 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
     stiffness = (strength * (qd.sign() * z < drives.reach)).sum(dim=0)
     decay = h * (damping + h * (servo_stiffness / 2 + stiffness)) / inertia
     theta = (3 + decay) / (6 + decay)
-    # at theta of the step; bristles at its end: they are the stiffest
+    # at theta of the step; bristles, which are the stiffest, at its end
     impulse, bristle_stiffness = theta * h * force, theta * h * h * strength
     damping = theta * h * (damping + h * theta * servo_stiffness)
-    # bristles by the velocity of the step, which is the unknown
+    # displacements are divided by h: the unknown is the mean velocity of the step
     bent, reach = z / h, drives.reach / h
     velocity = slipped(inertia * qd + impulse, inertia + damping, bristle_stiffness, bent, reach)
     if load.coupled:
         momentum = applied(load.inertia, qd) + impulse
-        # how far bristles give way depends on what other joints do
+        # the displacement of bristles depends on the other joints
         for _ in range(COUPLED_PASSES):
             rise = (bristle_stiffness * (moved_bristles(bent, velocity, reach) - bent)).sum(dim=0)
             secant = rise / torch.where(velocity == 0, 1.0, velocity)
@@ -119,23 +117,22 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
 
 
 def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Tensor) -> Tensor:
-    """Return the displacement x, (..., n), at which slope x and the bristles' rise balance a push, (..., n).
+    """Return the displacement x, (..., n), that solves slope x + sum_k strength_k (z_k(x) - z_k) = push, (..., n).
 
-    The rise is the sum of strength (z(x) - z). strength, z, reach: (K, ..., n), the shortest reach first. Bristles that
-    are bent one way slide in that order, so x is the largest zero of K + 1 straight lines: in the k-th, k slide.
+    strength, z, reach: (K, ..., n), the shortest break-away displacement first. Bristles that are deflected in the same
+    direction begin to slide in this order, so x is the largest zero of K + 1 straight lines: in the k-th, k slide.
     """
-    way, stiffness = push.sign(), slope + strength.sum(dim=0)
-    # running sums: of what remains of the push, and of what resists, when k slide
-    remaining = torch.cat([push.abs().unsqueeze(0), -strength * (reach - way * z)]).cumsum(dim=0)
+    direction, stiffness = push.sign(), slope + strength.sum(dim=0)
+    # running sums of the remaining push and of the stiffness, if k bristles slide
+    remaining = torch.cat([push.abs().unsqueeze(0), -strength * (reach - direction * z)]).cumsum(dim=0)
     resisting = torch.cat([stiffness.unsqueeze(0), -strength]).cumsum(dim=0)
-    return way * (remaining / resisting).amax(dim=0)
+    return direction * (remaining / resisting).amax(dim=0)
 
 
-def replayed(model: ServoArm, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) -> Tensor:
+def replayed(model: PortHamiltonian, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) -> Tensor:
     """Return positions (W, K, n) after each interval dt (W, K) [s], from q and qd (W, n).
 
-    Commands are delayed ones, (W, K, S, n). S: steps in an interval, over which what the bodies weigh and how inert
-    they are is taken once.
+    commands: delayed, (W, K, S, n); S: steps per interval. M and the gravity torque are evaluated once per interval.
     """
     with torch.no_grad():
         drives, prepared, positions = servo_drives(model), model.prepare(), []

@@ -1,4 +1,4 @@
-"""Where the tip of an arm is and how it moves: kinematics of a URDF by pytorch-kinematics."""
+"""Kinematics of the tip of an arm by pytorch-kinematics."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from spelgen.urdf.robot import Robot
 
 
 class TipKinematics:
-    """Pose and Jacobian of a link in the root link's frame, by the coordinates q (..., n) [rad; m].
+    """Pose and Jacobian of a link in the frame of the root link, as functions of q (..., n) [rad, m].
 
-    Joints that follow others by <mimic> follow here too, all others stand at zero. What it gives is float64 but
-    errs by about 1e-7 rad and m: pytorch-kinematics rounds the file's offsets to float32 whatever it is asked for.
-    In float32 throughout, the chain's products would add to that ten times over.
+    Mimic joints move with their leaders, all other joints are at zero. Results are float64 with an error of about
+    1e-7 rad and m: pytorch-kinematics rounds the offsets of a file to float32. With products in float32 the error would
+    be ten times as large.
     """
 
     def __init__(self, robot: Robot, joints: Sequence[str], link: str) -> None:
-        import pytorch_kinematics as pk  # takes long to import, with matplotlib
+        import pytorch_kinematics as pk  # imports matplotlib, which takes long
 
         self.link = link
         chain = pk.build_serial_chain_from_urdf(_way(robot, link), link)
@@ -37,21 +37,21 @@ class TipKinematics:
             raise ValueError(f"the joints {', '.join(missing)} do not lead to {link}")
 
     def pose(self, q: torch.Tensor) -> torch.Tensor:
-        """The homogeneous transform, (..., 4, 4)."""
+        """Return the homogeneous transform, (..., 4, 4)."""
         result: torch.Tensor = self._chain.forward_kinematics(self._rows(q)).get_matrix()
         return result.reshape(*q.shape[:-1], 4, 4)
 
     def position(self, q: torch.Tensor) -> torch.Tensor:
-        """The link's origin, (..., 3) [m]."""
+        """Return the origin of the link, (..., 3) [m]."""
         return self.pose(q)[..., :3, 3]
 
     def jacobian(self, q: torch.Tensor) -> torch.Tensor:
-        """Velocity of the link's origin [m/s], then angular velocity [rad/s], by qd; (..., 6, n), in root axes."""
+        """Return the Jacobian, (..., 6, n), in root axes: linear [m/s], then angular velocity [rad/s] per qd."""
         result: torch.Tensor = self._chain.jacobian(self._rows(q)) @ self._jacobian
         return result.reshape(*q.shape[:-1], 6, q.shape[-1])
 
     def _rows(self, q: torch.Tensor) -> torch.Tensor:
-        """Positions of the chain's joints, (states, joints)."""
+        """Return the positions of the joints of the chain, (states, joints)."""
         return (q.double() @ self._jacobian.mT + self._offset).reshape(-1, len(self._offset))
 
 
@@ -60,11 +60,10 @@ def tip_kinematics(
 ) -> TipKinematics:
     """Return the kinematics of ``link``.
 
-    By default it is the tip that the arm was loaded with, else the link after the last joint or the end of the fixed
-    links behind it.
+    By default it is the tip of the arm, or the link after the last joint or the end of the fixed links after that.
 
-    arm: of ``load_arm``, or the path of a URDF, with the names of its ``joints``. Raises ValueError where the joints
-    do not lead to the link.
+    arm: result of ``load_arm``, or the path of a URDF, with the names of its ``joints``. Raises ValueError if the
+    joints do not lead to the link.
     """
     if isinstance(arm, str | Path):
         robot, names = read_urdf(Path(arm)), list(joints or ())
@@ -77,7 +76,7 @@ def tip_kinematics(
 
 
 def last_link(robot: Robot, joints: Sequence[str]) -> str:
-    """The link after the last of these joints, or the end of the fixed links behind it."""
+    """Return the link after the last of these joints, or the end of the fixed links after it."""
     link = robot.joint[joints[-1]].child
     while True:
         fixed = [joint.child for joint in robot.joints_below[link] if joint.type == "fixed"]
@@ -87,9 +86,9 @@ def last_link(robot: Robot, joints: Sequence[str]) -> str:
 
 
 def _way(robot: Robot, link: str) -> bytes:
-    """The links and joints from the root to ``link`` as a URDF of their own.
+    """Return the links and joints from the root to ``link`` as a URDF.
 
-    pytorch-kinematics' parser is stricter than others about what nobody here needs: colours, meshes, transmissions.
+    The parser of pytorch-kinematics refuses some files for elements that are not needed: colours, transmissions.
     """
     path = robot.path_to(link)
     root = etree.Element("robot", name="way")

@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
+
 from spelgen.baselines.baseline import EvaluatedArm
 from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import Predictor, accurate_solver, of_dynamics
@@ -28,12 +30,19 @@ from spelgen.evaluation.results import Results
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import TorqueErrors, coarse_torques, torque_errors
 from spelgen.evaluation.traces import Traces, motion_traces, replay_traces
+from spelgen.evaluation.truth import mass_errors
 from spelgen.evaluation.tuning import TUNING
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import SHORTEST, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import SLOWEST
-from spelgen.logs.trajectory import Trajectory, require_commands, require_joints, require_torques
+from spelgen.logs.trajectory import (
+    Trajectory,
+    joined_column,
+    require_commands,
+    require_joints,
+    require_torques,
+)
 from spelgen.logs.windows import Windows
 
 if TYPE_CHECKING:
@@ -56,6 +65,7 @@ def evaluate(
     preprocessing: Preprocessing | None = None,
     steps: Sequence[int] = STEPS,
     seconds: Sequence[float] = SECONDS,
+    truth: ConfiguredArm | Path | str | None = None,
     progress: Progress | None = None,
 ) -> Results:
     """Predict the states and torques of test logs and measure the errors.
@@ -72,6 +82,7 @@ def evaluate(
         preprocessing: of states and torques; by default as the model was fitted.
         steps: horizons [samples].
         seconds: horizons [s]. Horizons longer than every trajectory are omitted, with a note.
+        truth: true arm of simulated logs, or its URDF, for the errors of M.
         progress: called with the number of finished rollouts, the number of all, and the name of the next one.
 
     Returns:
@@ -98,7 +109,7 @@ def evaluate(
         return _evaluate_commands(tested, logs, notes)
     require_torques(logs)
     used = _preprocessing(tested.fit.preprocessing if tested.fit else None, preprocessing, logs)
-    return _evaluate_torques(tested, logs, notes, used, baselines or {}, (steps, seconds), progress)
+    return _evaluate_torques(tested, logs, notes, used, baselines or {}, (steps, seconds), truth, progress)
 
 
 def _preprocessing(
@@ -120,6 +131,7 @@ def _evaluate_torques(
     used: Preprocessing,
     baselines: Mapping[str, RigidDynamics],
     ahead: tuple[Sequence[int], Sequence[float]],
+    truth: ConfiguredArm | Path | str | None,
     progress: Progress | None,
 ) -> Results:
     """Evaluate the torques, and the motion under the logged torques."""
@@ -160,6 +172,9 @@ def _evaluate_torques(
             do="omit --quick",
         )
     steps = coarse_torques(logs, tested.joints, notes) if torque else {}
+    masses = {}
+    if truth is not None:
+        masses = mass_errors(all_dynamics, truth, tested.joints, torch.from_numpy(joined_column(logs, "q")))
     return _results(
         tested,
         logs,
@@ -170,6 +185,7 @@ def _evaluate_torques(
         horizons=tuple(horizons),
         torque=torque,
         torque_steps=steps,
+        mass_errors=masses,
     )
 
 

@@ -15,7 +15,7 @@ from spelgen.evaluation.replay import Replay
 from spelgen.evaluation.torque import TorqueErrors
 from spelgen.evaluation.traces import Traces
 
-SCHEMA = 9
+SCHEMA = 10
 
 
 @dataclass(frozen=True, repr=False)
@@ -25,7 +25,8 @@ class Measurements:
     parameters: number of trained parameters. traces: curves behind the figures, of predictions over the longest
     horizon. cutoff: of the filter of the test logs [Hz], None without one. substeps: integrator steps of the model per
     sample interval. torque: errors by predictor, empty if the logs are too sparse for accelerations. torque_steps: see
-    `coarse_torques`. replays: of the commands of an arm under position servos.
+    `coarse_torques`. replays: of the commands of an arm under position servos. mass_errors: relative errors of M by
+    predictor, if the truth is known.
     """
 
     robot: str
@@ -41,6 +42,7 @@ class Measurements:
     torque: dict[str, TorqueErrors] = field(default_factory=dict)
     torque_steps: dict[str, float] = field(default_factory=dict)
     replays: tuple[Replay, ...] = ()
+    mass_errors: dict[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON form, versioned by `schema`."""

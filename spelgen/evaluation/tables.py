@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
 
-from spelgen.baselines.names import MODEL, observed
+from spelgen.baselines.names import LEAST_SQUARES, MODEL, URDF, observed
 from spelgen.labels import UNITS, Units, share, thousandths
 from spelgen.listing import Listing, number
 
@@ -25,6 +25,7 @@ Numbers = Mapping[str, float | None]
 JointErrors = Sequence[float | None]
 Errors = TypeVar("Errors")
 Value = TypeVar("Value")
+MASS_TITLE = "Error of the mass matrix, relative to the true one (at positions of the test logs)"
 CSV_HEAD = ("table", "row", "predictor", "value")
 PARTS = ("variance", "motion")
 LIMITS = ("torque.nmse", "joint.nmse", "rollout.rms")
@@ -92,6 +93,8 @@ def table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Table:
 def result_tables(results: Measurements) -> list[Table]:
     """Return the tables of an evaluation: replays, errors by horizon and by joint, torques."""
     tables = [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
+    if results.mass_errors:
+        tables.append(table(MASS_TITLE, {"M(q)": results.mass_errors}))
     return list(map(_without_empty_baselines, tables))
 
 
@@ -132,6 +135,21 @@ def csv_text(results: Measurements) -> str:
             for predictor, value in row.values.items():
                 writer.writerow((one_table.title, row.label, predictor, value))
     return file.getvalue()
+
+
+def summary(results: Measurements) -> Listing | None:
+    """Return the figures of URDF, least squares and model in one small table; None without torques."""
+    rows: dict[str, Numbers] = {"torque that is unexplained": _values(results.torque, lambda x: x.mean_nmse)}
+    if results.mass_errors:
+        rows["error of M(q)"] = results.mass_errors
+    names = [name for name in (URDF, LEAST_SQUARES, MODEL) if name in results.torque]
+    if MODEL not in names:
+        return None
+    lines = []
+    for label, values in rows.items():
+        numbers = [values.get(name) for name in names]
+        lines.append((label, *("-" if value is None else share(value) for value in numbers)))
+    return Listing(f"{results.robot} on the test logs", ("", *names), tuple(lines))
 
 
 def _values(errors: Mapping[str, Errors], value: Callable[[Errors], Value]) -> dict[str, Value]:

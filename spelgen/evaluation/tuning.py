@@ -38,6 +38,8 @@ class EvaluationTuning:
     uneven: float = 1.4
     # [1] Fraction of a joint's range below which the range of the logs is called narrow.
     narrow_range: float = 0.5
+    # [1] Positions of the test logs at which M is compared with the true one.
+    mass_positions: int = 500
     # [1] Random positions at which M must be positive definite.
     sampled_positions: int = 100_000
     # [1] Steps of 1 ms without input.

@@ -1,9 +1,9 @@
-"""A model under other weights than its own, as torch's functions of functions need it."""
+"""Evaluation of a model with other parameters than its own, as a differentiable function of these parameters."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch.func import functional_call
@@ -11,19 +11,25 @@ from torch.func import functional_call
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
 
-Weights = Mapping[str, torch.Tensor]
+NamedTensors = Mapping[str, torch.Tensor]
+"""Tensors by the names of a model's parameters and buffers."""
+
+Result = TypeVar("Result")
 
 
-class _Evaluated(torch.nn.Module):
+class _Caller(torch.nn.Module):
+    """`functional_call` calls `forward` only: this one calls any function of a model."""
+
     def __init__(self, model: ArmModel) -> None:
         super().__init__()
         self.model = model
 
-    def forward(self, function: Callable[[Any], Any]) -> Any:
+    def forward(self, function: Callable[[Any], Result]) -> Result:
         return function(self.model)
 
 
-def under_weights(model: ArmModel, weights: Weights, function: Callable[[Any], Any]) -> Any:
-    """Return what a function gives for the model under weights that stand in for its own, by their names there."""
-    named = {f"model.{name}": weight for name, weight in weights.items()}
-    return functional_call(_Evaluated(model), named, (function,))
+def evaluate_with(model: ArmModel, parameters: NamedTensors, function: Callable[[Any], Result]) -> Result:
+    """Return function(model) with the given parameters; all other parameters of the model keep their values."""
+    named = {f"model.{name}": tensor for name, tensor in parameters.items()}
+    result: Result = functional_call(_Caller(model), named, (function,))
+    return result

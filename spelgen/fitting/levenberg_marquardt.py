@@ -1,14 +1,16 @@
-"""Damped Gauss-Newton steps (Levenberg-Marquardt) down the cost of a nonlinear least-squares problem.
+"""Levenberg-Marquardt minimization of a nonlinear least-squares cost.
 
-Marquardt, J. SIAM 11:431 (1963): the curvature's diagonal is enlarged by a damping factor, which falls after a step
-that lowers the cost and rises until one does. What a problem moves (a vector of weights, or the weights of servos with
-their delay) and what it keeps of its residuals are its own; the solver only compares costs.
+Marquardt, J. SIAM 11:431 (1963): a step s solves (H + damping diag H) s = -g, with the Gauss-Newton Hessian H and the
+gradient g of the cost. A step that lowers the cost divides the damping by a factor; otherwise the damping is multiplied
+by it, and the step is repeated. A problem defines its own parameters (a vector, or a dataclass) and its own residual:
+the solver compares costs only.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import torch
@@ -17,119 +19,169 @@ from spelgen.fitting.tuning import DampingTuning
 
 TUNING = DampingTuning()
 
-Unknowns = TypeVar("Unknowns")
+Parameters = TypeVar("Parameters")
+
+
+class Termination(Enum):
+    """Reason for which the solver ended."""
+
+    SMALL_DECREASE = "the last step lowered the cost by less than the threshold"
+    SMALL_PREDICTION = "the predicted decrease of the cost is below the threshold"
+    NO_DECREASE = "no damping lowers the cost"
+    MAX_STEPS = "maximum number of steps"
 
 
 class NormalEquations(NamedTuple):
-    """A cost's curvature (..., k, k) by Gauss-Newton, and minus its gradient (..., k)."""
+    """Gauss-Newton Hessian of a cost, (..., k, k), and its negative gradient, (..., k)."""
 
     curvature: torch.Tensor
     descent: torch.Tensor
 
     def step(self, damping: float | torch.Tensor = 0.0) -> torch.Tensor:
-        """Return the damped step (..., k); damping: one for all, or (...) of each system of equations."""
+        """Return the damped step (..., k); damping: one number, or (...), one per system of equations."""
         factor = torch.as_tensor(damping, dtype=self.curvature.dtype)[..., None, None]
         diagonal = torch.diag_embed(self.curvature.diagonal(dim1=-2, dim2=-1))
         result: torch.Tensor = torch.linalg.solve(self.curvature + factor * diagonal, self.descent)
         return result
 
-    def promised(self, step: torch.Tensor) -> float:
-        """Return by how much the quadratic model of the cost falls along a step (k,)."""
+    def predicted_decrease(self, step: torch.Tensor) -> float:
+        """Return the decrease of the quadratic model of the cost after a step (k,): -g^T s - s^T H s / 2."""
         return float(step @ (self.descent - self.curvature @ step / 2))
 
 
 @dataclass(frozen=True, eq=False)
-class SolverState(Generic[Unknowns]):
-    """Hold where the steps have come to.
+class SolverState(Generic[Parameters]):
+    """Iterate of the solver.
 
-    residuals: what the problem found there, to be used again. damping: of the next step. steps: taken so far, over all
-    calls. converged: whether no step follows.
+    residual: of the problem at x, reused by its normal equations. damping: of the next step. steps: accepted steps,
+    those of former calls included.
     """
 
-    x: Unknowns
-    residuals: torch.Tensor
+    x: Parameters
+    residual: torch.Tensor
     cost: float
     damping: float
     steps: int = 0
-    converged: bool = False
 
 
-class LeastSquares(Protocol[Unknowns]):
-    """A cost of unknowns, by way of residuals (or of their sums of squares, where these are too many to keep)."""
+class Iteration(NamedTuple):
+    """Log entry of an accepted step: cost after the step, its predicted decrease, its damping."""
 
-    def residuals(self, x: Unknowns) -> torch.Tensor:
-        """Return what the cost and the normal equations are computed from."""
-
-    def cost(self, x: Unknowns, residuals: torch.Tensor) -> float:
-        """Return the cost; infinite where numbers blew up."""
-
-    def normal_equations(self, x: Unknowns, residuals: torch.Tensor) -> NormalEquations:
-        """Return curvature and minus gradient of the cost by the unknowns that move."""
-
-    def moved(self, x: Unknowns, step: torch.Tensor) -> Iterable[Unknowns]:
-        """Return where a step leads; a second way there is only tried where the first keeps little of its promise."""
+    cost: float
+    predicted_decrease: float
+    damping: float
 
 
-def start(
-    problem: LeastSquares[Unknowns], x: Unknowns, damping: float = TUNING.first, steps: int = 0
-) -> SolverState[Unknowns]:
-    """Return the state before the first step from ``x``."""
-    residuals = problem.residuals(x)
-    return SolverState(x, residuals, problem.cost(x, residuals), damping, steps)
+@dataclass(frozen=True, eq=False)
+class SolverResult(Generic[Parameters]):
+    """Last iterate, reason of termination, and the log of the accepted steps.
+
+    normal_equations: of the last linearization. It is at the last iterate, unless a threshold or the maximum number of
+    steps ended the solver right after a step; then it is at the iterate before that step.
+    """
+
+    state: SolverState[Parameters]
+    termination: Termination
+    log: tuple[Iteration, ...]
+    normal_equations: NormalEquations
+
+
+class LeastSquaresProblem(Protocol[Parameters]):
+    """Cost of parameters x, computed from a residual (or from its sums of squares, if the residual is too large)."""
+
+    def residual(self, x: Parameters) -> torch.Tensor:
+        """Return the residual, from which the cost and the normal equations are computed."""
+
+    def cost(self, x: Parameters, residual: torch.Tensor) -> float:
+        """Return the cost; infinite if the residual diverged."""
+
+    def normal_equations(self, x: Parameters, residual: torch.Tensor) -> NormalEquations:
+        """Return Gauss-Newton Hessian and negative gradient with respect to the free parameters, (k, k) and (k,)."""
+
+    def candidates(self, x: Parameters, step: torch.Tensor) -> Iterable[Parameters]:
+        """Return the parameters after a step (k,).
+
+        Further candidates are evaluated only if the gain ratio of the ones before (decrease of the cost divided by the
+        predicted decrease) is low.
+        """
+
+
+def initial_state(
+    problem: LeastSquaresProblem[Parameters], x: Parameters, damping: float = TUNING.initial, steps: int = 0
+) -> SolverState[Parameters]:
+    """Return the state at x before the first step."""
+    residual = problem.residual(x)
+    return SolverState(x, residual, problem.cost(x, residual), damping, steps)
 
 
 def levenberg_marquardt(
-    problem: LeastSquares[Unknowns],
-    state: SolverState[Unknowns],
+    problem: LeastSquaresProblem[Parameters],
+    state: SolverState[Parameters],
     *,
     max_steps: int,
-    least_gain: float = 0.0,
-    relative_gain: float = 0.0,
-) -> Iterator[SolverState[Unknowns]]:
-    """Yield the state after each step that lowers the cost.
+    min_decrease: float = 0.0,
+    min_relative_decrease: float = 0.0,
+    callback: Callable[[SolverState[Parameters]], None] = lambda state: None,
+) -> SolverResult[Parameters]:
+    """Minimize the cost of a problem.
 
-    The last one has ``converged`` set: it gained less than ``least_gain`` or less than ``relative_gain`` times the
-    cost, or it is the state before, from which no step gains. None has where ``max_steps`` ended the steps.
+    Args:
+        problem: cost, residual and normal equations.
+        state: first iterate, from `initial_state` or a former result.
+        max_steps: maximum number of accepted steps.
+        min_decrease: a smaller decrease of the cost, or a smaller predicted one, ends the solver.
+        min_relative_decrease: likewise relative to the cost after the step.
+        callback: is called with the state after each accepted step.
     """
-    for _ in range(max_steps):
-        if state.converged:
-            return
-        lower = _lower(problem, state, least_gain)
-        if lower is None:
-            yield replace(state, converged=True)
-            return
-        gain = state.cost - lower.cost
-        state = replace(lower, converged=gain < max(least_gain, relative_gain * lower.cost))
-        yield state
+    log: list[Iteration] = []
+    normal = problem.normal_equations(state.x, state.residual)
+    for number in range(max_steps):
+        if number:
+            normal = problem.normal_equations(state.x, state.residual)
+        accepted = _accepted_step(problem, state, normal, min_decrease)
+        if isinstance(accepted, Termination):
+            return SolverResult(state, accepted, tuple(log), normal)
+        decrease, (state, entry) = state.cost - accepted[0].cost, accepted
+        log.append(entry)
+        callback(state)
+        if decrease < max(min_decrease, min_relative_decrease * state.cost):
+            return SolverResult(state, Termination.SMALL_DECREASE, tuple(log), normal)
+    return SolverResult(state, Termination.MAX_STEPS, tuple(log), normal)
 
 
-def _lower(
-    problem: LeastSquares[Unknowns], state: SolverState[Unknowns], least_gain: float
-) -> SolverState[Unknowns] | None:
-    """Return the state after one step that lowers the cost; None: none does, or none promises to."""
-    normal = problem.normal_equations(state.x, state.residuals)
+def _accepted_step(
+    problem: LeastSquaresProblem[Parameters],
+    state: SolverState[Parameters],
+    normal: NormalEquations,
+    min_decrease: float,
+) -> tuple[SolverState[Parameters], Iteration] | Termination:
+    """Return the state after one step that lowers the cost, with its log entry, or the reason why there is none."""
     damping = state.damping
-    for _ in range(TUNING.tries):
+    for _ in range(TUNING.max_trials):
         step = normal.step(damping)
-        promised = normal.promised(step)
-        if promised < max(TUNING.least_promise * state.cost, least_gain):
-            return None
-        lower = _best(problem, state, step, promised)
-        if lower.cost < state.cost:
-            return replace(lower, damping=max(damping / TUNING.factor, TUNING.least))
+        predicted = normal.predicted_decrease(step)
+        if predicted < max(TUNING.min_predicted_decrease * state.cost, min_decrease):
+            return Termination.SMALL_PREDICTION
+        best = _best_candidate(problem, state, step, predicted)
+        if best.cost < state.cost:
+            next_damping = max(damping / TUNING.factor, TUNING.min_damping)
+            return replace(best, damping=next_damping), Iteration(best.cost, predicted, damping)
         damping *= TUNING.factor
-    return None
+    return Termination.NO_DECREASE
 
 
-def _best(
-    problem: LeastSquares[Unknowns], state: SolverState[Unknowns], step: torch.Tensor, promised: float
-) -> SolverState[Unknowns]:
-    """Return the state of least cost among the ways of a step, as far as these are worth trying."""
+def _best_candidate(
+    problem: LeastSquaresProblem[Parameters],
+    state: SolverState[Parameters],
+    step: torch.Tensor,
+    predicted: float,
+) -> SolverState[Parameters]:
+    """Return the state of minimum cost among the candidates of a step, up to the first with a high gain ratio."""
     best = replace(state, cost=float("inf"))
-    for x in problem.moved(state.x, step):
-        tried = start(problem, x, state.damping, state.steps + 1)
-        if tried.cost < best.cost:
-            best = tried
-        if state.cost - best.cost >= TUNING.kept_promise * promised:
+    for x in problem.candidates(state.x, step):
+        candidate = initial_state(problem, x, state.damping, state.steps + 1)
+        if candidate.cost < best.cost:
+            best = candidate
+        if state.cost - best.cost >= TUNING.min_gain_ratio * predicted:
             break
     return best

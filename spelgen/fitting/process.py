@@ -1,4 +1,4 @@
-"""What a fit asks of the machine: threads, a device, a folder of its own, and that a signal ends it in good order."""
+"""Resources of a fit: threads, a device, a locked folder, and an orderly end after a signal."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LOCK = ".lock"
 
 
 def require_device(device: str) -> None:
-    """Raise RunError where torch cannot use it."""
+    """Raise RunError if torch cannot use the device."""
     try:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:
@@ -33,7 +33,7 @@ def require_device(device: str) -> None:
 
 @contextmanager
 def threads_of_torch(count: int) -> Iterator[None]:
-    """The matrices are tiny: more than two threads rarely help, and one makes runs repeatable."""
+    """Set the number of torch's threads: more than two rarely help small matrices, and one makes runs repeatable."""
     previous = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -44,7 +44,7 @@ def threads_of_torch(count: int) -> Iterator[None]:
 
 @contextmanager
 def termination_as_interrupt() -> Iterator[None]:
-    """SIGTERM ends training as Ctrl-C does. Only the main thread may set handlers; others change nothing."""
+    """End training after SIGTERM as after Ctrl-C. Only the main thread can set handlers; others have no effect."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -61,10 +61,10 @@ def termination_as_interrupt() -> Iterator[None]:
 
 @contextmanager
 def locked(folder: Path | None) -> Iterator[None]:
-    """Make the folder, and keep other processes of this machine from training in it; None: do nothing.
+    """Create the folder and lock it against other processes of this machine; None: no effect.
 
-    Raises RunError that names who trains there already. The kernel lets go of the lock when its holder ends, however it
-    ends; so the file may stay behind.
+    Raises RunError with the process that holds the lock. The kernel releases the lock when its holder ends for any
+    reason, so a remaining file has no effect.
     """
     if folder is None:
         yield
@@ -88,5 +88,5 @@ def locked(folder: Path | None) -> Iterator[None]:
         file.unlink(missing_ok=True)
         lock.release()
         for path in created:
-            if not any(path.iterdir()):  # nothing came of it
+            if not any(path.iterdir()):  # the fit wrote nothing
                 path.rmdir()

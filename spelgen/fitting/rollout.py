@@ -1,4 +1,4 @@
-"""Predict windows with a model: an ODE solve from the first sample, the input held over each step."""
+"""Prediction of windows by a model: an ODE solution from the first sample, with zero-order hold of the input."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 TUNING, ADAPTIVE = IntegrationTuning(), AdaptiveTuning()
 SOLVER: dict[str, Any] = {"method": "dopri5", "rtol": ADAPTIVE.relative, "atol": ADAPTIVE.absolute}
-AT_REST = 1e-6  # [rad, m] finer than encoders
+AT_REST = 1e-6  # [rad, m] below the resolution of encoders
 
 
 def roll_out(
@@ -29,10 +29,14 @@ def roll_out(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return positions and velocities (W, K-1, n) predicted for samples 1..K-1 of each window from its sample 0.
 
-    The state is (q, p), p = M(q) qd, so that no derivative of M in time is needed. Windows make one batch, each with
-    its own sample times, and every interval between samples is solved by itself: the input jumps at its ends.
-    solver: "rk4" takes `substeps` steps of the classical Runge-Kutta method in each, "dopri5" as many as its tolerance
-    asks for. The weights stay the same over the whole window, and are prepared once.
+    The state is (q, p) with p = M(q) qd, so that no time derivative of M is needed. The windows form one batch, each
+    with its own sample times. Each interval between samples is solved separately: the input jumps at its ends.
+
+    Args:
+        model: its parameter cache is computed once.
+        windows: measured motion (W, K, n) and inputs.
+        substeps: steps of rk4 per interval.
+        solver: "rk4", the classical Runge-Kutta method, or "dopri5" with adaptive steps.
     """
     prepared = model.prepare()
     q = windows.q[:, 0]
@@ -66,29 +70,29 @@ def _adaptive_step(
     z: torch.Tensor,
     step: torch.Tensor | float,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """As `runge_kutta`, in as many steps as the tolerance asks for; gradients go through the solver.
+    """Integrate over one interval with adaptive steps; arguments and results (W, n) as of `runge_kutta`.
 
-    Dormand and Prince, J. Comput. Appl. Math. 6 (1980). Windows are solved together, in units of their own steps.
+    Dormand and Prince, J. Comput. Appl. Math. 6 (1980), differentiated through the solver. All windows are solved
+    together, with time in units of their own intervals.
     """
-    from torchdiffeq import odeint  # half a second, for those who ask for dopri5 alone
+    from torchdiffeq import odeint  # its import takes half a second
 
-    def slope(t: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+    def rate(t: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
         q_now, p_now = state.chunk(2, dim=-1)
         return step * torch.cat(rhs(q_now, p_now, memory_after(dynamics, z, q_now - q)), dim=-1)
 
     unit = torch.tensor([0.0, 1.0], dtype=q.dtype, device=q.device)
-    q_end, p_end = odeint(slope, torch.cat([q, p], dim=-1), unit, **SOLVER)[-1].chunk(2, dim=-1)
+    q_end, p_end = odeint(rate, torch.cat([q, p], dim=-1), unit, **SOLVER)[-1].chunk(2, dim=-1)
     return q_end, p_end, memory_after(dynamics, z, q_end - q), rhs(q, p, z)[0]
 
 
 def position_difference(
     predicted: torch.Tensor, measured: torch.Tensor, joint_types: Sequence[str]
 ) -> torch.Tensor:
-    """Return the signed distance (..., n): prismatic the difference, revolute the geodesic distance on SO(3).
+    """Return the signed distance (..., n) [rad, m]: the difference, for revolute joints the geodesic distance on SO(3).
 
-    For rotations about one common axis, R = exp(q e), the geodesic distance |log(R^T R')| / sqrt(2) is the
-    wrapped angle |q' - q - 2 pi round((q' - q) / 2 pi)|, so the log map of SPEL eq. 8 needs no matrices
-    here.
+    For rotations about a common axis, R = exp(q e), the geodesic distance |log(R^T R')| / sqrt(2) is the wrapped angle
+    |q' - q - 2 pi round((q' - q) / 2 pi)|: the log map of SPEL eq. 8 without matrices.
     """
     revolute = torch.tensor([kind == "revolute" for kind in joint_types], device=predicted.device)
     difference = predicted - measured
@@ -97,10 +101,10 @@ def position_difference(
 
 
 class LossScales(NamedTuple):
-    """Hold one unit of error of q, qd and tau.
+    """Units of the errors of q, qd and tau.
 
-    q, qd: for each sample but the first and joint (K-1, n), the root mean square change since the window's first
-    sample. tau: for each joint (n,) the standard deviation.
+    q, qd: (K-1, n), root mean square change since the first sample of a window, per sample and joint. tau: (n,),
+    standard deviation [Nm, N].
     """
 
     q: torch.Tensor
@@ -108,14 +112,14 @@ class LossScales(NamedTuple):
     tau: torch.Tensor
 
     def to(self, device: str | torch.device) -> LossScales:
-        """The same scales on another device."""
+        """Return the scales on another device."""
         return LossScales(*(x.to(device) for x in self))
 
 
 def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
-    """Return the scales of these windows; for a joint that hardly moves, a hundredth of the largest one.
+    """Return the scales of windows; of joints that hardly move, 1 % of the largest scale.
 
-    Raises LogError where none moves at all: any model predicts rest.
+    Raises LogError if no joint moves: any model predicts standstill.
     """
     moved = position_difference(windows.q[:, 1:], windows.q[:, :1], joint_types)
     if moved.abs().max() < AT_REST:
@@ -132,6 +136,7 @@ def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
 
 
 def _scale(mean_square: torch.Tensor) -> torch.Tensor:
+    """Return the root of mean squares (..., n), at least 1 % of the largest one."""
     root = mean_square.sqrt()
     smallest = (1e-2 * root.amax(dim=-1, keepdim=True)).clamp(min=1e-9)
     return torch.maximum(root, smallest)
@@ -149,25 +154,30 @@ def rollout_errors(
 def rollout_loss(
     model: ArmModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
 ) -> torch.Tensor:
-    """SPEL eq. 8: squared geodesic distance plus squared velocity error, here scaled per joint and averaged.
+    """Return the mean squared scaled error of the rollout, (): SPEL eq. 8 with other units.
 
-    The paper sums over joints and samples in rad and rad/s; scaled, a wrist counts as much as a shoulder and
-    the next sample as much as the last, and 1 is the loss of predicting that nothing changes.
+    The paper sums squared geodesic distances and velocity errors over joints and samples in rad and rad/s. Scaled, all
+    joints and samples have the same weight, and the loss of a prediction of standstill is 1.
     """
     return rollout_errors(model, windows, scales, substeps, solver).square().mean()
 
 
 def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> torch.Tensor:
-    """Return the error of the weak form: p(t) - p(0) against the impulse of all forces along the measured samples.
+    """Return the mean squared residual of the weak form, (): p(t) - p(0) minus the impulse of all forces until t.
 
-    Forces between samples are the mean of their values at both ends (trapezium rule): no ODE is solved and no
-    acceleration needed. What is missing is told as mean torque, in units of its standard deviation at the
-    joint. (Told as a velocity, M(q)^-1 times it, it would reward an M that is too large: errors of the measured
-    torque would count less.)
+    The impulse is along the measured samples, by the trapezium rule: no ODE solution and no accelerations are needed.
+    The residual is divided by the time, which is a mean torque, and by the standard deviation of the torque at the
+    joint. A residual velocity, M(q)^-1 times the impulse, would be smaller for an M that is too large.
+
+    Args:
+        model: with a momentum M(q) qd.
+        windows: measured motion (W, K, n) and inputs (W, K-1, n).
+        scales: its scale of the torque (n,) is used.
     """
     q, qd, tau = windows.q, windows.qd, windows.tau  # (W, K, n), (W, K, n), (W, K-1, n)
     dynamics, dt = model, windows.dt.unsqueeze(-1)
-    # velocities are measured, so M need not be positive definite on the way; kept so, descent stops where it is not
+    # M need not be positive definite here, since velocities are measured; constrained to it, the descent would end at
+    # the boundary
     with mass_as_learned(model):
         at = dynamics.configuration(q, model.prepare())
     p = (at.mass @ qd.unsqueeze(-1)).squeeze(-1)
@@ -179,16 +189,18 @@ def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> torc
         for held in ((tau, tau[:, -1:]), (tau[:, :1], tau))  # over the interval after each sample, and before
     ]
     mean = (force[:, :-1] + driven[0][:, :-1] + force[:, 1:] + driven[1][:, 1:]) / 2
-    missing = (p[:, 1:] - p[:, :1] - (dt * mean).cumsum(dim=1)) / dt.cumsum(dim=1)
+    residual = (p[:, 1:] - p[:, :1] - (dt * mean).cumsum(dim=1)) / dt.cumsum(dim=1)
     with torch.no_grad():
         inputs = dynamics.input_matrix(q).abs()
-    unit = (inputs @ scales.tau).mean(dim=(0, 1))  # gears may stand between motor and joint
-    result: torch.Tensor = (missing / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
+    unit = (inputs @ scales.tau).mean(
+        dim=(0, 1)
+    )  # of joint torques: there may be gears between motors and joints
+    result: torch.Tensor = (residual / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
     return result
 
 
 def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int) -> torch.Tensor:
-    """Return `rollout_errors` without gradients, NaN where numbers blow up."""
+    """Return `rollout_errors`, (W, K-1, 2n), without gradients; NaN if the rollout diverges."""
     try:
         with torch.no_grad():
             return rollout_errors(model, windows, scales, substeps)
@@ -197,9 +209,11 @@ def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int)
 
 
 def integration_error(coarse: torch.Tensor, fine: torch.Tensor) -> float:
-    """Return the difference of scaled errors of a rollout and of one with twice as many steps, relative to the latter.
+    """Return the integration error of a rollout relative to the error of the model.
 
-    Both are root mean squares in units of `scales`; of the model's error, at least `least_error` is taken.
+    Args:
+        coarse: (W, K-1, 2n) scaled errors of the rollout.
+        fine: (W, K-1, 2n) scaled errors with twice as many steps.
     """
     model_error = max(fine.square().mean().sqrt().item(), TUNING.least_error)
     error = (coarse - fine).square().mean().sqrt().item() / model_error
@@ -207,7 +221,7 @@ def integration_error(coarse: torch.Tensor, fine: torch.Tensor) -> float:
 
 
 def choose_substeps(model: ArmModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
-    """Return the fewest rk4 steps per sample interval, from `start` on, with a small error of integration."""
+    """Return the minimum number of rk4 steps per sample interval, at least `start`, with a small integration error."""
     substeps, coarse = start, probed(model, windows, scales, start)
     while substeps < TUNING.most_substeps:
         fine = probed(model, windows, scales, 2 * substeps)

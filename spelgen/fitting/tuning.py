@@ -10,18 +10,18 @@ class DampingTuning:
     """Damping of Gauss-Newton steps, relative to the diagonal of the curvature (`fitting.levenberg_marquardt`)."""
 
     # [1] Damping of the first step (Marquardt, J. SIAM 11:431, 1963: 1e-2).
-    first: float = 1e-3
+    initial: float = 1e-3
     # [1] Smallest damping: below it steps equal Gauss-Newton steps to nine digits.
-    least: float = 1e-9
+    min_damping: float = 1e-9
     # [1] Factor by which the damping is lowered after a step that decreases the cost, and raised otherwise
     # (Marquardt: 10).
     factor: float = 10.0
     # [1] Dampings tried for one step: from the smallest to 1e6, at which steps are negligible.
-    tries: int = 15
+    max_trials: int = 15
     # [1] Predicted reduction of the cost, as a fraction of the cost, below which a step is rounding and is not tried.
-    least_promise: float = 1e-10
+    min_predicted_decrease: float = 1e-10
     # [1] Gain ratio (decrease divided by predicted reduction) below which the second way of a step is tried, too.
-    kept_promise: float = 0.5
+    min_gain_ratio: float = 0.5
 
 
 @dataclass(frozen=True)

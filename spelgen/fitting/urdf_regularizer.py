@@ -1,6 +1,6 @@
-"""A regularizer towards the URDF's own M and gravity, for where the logs say little.
+"""Regularizer towards the mass matrix and gravity torque of a URDF, for directions that the logs do not determine.
 
-How M varies with q is compared, not its mean: rotors and loads that the URDF leaves out add constants.
+The variation of M with q is compared, not its mean: rotors and loads that the URDF does not specify add constants.
 """
 
 from __future__ import annotations
@@ -22,32 +22,40 @@ TUNING = RegularizerTuning()
 
 
 class UrdfRegularizer(NamedTuple):
-    """Hold the URDF's variation of M and its gravity torque at points q (S, n).
+    """Variation of M and gravity torque of a URDF at S positions.
 
-    The variation is relative to the model's mean M at the start.
+    q: (S, n) [rad, m]. whitening: (n, n), inverse Cholesky factor of the model's mean M before the fit. variation:
+    (S, n, n) of M, whitened. gravity: (S, n) [Nm, N]. gravity_scale: (n,) [Nm, N], unit of its errors.
     """
 
     q: torch.Tensor
-    whitening: torch.Tensor  # (n, n)
-    variation: torch.Tensor  # (S, n, n)
-    gravity: torch.Tensor  # (S, n)
-    gravity_scale: torch.Tensor  # (n,)
+    whitening: torch.Tensor
+    variation: torch.Tensor
+    gravity: torch.Tensor
+    gravity_scale: torch.Tensor
 
     def loss(self, model: ArmModel) -> torch.Tensor:
-        """Mean squared deviation of the model, relative to the sizes of M and of the gravity torque; no unit."""
+        """Return the mean squared difference of the model in M and in the gravity torque, both without unit."""
         variation = _variation(model.mass_matrix(self.q), self.whitening) - self.variation
-        load = (model.gravity(self.q) - self.gravity) / self.gravity_scale
-        return variation.square().sum(dim=(-2, -1)).mean() / load.shape[-1] + load.square().mean()
+        gravity = (model.gravity(self.q) - self.gravity) / self.gravity_scale
+        return variation.square().sum(dim=(-2, -1)).mean() / gravity.shape[-1] + gravity.square().mean()
 
     def to(self, device: str | torch.device) -> UrdfRegularizer:
-        """The same on another device."""
+        """Return the regularizer on another device."""
         return UrdfRegularizer(*(x.to(device) for x in self))
 
 
 def urdf_regularizer(urdf: Path, joints: Sequence[str], model: ArmModel, windows: Windows) -> UrdfRegularizer:
-    """Return the regularizer of a URDF around the positions of ``windows``.
+    """Return the regularizer of a URDF at random positions in the range of a log.
 
-    Raises what Pinocchio raises, and ImportError without it.
+    Args:
+        urdf: file.
+        joints: names of the model's n joints.
+        model: its mean M before the fit is the unit of M.
+        windows: positions (W, K, n) [rad, m], whose range is widened.
+
+    Raises:
+        ImportError: without Pinocchio, whose own errors are raised too.
     """
     dynamics = urdf_dynamics(urdf, joints)
     positions = windows.q.flatten(0, 1)
@@ -64,11 +72,11 @@ def urdf_regularizer(urdf: Path, joints: Sequence[str], model: ArmModel, windows
     largest = scale.max().item()
     floor = TUNING.least_scale * largest
     if not largest:
-        floor = 1.0  # gravity loads no joint: any unit will do
+        floor = 1.0  # no gravity torque at any joint: the unit is arbitrary
     scale = scale.clamp(min=floor)
     return UrdfRegularizer(q, whitening, _variation(dynamics.mass_matrix(q), whitening), gravity, scale)
 
 
 def _variation(mass: torch.Tensor, whitening: torch.Tensor) -> torch.Tensor:
-    """M - mean M, relative to what ``whitening`` takes to the identity."""
+    """Return W (M - mean M) W^T, (S, n, n), of M (S, n, n) and the whitening W (n, n)."""
     return whitening @ (mass - mass.mean(dim=0)) @ whitening.mT

@@ -1,8 +1,8 @@
-"""Find base parameters: which inertial parameters the torque shows, alone or only in fixed combinations.
+"""Base parameters: the combinations of inertial, friction and drive parameters that determine the torque.
 
-Of the bodies they are those of ``structure.base_parameters``, the same in every command: exact combinations with
-their names and order. Friction and drives follow, found by elimination on the regressor at random states: a column
-that the columns before it already span is regrouped into them (Gautier and Khalil, IEEE T-RA 6:368, 1990).
+The combinations of inertial parameters are the exact ones of `structure.base_parameters`, with the same names and order
+in every command. Combinations with friction and drives are numerical, from the regressor at random states: a column in
+the span of the columns before it is regrouped into these (Gautier and Khalil, IEEE T-RA 6:368, 1990).
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from spelgen.structure.base_parameters import parameter_name
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """Hold r base parameters of K parameters: ten a body, then those of friction and drives.
+    """r base parameters of K parameters: ten per body, then friction and drives.
 
-    names: of the base parameters; those of the bodies are ``inspect``'s. columns: (r,) of the regressor, the
-    parameter each stands for. combination: (r, K), base parameters are this times the parameters, with a one in
-    column ``columns[k]`` of row k. parameters: names of all K. bodies: how many of the r are of bodies.
+    names: of the r base parameters. columns: (r,), the column of the regressor per base parameter. combination: (r, K),
+    base parameters = combination @ parameters, with a one in column `columns[k]` of row k. parameters: K names. bodies:
+    number of base parameters of bodies, the first ones.
     """
 
     names: tuple[str, ...]
@@ -38,12 +38,12 @@ class BaseParameters:
         return len(self.columns)
 
     def formulas(self) -> tuple[str, ...]:
-        """Return what each base parameter is made of, e.g. ``Izz1 + m2 + 0.1 hx2``."""
+        """Return the formula of each base parameter, e.g. ``Izz1 + m2 + 0.1 hx2``."""
         rows = zip(self.combination, self.columns, strict=True)
         return tuple(_sum(row, column, self.parameters) for row, column in rows)
 
     def identifiability(self) -> dict[str, str]:
-        """Return by parameter whether motion can show it: ``alone``, ``in combination`` or ``never``."""
+        """Return the identifiability of each parameter: ``alone``, ``in combination`` or ``never``."""
         used = self.combination != 0
         alone = set(self.columns[used.sum(axis=1) == 1].tolist())
         result = dict.fromkeys(self.parameters, "never")
@@ -53,7 +53,13 @@ class BaseParameters:
 
 
 def base_parameters(arm: Arm, friction: FrictionModel, motors: np.ndarray | None = None) -> BaseParameters:
-    """Return the base parameters of ``arm`` and of this friction of its drives (see ``FrictionModel.columns``)."""
+    """Return the base parameters of an arm with friction.
+
+    Args:
+        arm: n joints.
+        friction: friction model of the drives.
+        motors: (n, n), speeds of the drives per speed of the joints; None: identity.
+    """
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     exact = body_base_parameters(arm)
     names = list(map(parameter_name, range(inertial)))
@@ -61,7 +67,7 @@ def base_parameters(arm: Arm, friction: FrictionModel, motors: np.ndarray | None
         names += [f"{effect}{joint + 1}" for joint in range(n)]
     columns = _columns(arm, friction, motors, len(names))
     candidates = np.array([parameter.index for parameter in exact] + list(range(inertial, len(names))))
-    # what is left of each column beside all before it
+    # norm of each column after projection onto the complement of all columns before it
     remainder = np.abs(np.diag(np.linalg.qr(columns[:, candidates], mode="r")))
     length = np.maximum(np.linalg.norm(columns[:, candidates], axis=0), 1.0)
     chosen = candidates[remainder > TUNING.dependent * length]
@@ -77,19 +83,20 @@ def base_parameters(arm: Arm, friction: FrictionModel, motors: np.ndarray | None
 
 
 def _columns(arm: Arm, friction: FrictionModel, motors: np.ndarray | None, count: int) -> np.ndarray:
-    """Return the whole regressor at random states, (rows, count)."""
+    """Return the regressor of all parameters at random states, (rows, count)."""
     n = len(arm.coordinates)
     shape = (2 * count // n + 1, n)  # twice as many equations as parameters
     q, qd, qdd = np.random.default_rng(0).uniform(-3.0, 3.0, (3, *shape))
-    bent = np.random.default_rng(1).uniform(-1.0, 1.0, (*shape, len(BRISTLES)))
-    rows = np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd, bent, motors)], axis=2)
+    deflection = np.random.default_rng(1).uniform(-1.0, 1.0, (*shape, len(BRISTLES)))
+    rows = np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd, deflection, motors)], axis=2)
     return rows.reshape(-1, count)
 
 
 def _sum(row: np.ndarray, first: int, names: tuple[str, ...]) -> str:
+    """Return the sum with the coefficients of a row (K,), beginning with the parameter `first`."""
     text = names[first]
     for k in np.flatnonzero(row):
         if k != first:
-            size = "" if f"{abs(row[k]):.4g}" == "1" else f"{abs(row[k]):.4g} "
-            text += f" {'-' if row[k] < 0 else '+'} {size}{names[k]}"
+            factor = "" if f"{abs(row[k]):.4g}" == "1" else f"{abs(row[k]):.4g} "
+            text += f" {'-' if row[k] < 0 else '+'} {factor}{names[k]}"
     return text

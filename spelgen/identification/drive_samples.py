@@ -1,4 +1,4 @@
-"""Hold samples of motion, thinned while logs go by, for `drive_hints` and `torque_delay`."""
+"""Samples of moving joints, subsampled while the logs are read, for `drive_hints` and `torque_delay`."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ SHIFTS = np.array(HINTS.shifts) / FREQUENCY  # [s]
 
 
 class DriveSamples(NamedTuple):
-    """Hold S samples of motion with the torques at n joints.
+    """S samples of moving joints with their torques.
 
-    q, qd, qdd: (S, n). bent: (S, n, K), of bristles, by their reach. direction: see `DynamicsSamples`.
-    torques: (S, n, D), moved by each of the D `SHIFTS`.
+    q, qd, qdd: (S, n) [rad, m, s]. bent: (S, n, K), bristle deflection divided by the break-away displacement.
+    direction: (S, n), see `DynamicsSamples`. torques: (S, n, D) [Nm, N], shifted by each of the D `SHIFTS`.
     """
 
     q: np.ndarray
@@ -44,42 +44,49 @@ class DriveSamples(NamedTuple):
 
     @property
     def tau(self) -> np.ndarray:
-        """Return torques as logged, (S, n)."""
+        """Return the torques without shift, (S, n) [Nm, N]."""
         return self.torques[..., STEPS]
 
     def thinned(self, stride: int) -> DriveSamples:
-        """Return one of so many samples."""
+        """Return every `stride`-th sample."""
         return DriveSamples(*(column[::stride] for column in self))
 
 
 class DriveLog:
-    """Collect samples of one trajectory after another, thinned evenly to at most twice `DriveHintTuning.samples`.
+    """Collector of samples of successive trajectories, evenly subsampled to at most twice `DriveHintTuning.samples`.
 
-    Of many trajectories only every second, fourth, ... is looked at: to filter all of a long log takes minutes.
+    If there are many trajectories, only every second, fourth, ... is used: to filter all of a long log takes minutes.
     """
 
-    def __init__(self, kinds: Sequence[str], drives: Drives, preprocessing: Preprocessing) -> None:
-        """Begin without samples. kinds: the joints' types. preprocessing: its filter and gap are used."""
+    def __init__(self, joint_types: Sequence[str], drives: Drives, preprocessing: Preprocessing) -> None:
+        """Create a collector without samples.
+
+        Args:
+            joint_types: of the n joints.
+            drives: inputs and speeds of the drives.
+            preprocessing: its filter and gap are used.
+        """
         self._inputs, self._preprocessing = drives.inputs, replace(preprocessing, torque_delay=0.0)
-        smoothing = np.full(len(kinds), FrictionModel().coulomb_smoothing_velocity)
-        self._reach = replace(reach_of(kinds, drives.speeds), smoothing_velocity=smoothing)
+        smoothing = np.full(len(joint_types), FrictionModel().coulomb_smoothing_velocity)
+        self._reach = replace(reach_of(joint_types, drives.speeds), smoothing_velocity=smoothing)
         self._samples: list[DriveSamples] = []
         self._every = self._step = 1
         self._number = 0
 
     def add(self, trajectory: Trajectory) -> None:
-        """Take in a trajectory, if it is dense and long enough for accelerations."""
-        if trajectory.duration < SHORTEST:  # most of ten thousand short motions, at no cost
+        """Add the samples of a trajectory that is dense and long enough for accelerations."""
+        # most of ten thousand short motions are skipped before they are filtered
+        if trajectory.duration < SHORTEST:
             return
         self._number += 1
         if self._number % self._step:
             return
         for piece in long_pieces(trajectory, self._preprocessing.gap):
-            # without a hole and pauses included, a filtered torque is moved by whole samples
+            # pauses included: at a constant rate a filtered torque is shifted by whole samples
             samples = dynamics_samples(
                 [piece], pauses=True, preprocessing=self._preprocessing, reach=self._reach
             )
-            self._samples += [self._moved(x).thinned(self._every) for x in samples if len(x.q) > 2 * STEPS]
+            self._samples += [self._shifted(x).thinned(self._every) for x in samples if len(x.q) > 2 * STEPS]
         while self._count > 2 * HINTS.samples:
             if len(self._samples) > HINTS.trajectories:
                 self._samples = self._samples[1::2]
@@ -88,8 +95,8 @@ class DriveLog:
                 self._samples = [x.thinned(2) for x in self._samples]
                 self._every *= 2
 
-    def _moved(self, samples: DynamicsSamples) -> DriveSamples:
-        """Return what moves of samples at a steady rate, but for the ends that torques are moved from."""
+    def _shifted(self, samples: DynamicsSamples) -> DriveSamples:
+        """Return the moving samples at a constant rate, without the ends, which have no shifted torques."""
         inner = samples[STEPS:-STEPS]
         assert inner.z is not None and inner.direction is not None
         torques = sliding_window_view(samples.tau @ self._inputs.T, len(SHIFTS), axis=0)
@@ -102,7 +109,7 @@ class DriveLog:
         return sum(len(x.q) for x in self._samples)
 
     def samples(self) -> DriveSamples | None:
-        """Return all together; None where nothing moves."""
+        """Return all samples, or None if no joint moves."""
         if not self._count:
             return None
         columns = zip(*self._samples, strict=True)

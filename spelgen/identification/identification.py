@@ -1,4 +1,4 @@
-"""Tell how parameters are identified, and what was found: base parameters with how sure they are."""
+"""Method and result of a linear identification: base parameters with standard deviations."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ DETERMINED = ("firm", "fair", "weak", "may be zero")
 _WEIGHTED = {
     "equal": "joints weighted equally",
     "range": "each joint weighted by its torque's range",
-    "noise": "each joint weighted by the noise left",
+    "noise": "each joint weighted by its residual noise",
 }
 
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """Say how parameters are fitted.
+    """Method of a linear identification.
 
-    weights: of the joints' squared errors: ``equal`` (a Nm is a Nm), by the ``range`` of each joint's torque, or
-    by the ``noise`` that is left, found in a few rounds.
+    weights: of the squared errors of the joints: ``equal``, ``range`` (divided by the variance of a joint's torque) or
+    ``noise`` (divided by the variance of its residual, in a few iterations).
     """
 
     weights: Literal["equal", "range", "noise"] = "noise"
@@ -48,10 +48,11 @@ class LeastSquares:
 class Identification:
     """Result of least squares for an arm with n joints and K parameters, r of them base parameters.
 
-    parameters: (K,), whose torque is the fit's; those outside the base are zero. values, deviations:
-    (r,) of the base parameters. condition: of the regressor (columns of length one, joints weighted). unseen:
-    directions of the base parameters that these logs do not excite. residual: (n,) root mean square [Nm, N];
-    nmse: (n,) its square by the torque's variance. drives: between logged torques and joints.
+    parameters: (K,), zero for parameters that are no base parameters. values, deviations: (r,), the base parameters and
+    their standard deviations. condition: condition number of the regressor (columns of length one, joints weighted).
+    unseen: number of directions of the base parameters that these logs do not excite. residual: (n,) root mean square
+    [Nm, N]. nmse: (n,), mean squared residual divided by the variance of the torque. drives: between logged torques and
+    joints.
     torque_delay: by which logged torques were moved.
     """
 
@@ -73,24 +74,29 @@ class Identification:
 
     @cached_property
     def dynamics(self) -> RegressorDynamics:
-        """Return the identified arm, e.g. as a baseline of ``evaluate``."""
+        """Dynamics of the identified arm, e.g. as a baseline of `evaluate`."""
         return identified_dynamics(self.arm, self.method.friction, self.parameters, self.drives)
 
     def torque(
         self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, z: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return joint torques (T, n) of the identified arm; z: friction's memory (T, n, K)."""
+        """Return the joint torques (T, n) [Nm, N] of the identified arm.
+
+        Args:
+            q, qd, qdd: (T, n) [rad, m, s].
+            z: (T, n, K) [rad, m], bristle states of a friction model with hysteresis.
+        """
         past = None if z is None else torch.from_numpy(z)
-        position, speed, rise = map(torch.from_numpy, (q, qd, qdd))
-        return self.dynamics.joint_torque(position, speed, rise, past).numpy()
+        position, velocity, acceleration = map(torch.from_numpy, (q, qd, qdd))
+        return self.dynamics.joint_torque(position, velocity, acceleration, past).numpy()
 
     @property
     def determined(self) -> tuple[str, ...]:
-        """How sure each base parameter is: ``firm``, ``fair``, ``weak`` or ``may be zero``."""
+        """Precision of each base parameter: ``firm``, ``fair``, ``weak`` or ``may be zero``."""
         return tuple(map(_determined, self.values, self.deviations))
 
     def to_dict(self) -> dict[str, object]:
-        """Return the JSON form, a public contract."""
+        """Return the result in its JSON form, a public contract."""
         joints = list(self.arm.joint_names)
         friction = self.method.friction
         records: list[dict[str, object]] = []
@@ -121,22 +127,22 @@ class Identification:
         }
 
     def text(self) -> str:
-        """Return all of it for a terminal, in 80 columns."""
+        """Return the result as text for a terminal of 80 columns."""
         residuals, parameters = self.listings()
-        meant = ["where"]
+        definitions = ["where"]
         for name, formula in zip(self.base.names, self.base.formulas(), strict=True):
             if name != formula:
                 line = f"{name} = {formula}"
-                meant.append(textwrap.fill(line, WIDTH, initial_indent="  ", subsequent_indent=" " * 8))
+                definitions.append(textwrap.fill(line, WIDTH, initial_indent="  ", subsequent_indent=" " * 8))
         never = [name for name, how in self.base.identifiability().items() if how == "never"]
         unseen = f"Unidentifiable: {', '.join(never) or 'none'}."
         return "\n\n".join([
             textwrap.fill(self.heading(), WIDTH), self.quality(), residuals.text(), parameters.text(),
-            "\n".join(meant), textwrap.fill(unseen, WIDTH),
+            "\n".join(definitions), textwrap.fill(unseen, WIDTH),
         ])  # fmt: skip
 
     def listings(self) -> tuple[Listing, Listing]:
-        """Return tables: the torque that is not explained, by joint, and the base parameters."""
+        """Return two tables: the torque residual per joint, and the base parameters."""
         joints: list[tuple[str, ...]] = []
         for x, rms, nmse in zip(self.arm.coordinates, self.residual, self.nmse, strict=True):
             joints.append((x.name, f"{rms:.4g}", UNITS[x.kind].torque, f"{nmse:.3g}"))
@@ -159,7 +165,7 @@ class Identification:
         return "".join(listing.html() for listing in self.listings())
 
     def heading(self) -> str:
-        """Return what was fitted to what."""
+        """Return the numbers of parameters and samples, and the weights."""
         drives = len(self.base) - self.base.bodies
         weighted = _WEIGHTED[self.method.weights]
         return (
@@ -168,7 +174,7 @@ class Identification:
         )
 
     def quality(self) -> str:
-        """Return how well posed the fit is, and how many parameters are how sure."""
+        """Return the condition number and the number of parameters per precision."""
         conditioned = f"Condition number {self.condition:.3g} (columns of length one): "
         if self.unseen:
             conditioned = (
@@ -189,20 +195,20 @@ class Identification:
 def identified_dynamics(
     arm: Arm, friction: FrictionModel, parameters: np.ndarray, drives: Drives
 ) -> RegressorDynamics:
-    """Return the arm with these parameters, (K,), the bodies' first."""
+    """Return the dynamics of an arm with these parameters, (K,): bodies, friction, drives."""
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     constants = parameters[inertial:].reshape(-1, n)
     reach = reach_of(arm.joint_types).values if friction.memory else None
 
     def torque(qd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-        bent = None if z is None or reach is None else z / reach
-        return friction.torque(constants, qd, bent, drives.speeds)
+        deflection = None if z is None or reach is None else z / reach
+        return friction.torque(constants, qd, deflection, drives.speeds)
 
     return RegressorDynamics(arm, parameters[:inertial], constants[0], torque, drives, reach)
 
 
 def _determined(value: float, deviation: float) -> str:
-    """Return how sure a base parameter is."""
+    """Return the precision of a base parameter: its standard deviation relative to its value."""
     for word, limit in zip(DETERMINED, (TUNING.firm, TUNING.fair, 1.0), strict=False):
         if deviation <= limit * abs(value):
             return word

@@ -1,4 +1,4 @@
-"""Identify an arm from logs: base parameters, friction and drives by least squares, and how sure they are."""
+"""Identification of an arm from logs: base parameters, friction and drives by linear least squares."""
 
 from __future__ import annotations
 
@@ -34,10 +34,16 @@ def identify(
     *,
     preprocessing: Preprocessing | None = None,
 ) -> Identification:
-    """Fit base parameters, friction and armature of ``arm`` to the torques in ``logs``.
+    """Fit base parameters, friction and armature of an arm to the torques of logs.
 
-    arm: of ``load_arm``, or the path of a URDF. Torques of motors are taken to the joints' by its input matrix.
-    preprocessing: its filter and gap. Raises LogError for logs that cannot be used.
+    Args:
+        arm: from `load_arm`, or the path of a URDF. Its input matrix maps motor torques to joint torques.
+        logs: with torques.
+        method: friction model and weights of the joints.
+        preprocessing: its filter, gap and torque delay are used.
+
+    Raises:
+        LogError: for logs without torques or without motion.
     """
     if not isinstance(arm, ConfiguredArm):
         arm = load_arm(arm)
@@ -51,29 +57,29 @@ def identify_by(
     methods: Sequence[LeastSquares],
     preprocessing: Preprocessing,
 ) -> list[Identification]:
-    """Return what each method makes of the same logs, which are filtered once; see `identify`."""
-    joints, kinds = arm.arm.joint_names, arm.arm.joint_types
+    """Return the result of each method for the same logs, which are filtered once; see `identify`."""
+    joints, joint_types = arm.arm.joint_names, arm.arm.joint_types
     for trajectory in logs:
         require_joints(trajectory, joints)
     require_torques(logs)
-    notes = check(logs, joints, kinds)
+    notes = check(logs, joints, joint_types)
     drives = arm.actuation.drives()
-    late = TorqueDelay(preprocessing.torque_delay or 0.0)
+    delay = TorqueDelay(preprocessing.torque_delay or 0.0)
     if preprocessing.torque_delay is None:
-        late = find_torque_delay(logs, kinds, drives, body_chain(arm.arm), preprocessing)
-        preprocessing = replace(preprocessing, torque_delay=late.delay)
-        notes += late.notes
+        delay = find_torque_delay(logs, joint_types, drives, body_chain(arm.arm), preprocessing)
+        preprocessing = replace(preprocessing, torque_delay=delay.delay)
+        notes += delay.notes
     reach = None
     if any(method.friction.memory for method in methods):
-        reach = reach_of(kinds, drives.speeds)
+        reach = reach_of(joint_types, drives.speeds)
     samples = dynamics_samples(logs, preprocessing=preprocessing, reach=reach)
     unused = sorted({x.name for x in logs} - {x.name for x in samples})
     if unused:
         message = f"sampled too slowly or too short for accelerations: {', '.join(unused)}"
         notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
-    # samples of motors' torques: the regressor's rows are joints'
+    # the rows of the regressor are joint torques
     equations = _Equations(arm.arm, [replace(x, tau=x.tau @ drives.inputs.T) for x in samples], drives)
-    return [replace(equations.solved(x), diagnostics=tuple(notes), torque_delay=late) for x in methods]
+    return [replace(equations.solved(x), diagnostics=tuple(notes), torque_delay=delay) for x in methods]
 
 
 def least_squares(
@@ -82,16 +88,23 @@ def least_squares(
     method: LeastSquares | None = None,
     drives: Drives | None = None,
 ) -> Identification:
-    """Fit ``arm`` to samples of joint torques; errors as for ``identify``.
+    """Fit an arm to samples of joint torques.
 
-    drives: those whose friction and armature are fitted; None: each moves its own joint alone.
+    Args:
+        arm: n joints.
+        samples: motion and joint torques, (T, n).
+        method: friction model and weights of the joints.
+        drives: with friction and armature; None: one drive per joint.
+
+    Raises:
+        LogError: without samples.
     """
-    alone = np.eye(len(arm.coordinates))
-    return _Equations(arm, samples, drives or Drives(alone, alone)).solved(method or LeastSquares())
+    identity = np.eye(len(arm.coordinates))
+    return _Equations(arm, samples, drives or Drives(identity, identity)).solved(method or LeastSquares())
 
 
 class _Equations:
-    """Give the equations of samples, a block at a time: the bodies' part is the same whatever the friction."""
+    """Linear equations of samples, one block at a time; the columns of the bodies are common to all friction models."""
 
     def __init__(self, arm: Arm, samples: Sequence[DynamicsSamples], drives: Drives) -> None:
         self.arm, self.samples, self.drives = arm, samples, drives
@@ -99,29 +112,30 @@ class _Equations:
         for x in samples:
             self._blocks += [x[start : start + TUNING.block] for start in range(0, len(x.q), TUNING.block)]
         self._regressors: list[np.ndarray] = []
-        # kept from pass to pass where memory allows
+        # computed once if they fit into memory
         size = 8 * sum(x.q.size for x in samples) * 10 * len(arm.bodies)
         if size <= TUNING.regressor_bytes:
             self._regressors = list(map(self._regressor, self._blocks))
 
     def _regressor(self, block: DynamicsSamples) -> np.ndarray:
+        """Return the regressor of the bodies, (T, n, 10 bodies)."""
         return regressor(self.arm, block.q, block.qd, block.qdd)
 
     def _rows(self, friction: FrictionModel) -> Iterator[Columns]:
         reach = reach_of(self.arm.joint_types).values
         regressors = self._regressors or map(self._regressor, self._blocks)
         for block, bodies in zip(self._blocks, regressors, strict=True):
-            bent = None if block.z is None else block.z / reach
-            columns = friction.columns(block.qd, block.qdd, bent, self.drives.speeds)
+            deflection = None if block.z is None else block.z / reach
+            columns = friction.columns(block.qd, block.qdd, deflection, self.drives.speeds)
             yield np.concatenate([bodies, columns], axis=2), block.tau
 
     def _noise(self, friction: FrictionModel, solution: Solution) -> np.ndarray:
-        """Return the standard deviations (n,), as if independent, of the errors that a solution leaves."""
+        """Return the standard deviations (n,) [Nm, N] of the residual, scaled as if its errors were independent."""
         residuals = [rows @ solution.parameters - tau for rows, tau in self._rows(friction)]
         return deviations(residuals, solution.rank)
 
     def solved(self, method: LeastSquares) -> Identification:
-        """Return the least squares of a method. Raises LogError without any samples."""
+        """Return the result of a method. Raises LogError without samples."""
         if not self._blocks:
             raise LogError(
                 "no samples to identify from",
@@ -129,15 +143,15 @@ class _Equations:
             )
         base = base_parameters(self.arm, method.friction, self.drives.speeds)
         triangles = reduce(self._rows(method.friction))
-        # a joint whose torque never changes must not weigh everything
+        # a joint of constant torque must not have an infinite weight
         torque_range = np.maximum(triangles.deviation, 1e-3 * triangles.deviation.max())
         weights = np.ones_like(torque_range) if method.weights == "equal" else 1.0 / torque_range
-        # with the weights "noise" again, by what was left of each joint's torque
+        # weights "noise": iteratively reweighted by the residual of each joint
         for _ in range(1 + TUNING.rounds * (method.weights == "noise")):
-            # each base parameter stands for the parameter that it is named after
+            # the columns that are no base parameters are zero
             solution = solve(triangles, weights, base.columns)
             noise = np.maximum(self._noise(method.friction, solution), TUNING.least_noise * torque_range)
-            used, weights = weights, (1.0 / noise)
+            used, weights = weights, 1.0 / noise
         squares = triangles.squares(solution.parameters) / triangles.count
         return Identification(
             arm=self.arm,

@@ -1,4 +1,4 @@
-"""Solve least squares on torques: n small triangles hold all that a weighting needs of the logs."""
+"""Linear least squares on torques, from one triangular factor per joint, which any weighting of joints can use."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from scipy.linalg import pinv
 from spelgen.identification.tuning import TUNING
 
 Columns = tuple[np.ndarray, np.ndarray]
-"""Of some samples: the regressor (T, n, K) and the torque (T, n)."""
+"""Regressor (T, n, K) and torque (T, n) [Nm, N] of T samples."""
 
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """Hold the normal equations of samples by joint: triangular factors (n, K + 1, K + 1) of [regressor, torque].
+    """QR factors of the equations of each joint.
 
-    count: samples. deviation: (n,) standard deviation of each joint's torque [Nm, N].
+    factors: (n, K + 1, K + 1), upper triangular, of the rows [regressor, torque]. count: number of samples. deviation:
+    (n,) standard deviation of the torque [Nm, N].
     """
 
     factors: np.ndarray
@@ -26,12 +27,12 @@ class Triangles:
     deviation: np.ndarray
 
     def squares(self, x: np.ndarray) -> np.ndarray:
-        """Return sums of squared residuals by joint, (n,), of the parameters x (K,)."""
+        """Return the squared residual per joint, (n,) [Nm^2, N^2], of the parameters x (K,)."""
         return np.asarray(np.square(self.factors @ np.append(x, -1.0)).sum(axis=1))
 
 
 def reduce(blocks: Iterable[Columns]) -> Triangles:
-    """Return the triangles of all blocks, one in memory at a time."""
+    """Return the factors of all blocks (T, n, K) and (T, n), one in memory at a time."""
     factors: np.ndarray | None = None
     count, total, square = 0, 0.0, 0.0
     for regressor, torque in blocks:
@@ -45,9 +46,9 @@ def reduce(blocks: Iterable[Columns]) -> Triangles:
 
 
 def block_products(rows: np.ndarray, blocks: int) -> np.ndarray:
-    """Return the products of the columns of rows (S, n, C) with one another, (n, blocks, C, C).
+    """Return the Gram matrices (n, blocks, C, C) of the columns of rows (S, n, C), per joint and block of time.
 
-    By joint and block of time; samples that do not fill the last block are left out.
+    The last samples, which do not fill a block, are not used.
     """
     by_joint = rows[: len(rows) // blocks * blocks].swapaxes(0, 1)
     by_joint = by_joint.reshape(rows.shape[1], blocks, -1, rows.shape[2])
@@ -55,8 +56,8 @@ def block_products(rows: np.ndarray, blocks: int) -> np.ndarray:
 
 
 def normal_solution(products: np.ndarray, targets: int) -> np.ndarray:
-    """Return the parameters (..., K, D) of least squares by products (..., K + D, K + D), for the last D columns."""
-    # kilograms and kilogram square metres, in columns of one length: products square the spread
+    """Return the least-squares parameters (..., K, D) of D targets, from Gram matrices (..., K + D, K + D)."""
+    # columns have different units (kg, kg m^2), and the Gram matrix squares the condition number: scaled to length one
     length = np.sqrt(np.diagonal(products, axis1=-2, axis2=-1))[..., :-targets, None]
     length = np.where(length > 0, length, 1.0)
     normal = products[..., :-targets, :-targets] / (length * length.swapaxes(-1, -2))
@@ -66,10 +67,10 @@ def normal_solution(products: np.ndarray, targets: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Parameters (K,) of least squares, of which those of some columns (r,) were fitted and the others are zero.
+    """Least-squares parameters (K,), zero except for the fitted columns (r,).
 
-    covariance: of the fitted ones (r, r), where the weights are the inverse standard deviations of independent errors.
-    condition: of the regressor with columns of length one; rank: directions that it shows.
+    covariance: (r, r) of the fitted parameters, for weights that are the inverse standard deviations of independent
+    errors. condition, rank: of the regressor with columns of length one.
     """
 
     parameters: np.ndarray
@@ -79,10 +80,14 @@ class Solution:
     rank: int
 
     def deviations(self, triangles: Triangles, errors: np.ndarray, combination: np.ndarray) -> np.ndarray:
-        """Return the standard deviations of combinations (k, r) of the fitted parameters.
+        """Return the standard deviations (k,) of combinations of the fitted parameters, by the sandwich estimator.
 
-        errors: (n,) standard deviations of the joints' torques, times the squares of their weights: a sandwich, for
-        weights need not be the inverse of what the errors turned out to be.
+        The weights need not be the inverse standard deviations of the errors (White, Econometrica 48:817, 1980).
+
+        Args:
+            triangles: of the samples.
+            errors: (n,) standard deviations of the joints' torque errors, times the squares of their weights.
+            combination: (k, r).
         """
         rows = triangles.factors[..., self.columns]
         effects = (combination @ self.covariance) @ rows.swapaxes(1, 2)
@@ -90,9 +95,12 @@ class Solution:
 
 
 def solve(triangles: Triangles, weights: np.ndarray, columns: np.ndarray) -> Solution:
-    """Return the parameters of these columns (r,) with the least weighted squares; weights (n,) by joint.
+    """Return the parameters that minimize the weighted squared residual; those of minimum norm if it is singular.
 
-    Directions that the samples do not show stay at zero.
+    Args:
+        triangles: of the samples.
+        weights: (n,) of the joints.
+        columns: (r,) of the fitted parameters.
     """
     weighted = triangles.factors * weights[:, None, None]
     weighted = weighted.reshape(-1, weighted.shape[2])
@@ -108,10 +116,13 @@ def solve(triangles: Triangles, weights: np.ndarray, columns: np.ndarray) -> Sol
 
 
 def deviations(residuals: Sequence[np.ndarray], parameters: int) -> np.ndarray:
-    """Return standard deviations (n,) of errors as if they were independent from sample to sample.
+    """Return the standard deviations (n,) of errors, scaled as if the errors of all samples were independent.
 
-    residuals: (T, n) by trajectory; parameters: that were fitted. Filtered and modelled torques err for many samples
-    in the same sense: the variance is multiplied by the time over which residuals stay correlated, in samples.
+    The residual of filtered torques is correlated: its variance is multiplied by its correlation time in samples.
+
+    Args:
+        residuals: (T, n) per trajectory.
+        parameters: number of fitted parameters.
     """
     count = sum(map(len, residuals))
     power = sum(np.square(x).sum(axis=0) for x in residuals)
@@ -120,15 +131,15 @@ def deviations(residuals: Sequence[np.ndarray], parameters: int) -> np.ndarray:
 
 
 def correlation_time(residuals: Sequence[np.ndarray]) -> np.ndarray:
-    """Return how many successive samples err alike, (n,), at least one.
+    """Return the integrated autocorrelation time in samples, (n,), at least one, of residuals (T, n) per trajectory.
 
-    1 + 2 times the sum of autocorrelations up to the first below zero (Geyer, Stat. Sci. 7:473, 1992).
+    It is 1 + 2 times the sum of the autocorrelations up to the first negative one (Geyer, Stat. Sci. 7:473, 1992).
     """
-    longest = min(TUNING.largest_lag, max(map(len, residuals)) - 1)
+    max_lag = min(TUNING.largest_lag, max(map(len, residuals)) - 1)
     power = sum(np.square(x).sum(axis=0) for x in residuals)
     time: np.ndarray = np.ones_like(power)
     correlated = power > 0
-    for lag in range(1, longest + 1):
+    for lag in range(1, max_lag + 1):
         products = np.zeros_like(power)
         for x in residuals:
             products += (x[lag:] * x[:-lag]).sum(axis=0)

@@ -129,7 +129,7 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
             f"only one trajectory: training on its first {t[cut - 1] - t[0]:.3g} s, "
             f"validation on the last {t[-1] - t[cut]:.3g} s"
         )
-        note = Diagnostic("warning", "validation-split", "logs", None, message)
+        note = Diagnostic("info", "validation-split", "logs", None, message)
         last = replace(trajectory[cut:], name=f"{trajectory.name} (last part)")
         return Split((trajectory[:cut],), (last,), note)
     # whole trajectories: neighbouring windows share samples, and would tell the answer

@@ -130,7 +130,7 @@ class FrictionLaws(nn.Module):
             "Nm s/rad, N s/m": friction / speed, "Nm, N": friction, "rad/s, m/s": speed, "1": friction.sign()
         }  # fmt: skip
         for name, _, unit, initial in FrictionLaws.parameter_groups[:-1]:
-            constants.append(initial * units[unit] * self.get_parameter(name).exp())
+            constants.append(initial * units[unit] * getattr(self, name).exp())
         load = MIN_LOAD * torch.where(friction > 0, friction, 1.0)
         fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
         rounding, sharp = self.stribeck_rounding, SHARP_VELOCITY * speed

@@ -56,7 +56,7 @@ class GaussianPrior(Group):
     (`shared_sizes`), of one element of bristles (`shared_fractions`) or of all friction (`shared_friction`).
     friction_compensation: of a drive, in usual sizes of friction at usual speed, where logs show one.
     bodies, armature and offset are first guesses, which count as `degrees_of_freedom` weights: how far those turn out
-    to be from where they start is found by the fit (see `most_probable`).
+    to be from where they start is found by the fit (see `update_widths`).
     """
 
     bodies: Positive = 0.75

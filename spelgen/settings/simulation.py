@@ -12,18 +12,22 @@ from spelgen.settings.values import Count, Group, Inputs, NonNegative, Number, P
 class SimulationSettings(Group):
     """How `spelgen simulate` makes logs.
 
-    protocol: random-inputs, or tracking: controlled motions, see `TrackingSettings`. Where neither it nor any `inputs`
-        are said: tracking, of fewer and longer trajectories than these (`ControlledSimulation`).
+    protocol: random-inputs; tracking: controlled motions, see `TrackingSettings`; prescribed: motions that are
+        performed exactly, torques by inverse dynamics. Without a protocol and `inputs`: tracking, of fewer and longer
+        trajectories than these (`ControlledSimulation`).
     trajectories: number, each from its own initial position, at rest.
     duration: of each [s]. sample_rate: of samples and of the inputs, which are held in between [Hz].
     inputs: the torques each actuated joint draws from, every sample anew [Nm].
     test_fraction: part of the trajectories kept for testing; with tracking, of each trajectory, its end.
+    presliding: of prescribed motions: the displacement over which dry friction builds up after a reversal (hysteresis)
+        [rad]; a tenth of it [m] for prismatic joints; 0: none.
+    torque_noise: of prescribed motions: standard deviation of white noise, relative to that of each joint's torque.
     positions: joint -> (lowest, highest) initial position [rad]; not given: its limits, +-pi if continuous.
     coulomb_smoothing_velocity: width of the tanh in place of Coulomb friction's jump [rad/s].
     delay: of the commands of position servos [s], whose motions are of their own kind, see `simulation.servo_motions`.
     """
 
-    protocol: Literal["random-inputs", "tracking"] = "random-inputs"
+    protocol: Literal["random-inputs", "tracking", "prescribed"] = "random-inputs"
     trajectories: Count = 64
     duration: Positive = 1.0
     sample_rate: Positive = 20.0
@@ -31,6 +35,8 @@ class SimulationSettings(Group):
     test_fraction: Share = 0.5
     positions: dict[str, tuple[Number, Number]] | None = None
     coulomb_smoothing_velocity: Positive = 0.05
+    presliding: NonNegative = 0.0
+    torque_noise: NonNegative = 0.0
     delay: NonNegative = 0.02
     seed: Whole = 0
 
@@ -46,7 +52,7 @@ class SimulationSettings(Group):
 class ControlledSimulation(SimulationSettings):
     """Defaults of arms that are controlled where nobody says how they are driven: fewer and longer trajectories."""
 
-    protocol: Literal["random-inputs", "tracking"] = "tracking"
+    protocol: Literal["random-inputs", "tracking", "prescribed"] = "tracking"
     trajectories: Count = 4
     duration: Positive = 8.0
     sample_rate: Positive = 125.0

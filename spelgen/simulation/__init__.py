@@ -1,1 +1,1 @@
-"""An Arm to logs: its motion simulated, with drives and friction."""
+"""Simulated logs of an arm: motion, drives, friction, encoders; and arms that differ from their URDF."""

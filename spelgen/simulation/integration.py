@@ -1,6 +1,6 @@
-"""Integrate an arm's motion under held torques, as exact as floating-point numbers allow.
+"""Integration of the equation of motion under piecewise constant torques, to the accuracy of floating-point numbers.
 
-    M(q) qdd + nonlinear_effects(q, qd) = tau - friction(qd)        tau held between samples
+    M(q) qdd + nonlinear_effects(q, qd) = tau - friction(qd)        tau constant between samples
 
 Joint limits are not enforced: there are no end stops.
 """
@@ -20,21 +20,28 @@ from spelgen.simulation.tuning import TUNING
 
 def rollout(
     dynamics: PinocchioDynamics,
-    start: np.ndarray,
+    initial: np.ndarray,
     t: np.ndarray,
     tau: np.ndarray,
-    looser: float = 1.0,
+    tolerance_factor: float = 1.0,
 ) -> np.ndarray:
-    """Return the states (q, qd), (T, 2n), at the times t (T,) [s] from a start (2n,) under tau (T, n).
+    """Return the states (q, qd), (T, 2n) [rad, rad/s; m, m/s].
 
-    LSODA (Petzold, SIAM J. Sci. Stat. Comput. 4, 1983), which friction that stops a joint at once does not hold to
-    short steps, begun anew where tau changes. looser: factor on the error allowed. Raises RunError where it cannot go
-    on.
+    Method: LSODA (Petzold, SIAM J. Sci. Stat. Comput. 4, 1983), restarted at each change of tau. It switches to an
+    implicit method for stiff friction, so a joint that stops within microseconds does not force short steps. Raises
+    RunError if the integration fails.
+
+    Args:
+        dynamics: The arm, with friction.
+        initial: State (2n,) at t[0].
+        t: Times (T,) [s].
+        tau: Inputs (T, n) [Nm; N]; tau[k] acts from t[k] to t[k+1].
+        tolerance_factor: Factor of the relative and the absolute tolerance.
     """
     n = tau.shape[1]
-    tolerances = {"rtol": TUNING.rtol * looser, "atol": TUNING.atol * looser}
+    tolerances = {"rtol": TUNING.rtol * tolerance_factor, "atol": TUNING.atol * tolerance_factor}
     states = np.empty((t.size, 2 * n))
-    states[0] = start
+    states[0] = initial
     changes = np.flatnonzero((tau[1:-1] != tau[:-2]).any(axis=1)) + 1
     for first, last in pairwise([0, *changes.tolist(), t.size - 1]):
         torque = tau[first]
@@ -65,5 +72,6 @@ def rollout(
 
 
 def _stuck(t: float, failure: str) -> RunError:
+    """Return the error of an integration that fails at t [s]."""
     cure = "check the inertials; make simulation.duration smaller or simulation.coulomb_smoothing_velocity larger"
     return RunError(f"the motion cannot be integrated beyond t = {t:g} s: {failure}", do=cure)

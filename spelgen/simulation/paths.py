@@ -1,4 +1,4 @@
-"""Say where a controlled arm shall be: sines of a frequency, or motions as `spelgen excite` begins its search with."""
+"""Desired motions of a controlled arm: sines, or random excitation trajectories."""
 
 from __future__ import annotations
 
@@ -14,16 +14,22 @@ from spelgen.simulation.tuning import TUNING as SIMULATION
 
 
 def paths(arm: Arm, settings: Settings, t: np.ndarray) -> list[Motion]:
-    """Return the path of each trajectory at times t (T,) [s], by `settings.tracking`, whatever their number.
+    """Return the desired motion of each trajectory, as `settings.tracking` specifies.
 
-    Raises SettingsError where sines do not fit into a joint's range, or a joint has none.
+    The first motions are the same for any number of trajectories. Raises SettingsError if sines exceed a joint's range,
+    or if a joint has no range.
+
+    Args:
+        arm: The arm.
+        settings: `simulation` and `tracking` are used.
+        t: Times (T,) [s].
     """
     count = settings.simulation.trajectories
     seeds = np.random.SeedSequence(settings.simulation.seed).spawn(count)
     randoms = list(map(np.random.default_rng, seeds))
     low, high = initial_range(arm, settings)
     if settings.tracking.paths == "excitation":
-        # the middle of the ranges at moderate speeds: a first try at an arm that nobody knows
+        # moderate: the middle of the ranges at moderate speeds, as for the first motion of an unknown arm
         middle, half = (low + high) / 2, SIMULATION.used_range * (high - low) / 2
         speeds = []
         for joint in arm.coordinates:
@@ -41,7 +47,15 @@ def paths(arm: Arm, settings: Settings, t: np.ndarray) -> list[Motion]:
 def sines(
     middle: np.ndarray, amplitude: np.ndarray | float, frequency: float, phase: np.ndarray, t: np.ndarray
 ) -> Motion:
-    """Return middle + amplitude sin(2 pi frequency t + phase), all but the frequency [Hz] and t (T,) of shape (n,)."""
+    """Return the motion middle + amplitude sin(2 pi frequency t + phase), (T, n).
+
+    Args:
+        middle: Mean positions (n,) [rad; m].
+        amplitude: Amplitudes (n,) [rad; m].
+        frequency: Frequency of all joints [Hz].
+        phase: Phases (n,) [rad].
+        t: Times (T,) [s].
+    """
     omega = 2 * np.pi * frequency
     angle = omega * t[:, None] + phase
     swing = amplitude * np.sin(angle)
@@ -49,7 +63,7 @@ def sines(
 
 
 def _amplitude(arm: Arm, settings: Settings, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the amplitude (n,) of each joint's sines, which must fit into its range."""
+    """Return the amplitudes (n,) [rad; m] of sines within low..high, (n,) each; SettingsError if they exceed these."""
     amplitude, errors = np.full(len(low), settings.tracking.amplitude), list[SpelgenError]()
     if "amplitude" not in settings.tracking.model_fields_set:
         amplitude = np.minimum(amplitude, SIMULATION.used_range * (high - low) / 2)

@@ -1,4 +1,4 @@
-"""What all protocols of a simulation have in common: friction, where motions start, and the logs that they give."""
+"""Parts that all simulation protocols share: friction, the range of initial positions, and the resulting logs."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.joint_friction import Friction, joint_friction
+from spelgen.dynamics.joint_friction import DriveFriction, joint_friction
 from spelgen.errors import SettingsError, collect
 from spelgen.logs.trajectory import Trajectory, trajectory_listing
 from spelgen.settings.settings import Settings
 
 
 class SimulatedLogs(list[Trajectory]):
-    """Hold simulated trajectories, those for training (`train`) first, then those for testing (`test`)."""
+    """Simulated trajectories: those for training (`train`), followed by those for testing (`test`)."""
 
     def __init__(self, train: Sequence[Trajectory], test: Sequence[Trajectory]) -> None:
         super().__init__([*train, *test])
@@ -27,18 +27,21 @@ class SimulatedLogs(list[Trajectory]):
         return trajectory_listing(self).html()
 
 
-def make_friction(arm: Arm, settings: Settings, speeds: np.ndarray | None = None) -> Friction:
-    """Return the friction of the arm: a joint's settings where it has some, else its URDF's <dynamics>.
+def make_friction(arm: Arm, settings: Settings, speeds: np.ndarray | None = None) -> DriveFriction:
+    """Return the friction of the drives: from a joint's settings if it has any, else from its URDF's <dynamics>.
 
-    speeds: C (n, n) of the drives. Where they move several joints, a joint's friction is that of its drive, as in the
-    models.
+    Args:
+        arm: The arm.
+        settings: `joints` and the smoothing velocity of `simulation` are used.
+        speeds: C (n, n): the drives' speeds are C qd. None: each drive moves its own joint. Friction belongs to the
+            drives, as in the models.
     """
     width = settings.simulation.coulomb_smoothing_velocity
     return joint_friction(arm.coordinates, settings.joints, width, speeds)
 
 
 def initial_range(arm: Arm, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest positions (n,) [rad; m] to start from; SettingsError where a joint has none."""
+    """Return the lowest and the highest initial position, (n,) each [rad; m]; SettingsError if a joint has no range."""
     positions = settings.simulation.positions or {}
     ranges, errors = [], []
     for joint in arm.coordinates:
@@ -49,7 +52,7 @@ def initial_range(arm: Arm, settings: Settings) -> tuple[np.ndarray, np.ndarray]
         elif joint.lower is not None and joint.upper is not None and joint.lower < joint.upper:
             ranges.append((joint.lower, joint.upper))
         else:
-            # 0 to 0 is what exporters write where nobody said a range
+            # exporters write 0 to 0 for an unknown range
             message = "the joint has no range: give its lowest and highest initial position"
             errors.append(SettingsError(message, element=f"simulation.positions.{joint.name}"))
     collect(errors)

@@ -1,4 +1,4 @@
-"""Simulate logs under random torques, held from sample to sample."""
+"""Simulated logs under random torques that are constant between samples."""
 
 from __future__ import annotations
 
@@ -22,13 +22,17 @@ def random_inputs(
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SimulatedLogs:
-    """Return random-input trajectories of the arm by `settings.simulation`; same settings, same logs.
+    """Return trajectories under random inputs; the same settings give the same logs.
 
-    Each starts at rest at a random position and has round(duration * sample_rate) + 1 samples; tau[k] acts from t[k]
-    to t[k+1]. drives: where the torques drawn and logged are those of motors, the joints get G tau, and friction is
-    the motors'. progress: called with (trajectories done, all) after each one.
-    Raises ArmError without inertials, SettingsError for a joint without a range of initial positions, and
-    RunError when the motion cannot be integrated.
+    Each trajectory starts at rest at a random position and has round(duration * sample_rate) + 1 samples; tau[k] acts
+    from t[k] to t[k+1]. Raises ArmError without inertials, SettingsError for a joint without a range of initial
+    positions, and RunError if the motion cannot be integrated.
+
+    Args:
+        arm: The arm.
+        settings: `simulation` and `joints` are used.
+        drives: Matrices of coupled motors: inputs are motor torques, joints get G tau, friction is the motors'.
+        progress: Called with (trajectories done, all) after each trajectory.
     """
     protocol = settings.simulation
     dynamics = arm_dynamics(arm, settings, make_friction(arm, settings, drives and drives.speeds))
@@ -39,7 +43,7 @@ def random_inputs(
         is_driven = joint.actuated and not coordinate.passive
         torques.append(np.array(joint.inputs or protocol.inputs) if is_driven else np.zeros(1))
     t = np.arange(round(protocol.duration * protocol.sample_rate) + 1) / protocol.sample_rate
-    # a seed for each trajectory: more of them leave the first ones as they were
+    # one seed per trajectory: the first trajectories do not depend on their number
     split_seed, *seeds = np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories + 1)
     trajectories = []
     for number, seed in enumerate(seeds):
@@ -51,7 +55,7 @@ def random_inputs(
         q, qd = np.split(states, 2, axis=1)
         trajectories.append(Trajectory(t, q, qd, tau, f"traj_{number:02d}"))
         progress(number + 1, protocol.trajectories)
-    # at least one is left to train on
+    # at least one trajectory remains for training
     count = protocol.trajectories
     order = np.random.default_rng(split_seed).permutation(count)
     tests = min(round(protocol.test_fraction * count), count - 1)

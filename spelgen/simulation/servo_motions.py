@@ -1,4 +1,4 @@
-"""Simulate logs of an arm under position servos: commands that swing, hold and jump, positions of encoders."""
+"""Simulated logs of an arm under position servos: commands with sines, holds and steps; positions of encoders."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from spelgen.settings.settings import Settings
 from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction
 from spelgen.simulation.tuning import SERVOS as TUNING
 
-SWEEPS = 4  # over the joints, of dry friction
-ENCODER = 2 * np.pi / 4096  # rad: a turn in twelve bits; of a sliding joint [m] a tenth of that
-EFFORT, LAG = 5.0, 0.05  # Nm, s: of a servo of which nothing is said
+SWEEPS = 4  # Gauss-Seidel iterations over the joints, for dry friction
+ENCODER = 2 * np.pi / 4096  # [rad], 12 bits per revolution; a tenth of it [m] for prismatic joints
+EFFORT, LAG = 5.0, 0.05  # [Nm], [s]: torque limit and time constant kd / kp of an unspecified servo
 
 
 def servo_motions(
@@ -26,9 +26,9 @@ def servo_motions(
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SimulatedLogs:
-    """Return trajectories by `settings.simulation`; same settings, same logs.
+    """Return trajectories under random commands; the same settings give the same logs.
 
-    Arguments and errors as of `random_inputs`.
+    Arguments and errors are those of `random_inputs`.
     """
     protocol = settings.simulation
     lowest, highest = initial_range(arm, settings)
@@ -48,7 +48,7 @@ def servo_motions(
 
 
 def _commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:
-    """Return (T, n) between -1 and 1: sines about levels that are held for a while."""
+    """Return random commands (T, n) in [-1, 1] at times t (T,) [s]: the mean of sines and of random levels."""
     low, high = np.log(TUNING.lowest_frequency), np.log(TUNING.highest_frequency)
     frequencies = np.exp(random.uniform(low, high, (3, n)))
     phases = random.uniform(0, 2 * np.pi, (3, n))
@@ -58,11 +58,17 @@ def _commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:
 
 
 def _positions(arm: Arm, settings: Settings, t: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return positions (T, n) from rest at the first command: semi-implicit Euler, dry friction as impulses.
+    """Return positions (T, n) [rad; m] from rest at the first command.
 
-    Servos of which nothing is said are stiff as their effort and late by `LAG`. The impulse of a joint's dry friction
-    is the one that stops it, or else its largest one (projected Gauss-Seidel, as in physics engines: Catto, Iterative
-    Dynamics with Temporal Coherence, 2005).
+    Method: semi-implicit Euler with dry friction as impulses. The impulse of a joint's dry friction stops it, within
+    the bounds of Coulomb friction (projected Gauss-Seidel, as in physics engines: Catto, Iterative Dynamics with
+    Temporal Coherence, 2005). Servos without kp get kp = 2 limit, kd = `LAG` kp.
+
+    Args:
+        arm: The arm.
+        settings: `joints` and `simulation.delay` are used.
+        t: Times (T,) [s], at equal steps.
+        u: Commanded positions (T, n) [rad; m].
     """
     dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings)
     limit = np.array([coordinate.effort or EFFORT for coordinate in arm.coordinates])
@@ -72,29 +78,38 @@ def _positions(arm: Arm, settings: Settings, t: np.ndarray, u: np.ndarray) -> np
     kd = LAG * kp
     interval = t[1] - t[0]
     steps = int(np.ceil(interval / TUNING.step))
-    h, late = interval / steps, round(settings.simulation.delay * steps / interval)
-    damping = np.diag(h / 2 * (kd + friction.viscous))  # at a step's middle, as the positions are
+    h, delay = interval / steps, round(settings.simulation.delay * steps / interval)
+    damping = np.diag(h / 2 * (kd + friction.viscous))  # implicit midpoint rule of the damping torques
     impulses = -h * np.stack([friction.forward, friction.backward])
     q, qd, positions = u[0].copy(), np.zeros(u.shape[1]), np.empty_like(u)
     for step in range(steps * len(t)):
         if step % steps == 0:
             positions[step // steps] = q
-        command = u[max(0, step - late) // steps]
+        command = u[max(0, step - delay) // steps]
         torque = np.clip(kp * (command - q) - kd * qd, -limit, limit)
         force = torque - friction.viscous * qd - dynamics.nonlinear_effects(q, qd)
         inverse = np.linalg.inv(dynamics.mass_matrix(q) + damping)
-        qd = _slowed(qd + h * inverse @ force, inverse, *impulses)
+        qd = _after_dry_friction(qd + h * inverse @ force, inverse, *impulses)
         q = q + h * qd
     return positions
 
 
-def _slowed(qd: np.ndarray, inverse: np.ndarray, least: np.ndarray, most: np.ndarray) -> np.ndarray:
-    """Return the velocity after dry friction's impulses, each between ``least`` and ``most`` (n,)."""
+def _after_dry_friction(
+    qd: np.ndarray, inverse: np.ndarray, lower: np.ndarray, upper: np.ndarray
+) -> np.ndarray:
+    """Return the velocity (n,) after the impulses of dry friction.
+
+    Args:
+        qd: Velocity (n,) without dry friction.
+        inverse: Inverse of the mass matrix, (n, n).
+        lower: Smallest impulses (n,) [Nm s; N s].
+        upper: Largest impulses (n,).
+    """
     impulse = np.zeros_like(qd)
     for _ in range(SWEEPS):
         for k in range(len(qd)):
             stopping = impulse[k] - qd[k] / inverse[k, k]
-            change = min(max(stopping, least[k]), most[k]) - impulse[k]
+            change = min(max(stopping, lower[k]), upper[k]) - impulse[k]
             impulse[k] += change
             qd = qd + inverse[:, k] * change
     return qd

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.errors import SettingsError
+from spelgen.excitation.trajectory import Motion
 from spelgen.settings.messages import validated
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import ControlledSimulation, ServoSimulation, SimulationSettings
 from spelgen.settings.yaml_document import Document
+from spelgen.simulation.prescribed import prescribed
 from spelgen.simulation.protocol import SimulatedLogs
 from spelgen.simulation.random_inputs import random_inputs
 from spelgen.simulation.servo_motions import servo_motions
 from spelgen.simulation.tracking import track
 from spelgen.simulation.tuning import TUNING
 
-PROTOCOLS = {"random-inputs": random_inputs, "tracking": track}
+PROTOCOLS = {"random-inputs": random_inputs, "tracking": track, "prescribed": prescribed}
 
 
 def simulate(
@@ -27,15 +30,24 @@ def simulate(
     sample_rate: float | None = None,
     test_fraction: float | None = None,
     seed: int | None = None,
+    motions: Sequence[Motion] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> SimulatedLogs:
-    """Return simulated logs of the arm: all trajectories in a list, `train` and `test` apart.
+    """Return simulated logs of the arm: all trajectories in a list, and those in `train` and `test`.
 
-    What is not given is as `simulation` in the settings beside the URDF says: how many trajectories, of which
-    duration [s] and sample rate [Hz], the part kept for testing, the seed. Same arguments, same logs. progress:
-    called with (trajectories done, all) after each one. Mimic joints move as the URDF says.
-    Raises ArmError without inertials, SettingsError for values that cannot be or a joint without a range of initial
-    positions, and RunError when the motion cannot be integrated.
+    Values that are not given are those of `simulation` in the settings beside the URDF. The same arguments give the
+    same logs. Mimic joints move as the URDF specifies. Raises ArmError without inertials, SettingsError for an invalid
+    value or a joint without a range of initial positions, and RunError if the motion cannot be integrated.
+
+    Args:
+        arm: The arm, from `load_arm` or `as_built`.
+        trajectories: Number of trajectories.
+        duration: Duration of each trajectory [s].
+        sample_rate: Sample rate [Hz].
+        test_fraction: Fraction of the trajectories, or of each one, for testing.
+        seed: Seed of all random numbers.
+        motions: Motions that the arm performs exactly, (T, n) each; they replace the protocol of the settings.
+        progress: Called with (trajectories done, all) after each trajectory.
     """
     arguments = {
         "trajectories": trajectories, "duration": duration, "sample_rate": sample_rate,
@@ -45,26 +57,38 @@ def simulate(
     values = arm.settings.simulation.model_dump(exclude_unset=True) | changes
     changed = validated(SimulationSettings, values, Document(Path("simulate"), None))
     settings = _controlled(arm.settings.model_copy(update={"simulation": changed}))
+    drives = arm.actuation.drives()
+    progress = progress or (lambda done, total: None)
+    if motions:
+        if settings.input == "position":
+            raise SettingsError(
+                "motions of an arm with position servos", element="input", expected="input: torque",
+                do="simulate without motions: commands are random",
+            )  # fmt: skip
+        return prescribed(arm.arm, settings, drives, motions=motions, progress=progress)
     run = servo_motions if settings.input == "position" else PROTOCOLS[settings.simulation.protocol]
-    return run(arm.arm, settings, arm.actuation.drives(), progress=progress or (lambda done, total: None))
+    return run(arm.arm, settings, drives, progress=progress)
 
 
 def _controlled(settings: Settings) -> Settings:
-    """The settings, with the arm controlled where nobody says how it is driven: under random torques it would fall."""
+    """Return the settings with the defaults of a controlled arm if no protocol and no inputs are set.
+
+    Under random torques an arm that nobody tuned them for would fall.
+    """
     simulation, tracking = settings.simulation, settings.tracking
     if settings.input == "position":
-        usual = ServoSimulation(**simulation.model_dump(exclude_unset=True))
-        return settings.model_copy(update={"simulation": usual})
+        servo = ServoSimulation(**simulation.model_dump(exclude_unset=True))
+        return settings.model_copy(update={"simulation": servo})
     is_driven = {"protocol", "inputs"} & simulation.model_fields_set
     if is_driven or any(joint.inputs for joint in settings.joints.values()):
         return settings
     simulation = ControlledSimulation(**simulation.model_dump(exclude_unset=True))
     rate = simulation.sample_rate
-    usual_tracking: dict[str, object] = {
+    defaults: dict[str, object] = {
         "control": "computed-torque",
         "paths": "own" if {"amplitude", "frequency"} & tracking.model_fields_set else "excitation",
         "control_rate": rate / max(1, round(rate / TUNING.control_rate)),
         "cutoff": min(tracking.cutoff, rate / 4),
     }
-    tracking = tracking.model_copy(update=usual_tracking | tracking.model_dump(exclude_unset=True))
+    tracking = tracking.model_copy(update=defaults | tracking.model_dump(exclude_unset=True))
     return settings.model_copy(update={"simulation": simulation, "tracking": tracking})

@@ -1,7 +1,7 @@
-"""Simulate logs as real arms give them: controlled along paths, seen by encoders, velocities by differences.
+"""Simulated logs of a controlled arm: feedback control along paths, encoder positions, velocities by differences.
 
-Stands in for the protocol of the paper's real arm (Wang, Chen, Ding, Sci Rep 15:33179, 2025), whose logs are not
-public. What the paper leaves open is ours: gains, phases, encoders and the filter's cutoff.
+It replaces the recordings of the real arm in the paper (Wang, Chen, Ding, Sci Rep 15:33179, 2025), which are not
+public. Values that the paper does not state are chosen here: gains, phases, encoders and the cutoff of the filter.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.joint_friction import Friction
+from spelgen.dynamics.joint_friction import DriveFriction
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import SettingsError
@@ -30,7 +30,7 @@ from spelgen.simulation.tuning import TUNING
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """Hold a PID controller's gains by joint, (n,): torque per error of position, of its integral and of velocity."""
+    """Gains of PID controllers, (n,) each: torque per position error, per its integral, and per velocity error."""
 
     proportional: np.ndarray
     integral: np.ndarray
@@ -39,10 +39,10 @@ class Gains:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One motion of T samples: what happened, and what the arm's own sensors saw of it.
+    """One motion of T samples: the true states, and the signals of the sensors.
 
-    t: (T,) [s]. states: (T, 2n) true positions and velocities. encoders: (T, n) positions in whole steps of the
-    encoders. tau: (T, n) motor torques, tau[k] constant from t[k] to t[k+1], known exactly.
+    t: (T,) [s]. states: (T, 2n) true positions and velocities. encoders: (T, n) positions, rounded to steps of the
+    encoders. tau: (T, n) motor torques [Nm; N], tau[k] constant from t[k] to t[k+1].
     """
 
     t: np.ndarray
@@ -58,11 +58,12 @@ def track(
     *,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SimulatedLogs:
-    """Return logs of the arm controlled along paths, by `settings.simulation` and `settings.tracking`.
+    """Return logs of the arm under feedback control along paths.
 
-    Every recording has its own gains, and its own phases or place to begin. The last `test_fraction` of each is
-    for testing. Logged are positions from the encoders after a zero-phase low-pass, velocities by central
-    differences of these, and the motors' torques. Arguments and errors as for `random_inputs`.
+    Each recording has its own gains, and its own phases or initial position. The last `test_fraction` of each recording
+    is for testing. Logged are positions from the encoders after a zero-phase low-pass, velocities by central
+    differences of these, and motor torques. Arguments and errors are those of `random_inputs`; `settings.tracking` is
+    used as well.
     """
     protocol = settings.simulation
     friction = make_friction(arm, settings, drives and drives.speeds)
@@ -75,7 +76,7 @@ def track(
     train, test = [], []
     for number, path in enumerate(paths(arm, settings, ticks)):
         bandwidth = settings.tracking.bandwidths[number % len(settings.tracking.bandwidths)]
-        # what a joint feels when the others are free
+        # inertia of each joint if all others move freely
         inertia = 1 / np.diag(np.linalg.inv(dynamics.mass_matrix(middle)))
         gains = tuned_gains(inertia, bandwidth)
         recording = record(dynamics, friction, inputs, path, gains, settings, 2 * np.pi * bandwidth)
@@ -89,64 +90,84 @@ def track(
 
 
 def tuned_gains(inertia: np.ndarray, bandwidth: float) -> Gains:
-    """Return gains for joints of inertia (n,) [kg m^2; kg]; both poles of the position loop are at the bandwidth."""
+    """Return PID gains that place both poles of the position loop at the bandwidth.
+
+    Args:
+        inertia: Inertias (n,) [kg m^2; kg] of the joints.
+        bandwidth: Bandwidth of the position loop [Hz].
+    """
     omega = 2 * np.pi * bandwidth
     return Gains(inertia * omega**2, TUNING.integral_gain * inertia * omega**3, 2 * inertia * omega)
 
 
 def computed_torque(
     dynamics: PinocchioDynamics,
-    friction: Friction,
+    friction: DriveFriction,
     motion: tuple[np.ndarray, np.ndarray, np.ndarray],
     error: np.ndarray,
-    lag: np.ndarray,
+    velocity_error: np.ndarray,
     omega: float,
 ) -> np.ndarray:
-    """Return the joint torques (n,) of a controller that knows the arm (Siciliano et al., Robotics, 2009, 8.5.2).
+    """Return the joint torques (n,) [Nm; N] of inverse-dynamics control (Siciliano et al., Robotics, 2009, 8.5.2).
 
-    They are M (qdd* + 2 omega e' + omega^2 e) + what motion, gravity and friction take.
+        M (qdd* + 2 omega e' + omega^2 e) + h(q, qd*) + friction(qd*)
 
-    motion: q as it is seen, qd* and qdd* (n,). error, lag: e and e', those of position and velocity. Where viscous
-    friction alone makes a joint slower than omega, a stiffness of viscous * omega beside it.
+    If viscous friction makes a joint slower than omega, a stiffness viscous * omega is added for it.
+
+    Args:
+        dynamics: The arm, whose parameters the controller knows.
+        friction: Friction of the drives.
+        motion: Measured q, desired qd* and qdd*, (n,) each.
+        error: Position error e (n,) [rad; m].
+        velocity_error: Velocity error e' (n,).
+        omega: Natural frequency of the error [rad/s].
     """
     q, qd, qdd = motion
     mass = dynamics.mass_matrix(q)
     slow = np.where(friction.viscous > np.diag(mass) * omega, friction.viscous * omega, 0.0)
-    torque = mass @ (qdd + 2 * omega * lag + omega**2 * error) + slow * error
+    torque = mass @ (qdd + 2 * omega * velocity_error + omega**2 * error) + slow * error
     return np.asarray(torque + dynamics.nonlinear_effects(q, qd) + friction(qd))
 
 
 def record(
     dynamics: PinocchioDynamics,
-    friction: Friction,
+    friction: DriveFriction,
     inputs: np.ndarray,
     path: Motion,
     gains: Gains,
     settings: Settings,
     omega: float = 0.0,
 ) -> Recording:
-    """Return a motion along a path: the controller sees the encoders and holds its torques between its ticks.
+    """Return a motion along a path: the controller measures the encoders, its torques are constant between its ticks.
 
-    path: at the ticks. inputs: G (n, n). The arm starts at rest where the path begins, held against its weight.
-    omega: of computed torques [rad/s], where these are asked for.
+    The arm starts at rest at the first position of the path, in equilibrium with gravity.
+
+    Args:
+        dynamics: The arm, with friction.
+        friction: The same friction, for the controller.
+        inputs: G (n, n).
+        path: Desired motion at the ticks of the controller.
+        gains: Gains of the PID controllers.
+        settings: `simulation` and `tracking` are used.
+        omega: Natural frequency of inverse-dynamics control [rad/s]; only for `tracking.control: computed-torque`.
     """
     tracking, n = settings.tracking, path.q.shape[1]
     tick, samples = 1.0 / tracking.control_rate, _samples_of_a_tick(settings)
-    # passive joints have no motor: the pseudo-inverse leaves them alone
+    # passive joints have no motor: the pseudo-inverse gives them no torque
     to_motors = np.linalg.pinv(inputs)
     state = np.concatenate([path.q[0], np.zeros(n)])
-    # begun at the arm's weight, as a brake is released: else it falls until the integral has grown
+    # the integral starts at the gravity torque, as after a brake's release; from zero the arm would fall at first
     integral = dynamics.nonlinear_effects(*np.split(state, 2))
-    previous = seen = _seen(state[:n], tracking)
+    previous = encoders = quantized(state[:n], tracking)
     states, torques = [], []
     within = np.arange(samples + 1) / settings.simulation.sample_rate
     for k, (q, qd, qdd) in enumerate(zip(path.q, path.qd, path.qdd, strict=True)):
-        previous, seen = seen, _seen(state[:n], tracking)
-        error, lag = q - seen, qd - (seen - previous) / tick
+        previous, encoders = encoders, quantized(state[:n], tracking)
+        error, velocity_error = q - encoders, qd - (encoders - previous) / tick
         integral = integral + tick * gains.integral * error
-        effort = gains.proportional * error + gains.derivative * lag + integral
+        effort = gains.proportional * error + gains.derivative * velocity_error + integral
         if tracking.control == "computed-torque":
-            effort = computed_torque(dynamics, friction, (seen, qd, qdd), error, lag, omega)
+            effort = computed_torque(dynamics, friction, (encoders, qd, qdd), error, velocity_error, omega)
         torques.append(to_motors @ effort)
         torque = np.tile(inputs @ torques[-1], (samples + 1, 1))
         passed = rollout(dynamics, state, k * tick + within, torque, TUNING.seen_loosening)
@@ -154,23 +175,23 @@ def record(
         state = passed[-1]
     true = np.concatenate(states)
     t = np.arange(len(true)) / settings.simulation.sample_rate
-    return Recording(t, true, _seen(true[:, :n], tracking), np.repeat(torques, samples, axis=0))
+    return Recording(t, true, quantized(true[:, :n], tracking), np.repeat(torques, samples, axis=0))
 
 
 def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Trajectory:
-    """Return what is logged of a motion: filtered positions, their differences, and the torques."""
+    """Return the log of a recording: low-pass filtered positions, their central differences, and torques."""
     sample_rate = 1.0 / (recording.t[1] - recording.t[0])
     q = low_pass_regular(recording.encoders, sample_rate, tracking.cutoff)
     return Trajectory(recording.t, q, np.gradient(q, recording.t, axis=0), recording.tau, name)
 
 
-def _seen(q: np.ndarray, tracking: TrackingSettings) -> np.ndarray:
-    """Return the nearest whole steps of the encoders."""
+def quantized(q: np.ndarray, tracking: TrackingSettings) -> np.ndarray:
+    """Return positions q (T, n) or (n,) rounded to steps of the encoders."""
     return np.round(q / tracking.resolution) * tracking.resolution
 
 
 def _samples_of_a_tick(settings: Settings) -> int:
-    """Return how many samples the controller holds a torque."""
+    """Return the number of samples per tick of the controller; SettingsError if it is not an integer."""
     sample_rate, control_rate = settings.simulation.sample_rate, settings.tracking.control_rate
     count = round(sample_rate / control_rate)
     if count < 1 or abs(count * control_rate - sample_rate) > 1e-9 * sample_rate:

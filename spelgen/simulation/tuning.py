@@ -41,4 +41,35 @@ class ServoSimulationTuning:
     highest_frequency: float = 1.2
 
 
-TUNING, SERVOS = SimulationTuning(), ServoSimulationTuning()
+@dataclass(frozen=True)
+class AsBuiltTuning:
+    """How far an arm as built differs from its URDF; pairs are the bounds of uniform distributions."""
+
+    # Relative standard deviation of masses, inertias and, by the radius of gyration, centres of mass.
+    inertial_error: float = 0.3
+    # Coulomb friction, relative to the rigid-body torque of moderate motion, and its asymmetry between directions.
+    coulomb: tuple[float, float] = (0.04, 0.12)
+    asymmetry: float = 0.1
+    # Viscous friction at moderate speed, relative to Coulomb friction.
+    viscous: tuple[float, float] = (0.3, 1.0)
+    # Armature, relative to the mean diagonal entry of M.
+    armature: tuple[float, float] = (0.02, 0.2)
+    # Moderate motion: angular frequency [rad/s] that turns a speed into an acceleration.
+    acceleration: float = 2.0
+    # Random positions, and the fraction of the joint ranges they cover, from which magnitudes are computed.
+    positions: int = 50
+    range_fraction: float = 0.7
+    # Presliding of gears [rad]: largest breakaway displacement, ratio of largest to smallest, number of elements.
+    presliding: float = 0.03
+    presliding_span: float = 150.0
+    elements: int = 5
+    # White noise of the torque sensors, relative to the standard deviation of the torque.
+    torque_noise: float = 0.02
+    # Encoders of 19 bits [rad; m].
+    resolution: float = 1.2e-5
+    # Recordings [s], [Hz].
+    duration: float = 15.0
+    sample_rate: float = 200.0
+
+
+TUNING, SERVOS, AS_BUILT = SimulationTuning(), ServoSimulationTuning(), AsBuiltTuning()

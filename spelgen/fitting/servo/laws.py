@@ -24,7 +24,7 @@ TUNING, SOLVER = ServoLawTuning(), ServoSolverTuning()
 
 def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
     """Return parameters with the dead zones that the joints turn out to have, which are fitted from then on."""
-    problem.weigh(problem.residuals(x))
+    problem.weigh(problem.residual(x))
     plain, plain_costs = _joint_minima(problem, x)
     zoned, zoned_costs = _joint_minima(problem, divided(problem, x, TUNING.dead_zone_fraction))
     better = zoned_costs + TUNING.significance**2 / 2 < plain_costs  # never where a rollout left all bounds
@@ -46,9 +46,9 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
 
     Each joint has a damping of its own: one for all would follow the joint that is worst off, and others end early.
     """
-    errors = problem.residuals(x)
+    errors = problem.residual(x)
     costs = problem.joint_costs(x, errors)
-    damping, active = torch.full_like(costs, DAMPING.first), torch.ones_like(costs).bool()
+    damping, active = torch.full_like(costs, DAMPING.initial), torch.ones_like(costs).bool()
     p, n = x.joints.shape
     for _ in range(TUNING.steps):
         normal = problem.normal_equations(x, errors)
@@ -56,7 +56,7 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
         joints = NormalEquations(blocks.permute(2, 0, 1), normal.descent[: p * n].view(p, n).mT)
         steps = joints.step(damping).clamp(-LONGEST_STEP, LONGEST_STEP)
         moved = replace(x, joints=x.joints + steps.mT * x.active)
-        moved_errors = problem.residuals(moved)
+        moved_errors = problem.residual(moved)
         moved_costs = problem.joint_costs(moved, moved_errors)
         better = active & (moved_costs < costs)
         active &= torch.where(better, costs - moved_costs >= SOLVER.gain, damping < 1.0)

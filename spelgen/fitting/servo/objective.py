@@ -11,6 +11,7 @@ import copy
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
@@ -20,7 +21,7 @@ from spelgen.dynamics.bristles import encoder_step
 from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import digest
 from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
-from spelgen.fitting.levenberg_marquardt import levenberg_marquardt, start
+from spelgen.fitting.levenberg_marquardt import SolverState, initial_state, levenberg_marquardt
 from spelgen.fitting.objective import FitRequest, Objective, PreparedLogs, Status
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.laws import select_dead_zones, without_faint
@@ -99,19 +100,20 @@ class ServoObjective(Objective):
         problem = self._problem
         while True:
             number = len(self._rounds)
-            x, damping = self._rounds[-1], DAMPING.first
+            show = partial(_show_progress, progress, number)
+            x, damping = self._rounds[-1], DAMPING.initial
             if number > 1:  # near the minimum from where the round before ended
                 damping = TUNING.later_damping
-            for state in levenberg_marquardt(
+            result = levenberg_marquardt(
                 problem,
-                start(problem, x, damping, self._steps),
+                initial_state(problem, x, damping, self._steps),
                 max_steps=TUNING.steps if number < ROUNDS else TUNING.last_steps,
-                least_gain=TUNING.gain,
-                relative_gain=TUNING.relative_gain,
-            ):
-                rms = float(state.residuals.square().mean().sqrt())
-                progress.round(number, ROUNDS, state.steps, rms)
-            x, self._steps = state.x, state.steps
+                min_decrease=TUNING.gain,
+                min_relative_decrease=TUNING.relative_gain,
+                callback=show,
+            )
+            show(result.state)
+            x, self._steps = result.state.x, result.state.steps
             if number == ROUNDS:
                 break
             # dead zones are chosen when gains are right: before, errors are those of the gains
@@ -152,7 +154,7 @@ class ServoObjective(Objective):
             problem.windows = replace(problem.windows, steps=self._windows.steps)
         if self._rounds:
             problem.linearise(x, problem.predicted_path(x))
-        errors = problem.residuals(x)
+        errors = problem.residual(x)
         problem.weigh(errors)
         problem.write(x)  # for the checkpoint: an interrupted fit is usable
         self._rounds.append(x)
@@ -174,3 +176,8 @@ class ServoObjective(Objective):
                 "steps": self._first_steps,
             },
         }
+
+
+def _show_progress(progress: TrainingProgress, number: int, state: SolverState[ServoParameters]) -> None:
+    rms = float(state.residual.square().mean().sqrt())
+    progress.round(number, ROUNDS, state.steps, rms)

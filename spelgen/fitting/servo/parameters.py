@@ -13,7 +13,7 @@ from torch.autograd.functional import jacobian
 
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.parameters import parameters_of_kind
-from spelgen.fitting.functional_model import under_weights
+from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.servo.tuning import ServoPriorTuning
 
 if TYPE_CHECKING:
@@ -134,5 +134,5 @@ def body_directions(model: ArmModel, q: torch.Tensor) -> torch.Tensor:
 def inertial_parameters(model: ArmModel, raw: torch.Tensor) -> torch.Tensor:
     """Return the ten parameters of all bodies, (B, 10), made of trained ones (B, 10)."""
     (name,) = parameters_of_kind(model, "bodies")
-    parameters: torch.Tensor = under_weights(model, {name: raw}, lambda x: x.inertial_parameters)
+    parameters: torch.Tensor = evaluate_with(model, {name: raw}, lambda x: x.inertial_parameters)
     return parameters

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from spelgen.dynamics.servo_rollout import Load, ServoDrives, advanced, balanced, servo_drives
-from spelgen.fitting.functional_model import under_weights
+from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo.parameters import (
     ParameterRows,
@@ -71,7 +71,7 @@ class Likelihood:
 
 
 class ServoProblem:
-    """A `LeastSquares` problem of `ServoParameters`: windows, a model, and the errors that it makes on them.
+    """A `LeastSquaresProblem` of `ServoParameters`: windows, a model, and the errors that it makes on them.
 
     nudge: of finite differences.
     """
@@ -106,7 +106,7 @@ class ServoProblem:
             body_parameters(self.model).copy_(self._bodies_at(x.bodies))
             self.model.servo.delay.fill_(x.delay)
 
-    def residuals(self, x: ServoParameters) -> torch.Tensor:
+    def residual(self, x: ServoParameters) -> torch.Tensor:
         """Return predicted less measured positions (W, K', n), all samples after the windows' settling."""
         return self._errors(self._rollout_at(x)[0])[0]
 
@@ -129,7 +129,7 @@ class ServoProblem:
     def _prior(self, x: ServoParameters) -> torch.Tensor:
         return self.rows.precision(x) * (x.flat - self.start.flat).square() / 2
 
-    def moved(self, x: ServoParameters, step: torch.Tensor) -> Iterable[ServoParameters]:
+    def candidates(self, x: ServoParameters, step: torch.Tensor) -> Iterable[ServoParameters]:
         """Return where a step (k,) leads."""
         return [x.moved(step.clamp(-LONGEST_STEP, LONGEST_STEP))]
 
@@ -195,7 +195,7 @@ class ServoProblem:
         named = self.rows.named(joints)
         tensors = {name: tensor.detach() for name, tensor in named.items()}
         with torch.inference_mode():  # small operations, of which each takes a tenth less so
-            drives, armature = under_weights(self.model, tensors, _drives)
+            drives, armature = evaluate_with(self.model, tensors, _drives)
             change = torch.einsum("wkni,pi->pwkn", self.load.slopes, self._changed(bodies))
             return self._integrate(drives, armature, change, commands)
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import torch
 from scipy.special import stdtrit
 
-from spelgen.fitting.functional_model import under_weights
+from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.laws import sliding_friction
@@ -77,7 +77,7 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     there; what the step changes is added to the covariance. Parameters stay at x where the step raises the cost.
     """
     # a dead zone that a joint does not have makes its dry friction no better known
-    free, errors = replace(x, active=torch.ones_like(x.active)), problem.residuals(x)
+    free, errors = replace(x, active=torch.ones_like(x.active)), problem.residual(x)
     windows = problem.window_equations(free, errors)
     windows = by_stretch(windows, problem.windows.stretches(TUNING.logs, TUNING.stretches))
     precision = problem.rows.precision(free)
@@ -86,7 +86,7 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     windows = windows._replace(descent=windows.descent - windows.curvature @ step)
     end = x.moved(step)
     # where joints just slip, errors are far from linear in the parameters
-    if problem.cost(end, problem.residuals(end)) > problem.cost(x, errors):
+    if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
     return end, ServoSolution(windows, precision, covariance(windows, precision, step))
 
@@ -147,7 +147,7 @@ def ratios_with_deviations(
     """Return the ratios to kp, and the standard deviations of their logarithms, each (n,)."""
     tensors = {name: x.detach().clone().requires_grad_() for name, x in problem.rows.tensors.items()}
     qd, gravity = problem.along.qd, problem.load.gravity
-    values = under_weights(problem.model, tensors, lambda model: ratios(model, qd, gravity))
+    values = evaluate_with(problem.model, tensors, lambda model: ratios(model, qd, gravity))
     p, n = problem.start.joints.shape
     blocks = solution.covariance[: p * n, : p * n].view(p, n, p, n).diagonal(dim1=1, dim2=3)  # (p, p, n)
     result = {}
@@ -169,7 +169,7 @@ def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParamet
     """
     return {
         "delay": {"value": x.delay, "half": solution.quantile * float(solution.covariance[-1, -1].sqrt())},
-        "rms": problem.residuals(x).square().mean(dim=(0, 1)).sqrt().tolist(),
+        "rms": problem.residual(x).square().mean(dim=(0, 1)).sqrt().tolist(),
         "steps": steps,
         "joints": _joint_records(problem, solution),
     }

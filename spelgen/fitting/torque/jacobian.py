@@ -1,9 +1,8 @@
-"""The torque that rigid bodies miss on samples, and its normal equations by all weights, block by block."""
+"""Torque residual of rigid bodies, drives and friction on samples, with its Jacobian and normal equations."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,347 +12,290 @@ from torch.autograd import grad as gradient
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.residuals import friction_factor, residual_torque
-from spelgen.fitting.functional_model import Weights, under_weights
-from spelgen.fitting.torque.samples import Block, TorqueSamples
-from spelgen.fitting.torque.tuning import TorqueTuning
-from spelgen.fitting.torque.weights import RigidWeights, joint_torque, moved_bodies
+from spelgen.fitting.functional_model import NamedTensors, evaluate_with
+from spelgen.fitting.torque import linearization
+from spelgen.fitting.torque.linearization import (
+    NO_TERMS,
+    JointRows,
+    LinearTerms,
+    RigidProjection,
+    concatenate_blocks,
+)
+from spelgen.fitting.torque.parameters import RigidParameters, joint_torque, step_in_inertial_parameters
+from spelgen.fitting.torque.samples import SampleBlock, TorqueSamples
+from spelgen.fitting.torque.tuning import TUNING
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
 
-TUNING = TorqueTuning()
-NO_FUNCTIONS: Mapping[int, FollowingFunctions] = {}
-LOGARITHMS = ("armature", "sizes", "effects", "load_dependence")
+LOGARITHMIC_GROUPS = ("armature", "sizes", "effects", "load_dependence")
 
 
-class _Samples(NamedTuple):
-    """Samples (T, n) with the drives' motion, and the regressors (T, n, 10 B) of torque and of the gravity torque that
-    the drives bear. residual: (T, n) torque of what stands beside rigid bodies. factor: (T, n) on friction.
+class _RegressorBlock(NamedTuple):
+    """T samples with all factors of the torque that do not depend on the parameters.
+
+    speed, acceleration: (T, n) of the drives. regressor: (T, n, 10 B) of the torque; load_regressor: likewise of the
+    gravity torque on the drives. residual_torque: (T, n) of the residual terms. friction_factor: (T, n), theirs.
     """
 
-    measured: Block
+    samples: SampleBlock
     speed: torch.Tensor
     acceleration: torch.Tensor
     regressor: torch.Tensor
     load_regressor: torch.Tensor
-    residual: torch.Tensor
-    factor: torch.Tensor
+    residual_torque: torch.Tensor
+    friction_factor: torch.Tensor
 
 
 class ResidualSamples(NamedTuple):
-    """Samples (T, n) with the torque that is missing, and friction's at the drives."""
+    """T samples with the torque residual of the model and the friction torque of its drives, all (T, n)."""
 
     q: torch.Tensor
     qd: torch.Tensor
     qdd: torch.Tensor
-    missing: torch.Tensor
+    torque_residual: torch.Tensor
     friction: torch.Tensor
 
 
-class Slope(NamedTuple):
-    """How a joint's torque follows the columns (C,) of weights that move it: J (T, C); and what is missing (T,)."""
-
-    joint: int
-    columns: torch.Tensor
-    slope: torch.Tensor
-    missing: torch.Tensor
-
-
-@dataclass(frozen=True, eq=False)
-class FollowingFunctions:
-    """Functions of a joint's position, of which weights follow whatever else explains its torque: variable projection
-    (Golub and Pereyra, SIAM J. Numer. Anal. 10:413, 1973).
-
-    features: (T, P). penalty: (P,) of a weight's square, in squares of the torque.
-    """
-
-    features: torch.Tensor
-    penalty: torch.Tensor
-
-    @cached_property
-    def gains(self) -> torch.Tensor:
-        """Return the weights by the torque of each sample (P, T)."""
-        curvature = self.features.mT @ self.features + self.penalty.diag()
-        gains: torch.Tensor = torch.linalg.solve(curvature, self.features.mT)
-        return gains
-
-    def weights(self, torque: torch.Tensor) -> torch.Tensor:
-        """Return the weights (P, ...) that explain most of a torque (T, ...) at the least penalty."""
-        return self.gains @ torque
-
-    def left(self, torque: torch.Tensor) -> torch.Tensor:
-        """Return (T + P, ...) what they leave of a torque (T, ...), then roots of the penalties."""
-        weights = self.weights(torque)
-        return torch.cat([torque - self.features @ weights, self.penalty.sqrt().diag() @ weights])
-
-
-class RigidResponse(NamedTuple):
-    """How bodies, drives and friction laws follow a torque on each joint.
-
-    slopes: J (T, C), see `TorqueJacobian.slopes`. gains: what a fit of these makes of J^T torque (C, C).
-    """
-
-    slopes: tuple[torch.Tensor, ...]
-    gains: tuple[torch.Tensor, ...]
-
-    def remaining(self, joint: int, torque: torch.Tensor) -> torch.Tensor:
-        """Return what of torques (T, P) on a joint is left when these weights have taken over what they can."""
-        slope = self.slopes[joint]
-        return torque - slope @ (self.gains[joint] @ (slope.mT @ torque))
-
-
 class TorqueJacobian:
-    """Of a model of rigid bodies on ``samples``; x is all their weights (K,), flattened one after the other.
+    """Torque residual of a model on samples, and its derivatives with respect to all rigid parameters x (K,).
 
-    Residuals beside bodies are taken as they are when this is made, but for functions of joints that follow.
+    The torque is Y(q, qd, qdd) theta + C^T (friction + armature a), with the inertial parameters theta of B bodies, the
+    speeds C qd of the drives and their accelerations a. The residual terms of the model are constant, those of the
+    moment when this object is created; `terms` are eliminated by variable projection in addition.
     """
 
     def __init__(
-        self,
-        model: ArmModel,
-        samples: TorqueSamples,
-        functions: Mapping[int, FollowingFunctions] = NO_FUNCTIONS,
+        self, model: ArmModel, samples: TorqueSamples, terms: Mapping[int, LinearTerms] = NO_TERMS
     ) -> None:
-        self.model: Any = model
-        self.functions = functions
-        self.samples = samples
-        self.rigid = RigidWeights(model)
+        self.model, self.samples, self.terms = model, samples, terms
+        self.rigid = RigidParameters(model)
         self._of_bodies = self.rigid.mask("bodies")
         self._motors = motors_of(model)
-        self._drives = self._motors != 0  # (n, n): whether a drive moves a joint
-        self._moves = self._moved_joints()
-        self._colours = _colours(self._drives.double().mT @ self._drives.double() > 0)
+        self._affects = self._motors != 0  # (n, n): whether a drive affects a joint's torque
+        self._affected = self._affected_joints()
+        self._colours = _colour(self._affects.double().mT @ self._affects.double() > 0)
         self._blocks = [self._with_regressors(block) for block in samples.blocks(TUNING.block)]
 
-    def squares(self, x: torch.Tensor) -> torch.Tensor:
-        """Return sums of squares (n,) of the missing torque [Nm^2, N^2], as logged where gains are trained."""
-        weights = self.rigid.named(x)
+    @cached_property
+    def torque_std(self) -> torch.Tensor:
+        """Standard deviation of the measured joint torque, (n,) [Nm, N]."""
+        return joint_torque(self.model, self.samples.columns).std(dim=0)
+
+    def squared_residual(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the sum of the squared torque residual per joint, (n,) [Nm^2, N^2].
+
+        If motor gains are trained, the residual is the one of the logged torque: joint torques are proportional to the
+        gains, so their residual would be smallest for gains of zero.
+        """
+        parameters = self.rigid.unflatten(x)
         with torch.no_grad():
-            blocks = [self._missing(weights, block)[0] for block in self._blocks]
-        missing = torch.cat(blocks) * self.per_gain(x)
-        squares = missing.square().sum(dim=0)
-        for joint, functions in self.functions.items():
-            squares[joint] = functions.left(missing[:, joint]).square().sum()
-        return squares
+            blocks = [self._torque_residual(parameters, block)[0] for block in self._blocks]
+        residual = torch.cat(blocks) * self.logged_scale(x)
+        squared_residual = residual.square().sum(dim=0)
+        for joint, terms in self.terms.items():
+            squared_residual[joint] = terms.residual(residual[:, joint]).square().sum()
+        return squared_residual
 
-    def per_gain(self, x: torch.Tensor) -> torch.Tensor:
-        """Return what of a joint torque is logged (n,), relative to the start: 1, but where gains are trained."""
-        return self._per_gain(self.rigid.named(x)).detach()
+    def logged_scale(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the logged torque per joint torque (n,), relative to the initial gains: 1 unless gains are trained."""
+        return self._logged_scale(self.rigid.unflatten(x)).detach()
 
-    def _per_gain(self, weights: Weights) -> torch.Tensor:
+    def _logged_scale(self, parameters: NamedTensors) -> torch.Tensor:
+        """Return `logged_scale`, (..., n), differentiable; parameters: one set, or (...) sets."""
         ones = torch.ones(self.model.n).double()
-        for name in self.rigid.of_kind("gains"):  # logarithms of gains between logged and joint torques
-            change = weights[name] - self.rigid.start[name]
+        for name in self.rigid.names("gains"):  # logarithms of joint torque per logged torque
+            change = parameters[name] - self.rigid.initial[name]
             return ones.expand(*change.shape[:-1], -1).index_copy(-1, self.model.gain_rows, (-change).exp())
         return ones
 
     def normal_equations(self, x: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return J^T J (K, K) and J^T r (K,) of the missing torque r, in units of ``noise`` (n,)."""
-        slopes: Iterable[Slope] = self.slopes(x)
-        if self.functions:
-            slopes = self._left_by_functions(slopes)
-        curvature, descent = _normal_equations(slopes, noise, len(x))
-        along = self._along(x)
-        return along.mT @ curvature @ along, along.mT @ descent
+        """Return J^T W J (K, K) and J^T W r (K,) of the torque residual r, with W = 1 / noise^2, noise (n,)."""
+        rows: Iterable[JointRows] = self.joint_rows(x)
+        if self.terms:
+            rows = self._projected(rows)
+        curvature, descent = linearization.normal_equations(rows, noise, len(x))
+        change = self._theta_jacobian(x)
+        return change.mT @ curvature @ change, change.mT @ descent
 
-    def least_squares(
-        self, slopes: Sequence[Slope], noise: torch.Tensor, free: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return sums of squares (n,) that least squares by the free weights (K,) leave, and how many weights each
-        torque determines (n,); torques are linear, with these `slopes`.
+    def joint_rows(self, x: torch.Tensor) -> Iterator[JointRows]:
+        """Yield the Jacobian of each joint and block with respect to theta (K,), at x (K,).
+
+        theta is x with the inertial parameters in place of their log-Cholesky parameters: there the Jacobian is the
+        regressor, without a derivative to compute. `_theta_jacobian` is d theta / d x.
         """
-        curvature, descent = _normal_equations(slopes, noise, len(free))
-        inverse = torch.zeros_like(curvature)
-        inverse[free[:, None] & free] = _pseudo_inverse(curvature[free][:, free]).flatten()
-        step = inverse @ descent
-        squares, weights = torch.zeros(2, len(noise)).double()
-        for joint, columns, slope, missing in slopes:
-            squares[joint] += (missing - slope @ step[columns]).square().sum()
-            weights[joint] += ((slope @ inverse[columns[:, None], columns]) * slope).sum() / noise[joint] ** 2
-        return squares, weights
-
-    def slopes(self, x: torch.Tensor) -> Iterator[Slope]:
-        """Yield J of each joint, block by block: by the bodies' parameters in place of their weights, see `_along`."""
-        weights, per_gain = self.rigid.named(x), self.per_gain(x)
-        of_bodies, of_joints = self._of_bodies.nonzero()[:, 0], (~self._of_bodies).nonzero()[:, 0]
+        parameters, scale = self.rigid.unflatten(x), self.logged_scale(x)
+        body_columns = self._of_bodies.nonzero()[:, 0]
+        other_columns = (~self._of_bodies).nonzero()[:, 0]
         for block in self._blocks:
-            missing, by_weights, by_load = self._joint_slope(weights, block)
+            residual, parameter_columns, load_columns = self._compressed_jacobian(parameters, block)
             for joint, colour in enumerate(self._colours):
-                # of the weights of joints, few move this one's torque: the others' columns are zero
-                moving, drives = self._moves[:, joint], self._drives[:, joint]
-                loads = by_load[colour][:, drives].unsqueeze(-1) * block.load_regressor[:, drives]
-                bodies = per_gain[joint] * block.regressor[:, joint] + loads.sum(dim=1)
-                slope = torch.cat([bodies, by_weights[colour][:, moving]], dim=1)
-                yield Slope(joint, torch.cat([of_bodies, of_joints[moving]]), slope, missing[:, joint])
+                # decompression: the columns of this joint are the ones of the parameters that affect its torque
+                affecting, drives = self._affected[:, joint], self._affects[:, joint]
+                loads = load_columns[colour][:, drives].unsqueeze(-1) * block.load_regressor[:, drives]
+                bodies = scale[joint] * block.regressor[:, joint] + loads.sum(dim=1)
+                jacobian = torch.cat([bodies, parameter_columns[colour][:, affecting]], dim=1)
+                columns = torch.cat([body_columns, other_columns[affecting]])
+                yield JointRows(joint, columns, jacobian, residual[:, joint])
 
-    def _left_by_functions(self, slopes: Iterable[Slope]) -> Iterator[Slope]:
-        """Yield of each joint what its functions leave, of all samples."""
-        for slope in _by_joint(slopes, self.model.n):
-            functions = self.functions.get(slope.joint)
-            if functions is None:
-                yield slope
+    def _projected(self, rows: Iterable[JointRows]) -> Iterator[JointRows]:
+        """Yield the rows of each joint after variable projection of its terms, over all blocks."""
+        for of_joint in concatenate_blocks(rows, self.model.n):
+            terms = self.terms.get(of_joint.joint)
+            if terms is None:
+                yield of_joint
             else:
-                yield slope._replace(slope=functions.left(slope.slope), missing=functions.left(slope.missing))
+                jacobian, residual = terms.residual(of_joint.jacobian), terms.residual(of_joint.residual)
+                yield of_joint._replace(jacobian=jacobian, residual=residual)
 
-    def _along(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the derivative (K, K) of what torques are linear in by the weights: each body's are its own."""
-        weights = self.rigid.named(x)
-        # ten times the weights: one for the derivative of each parameter
-        bodies = weights[self.rigid.bodies].expand(10, -1, -1).detach().requires_grad_()
+    def _theta_jacobian(self, x: torch.Tensor) -> torch.Tensor:
+        """Return d theta / d x, (K, K): block diagonal over bodies, identity for all other parameters."""
+        parameters = self.rigid.unflatten(x)
+        # ten copies of the bodies' parameters, so that one reverse pass has the gradients of all ten entries of theta:
+        # copy k receives the gradient of the k-th entry
+        copies = parameters[self.rigid.bodies].expand(10, -1, -1).detach().requires_grad_()
         with torch.enable_grad():
-            parameters = self._inertial_parameters({**weights, self.rigid.bodies: bodies})
-        (slopes,) = gradient(parameters.diagonal(dim1=0, dim2=2).sum(), bodies)
-        along = torch.eye(len(x)).double()
-        along[self._of_bodies[:, None] & self._of_bodies] = torch.block_diag(
-            *slopes.transpose(0, 1)
-        ).flatten()
-        return along
+            theta = self._inertial_parameters({**parameters, self.rigid.bodies: copies})
+        (gradients,) = gradient(theta.diagonal(dim1=0, dim2=2).sum(), copies)
+        change = torch.eye(len(x)).double()
+        of_bodies = self._of_bodies[:, None] & self._of_bodies
+        change[of_bodies] = torch.block_diag(*gradients.transpose(0, 1)).flatten()
+        return change
 
     def residual_samples(self, x: torch.Tensor) -> ResidualSamples:
-        """Return what these weights leave of the torque, of all samples."""
-        weights, blocks = self.rigid.named(x), []
+        """Return all samples with the torque residual and the friction torque at x (K,)."""
+        parameters, blocks = self.rigid.unflatten(x), []
         with torch.no_grad():
             for block in self._blocks:
-                motion = block.measured[:3]
-                blocks.append(ResidualSamples(*motion, *self._missing(weights, block)))
+                motion = block.samples[:3]
+                blocks.append(ResidualSamples(*motion, *self._torque_residual(parameters, block)))
         return ResidualSamples(*(torch.cat(column) for column in zip(*blocks, strict=True)))
 
-    def response(self, x: torch.Tensor, noise: torch.Tensor, covariance: torch.Tensor) -> RigidResponse:
-        """Return how the weights follow, that have this covariance (K, K) after a fit under this noise (n,)."""
-        along = self._along(x)
-        covariance = along @ covariance @ along.mT
-        slopes = _by_joint(self.slopes(x), len(noise))
-        gains = []
-        for joint, columns, _, _ in slopes:
-            gains.append(covariance[columns[:, None], columns] / noise[joint] ** 2)
-        return RigidResponse(tuple(of_joint.slope for of_joint in slopes), tuple(gains))
+    def rigid_projection(
+        self, x: torch.Tensor, noise: torch.Tensor, covariance: torch.Tensor
+    ) -> RigidProjection:
+        """Return the projection of joint torques onto the rigid-body and friction model.
 
-    def torque_deviation(self) -> torch.Tensor:
-        """Return standard deviations (n,) of the measured torque, as the joints feel it."""
-        return joint_torque(self.model, self.samples.columns).std(dim=0)
-
-    def moved(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Return the weights (K,) after a step, which goes straight where torques do: in the bodies' inertial
-        parameters, and in what grows of the quantities whose logarithms are weights.
+        Args:
+            x: (K,) parameters, at which the torque is linearized.
+            noise: (n,) standard deviations [Nm, N].
+            covariance: (K, K) posterior covariance of x.
         """
-        change, bodies = self.rigid.named(step), self.rigid.bodies
-        weights = self.rigid.named(x + step)
-        for name in self.rigid.of_kind(*LOGARITHMS):
-            weights[name] = (
-                weights[name] - change[name] + torch.minimum(change[name], change[name].clamp(min=0).log1p())
-            )
-        moved = moved_bodies(self.rigid.named(x)[bodies], change[bodies])
-        # bodies that stay keep their last digit, too
-        weights[bodies] = torch.where(change[bodies].any(dim=-1, keepdim=True), moved, weights[bodies])
-        return self.rigid.flattened(weights)
+        change = self._theta_jacobian(x)
+        covariance = change @ covariance @ change.mT
+        rows = concatenate_blocks(self.joint_rows(x), len(noise))
+        gains = []
+        for joint, columns, _, _ in rows:
+            gains.append(covariance[columns[:, None], columns] / noise[joint] ** 2)
+        return RigidProjection(tuple(of_joint.jacobian for of_joint in rows), tuple(gains))
 
-    def _with_regressors(self, block: Block) -> _Samples:
+    def curved_step(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+        """Return parameters (K,) after a step (K,) that is straight where the torque is linear.
+
+        Bodies are moved straight in their inertial parameters (see `step_in_inertial_parameters`). Coefficients c whose
+        logarithms are parameters are moved straight in c if they increase, log c + log(1 + step); a decrease stays
+        straight in log c, for c must remain positive.
+        """
+        change, bodies = self.rigid.unflatten(step), self.rigid.bodies
+        parameters = self.rigid.unflatten(x + step)
+        for name in self.rigid.names(*LOGARITHMIC_GROUPS):
+            parameters[name] = (
+                parameters[name]
+                - change[name]
+                + torch.minimum(change[name], change[name].clamp(min=0).log1p())
+            )
+        moved = step_in_inertial_parameters(self.rigid.unflatten(x)[bodies], change[bodies])
+        # a body without a step keeps its parameters to the last digit
+        changed = change[bodies].any(dim=-1, keepdim=True)
+        parameters[bodies] = torch.where(changed, moved, parameters[bodies])
+        return self.rigid.flatten(parameters)
+
+    def _with_regressors(self, block: SampleBlock) -> _RegressorBlock:
         model, q, qd, qdd = self.model, block.q, block.qd, block.qdd
-        still = torch.zeros_like(q)
+        zero = torch.zeros_like(q)
         with torch.no_grad():
-            gravity_regressor = regressor_of(model.chain, q, still, still)
-            return _Samples(
-                measured=block,
+            gravity_regressor = regressor_of(model.chain, q, zero, zero)
+            return _RegressorBlock(
+                samples=block,
                 speed=qd @ self._motors.mT,
                 acceleration=qdd @ self._motors.mT,
                 regressor=regressor_of(model.chain, q, qd, qdd),
                 load_regressor=torch.einsum("jm,tjk->tmk", torch.linalg.inv(self._motors), gravity_regressor),
-                residual=residual_torque(model, q, qd, qdd),
-                factor=friction_factor(model, q),
+                residual_torque=residual_torque(model, q, qd, qdd),
+                friction_factor=friction_factor(model, q),
             )
 
-    def _moved_joints(self) -> torch.Tensor:
-        """Return which joints' torques each weight moves (K', n), of all weights but those of bodies."""
-        moves = []
-        for name, weight in self.rigid.start.items():
+    def _affected_joints(self) -> torch.Tensor:
+        """Return a mask (K', n) of the joints whose torque depends on each of the K' parameters except the bodies'."""
+        masks = []
+        for name, tensor in self.rigid.initial.items():
             if name == self.rigid.bodies:
                 continue
-            rows = self._drives
-            if self.rigid.kinds[name] == "gains":
+            rows = self._affects
+            if self.rigid.groups[name] == "gains":
                 rows = rows[self.model.gain_rows]
-            moves.append(rows.repeat_interleave(weight[0].numel(), dim=0))
-        return torch.cat(moves)
+            masks.append(rows.repeat_interleave(tensor[0].numel(), dim=0))
+        return torch.cat(masks)
 
-    def _inertial_parameters(self, weights: Weights) -> torch.Tensor:
-        """Return the ten parameters of all bodies (B, 10)."""
-        parameters: torch.Tensor = under_weights(self.model, weights, lambda model: model.inertial_parameters)
-        return parameters
+    def _inertial_parameters(self, parameters: NamedTensors) -> torch.Tensor:
+        """Return the inertial parameters of all bodies (B, 10)."""
+        theta: torch.Tensor = evaluate_with(self.model, parameters, lambda model: model.inertial_parameters)
+        return theta
 
-    def _missing(
-        self, weights: Weights, samples: _Samples, load: torch.Tensor | None = None
+    def _torque_residual(
+        self, parameters: NamedTensors, block: _RegressorBlock, load: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the torque that the model does not explain, and that of friction at the drives, (T, n).
+        """Return measured minus modelled joint torque, and the friction torque of the drives, both (T, n) [Nm, N].
 
-        load: gravity torque that the drives bear (T, n); None: that of the weights.
+        load: (T, n) gravity torque on the drives; None: of these parameters.
         """
-        measured = samples.measured
+        samples = block.samples
 
         def torques(model: Any) -> tuple[torch.Tensor, torch.Tensor]:
-            constants, parameters = model.friction.prepare(), model.inertial_parameters.flatten()
-            borne = samples.load_regressor @ parameters if load is None else load
-            friction = constants.torque(samples.speed, borne, measured.z, measured.direction)
-            friction = samples.factor * friction
-            of_drives = friction + model.armature * samples.acceleration
-            force = model.input_force(None, measured.qd, measured.tau) - samples.residual
-            return force - samples.regressor @ parameters - of_drives @ self._motors, friction
+            constants, theta = model.friction.prepare(), model.inertial_parameters.flatten()
+            gravity = block.load_regressor @ theta if load is None else load
+            friction = constants.torque(block.speed, gravity, samples.z, samples.direction)
+            friction = block.friction_factor * friction
+            drive_torque = friction + model.armature * block.acceleration
+            force = model.input_force(None, samples.qd, samples.tau) - block.residual_torque
+            return force - block.regressor @ theta - drive_torque @ self._motors, friction
 
-        missing, friction = under_weights(self.model, weights, torques)
-        return missing, friction
+        return evaluate_with(self.model, parameters, torques)
 
-    def _joint_slope(
-        self, weights: Weights, samples: _Samples
+    def _compressed_jacobian(
+        self, parameters: NamedTensors, block: _RegressorBlock
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
-        """Return the missing torque as logged (T, n), and minus its derivatives, for each colour of joints the sum of
-        theirs: (T, K) by the K weights that are not of bodies, and (T, n) by the load on each drive.
+        """Return the residual of the logged torque (T, n), and minus its Jacobian, compressed over joints.
 
-        With weights of their own all samples have their slopes in one reverse pass: a weight moves a joint of a colour.
-        The gradients are those of sums: of several outputs they would load torch's symbolic shapes, half a second.
+        Graph colouring (Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974): joints that share no drive have
+        one colour, so that each parameter affects at most one joint of a colour. The gradient of the sum of their
+        torques then has the rows of all of them, and there are as many reverse passes as colours, mostly one, instead
+        of n. Each sample has its own copy of the parameters: one pass has the gradients of all samples.
+
+        The second result has (T, K') per colour, with respect to the K' parameters except the bodies'; the third has
+        (T, n), with respect to the load on each drive. A gradient of several outputs at once (`is_grads_batched`)
+        would import torch's symbolic shapes, half a second.
         """
-        repeated = {}
-        for name, weight in weights.items():
+        copies = {}
+        for name, tensor in parameters.items():
             if name != self.rigid.bodies:
-                repeated[name] = weight.expand(len(samples.speed), *weight.shape).detach().requires_grad_()
-        parameters = self._inertial_parameters(weights).flatten()
-        load = (samples.load_regressor @ parameters).detach().requires_grad_()
+                copies[name] = tensor.expand(len(block.speed), *tensor.shape).detach().requires_grad_()
+        theta = self._inertial_parameters(parameters).flatten()
+        load = (block.load_regressor @ theta).detach().requires_grad_()
         with torch.enable_grad():
-            by_sample = {**weights, **repeated}
-            missing = self._missing(by_sample, samples, load)[0] * self._per_gain(by_sample)
-        by_weights, by_load, colours = [], [], torch.tensor(self._colours)
+            per_sample = {**parameters, **copies}
+            residual = self._torque_residual(per_sample, block, load)[0] * self._logged_scale(per_sample)
+        parameter_columns, load_columns, colours = [], [], torch.tensor(self._colours)
         for colour in range(max(self._colours) + 1):
-            total = -missing[:, colours == colour].sum()
-            slopes = gradient(total, [load, *repeated.values()], retain_graph=True, materialize_grads=True)
-            by_load.append(slopes[0])
-            by_weights.append(torch.cat([slope.flatten(1) for slope in slopes[1:]], dim=1))
-        return missing.detach(), by_weights, by_load
+            total = -residual[:, colours == colour].sum()
+            gradients = gradient(total, [load, *copies.values()], retain_graph=True, materialize_grads=True)
+            load_columns.append(gradients[0])
+            parameter_columns.append(torch.cat([x.flatten(1) for x in gradients[1:]], dim=1))
+        return residual.detach(), parameter_columns, load_columns
 
 
-def _by_joint(slopes: Iterable[Slope], joints: int) -> list[Slope]:
-    """Return the slope of each joint, of the samples of all blocks."""
-    blocks: list[list[Slope]] = [[] for _ in range(joints)]
-    for slope in slopes:
-        blocks[slope.joint].append(slope)
-    return [
-        of_joint[0]._replace(
-            slope=torch.cat([block.slope for block in of_joint]),
-            missing=torch.cat([block.missing for block in of_joint]),
-        )
-        for of_joint in blocks
-    ]
-
-
-def _normal_equations(
-    slopes: Iterable[Slope], noise: torch.Tensor, count: int
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return J^T J (K, K) and J^T r (K,) of so many weights, in units of noise (n,)."""
-    curvature, descent = torch.zeros(count, count).double(), torch.zeros(count).double()
-    for joint, columns, slope, missing in slopes:
-        curvature[columns[:, None], columns] += slope.mT @ slope / noise[joint] ** 2
-        descent[columns] += slope.mT @ missing / noise[joint] ** 2
-    return curvature, descent
-
-
-def _colours(coupled: torch.Tensor) -> list[int]:
-    """Return a number for each joint, another one than of all before it that it is coupled with (n, n)."""
+def _colour(coupled: torch.Tensor) -> list[int]:
+    """Return a colour per joint, different for any two joints that are coupled (n, n): greedy, in order."""
     colours: list[int] = []
     for row in coupled.tolist():
         used = {colour for colour, shared in zip(colours, row, strict=False) if shared}
@@ -362,12 +304,3 @@ def _colours(coupled: torch.Tensor) -> list[int]:
             colour += 1
         colours.append(colour)
     return colours
-
-
-def _pseudo_inverse(curvature: torch.Tensor) -> torch.Tensor:
-    """Return the inverse (K, K) of a curvature in the directions that samples show."""
-    length = curvature.diagonal().sqrt()
-    scale = torch.where(length > 0, 1 / length, 0.0)
-    scale = scale * scale[:, None]
-    inverse: torch.Tensor = torch.linalg.pinv(curvature * scale, rtol=TUNING.seen, hermitian=True)
-    return inverse * scale

@@ -1,44 +1,50 @@
-"""Functions of single joints that stand beside rigid bodies: what they are on samples, and their fit.
+"""Residual terms of single joints: torques and friction factors as linear models on samples, and their fit.
 
-They are linear in their weights, which are found with their scale by maximising the marginal likelihood (MacKay,
-Neural Computation 4:415, 1992). Bodies and friction laws were fitted alone, and have taken over what they can of a
-spring. A torque by position is therefore compared as far as they cannot: a partial regression (Frisch and Waugh,
-Econometrica 1:387, 1933).
+Candidates are fitted after the rigid-body and friction model, which absorbs a part of a torque of position such as a
+spring. Such features are therefore compared after orthogonalization against the Jacobian of that model: a partial
+regression (Frisch and Waugh, Econometrica 1:387, 1933).
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 import torch.nn.functional as F
 
 from spelgen.dynamics.protocol import motors_of
-from spelgen.fitting.torque.jacobian import FollowingFunctions, ResidualSamples, RigidResponse
-from spelgen.fitting.torque.tuning import ResidualTuning
-from spelgen.runtime.residual_terms import LARGEST, SPLINES
+from spelgen.fitting.torque.bayesian_ridge import BayesianRidge, append_target, bayesian_ridge
+from spelgen.fitting.torque.jacobian import ResidualSamples
+from spelgen.fitting.torque.linearization import LinearTerms, RigidProjection
+from spelgen.runtime.residual_terms import LARGEST, SPLINES, ResidualTerms
 
-TUNING = ResidualTuning()
+if TYPE_CHECKING:
+    from spelgen.emission.assemble import ArmModel
 
-EVERY = slice(None)
+TermKey = tuple[str, int | None]
+"""Parameter of a residual term, and its joint; None: all joints."""
+
+ALL = slice(None)
 FRICTION = "raw_friction_splines"
-WIDEST = 0.99 * LARGEST  # weights of friction's logarithm: beyond, the model's own are infinite
+LOG_FACTOR_LIMIT = 0.99 * LARGEST  # of friction's log factor: at LARGEST its parameter is infinite
 
 
 @dataclass(frozen=True, eq=False)
 class JointFunction:
-    """A function of one joint.
+    """A residual term of one joint, as a linear model of P = L + W weights on T samples.
 
-    The model's parameter of that name has a row (W,) for it, in units of ``scale``. Weights are those of ``lines``,
-    (W, L), which are sums over the row, and then the row's own: P = L + W.
-    position: (T,) of the joint.
-    columns: (T, P) its torque by these weights.
-    features: (T, P) of torques by position, what bodies and laws cannot take over of that.
-    force: (n,) how its torque acts on the joints.
-    groups: (P,) which weights have a scale in common.
-    friction: (T,) what the function varies, with weights of its logarithm, to which features are the linear answer.
+    The model's parameter has W entries for the joint, in units of `scale`. Of the P weights the first L belong to
+    trends over these entries (a straight line over all splines), the columns of `trends`, the others to the entries.
+
+    position: (T,) of the joint [rad, m].
+    columns: (T, P) torque per weight [Nm, N].
+    features: (T, P), the columns after orthogonalization; the columns themselves if the term is a friction factor.
+    direction: (n,) joint torques per torque of the term.
+    groups: (P,) index of the weights' group, which has one prior precision.
+    friction: (T,) friction torque that the term multiplies; its weights are then the ones of the factor's logarithm,
+        and columns @ weights is its torque to first order. None: the term is a torque.
     """
 
     parameter: str
@@ -47,134 +53,145 @@ class JointFunction:
     position: torch.Tensor
     columns: torch.Tensor
     features: torch.Tensor
-    force: torch.Tensor
-    lines: torch.Tensor
+    direction: torch.Tensor
+    trends: torch.Tensor
     groups: torch.Tensor
     friction: torch.Tensor | None
 
-    def weights(self, functions: Any) -> torch.Tensor:
-        """Return weights (P,) that give the model's."""
+    def read(self, terms: ResidualTerms) -> torch.Tensor:
+        """Return weights (P,) that represent the model's current parameter."""
         if self.friction is not None:
-            row = functions.friction_logarithms()[self.joint]
+            entries = terms.friction_logarithms()[self.joint]
         else:
-            row = functions.get_parameter(self.parameter)[self.joint] * self.scale
-        return F.pad(row.detach(), (self.lines.shape[1], 0))
+            entries = terms.get_parameter(self.parameter)[self.joint] * self.scale
+        return F.pad(entries.detach(), (self.trends.shape[1], 0))
 
-    def write(self, functions: Any, weights: torch.Tensor) -> None:
-        """Make them the model's."""
-        count = self.lines.shape[1]
-        weights = self.lines @ weights[:count] + weights[count:]
+    def write(self, terms: ResidualTerms, weights: torch.Tensor) -> None:
+        """Set the model's parameter to weights (P,)."""
+        count = self.trends.shape[1]
+        entries = self.trends @ weights[:count] + weights[count:]
         if self.friction is not None:
-            weights = LARGEST * (weights.clamp(-WIDEST, WIDEST) / LARGEST).atanh()
+            entries = LARGEST * (entries.clamp(-LOG_FACTOR_LIMIT, LOG_FACTOR_LIMIT) / LARGEST).atanh()
         with torch.no_grad():
-            functions.get_parameter(self.parameter)[self.joint] = weights / self.scale
+            terms.get_parameter(self.parameter)[self.joint] = entries / self.scale
 
-    def torque(self, weights: torch.Tensor, rows: slice = EVERY) -> torch.Tensor:
-        """Return what they add to these samples (T,)."""
+    def torque(self, weights: torch.Tensor, rows: slice = ALL) -> torch.Tensor:
+        """Return the torque (T,) [Nm, N] of weights (P,) on the samples of these rows."""
         features = self.features[rows]
         if self.friction is None:
             return features @ weights
         friction = self.friction[rows]
-        logarithm = (features @ weights.clamp(-WIDEST, WIDEST)) / friction
-        return friction * logarithm.nan_to_num().expm1()
+        log_factor = (features @ weights.clamp(-LOG_FACTOR_LIMIT, LOG_FACTOR_LIMIT)) / friction
+        return friction * log_factor.nan_to_num().expm1()
 
-    def target(self, missing: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-        """Return what of the missing torque (T, n) the function could be (T,)."""
-        weight = self.force / noise.square()
-        return (missing @ weight) / (self.force @ weight)
+    def target(self, torque_residual: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """Return the torque (T,) of the term that explains a residual (T, n) best, weighted by 1 / noise^2, (n,)."""
+        weight = self.direction / noise.square()
+        return (torque_residual @ weight) / (self.direction @ weight)
+
+    def fit(self, target: torch.Tensor, correlation_length: float, rows: slice = ALL) -> BayesianRidge:
+        """Return the fit to a target (T,) on the samples of these rows."""
+        samples = append_target(self.features[rows], target[rows])
+        return bayesian_ridge(samples.mT @ samples, len(samples), self.groups, correlation_length)
 
 
-class FollowingResiduals(NamedTuple):
-    """Torques by position that are to follow bodies: the functions of each joint as one, and what these are made of."""
+class ProjectedTerms(NamedTuple):
+    """Torques of position that a fit eliminates: linear terms per joint, and the candidates they consist of."""
 
-    functions: dict[int, FollowingFunctions]
+    terms: dict[int, LinearTerms]
     candidates: tuple[JointFunction, ...]
 
-    def write(self, model: Any, missing: torch.Tensor) -> None:
-        """Give the model what they explain of the torque that bodies leave (T, n)."""
-        weights = {joint: of_joint.weights(missing[:, joint]) for joint, of_joint in self.functions.items()}
+    def write(self, model: ArmModel, torque_residual: torch.Tensor) -> None:
+        """Set the model's residual terms to the weights eliminated at a torque residual (T, n)."""
+        weights = {joint: terms.weights(torque_residual[:, joint]) for joint, terms in self.terms.items()}
         for candidate in self.candidates:
             joint, count = candidate.joint, candidate.columns.shape[1]
             candidate.write(model.residuals, weights[joint][:count])
             weights[joint] = weights[joint][count:]
 
 
-def clear_functions(model: Any, joints: Iterable[int]) -> None:
-    """Leave the model without functions of these joints."""
-    functions = model.residuals
+def clear_terms(model: ArmModel, joints: Iterable[int]) -> None:
+    """Set all residual terms of single joints to zero for these joints."""
+    terms = model.residuals
     with torch.no_grad():
-        for weights in (
-            functions.raw_torque_splines,
-            functions.raw_friction_splines,
-            functions.raw_torque_ripple,
-        ):
+        for weights in (terms.raw_torque_splines, terms.raw_friction_splines, terms.raw_torque_ripple):
             weights[list(joints)] = 0.0
 
 
-def refit_residuals(
-    model: Any,
+def refit_terms(
+    model: ArmModel,
     samples: ResidualSamples,
-    rigid: RigidResponse,
-    chosen: Collection[tuple[str, int | None]],
-    correlation: float,
-) -> FollowingResiduals:
-    """Fit the chosen functions, by parameter and joint, anew, beside what else has changed since.
+    projection: RigidProjection,
+    selected: Collection[TermKey],
+    correlation_length: float,
+) -> ProjectedTerms:
+    """Refit the selected terms to the current torque residual, one after the other.
 
-    Friction is fitted to all that is missed. Torques by position are as large as what bodies and laws cannot explain
-    says; the model is left without them, and they are to follow bodies.
+    Friction factors are written to the model. Of torques of position only the penalty is kept: they are set to zero in
+    the model and returned as linear terms, to be eliminated in the next fit of the rigid-body parameters.
+
+    Args:
+        model: model with residual terms.
+        samples: torque residual of the model with its current terms.
+        projection: of the rigid-body and friction model.
+        selected: terms to refit.
+        correlation_length: number of samples per independent error.
     """
-    noise, missing, functions = deviations(samples.missing), samples.missing, model.residuals
-    following: dict[int, FollowingFunctions] = {}
-    candidates = []
-    for candidate in joint_functions(model, samples, rigid, chosen):
-        present = (candidate.features @ candidate.weights(functions)).unsqueeze(-1) * candidate.force
-        target = candidate.target(missing + present, noise)
-        weights, penalty = fit_function(candidate, target, correlation)
-        changed = (candidate.features @ weights).unsqueeze(-1) * candidate.force
-        missing = missing + present - changed
+    residual, noise = samples.torque_residual, rms_per_joint(samples.torque_residual)
+    terms: dict[int, LinearTerms] = {}
+    torques = []
+    for candidate in joint_functions(model, samples, projection, selected):
+        current = (candidate.features @ candidate.read(model.residuals)).unsqueeze(-1) * candidate.direction
+        target = candidate.target(residual + current, noise)
+        fit = candidate.fit(target, correlation_length)
+        weights = fit.coef
+        changed = (candidate.features @ weights).unsqueeze(-1) * candidate.direction
+        residual = residual + current - changed
         if candidate.friction is None:
-            candidates.append(candidate)
-            columns, joint = candidate.columns, candidate.joint
-            if joint in following:
-                columns = torch.cat([following[joint].features, columns], dim=1)
-                penalty = torch.cat([following[joint].penalty, penalty])
-            following[joint] = FollowingFunctions(columns, penalty)
+            torques.append(candidate)
+            columns, penalty, joint = candidate.columns, fit.penalty, candidate.joint
+            if joint in terms:
+                columns = torch.cat([terms[joint].features, columns], dim=1)
+                penalty = torch.cat([terms[joint].penalty, penalty])
+            terms[joint] = LinearTerms(columns, penalty)
             weights = torch.zeros_like(weights)
-        candidate.write(functions, weights)
-    return FollowingResiduals(following, tuple(candidates))
+        candidate.write(model.residuals, weights)
+    return ProjectedTerms(terms, tuple(torques))
 
 
 def joint_functions(
-    model: Any,
+    model: ArmModel,
     samples: ResidualSamples,
-    rigid: RigidResponse,
-    chosen: Collection[tuple[str, int | None]] | None = None,
+    projection: RigidProjection,
+    selected: Collection[TermKey] | None = None,
 ) -> Iterator[JointFunction]:
-    """Yield what could be selected: smooth torques, friction that varies, and ripple.
+    """Yield the candidates per joint: smooth torque, friction factor, ripple; None: all, else the selected ones.
 
-    chosen: parameters and joints; None: all.
+    The weights of smooth torques and friction factors have one prior precision, the ones of ripple one per frequency.
+    The straight line of smooth torques has a precision of its own: it extrapolates to positions without samples, as
+    springs do.
     """
-    functions, motors = model.residuals, motors_of(model)
+    terms, motors = model.residuals, motors_of(model)
     with torch.no_grad():
-        splines, ripple = functions.splines(samples.q), functions.revolute * functions.waves(samples.q)
-    joints, unit = torch.eye(len(motors)).to(motors), functions.unit.flatten()
-    alike, pairs = torch.zeros(SPLINES), torch.arange(ripple.shape[-1] // 2).repeat(2)
-    # a straight line, and what is not straight: a spring is known where no motion has been
+        splines, ripple = terms.splines(samples.q), terms.revolute * terms.waves(samples.q)
+    joints, unit = torch.eye(len(motors)).to(motors), terms.unit.flatten()
+    one_group, frequencies = torch.zeros(SPLINES), torch.arange(ripple.shape[-1] // 2).repeat(2)
     line = torch.linspace(-1, 1, SPLINES).double().unsqueeze(-1)
-    varied = splines * samples.friction.unsqueeze(-1)
-    kinds = (
-        ("raw_torque_splines", splines, unit, joints, line, F.pad(alike + 1, (1, 0))),
-        (FRICTION, varied, torch.ones(len(motors)), motors, line[:, :0], alike),
-        ("raw_torque_ripple", ripple, unit, joints, torch.zeros(len(pairs), 0).double(), pairs),
+    friction = splines * samples.friction.unsqueeze(-1)
+    no_line, no_trend = line[:, :0], torch.zeros(len(frequencies), 0).double()
+    forms = (
+        ("raw_torque_splines", splines, unit, joints, line, F.pad(one_group + 1, (1, 0))),
+        (FRICTION, friction, torch.ones(len(motors)), motors, no_line, one_group),
+        ("raw_torque_ripple", ripple, unit, joints, no_trend, frequencies),
     )
-    for parameter, features, scale, force, lines, groups in kinds:
+    for parameter, values, scale, directions, trends, groups in forms:
         for joint in range(len(motors)):
-            if chosen is not None and (parameter, joint) not in chosen:
+            if selected is not None and (parameter, joint) not in selected:
                 continue
-            columns = features[:, joint]
+            columns = values[:, joint]
             if not columns.any() or scale[joint] <= 0:
                 continue
-            columns = torch.cat([columns @ lines, columns], dim=1)
+            columns = torch.cat([columns @ trends, columns], dim=1)
             of_friction = parameter == FRICTION
             yield JointFunction(
                 parameter=parameter,
@@ -182,56 +199,15 @@ def joint_functions(
                 scale=float(scale[joint]),
                 position=samples.q[:, joint],
                 columns=columns,
-                features=columns if of_friction else rigid.remaining(joint, columns),
-                force=force[joint],
-                lines=lines,
+                features=columns if of_friction else projection.orthogonalize(joint, columns),
+                direction=directions[joint],
+                trends=trends,
                 groups=groups,
                 friction=samples.friction[:, joint] if of_friction else None,
             )
 
 
-def deviations(missing: torch.Tensor) -> torch.Tensor:
-    deviation = missing.square().mean(dim=0).sqrt()
-    return deviation.clamp(min=1e-12 * float(deviation.max()) + 1e-300)
-
-
-def fit_function(
-    candidate: JointFunction, target: torch.Tensor, correlation: float, rows: slice = EVERY
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the most probable weights (P,) after these samples, with their penalties, see `most_probable`."""
-    samples = beside(candidate.features[rows], target[rows])
-    return most_probable(samples.mT @ samples, len(samples), candidate.groups, correlation)
-
-
-def beside(features: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Return a linear model's features (T, P) with its target (T,) as the last column."""
-    return torch.cat([features, target.unsqueeze(-1)], dim=1)
-
-
-def most_probable(
-    sums: torch.Tensor, count: int, groups: torch.Tensor, correlation: float
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return weights (P,) of a linear model, with the noise and the deviation of each group of weights at which the
-    samples are most probable; and penalties (P,) of the weights' squares, in squares of the target, which lead there.
-
-    sums: (P + 1, P + 1) of products of so many samples' features and target, see `beside`.
-    """
-    gram, moment, square = sums[:-1, :-1], sums[:-1, -1], float(sums[-1, -1])
-    member = F.one_hot(groups.long()).double()  # (P, groups)
-    seen = gram.diagonal() > 0
-    size, noise = member.sum(dim=0), square / count
-    height = (member.mT @ gram.diagonal() / count / size).clamp(min=1e-300)
-    precision = 10 * height * size / max(noise, 1e-300)  # a tenth of the torque, at first
-    weights = torch.zeros_like(moment)
-    for _ in range(TUNING.rounds):
-        penalty = noise * correlation * (member @ precision)
-        curvature = gram / (noise * correlation) + torch.diag(member @ precision)
-        covariance = torch.linalg.inv(curvature)
-        weights = covariance @ moment / (noise * correlation) * seen
-        determined = (size - precision * (member.mT @ covariance.diagonal())).clamp(min=1e-9)
-        precision = (determined / (member.mT @ weights.square()).clamp(min=1e-300)).clamp(max=1e14)
-        missed = square - float(2 * weights @ moment - weights @ gram @ weights)
-        previous, noise = noise, max(missed, 1e-12 * square) / count
-        if abs(noise - previous) < TUNING.converged * previous:
-            break
-    return weights, penalty
+def rms_per_joint(torque_residual: torch.Tensor) -> torch.Tensor:
+    """Return the root mean square per joint (n,) of a torque residual (T, n), positive also without a residual."""
+    rms = torque_residual.square().mean(dim=0).sqrt()
+    return rms.clamp(min=1e-12 * float(rms.max()) + 1e-300)

@@ -1,4 +1,4 @@
-"""Fit a model of networks to torques: L-BFGS on the error of its inverse dynamics, all samples at once."""
+"""Fit of a model of networks to torques: L-BFGS on the error of its inverse dynamics, on all samples at once."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from spelgen.settings.fits import DEFAULTS, Adaptation
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
 
-MOVING: dict[Adaptation, tuple[str, ...]] = {
+ADAPTED_PARTS: dict[Adaptation, tuple[str, ...]] = {
     "load": ("mass.", "potential."),
     "friction": ("friction.",),
     "unit": ("",),
 }
-"""How the names of weights begin that an adaptation moves."""
-BLOCK = 2**16  # samples in memory with all that their gradient needs
+"""Prefixes of the names of the weights that an adaptation fits."""
+BLOCK = 2**16  # samples in memory at a time, with the intermediate results that their gradient needs
 
 
 def fit_networks(
@@ -30,16 +30,20 @@ def fit_networks(
     penalty: Callable[[], torch.Tensor | float] | None = None,
     evaluations: int = 2000,
 ) -> int:
-    """Set the weights of ``model`` to what meets the samples' torques best; return the evaluations it took.
+    """Minimize the mean squared torque error of a model over its weights; return the number of evaluations.
 
-    The error of each joint is told in standard deviations of its torque. weight_decay: see ``LBFGS``; penalty: what
-    else is to be small, the distance from a URDF for one.
+    Args:
+        model: its weights that require a gradient are fitted.
+        samples: torques as logged, (T, n) [Nm, N]; errors are divided by the standard deviation of each joint's torque.
+        weight_decay: see `LBFGS`.
+        penalty: is added to the loss, for example the distance from a URDF.
+        evaluations: maximum number of evaluations of the loss.
     """
     count, joints = samples.columns.tau.shape
     scale = samples.columns.tau.std(dim=0)
     scale = torch.maximum(scale, 1e-2 * scale.amax())
 
-    def missed() -> Iterator[torch.Tensor]:
+    def summands() -> Iterator[torch.Tensor]:
         for number, (q, qd, qdd, tau, *_) in enumerate(samples.blocks(BLOCK)):
             error = ((model.inverse_dynamics(q, qd, qdd) - tau) / scale).square()
             cost = error.mean() if count <= BLOCK else error.sum() / (count * joints)
@@ -47,7 +51,7 @@ def fit_networks(
                 cost = cost + penalty()
             yield cost
 
-    return minimise(model, missed, evaluations, weight_decay)
+    return minimise(model, summands, evaluations, weight_decay)
 
 
 def adapt_networks(
@@ -57,19 +61,25 @@ def adapt_networks(
     weight_decay: float = DEFAULTS.lbfgs_decay,
     evaluations: int = 2000,
 ) -> int:
-    """Move a part of a fitted model to what meets the samples' torques best; return the evaluations it took.
+    """Fit a part of a fitted model to further samples; return the number of evaluations.
 
-    weight_decay: of half the sum of squared changes, so that what these samples do not show stays as it was.
+    Args:
+        model: fitted model.
+        samples: torques as logged, (T, n) [Nm, N].
+        adapt: part of the model, see `ADAPTED_PARTS`.
+        weight_decay: factor of half the squared change of the weights, which is added to the loss: weights that these
+            samples do not determine are unchanged.
+        evaluations: maximum number of evaluations of the loss.
     """
-    moving = {name: x for name, x in model.named_parameters() if name.startswith(MOVING[adapt])}
-    start = {name: x.detach().clone() for name, x in moving.items()}
+    fitted = {name: x for name, x in model.named_parameters() if name.startswith(ADAPTED_PARTS[adapt])}
+    initial = {name: x.detach().clone() for name, x in fitted.items()}
 
-    def changed() -> torch.Tensor | float:
-        return weight_decay / 2 * sum((x - start[name]).square().sum() for name, x in moving.items())
+    def penalty() -> torch.Tensor | float:
+        return weight_decay / 2 * sum((x - initial[name]).square().sum() for name, x in fitted.items())
 
     try:
         for name, parameter in model.named_parameters():
-            parameter.requires_grad_(name in moving)
-        return fit_networks(model, samples, 0.0, changed, evaluations)
+            parameter.requires_grad_(name in fitted)
+        return fit_networks(model, samples, 0.0, penalty, evaluations)
     finally:
         model.requires_grad_(True)

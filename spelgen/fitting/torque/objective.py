@@ -1,4 +1,4 @@
-"""The objective torque: fit inverse dynamics to the torques of all logs, then measure the model on windows."""
+"""Objective torque: fit inverse dynamics to the torques of all logs, then validate the model on windows."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import TrainingData, Validation
 from spelgen.fitting.objective import PreparedLogs, TorqueLogObjective
 from spelgen.fitting.torque.fit import fit_torque
-from spelgen.fitting.torque.jacobian import TUNING
 from spelgen.fitting.torque.networks import BLOCK, adapt_networks, fit_networks
 from spelgen.fitting.torque.report import torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.fitting.torque.tuning import TUNING
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay, find_torque_delay
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
@@ -36,36 +36,36 @@ from spelgen.settings.fits import TorqueFit
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
 
-SAMPLES = 5  # of a window that the model is measured on
-MOVED = {
-    "load": "a load at the tip alone fitted",
-    "friction": "friction and torque offsets alone fitted",
-    "unit": "what sets this unit apart fitted",
+SAMPLES = 5  # per validation window
+FITTED = {
+    "load": "only a load at the tip fitted",
+    "friction": "only friction and torque offsets fitted",
+    "unit": "the differences of this unit fitted",
 }
 
 
 class TorqueObjective(TorqueLogObjective):
-    """All is done in `begin`, before there is a run folder: a fit to torques takes seconds to minutes."""
+    """The whole fit is in `begin`, before there is a run folder: a fit to torques takes seconds to minutes."""
 
     name: ClassVar[str] = "torque"
     config: TorqueFit
 
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
-        preprocessing, self._late = self.request.preprocessing, NO_DELAY
+        preprocessing, self._delay = self.request.preprocessing, NO_DELAY
         if preprocessing.torque_delay is None and isinstance(self.model, RigidBodyDynamics):
-            self._late = torque_delay(self.model, self.request.logs, preprocessing)
-            preprocessing = replace(preprocessing, torque_delay=self._late.delay)
+            self._delay = torque_delay(self.model, self.request.logs, preprocessing)
+            preprocessing = replace(preprocessing, torque_delay=self._delay.delay)
             self.request = replace(self.request, preprocessing=preprocessing)
-        # windows only measure the model: few are enough
-        stride = -(-sum(map(len, self.request.logs)) // TUNING.windows)
+        # windows are for validation only: few suffice
+        stride = -(-sum(map(len, self.request.logs)) // TUNING.max_windows)
         self.data = self._cut_windows(SAMPLES, stride)
         return self._prepared(self.data, self.config)
 
     def begin(self) -> list[Diagnostic]:
-        """Fit the model. Raises LogError where no log is sampled densely enough for accelerations."""
+        """Fit the model. Raises LogError if no log is sampled densely enough for accelerations."""
         model = self.model
-        notes = self._late.notes
+        notes = self._delay.notes
         samples = torque_samples(model, self.data)
         if samples is None:
             what = "to adapt to" if self.config.adapt else "to fit torques to"
@@ -75,12 +75,12 @@ class TorqueObjective(TorqueLogObjective):
                 do="fit windows: the objective rollout",
             )
         regularizer = None
-        if not isinstance(model, RigidBodyDynamics):  # the torques of rigid bodies have a prior of their own
+        if not isinstance(model, RigidBodyDynamics):  # rigid bodies have a prior of their own at the URDF
             regularizer = self._regularizer(self.data, self.config.urdf_weight, notes)
         notes += fit_torques(model, samples, self.config, regularizer)
-        # residuals that were not selected add nothing but time
-        few = replace(self.data, validation=thinned(self.data.validation, TUNING.measured_windows))
-        validation = Validation(without_idle_residuals(model), few, self.request.options.device)
+        # residual terms that were not selected are zero, and take time
+        subset = replace(self.data, validation=thinned(self.data.validation, TUNING.validation_windows))
+        validation = Validation(without_idle_residuals(model), subset, self.request.options.device)
         substeps = validation.substeps()
         self._checkpoint = {
             "epoch": 0,
@@ -96,7 +96,7 @@ class TorqueObjective(TorqueLogObjective):
 
 
 def torque_nmse(model: ArmModel, samples: TorqueSamples) -> list[float]:
-    """Return the mean squared torque error of the samples by joint, relative to the variance of the torque."""
+    """Return the mean squared torque error divided by the variance of the torque, per joint (n values)."""
     tau = samples.columns.tau
     squares = torch.zeros(model.n, dtype=torch.float64)
     with torch.no_grad():
@@ -109,7 +109,7 @@ def torque_nmse(model: ArmModel, samples: TorqueSamples) -> list[float]:
 
 
 def torque_delay(model: ArmModel, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> TorqueDelay:
-    """Return how much later than positions these logs show torques, by the bodies of a model."""
+    """Return the delay of the torques relative to the positions in these logs, from the bodies of a model."""
     with torch.no_grad():
         inputs = model.input_matrix(torch.zeros(1, model.n).double())[0].numpy()
     drives = Drives(inputs, motors_of(model).numpy())
@@ -117,7 +117,7 @@ def torque_delay(model: ArmModel, logs: Sequence[Trajectory], preprocessing: Pre
 
 
 def torque_samples(model: ArmModel, data: TrainingData) -> TorqueSamples | None:
-    """Return the samples of all logs, those of validation included; None: no log has samples that move, and densely."""
+    """Return the samples of all logs, validation included; None if no log has moving samples at a sufficient rate."""
     decimation, reach = 1, bristle_reach(model)
     if isinstance(model, RigidBodyDynamics):
         decimation = TUNING.decimation
@@ -135,7 +135,7 @@ def torque_samples(model: ArmModel, data: TrainingData) -> TorqueSamples | None:
 def fit_torques(
     model: ArmModel, samples: TorqueSamples, config: TorqueFit, regularizer: UrdfRegularizer | None = None
 ) -> list[Diagnostic]:
-    """Fit the model to samples; return what there is to tell."""
+    """Fit the model to samples; return the notes of the fit."""
     notes: list[Diagnostic] = []
     if isinstance(model, RigidBodyDynamics):
         solution = fit_torque(model, samples, config.prior, config.adapt)
@@ -150,7 +150,7 @@ def fit_torques(
             penalty = lambda: config.urdf_weight * regularizer.loss(model)  # noqa: E731
         steps = fit_networks(model, samples, config.weight_decay, penalty, config.evaluations)
     message = (
-        f"{MOVED.get(config.adapt or '', 'fitted')} to the torques of {samples.seen} samples, those of validation "
-        f"included, in {steps} steps"
+        f"{FITTED.get(config.adapt or '', 'fitted')} to the torques of {samples.original_count} samples, those of "
+        f"validation included, in {steps} steps"
     )
     return [Diagnostic("info", "torque-fit", "logs", None, message), *notes]

@@ -1,292 +1,245 @@
-"""The cost of rigid bodies that are fitted to torques, and how its noise and prior are found.
+"""MAP estimation of rigid-body and friction parameters x from torques.
 
-The torque is linear in the bodies' parameters, which the log-Cholesky weights make possible ones, and smooth in the
-few constants of each joint: seconds are enough, and no step size is to be chosen. What is minimised is
+The torque is linear in the inertial parameters, whose log-Cholesky parameters keep them physically consistent, and
+smooth in the few constants of each joint. The cost is the negative log posterior of x,
 
-    sum over joints and samples of (missing torque / noise)^2 + (weights - start)^T covariance^-1 (weights - start),
+    1/2 sum over joints j of |r_j(x)|^2 / s_j^2 + 1/2 (x - m)^T P (x - m),
 
-half of it, with the covariance of a Gaussian prior (see ``covariance``). Where gains between logged and joint torques
-are trained, what is missed is in the logged ones, else all torques would shrink with their gains. The noise of a joint
-is what least squares leave of its torque, and then what the fit leaves, found in rounds, as is how far the start is to
-be trusted (see ``most_probable``).
+with the torque residual r, its noise s, and a Gaussian prior of mean m and precision P (see `prior`). The residual is
+the one of the logged torque if motor gains are trained (see `TorqueJacobian.squared_residual`). Noise and prior widths
+are estimated from the data: outer iterations alternate Levenberg-Marquardt steps with their updates.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 
-from spelgen.fitting.levenberg_marquardt import NormalEquations, SolverState, levenberg_marquardt, start
-from spelgen.fitting.torque.jacobian import (
-    NO_FUNCTIONS,
-    TUNING,
-    FollowingFunctions,
-    ResidualSamples,
-    RigidResponse,
-    TorqueJacobian,
+from spelgen.fitting.levenberg_marquardt import (
+    NormalEquations,
+    SolverResult,
+    SolverState,
+    Termination,
+    levenberg_marquardt,
 )
-from spelgen.fitting.torque.prior import ADAPTED, covariance, most_probable
+from spelgen.fitting.torque.jacobian import ResidualSamples, TorqueJacobian
+from spelgen.fitting.torque.linearization import (
+    NO_TERMS,
+    LinearTerms,
+    RigidProjection,
+    least_squares_residual,
+)
+from spelgen.fitting.torque.prior import ParameterPrior, update_widths
 from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.fitting.torque.weights import NONE
+from spelgen.fitting.torque.tuning import TUNING
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 State = SolverState[torch.Tensor]
-"""Weights (K,); as residuals the sums of squares of the torque that they miss (n,)."""
+"""Parameters x (K,), and as residual the squared torque residual per joint (n,)."""
 
 
-EFFECTS = ("effects", "load_dependence")
-"""Kinds of what varies friction, which not every joint has."""
+@dataclass(frozen=True, eq=False)
+class NoiseEstimator:
+    """Estimator of the torque noise s (n,) from the squared residual of `count` samples.
 
-Snapshot = tuple[torch.Tensor, torch.Tensor, GaussianPrior, torch.Tensor]
+    Errors of filtered samples are correlated. `correlation_length` samples count as one independent error: s^2 is the
+    mean squared residual times this length, so that sums over all samples have the weight of independent errors.
 
-
-class TorqueProblem:
-    """The cost of weights (K,) under a noise and a prior, which rounds of steps find anew: a `LeastSquares`.
-
-    compensated: (n,) joints whose drives compensate friction unseen. covariance: of the weights, as last found.
-    noise: (n,) standard deviations of errors as if they were independent from sample to sample.
+    torque_std: (n,) standard deviation of the torque [Nm, N].
     """
 
-    def __init__(self, jacobian: TorqueJacobian, prior: GaussianPrior, adapt: Adaptation | None) -> None:
-        rigid = jacobian.rigid
-        self.start, self.guess, self.adapt = rigid.flattened(rigid.start), prior, adapt
-        self.compensated = rigid.start[rigid.compensation] != 0
-        self.covariance = torch.zeros(len(self.start), len(self.start)).double()
-        self.masks = {kind: rigid.mask(kind) for kind in ADAPTED}
-        self._use(jacobian)
-        self.set_prior(prior)
+    count: int
+    correlation_length: float
+    torque_std: torch.Tensor
 
-    def _use(self, jacobian: TorqueJacobian) -> None:
-        self.jacobian, self.count = jacobian, jacobian.samples.count
-        self.correlation = max(1.0, TUNING.correlation_length / jacobian.samples.step)
-        self.lasting = max(1.0, TUNING.lasting_errors / jacobian.samples.step)
-        deviation = jacobian.torque_deviation()
-        self.range = torch.maximum(deviation, 1e-3 * deviation.max())
+    @classmethod
+    def of(cls, jacobian: TorqueJacobian) -> NoiseEstimator:
+        """Return the estimator for the samples of a Jacobian."""
+        correlation_length = max(1.0, TUNING.correlation_length / jacobian.samples.stride)
+        # a joint of constant torque has a standard deviation of zero, by which nothing can be divided
+        torque_std = torch.maximum(jacobian.torque_std, 1e-3 * jacobian.torque_std.max())
+        return cls(jacobian.samples.count, correlation_length, torque_std)
 
-    def set_samples(self, state: State, jacobian: TorqueJacobian) -> State:
-        """Go on from a state with other samples."""
-        self._use(jacobian)
-        return replace(state, residuals=jacobian.squares(state.x))
+    def upper_bound(self) -> torch.Tensor:
+        """Return the noise (n,) [Nm, N] of a model that explains nothing."""
+        return self.torque_std * math.sqrt(self.correlation_length)
 
-    def refine(
-        self, state: State, samples: TorqueSamples, functions: Mapping[int, FollowingFunctions] = NO_FUNCTIONS
-    ) -> State:
-        """Go on from a fit near by with other samples, or beside other residuals: only the last digits are fitted."""
-        state = self.set_samples(state, TorqueJacobian(self.jacobian.model, samples, functions))
-        self.set_noise(state.residuals)
-        return self.solve(state, TUNING.last_rounds)
+    def estimate(
+        self, squared_residual: torch.Tensor, effective_parameters: torch.Tensor | float = 0.0
+    ) -> torch.Tensor:
+        """Return the noise (n,) [Nm, N], at least a fraction of the torque's standard deviation.
 
-    def set_prior(self, prior: GaussianPrior) -> None:
-        """Go on with another prior."""
-        self.prior = prior
-        rigid = self.jacobian.rigid
-        self.precision = torch.linalg.inv(covariance(prior, rigid.start, rigid.kinds))
-
-    def set_noise(self, squares: torch.Tensor, determined: torch.Tensor | float = 0.0) -> None:
-        """Take for noise what is missed: sums of squares (n,). This is the one place of the noise model.
-
-        determined: how many weights each torque determines, (n,), of which each takes an independent error.
+        Args:
+            squared_residual: (n,) [Nm^2, N^2], of all samples.
+            effective_parameters: number of parameters that each joint's torque determines, (n,): each reduces the
+                degrees of freedom of the residual by one independent error.
         """
-        errors = self.count / self.correlation
-        left = torch.as_tensor(1.0 - determined / errors).clamp(min=TUNING.least_left)
-        rms = torch.maximum((squares / self.count / left).sqrt(), TUNING.least_noise * self.range)
-        self.noise = self.correlation**0.5 * rms
+        errors = self.count / self.correlation_length
+        fraction = torch.as_tensor(1.0 - effective_parameters / errors).clamp(min=TUNING.min_error_fraction)
+        rms = (squared_residual / self.count / fraction).sqrt()
+        return torch.maximum(rms, TUNING.min_noise * self.torque_std) * math.sqrt(self.correlation_length)
 
-    def _set_least_squares_noise(self, x: torch.Tensor) -> None:
-        """Take for noise what least squares miss, which no prior holds; of torques that are linear about x (K,)."""
-        self.noise = self.correlation**0.5 * self.range
-        slopes = list(self.jacobian.slopes(x))
-        for _ in range(TUNING.last_rounds):
-            self.set_noise(*self.jacobian.least_squares(slopes, self.noise, self.free))
+    def annealed(self, squared_residual: torch.Tensor) -> torch.Tensor:
+        """Return the noise (n,) [Nm, N] of an early iteration: a fraction of its residual (n,) [Nm^2, N^2]."""
+        return TUNING.annealing_fraction * (self.correlation_length * squared_residual / self.count).sqrt()
 
-    def _first_fit(self, x: torch.Tensor, steps: int) -> State:
-        """Return the end of all steps from weights x (K,), under the noise of least squares.
 
-        Bodies that are far off leave much of the torque, which is taken for noise, and noise asks for no better bodies.
-        """
-        self._set_least_squares_noise(x)
-        return self._steps(start(self, x, steps=steps), TUNING.first_steps)
+@dataclass(frozen=True, eq=False)
+class TorqueProblem:
+    """Negative log posterior of x (K,) for a given noise and prior: a `LeastSquaresProblem`.
 
-    def _fit_from_start(self, steps: int) -> State:
-        """Return the first fit from the start, where bodies may be far off.
+    noise: (n,) standard deviations, scaled as if the errors of all samples were independent. adapt: see `TorqueFit`.
+    compensated: (n,) joints whose drives compensate friction (see `stages.find_compensation`).
+    """
 
-        Under the noise of least squares these wind along a narrow valley: noise falls to it with what is missed.
-        """
-        self._set_least_squares_noise(self.start)
-        least = self.noise
-        state = start(self, self.start, steps=steps)
-        for _ in range(TUNING.first_rounds):
-            missed = (self.correlation * state.residuals / self.count).sqrt()
-            self.noise = torch.maximum(least, TUNING.first_noise * missed)
-            if (self.noise == least).all():
-                break
-            state = self._steps(state, TUNING.steps)
-        return self._first_fit(state.x, state.steps)
+    jacobian: TorqueJacobian
+    noise: torch.Tensor
+    prior: ParameterPrior
+    adapt: Adaptation | None
+    compensated: torch.Tensor
+
+    @classmethod
+    def of(
+        cls, jacobian: TorqueJacobian, widths: GaussianPrior, adapt: Adaptation | None = None
+    ) -> TorqueProblem:
+        """Return the problem whose prior mean is the current x of the model."""
+        rigid, noise = jacobian.rigid, NoiseEstimator.of(jacobian).upper_bound()
+        prior = ParameterPrior(rigid, widths, widths, rigid.flatten(rigid.initial))
+        return cls(jacobian, noise, prior, adapt, rigid.initial[rigid.compensation] != 0)
+
+    @cached_property
+    def free(self) -> torch.Tensor:
+        """Mask (K,) of the estimated parameters."""
+        return self.jacobian.rigid.free_mask(self.adapt, self.compensated)
 
     @property
-    def free(self) -> torch.Tensor:
-        """Which weights (K,) move."""
-        return self.jacobian.rigid.free(self.adapt, self.compensated)
+    def selection_correlation_length(self) -> float:
+        """Samples per independent error in the choice of friction models and residual terms."""
+        return max(1.0, TUNING.selection_correlation_length / self.jacobian.samples.stride)
 
-    def solve_from_start(self) -> State:
-        """As `solve`, all rounds from the start; from there anew while further joints want a compensation, for what a
-        fit made of their torque without one leads astray.
+    def with_least_squares_noise(self, x: torch.Tensor) -> TorqueProblem:
+        """Return the problem under the noise of unconstrained least squares, linearized at x (K,).
+
+        Unconstrained least squares fits the samples better than any physically consistent x: its residual is the lower
+        bound of the noise. An estimate from the residual of a poor initial guess would be too large, and the fit would
+        stop early.
         """
-        state = self._fit_from_start(0)
-        while self.adapt is None and self._compensate(state.x):
-            state = self._fit_from_start(state.steps)
-        return self.solve(state, TUNING.rounds)
+        estimator = NoiseEstimator.of(self.jacobian)
+        noise, rows = estimator.upper_bound(), list(self.jacobian.joint_rows(x))
+        # iterated: the noise is the weight of the joints, whose torques have common parameters
+        for _ in range(TUNING.final_iterations):
+            noise = estimator.estimate(*least_squares_residual(rows, noise, self.free))
+        return replace(self, noise=noise)
 
-    def select_memory(self, state: State) -> State:
-        """Go on from a fit without memory of friction; give bristles to the joints whose samples show memory.
+    def residual(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the squared torque residual per joint (n,) [Nm^2, N^2]; see `LeastSquaresProblem`."""
+        return self.jacobian.squared_residual(x)
 
-        Bristles turn around after a displacement, and so late: where friction turns around at once, they pass for
-        inertia. The gears of an arm are mostly alike: weak evidence of a joint yields to that of all.
-        """
-        laws, before = self.jacobian.model.friction, self.snapshot()
-        laws.memoryless.fill_(0.0)
-        remembering = self.solve(self._first_fit(state.x, state.steps), TUNING.rounds)
-        evidence = self._evidence(remembering, state) - self._fractions_narrowed()
-        laws.memoryless.copy_(_unlikely(evidence))
-        if laws.memoryless.all():
-            self.restore(before)
-            return state
-        if laws.memoryless.any():
-            return self.solve(self.set_samples(remembering, self.jacobian), TUNING.rounds)
-        return remembering
+    def cost(self, x: torch.Tensor, residual: torch.Tensor) -> float:
+        """Return the negative log posterior of x (K,), except for a constant; residual: squared, (n,) [Nm^2, N^2]."""
+        deviation = x - self.prior.mean
+        penalty = deviation @ self.prior.precision @ deviation
+        return float(((residual / self.noise.square()).sum() + penalty) / 2)
 
-    def select_effects(self, state: State) -> State:
-        """Go on without Stribeck effect, saturation and dependence on load of joints whose samples show none of them.
-
-        They are positive, and so none is an error to one side, of all joints together.
-        """
-        rigid = self.jacobian.rigid
-        places = rigid.named(torch.arange(len(self.start)))
-        effects = torch.stack([places[name] for name in rigid.of_kind(*EFFECTS)], dim=-1)
-
-        def without(joints: torch.Tensor) -> State:
-            x, rows = state.x.clone(), effects[joints]
-            self.start = self.start.clone()
-            self.start[rows] = x[rows] = NONE
-            return self.solve(replace(state, x=x, residuals=self.jacobian.squares(x)), TUNING.rounds)
-
-        before = self.snapshot()
-        plain = without(torch.ones(len(effects), dtype=torch.bool))
-        unlikely = _unlikely(self._evidence(state, plain) - TUNING.effects_evidence)
-        if unlikely.all():
-            return plain
-        self.restore(before)
-        return without(unlikely) if unlikely.any() else state
-
-    def _evidence(self, state: State, other: State) -> torch.Tensor:
-        """Return how much more likely the samples of each joint (n,) are after a fit: twice the logarithm."""
-        return self.count / self.lasting * (other.residuals / state.residuals).log()
-
-    def snapshot(self) -> Snapshot:
-        """Return what rounds have found, to be restored."""
-        return self.start, self.noise, self.prior, self.covariance.clone()
-
-    def restore(self, snapshot: Snapshot) -> None:
-        """Go on from what rounds had found before."""
-        self.start, self.noise, prior, self.covariance = snapshot
-        self.set_prior(prior)
-
-    def _fractions_narrowed(self) -> torch.Tensor:
-        """Return, of each joint (n,), by how much samples narrowed its bristles' fractions: logarithms of variances.
-
-        Freedom explains noise, too: evidence is what a fit explains, less what it was narrowed (MacKay, 1992).
-        """
-        rigid = self.jacobian.rigid
-        (fractions,) = rigid.of_kind("fractions")
-        places = rigid.named(torch.arange(len(self.start)))[fractions]
-        block = places.unsqueeze(-1), places.unsqueeze(-2)
-        before: torch.Tensor = torch.linalg.inv(self.precision)[block]
-        return before.logdet() - self.covariance[block].logdet()
-
-    def around(self, state: State) -> tuple[ResidualSamples, RigidResponse]:
-        """Return what bodies and laws miss after a fit, and how they would follow what else explained it."""
-        self.normal_equations(state.x, state.residuals)
-        self._set_covariance()  # under the noise of now: what followed too far would show a spring that is none
-        response = self.jacobian.response(state.x, self.noise, self.covariance)
-        return self.jacobian.residual_samples(state.x), response
-
-    def _compensate(self, x: torch.Tensor) -> bool:
-        """Give a compensation to further joints that want one; return whether there are such.
-
-        No friction explains a torque that falls with velocity: a drive that compensates friction by itself, after
-        its torque was measured, does.
-        """
-        samples = self.jacobian.residual_samples(x)
-        products = (samples.missing * samples.qd).sum(dim=0)
-        slope = products / samples.qd.square().sum(dim=0).clamp(min=1e-300)
-        # of the sum of squares, what a line explains
-        explained = slope * products / samples.missing.square().sum(dim=0).clamp(min=1e-300)
-        count = self.count / self.correlation
-        significant = explained * count > TUNING.compensation_deviations**2 * (1 - explained)
-        # milliseconds between torque and motion look alike, but smaller
-        visible = (slope * products / self.count).sqrt() > TUNING.compensation_visible * self.range
-        falls = (slope < 0) & (explained > TUNING.compensation_explained) & visible
-        further = falls & significant & ~self.compensated
-        self.compensated = self.compensated | further
-        return bool(further.any())
-
-    def solve(self, state: State, rounds: int) -> State:
-        """Take steps in rounds, after each of which noise and prior are found anew, while much is gained."""
-        for number in range(TUNING.longer * rounds):
-            state = self._steps(state, TUNING.steps)
-            previous = self.noise
-            self._set_covariance()
-            self.set_noise(state.residuals, self._determined() / len(state.residuals))
-            if self.adapt != "load":
-                away = state.x - self.start
-                self.set_prior(most_probable(self.prior, self.guess, self.masks, away, self.covariance))
-            if number + 1 >= rounds and (self.noise > TUNING.noise_settled * previous).all():
-                break
-        return state
-
-    def _determined(self) -> float:
-        """Return how many weights all torques determine: those that move, less what is the prior's (MacKay, 1992)."""
-        free = self.free
-        return float(free.sum() - (self.covariance * self.precision)[free][:, free].sum())
-
-    def _set_covariance(self) -> None:
-        """Take the covariance from the curvature of the last normal equations."""
-        free = self.free
-        self.covariance[free[:, None] & free] = torch.linalg.inv(self.curvature).flatten()
-
-    def _steps(self, state: State, most: int) -> State:
-        """Take steps under the noise and prior of now."""
-        state = replace(state, cost=self.cost(state.x, state.residuals), converged=False)
-        for step in levenberg_marquardt(self, state, max_steps=most, relative_gain=TUNING.gain):
-            state = step
-        return state
-
-    def residuals(self, x: torch.Tensor) -> torch.Tensor:
-        """Return sums of squares of the torque that is missed (n,)."""
-        return self.jacobian.squares(x)
-
-    def cost(self, x: torch.Tensor, residuals: torch.Tensor) -> float:
-        """Return what is minimised (see the top of this file)."""
-        away = x - self.start
-        return float(((residuals / self.noise.square()).sum() + away @ self.precision @ away) / 2)
-
-    def normal_equations(self, x: torch.Tensor, residuals: torch.Tensor) -> NormalEquations:
-        """Return them by the weights that move."""
-        free = self.free
+    def normal_equations(self, x: torch.Tensor, residual: torch.Tensor) -> NormalEquations:
+        """Return Gauss-Newton Hessian (k, k) and negative gradient (k,) with respect to the k free parameters."""
         curvature, descent = self.jacobian.normal_equations(x, self.noise)
-        away = self.precision @ (x - self.start)
-        self.curvature = (curvature + self.precision)[free][:, free]
-        return NormalEquations(self.curvature, (descent - away)[free])
+        penalty_gradient = self.prior.precision @ (x - self.prior.mean)
+        curvature = (curvature + self.prior.precision)[self.free][:, self.free]
+        return NormalEquations(curvature, (descent - penalty_gradient)[self.free])
 
-    def moved(self, x: torch.Tensor, step: torch.Tensor) -> Iterator[torch.Tensor]:
-        """Yield where a step leads, straight in the weights or in the bodies' parameters."""
+    def candidates(self, x: torch.Tensor, step: torch.Tensor) -> Iterator[torch.Tensor]:
+        """Yield x + step, (K,), then the step that is straight in the inertial parameters (`curved_step`).
+
+        step: (k,) of the free parameters.
+        """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
         yield x + change
-        yield self.jacobian.moved(x, change)
+        yield self.jacobian.curved_step(x, change)
+
+    def minimize(self, state: State, max_steps: int) -> SolverResult[torch.Tensor]:
+        """Return the result of Levenberg-Marquardt steps from a state of x (K,), whose cost is recomputed."""
+        state = replace(state, cost=self.cost(state.x, state.residual))
+        return levenberg_marquardt(
+            self, state, max_steps=max_steps, min_relative_decrease=TUNING.min_relative_decrease
+        )
+
+    def covariance(self, curvature: torch.Tensor) -> torch.Tensor:
+        """Return the posterior covariance (K, K), zero for fixed parameters, from the curvature of the free ones."""
+        covariance = torch.zeros_like(self.prior.precision)
+        covariance[self.free[:, None] & self.free] = torch.linalg.inv(curvature).flatten()
+        return covariance
+
+    def updated(self, state: State, covariance: torch.Tensor) -> TorqueProblem:
+        """Return the problem with noise and prior widths re-estimated at a state.
+
+        The effective number of parameters is gamma = tr(1 - covariance P) (MacKay, 1992), assigned to all joints in
+        equal shares.
+        """
+        free, joints = self.free, len(state.residual)
+        gamma = float(free.sum() - (covariance * self.prior.precision)[free][:, free].sum())
+        noise = NoiseEstimator.of(self.jacobian).estimate(state.residual, gamma / joints)
+        # one body is too little data for the widths of a load
+        prior = self.prior if self.adapt == "load" else update_widths(self.prior, state.x, covariance)
+        return replace(self, noise=noise, prior=prior)
 
 
-def _unlikely(evidence: torch.Tensor) -> torch.Tensor:
-    """Return the joints (n,) whose evidence says no; weak evidence of a joint yields to that of all."""
-    return evidence < -TUNING.strong_evidence * evidence.sum().sign()
+@dataclass(frozen=True, eq=False)
+class TorqueEstimate:
+    """MAP estimate: the problem with its noise and prior, the solver's state, and the posterior covariance (K, K)."""
+
+    problem: TorqueProblem
+    state: State
+    covariance: torch.Tensor
+    termination: Termination
+
+    def with_jacobian(self, jacobian: TorqueJacobian) -> TorqueEstimate:
+        """Return the same parameters on other samples, or with other residual terms or friction models."""
+        state = replace(self.state, residual=jacobian.squared_residual(self.state.x))
+        return replace(self, problem=replace(self.problem, jacobian=jacobian), state=state)
+
+    def with_current_covariance(self) -> TorqueEstimate:
+        """Return the estimate with the covariance under its current noise and prior."""
+        normal = self.problem.normal_equations(self.state.x, self.state.residual)
+        return replace(self, covariance=self.problem.covariance(normal.curvature))
+
+    def linearize(self) -> tuple[ResidualSamples, RigidProjection]:
+        """Return the torque residual, and the projection of joint torques onto the rigid-body and friction model.
+
+        The projection needs the covariance under the current noise (`with_current_covariance`): with the covariance of
+        a larger noise it would remove too much of a torque.
+        """
+        jacobian, x = self.problem.jacobian, self.state.x
+        projection = jacobian.rigid_projection(x, self.problem.noise, self.covariance)
+        return jacobian.residual_samples(x), projection
+
+
+def alternate(problem: TorqueProblem, state: State, iterations: int) -> TorqueEstimate:
+    """Alternate Levenberg-Marquardt steps with updates of noise and prior.
+
+    Args:
+        problem: with initial noise and prior.
+        state: first iterate.
+        iterations: number of outer iterations; more, up to a multiple, follow while the noise of a joint decreases.
+    """
+    for number in range(TUNING.max_extension * iterations):
+        result = problem.minimize(state, TUNING.iteration_steps)
+        state, covariance = result.state, problem.covariance(result.normal_equations.curvature)
+        previous, problem = problem, problem.updated(state, covariance)
+        if number + 1 >= iterations and (problem.noise > TUNING.noise_converged * previous.noise).all():
+            break
+    return TorqueEstimate(problem, state, covariance, result.termination)
+
+
+def refine(
+    estimate: TorqueEstimate, samples: TorqueSamples, terms: Mapping[int, LinearTerms] = NO_TERMS
+) -> TorqueEstimate:
+    """Return the estimate for other samples or residual terms, with the former one as warm start."""
+    jacobian = TorqueJacobian(estimate.problem.jacobian.model, samples, terms)
+    estimate = estimate.with_jacobian(jacobian)
+    noise = NoiseEstimator.of(jacobian).estimate(estimate.state.residual)
+    return alternate(replace(estimate.problem, noise=noise), estimate.state, TUNING.final_iterations)

@@ -1,4 +1,4 @@
-"""The samples that torques are fitted on: tensors of all logs, passed over block by block."""
+"""Samples of all logs that a model is fitted to, as tensors, split into blocks of bounded size."""
 
 from __future__ import annotations
 
@@ -12,8 +12,12 @@ import torch
 from spelgen.logs.dynamics_samples import DynamicsSamples
 
 
-class Block(NamedTuple):
-    """q, qd, qdd and tau, (T, n), and z and direction of friction (see `DynamicsSamples`); None: not known."""
+class SampleBlock(NamedTuple):
+    """T samples: q, qd, qdd [rad, m, s] and tau as logged [Nm, N], all (T, n).
+
+    z: (T, n, K) [rad, m], bristle states; direction: (T, n) of rate-only dry friction (see `DynamicsSamples`). Both are
+    None if unknown.
+    """
 
     q: torch.Tensor
     qd: torch.Tensor
@@ -22,56 +26,59 @@ class Block(NamedTuple):
     z: torch.Tensor | None = None
     direction: torch.Tensor | None = None
 
-    def rows(self, rows: slice) -> Block:
-        """Return these samples alone."""
-        return Block._make(None if column is None else column[rows].contiguous() for column in self)
+    def select(self, rows: slice) -> SampleBlock:
+        """Return the samples of these rows."""
+        return SampleBlock._make(None if column is None else column[rows].contiguous() for column in self)
 
 
 @dataclass(frozen=True, eq=False)
 class TorqueSamples:
-    """Samples of all trajectories, one after the other.
+    """Samples of all trajectories, concatenated.
 
-    seen: the samples that these were taken from. step: samples from one to the next, of those that were decimated
-    alone.
+    original_count: number of samples before decimation and subsampling. stride: between successive samples, in samples
+    of the decimated trajectories.
     """
 
-    columns: Block
-    seen: int
-    step: int = 1
+    columns: SampleBlock
+    original_count: int
+    stride: int = 1
 
     @classmethod
     def of(cls, trajectories: Iterable[DynamicsSamples], decimation: int = 1) -> TorqueSamples:
-        """Take one of so many samples of each trajectory."""
-        pieces, seen = [], 0
-        for samples in trajectories:
-            columns = (getattr(samples, name) for name in Block._fields)
-            # a copy: a slice would keep all samples in memory
-            pieces.append([x if x is None else np.ascontiguousarray(x[::decimation]) for x in columns])
-            seen += len(samples.q)
-        return cls(Block._make(map(_joined, zip(*pieces, strict=True))), seen)
+        """Return every `decimation`-th sample of each trajectory."""
+        decimated, count = [], 0
+        for x in trajectories:
+            columns = (x.q, x.qd, x.qdd, x.tau, x.z, x.direction)
+            # copies: a view would keep all samples in memory
+            decimated.append(
+                [None if column is None else np.ascontiguousarray(column[::decimation]) for column in columns]
+            )
+            count += len(x.q)
+        return cls(SampleBlock._make(map(_concatenated, zip(*decimated, strict=True))), count)
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of samples."""
         return len(self.columns.q)
 
-    def thinned(self, count: int) -> TorqueSamples:
-        """Return at most that many of them, evenly spread; these themselves where there are no more."""
-        step = -(-self.count // count)
+    def subsampled(self, max_count: int) -> TorqueSamples:
+        """Return at most `max_count` samples, evenly spaced; this object itself if it has no more."""
+        step = -(-self.count // max_count)
         if step <= 1:
             return self
-        return TorqueSamples(self.columns.rows(slice(None, None, step)), self.seen, step * self.step)
+        columns = self.columns.select(slice(None, None, step))
+        return TorqueSamples(columns, self.original_count, step * self.stride)
 
-    def rows(self, rows: slice) -> TorqueSamples:
-        """Return these samples alone."""
-        return TorqueSamples(self.columns.rows(rows), self.seen, self.step)
+    def select(self, rows: slice) -> TorqueSamples:
+        """Return the samples of these rows."""
+        return TorqueSamples(self.columns.select(rows), self.original_count, self.stride)
 
-    def blocks(self, size: int) -> Iterator[Block]:
-        """Yield all samples in order, at most ``size`` at a time."""
-        for start in range(0, self.count, size):
-            yield self.columns.rows(slice(start, start + size))
+    def blocks(self, size: int) -> Iterator[SampleBlock]:
+        """Yield all samples in order, at most `size` at a time."""
+        for first in range(0, self.count, size):
+            yield self.columns.select(slice(first, first + size))
 
 
-def _joined(columns: tuple[np.ndarray | None, ...]) -> torch.Tensor | None:
+def _concatenated(columns: tuple[np.ndarray | None, ...]) -> torch.Tensor | None:
     arrays = [column for column in columns if column is not None]
     return torch.from_numpy(np.concatenate(arrays)) if arrays else None

@@ -33,9 +33,9 @@ class TorqueTuning:
     correlation_length: float = 3.1
     # [1] The same for comparisons of friction models and for the selection of residual terms, in samples of 20 ms
     # (0.1 s).
-    lasting_errors: float = 5.0
+    selection_correlation_length: float = 5.0
     # [1] Outer iterations of noise and prior after the initial fit.
-    rounds: int = 5
+    iterations: int = 5
     # [1] Twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773,
     # 1995).
     strong_evidence: float = 6.0
@@ -43,46 +43,46 @@ class TorqueTuning:
     # Trans. Autom. Control 19:716, 1974).
     effects_evidence: float = 2.0
     # [1] Largest number of steps before noise and prior are estimated.
-    first_steps: int = 60
+    initial_steps: int = 60
     # [1] Largest number of iterations in which the noise is lowered to that of least squares.
-    first_rounds: int = 12
+    annealing_iterations: int = 12
     # [1] Noise of these iterations, as a fraction of the torque residual (a low_cost_robot with placeholder
     # inertials: error of M(q) 0.44 -> 0.005).
-    first_noise: float = 0.03
+    annealing_fraction: float = 0.03
     # [1] Outer iterations of a final fit, and of unconstrained least squares.
-    last_rounds: int = 2
+    final_iterations: int = 2
     # [1] Factor on the number of outer iterations while the noise of a joint decreases.
-    longer: int = 4
+    max_extension: int = 4
     # [1] Noise divided by the noise of the previous iteration, above which the noise has converged.
-    noise_settled: float = 0.98
+    noise_converged: float = 0.98
     # [1] Largest number of steps in an outer iteration.
-    steps: int = 5
+    iteration_steps: int = 5
     # [1] Relative decrease of the cost below which an outer iteration ends.
-    gain: float = 1e-4
+    min_relative_decrease: float = 1e-4
     # [1] Alternations of rigid bodies and residual terms.
-    turns: int = 3
+    alternations: int = 3
     # [1] Evenly spread samples of the first outer iterations; the last ones use all samples.
-    subset: int = 2**10
+    initial_samples: int = 2**10
     # [1] Largest number of windows of 5 samples from which the scales of the motion are computed.
-    windows: int = 2**12
+    max_windows: int = 2**12
     # [1] Largest number of validation windows on which the fitted model is measured.
-    measured_windows: int = 2**8
+    validation_windows: int = 2**8
     # [1] Samples for the selection of residual terms.
     residual_samples: int = 2**14
     # [1] Directions with less than this fraction of the largest curvature are not determined by the samples.
-    seen: float = 1e-10
+    min_relative_curvature: float = 1e-10
     # [1] Smallest noise, as a fraction of a torque's range: noise-free samples are fitted to four digits.
-    least_noise: float = 1e-4
+    min_noise: float = 1e-4
     # [1] Smallest fraction of independent errors that remains, however many parameters are determined.
-    least_left: float = 0.1
+    min_error_fraction: float = 0.1
     # [1] Fraction of the squared residual that friction compensation by a drive (torque that increases with velocity)
     # must explain.
-    compensation_explained: float = 0.1
+    min_explained: float = 0.1
     # [1] Standard deviations by which the coefficient of friction compensation must differ from zero.
-    compensation_deviations: float = 4.0
+    min_significance: float = 4.0
     # [1] Smallest standard deviation of friction compensation, as a fraction of that of the torque: delays of
     # milliseconds have a similar but smaller effect.
-    compensation_visible: float = 0.05
+    min_compensation: float = 0.05
     # [1] Samples of one block: some 100 MB for seven joints with their derivatives.
     block: int = 2**13
     # [B] Largest size of the regressors: 70,000 samples of six joints; of more samples a subset is used.
@@ -109,24 +109,24 @@ class ResidualTuning:
     # [1] Contiguous blocks of samples, each held out once.
     folds: int = 10
     # [1] Correlation lengths that are left out between fitted and held-out samples: 0.5 s with
-    # `TorqueTuning.lasting_errors`.
+    # `TorqueTuning.selection_correlation_length`.
     gap: float = 5.0
     # [1] Standard errors that the mean error reduction over the blocks must exceed: p = 0.01 of Student's t with nine
     # degrees of freedom.
     standard_errors: float = 2.82
     # [1] Smallest error reduction of a residual term.
-    least_gain: float = 1e-3
+    min_reduction: float = 1e-3
     # [1] A later term is preferred to the best one so far only if its residual is below this fraction of the residual
     # of the best one.
-    clearly_less: float = 0.9
+    preference_ratio: float = 0.9
     # [1] Largest number of fixed-point iterations of the marginal likelihood.
-    rounds: int = 30
+    max_iter: int = 30
     # [1] Relative change of the noise at which these iterations end.
-    converged: float = 1e-3
+    tolerance: float = 1e-3
     # [1] Samples to which networks are fitted.
     network_samples: int = 2**12
     # [1] Evaluations of the loss after which a network without error reduction is discarded.
-    network_first_look: int = 20
+    network_probe_evaluations: int = 20
     # [1] Evaluations of the loss of a network.
     network_evaluations: int = 100
 
@@ -141,3 +141,7 @@ class TorqueReportTuning:
     weak_acceleration: float = 2.0
     # [1] Positions at which inertias are evaluated.
     positions: int = 50
+
+
+TUNING = TorqueTuning()
+SELECTION = ResidualTuning()

@@ -1,4 +1,4 @@
-"""The objective momentum: steps on the weak form of the equations alone, with which fits of windows begin."""
+"""Objective momentum: fit the weak form of the equations of motion, the first stage of fits of windows."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ TUNING = WindowTuning()
 
 
 class MomentumObjective(TorqueLogObjective):
-    """Steps on the weak form, kept where they predict validation windows better. All windows are in memory.
+    """Steps on the weak form, kept if they lower the validation loss. All windows are in memory.
 
-    best_loss, best_weights: of the best model so far, by validation. substeps: of the integrator between samples.
-    seconds: of the allowed time that is gone. call_steps, epoch_steps: in a call of the optimizer, and in an epoch.
+    best_loss, best_weights: of the model with the lowest validation loss so far. substeps: of the integrator between
+    samples. seconds: elapsed part of the allowed time. call_steps, epoch_steps: in a call of the optimizer, and in an
+    epoch.
     """
 
     name: ClassVar[str] = "momentum"
@@ -37,7 +38,7 @@ class MomentumObjective(TorqueLogObjective):
     kept: ClassVar[tuple[str, ...]] = (
         "epoch", "step", "best_epoch", "best_loss", "best_weights", "seconds", "substeps", "momentum_done",
     )  # fmt: skip
-    """The attributes that a checkpoint has."""
+    """Attributes that are saved in a checkpoint."""
 
     def __init__(self, request: FitRequest) -> None:
         super().__init__(request)
@@ -50,17 +51,17 @@ class MomentumObjective(TorqueLogObjective):
         """See `Objective`."""
         self.data = self._cut_windows(self.config.window, self.config.stride)
         self.config = self.config.resolved(len(self.data.training))
-        # towards the URDF as the model has it before any fit, in a resumed run too
+        # relative to the model before any fit, also in a resumed run
         self.regularizer = self._regularizer(self.data, self.config.urdf_weight, self.notes)
         return self._prepared(self.data, self.config)
 
     def begin(self) -> list[Diagnostic]:
-        """Measure the model as it is."""
+        """Validate the initial model."""
         self._set_up()
         return self.notes
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Go on from the best weights so far; steps that were not all taken start again."""
+        """Resume from the best weights so far; an incomplete momentum stage is repeated."""
         self._set_up()
         self._restore(checkpoint)
 
@@ -80,7 +81,7 @@ class MomentumObjective(TorqueLogObjective):
         return {name: getattr(self, name) for name in self.kept}
 
     def _set_up(self, solver: Solver = "rk4", substeps: int | None = None) -> None:
-        """Measure the model as it is; solver, substeps: of the validation, as in `Rollout`."""
+        """Validate the current model; solver, substeps: of the validation, see `Rollout`."""
         device = self.request.options.device
         self.seconds = time.monotonic() - self.request.began
         self.model.to(device)
@@ -98,55 +99,55 @@ class MomentumObjective(TorqueLogObjective):
         self.momentum_done = not self.config.momentum_steps
 
     def _restore(self, checkpoint: Content) -> None:
-        """Go on from a checkpoint, with the best weights."""
+        """Restore the attributes of a checkpoint, and its best weights."""
         for name in self.kept:
             setattr(self, name, checkpoint[name])
         self.model.load_state_dict(self.best_weights)
 
     def _keep(self, measured: Measured) -> None:
-        """Take what was measured for the best so far."""
+        """Set a validated model as the best so far."""
         self.substeps, self.best_loss, self.best_weights = measured.substeps, measured.loss, measured.weights
 
     def _start_clock(self) -> None:
         self._since = time.monotonic() - self.seconds
 
     def seconds_now(self) -> float:
-        """Return the time of the fit so far [s]."""
+        """Return the elapsed time of the fit [s]."""
         return time.monotonic() - self._since
 
     def fraction(self, seconds: float) -> float:
-        """Return how much of the allowed time these seconds are; 0 where any time is allowed."""
+        """Return the fraction of the allowed time; 0 without a limit."""
         return seconds / self.allowed if self.allowed else math.inf
 
     @property
     def _takes_all(self) -> bool:
-        """Whether a step takes all windows at once."""
+        """Whether a step uses all windows at once."""
         return self.config.optimizer == "lbfgs"
 
     def _new_optimizer(self, generator: torch.Generator) -> WindowOptimizer:
-        """Return one from the present weights, of those that require a gradient; ``generator`` orders batches."""
+        """Return an optimizer of the weights that require a gradient; generator: for the order of batches."""
         decay = self.config.weight_decay or 0.0
         if self._takes_all:
             return LBFGS(self.model, decay)
         return MiniBatchAdamW(self.model, self.batch, decay, generator)
 
     def penalty(self) -> torch.Tensor | float:
-        """Return what straying from the URDF costs."""
+        """Return the regularization loss, ()."""
         if self.regularizer is None:
             return 0.0
         return self.config.urdf_weight * self.regularizer.loss(self.model)
 
     def learning_rate(self, fraction: float) -> float:
-        """Return the learning rate when this much of training is done: a linear rise times a cosine down."""
+        """Return the learning rate at a fraction of the training: a linear warm-up times a cosine decay."""
         cosine = (1 + math.cos(math.pi * min(fraction, 1.0))) / 2
-        fall = TUNING.final_rate + (1 - TUNING.final_rate) * cosine
-        rise = min(1.0, (fraction + 1e-3) / TUNING.warm_up)
-        return (self.config.learning_rate or DEFAULTS.learning_rate) * rise * fall
+        decay = TUNING.final_rate + (1 - TUNING.final_rate) * cosine
+        warm_up = min(1.0, (fraction + 1e-3) / TUNING.warm_up)
+        return (self.config.learning_rate or DEFAULTS.learning_rate) * warm_up * decay
 
     def _momentum_stage(self, progress: TrainingProgress) -> None:
-        """Take the momentum steps, which need no ODE solve, and keep them where validation says so.
+        """Take the momentum steps, which need no ODE solver, and keep them if they lower the validation loss.
 
-        An interruption here starts the stage again on resumption.
+        After an interruption the stage is repeated.
         """
         model, call, steps = self.model, self.call_steps, self.config.momentum_steps
         optimizer = self._new_optimizer(torch.Generator().manual_seed(self.request.seed))

@@ -1,4 +1,4 @@
-"""The objective rollout: epochs of predicted windows, checkpoints, and what happens when numbers blow up."""
+"""Objective rollout: epochs of predicted windows, with checkpoints and rollbacks of diverged epochs."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ TUNING = LoopTuning()
 
 
 class RolloutObjective(MomentumObjective):
-    """Torques first, of rigid bodies; then momentum; then predicted windows, epoch by epoch.
+    """Stages: torque fit of rigid bodies, momentum steps, epochs of predicted windows.
 
-    A checkpoint has all of the changing state, so that a resumed run repeats the same numbers.
+    A checkpoint has the whole state, so that a resumed run repeats the same numbers.
 
-    What stands beside rigid bodies and was not selected before rests until the bodies are done, for short windows are
-    explained by it too, and worse. It then moves from the best weights so far, and stays where validation says so.
+    Residual terms that the torque fit did not select are fixed in the first part of the epochs: on short windows they
+    would absorb a part of the rigid-body motion. In the second part they are fitted, too, from the best weights so far.
     """
 
     name: ClassVar[str] = "rollout"
     config: Rollout
     kept: ClassVar[tuple[str, ...]] = (
-        *MomentumObjective.kept, "rollbacks", "learning_rate_factor", "resting", "stage_from", "stage_epoch",
+        *MomentumObjective.kept, "rollbacks", "learning_rate_factor", "fixed", "stage_from", "stage_epoch",
     )  # fmt: skip
 
     def begin(self) -> list[Diagnostic]:
-        """Fit torques, and measure the model then."""
+        """Fit torques, then validate the model."""
         if self.config.torque_first and isinstance(self.model, RigidBodyDynamics):
             samples = torque_samples(self.model, self.data)
             if samples is not None:
@@ -57,7 +57,7 @@ class RolloutObjective(MomentumObjective):
         return self.notes
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Go on from the last whole epoch."""
+        """Resume from the last complete epoch."""
         self._set_up_epochs()
         self._restore(checkpoint)
         self.optimizer = self._optimizer()
@@ -67,7 +67,7 @@ class RolloutObjective(MomentumObjective):
         self.history = history[: self.epoch]
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Go on until an end is reached; ``save`` is called after each epoch."""
+        """Run epochs until one of the stopping criteria holds; `save` is called after each epoch."""
         self._start_clock()
         if not self.momentum_done:
             self._momentum_stage(progress)
@@ -86,18 +86,18 @@ class RolloutObjective(MomentumObjective):
         return super().checkpoint() | state | {"generator": self.generator.get_state()}
 
     def _set_up_epochs(self) -> None:
-        """Measure the model as it is, and make an optimizer."""
+        """Validate the current model and create its optimizer."""
         self._set_up(self.config.solver, self.config.substeps)
         self.generator = torch.Generator().manual_seed(self.request.seed)
-        self.resting, self.stage_from, self.stage_epoch = idle_residuals(self.model), 0.0, 0
+        self.fixed, self.stage_from, self.stage_epoch = idle_residuals(self.model), 0.0, 0
         self.optimizer = self._optimizer()
         self.rollbacks, self.learning_rate_factor = 0, 1.0
         self._step_seconds, self._validation_seconds = 0.0, 0.0
 
     def _optimizer(self) -> WindowOptimizer:
-        """Return one of the weights that do not rest."""
+        """Return an optimizer of all weights that are not fixed."""
         for name, parameter in self.model.named_parameters():
-            parameter.requires_grad_(name not in self.resting)
+            parameter.requires_grad_(name not in self.fixed)
         return self._new_optimizer(self.generator)
 
     def _rollout_loss(self, windows: Windows) -> torch.Tensor:
@@ -105,6 +105,7 @@ class RolloutObjective(MomentumObjective):
         return rollout_loss(self.model, windows, scales, self.substeps, solver) + self.penalty()
 
     def _end(self) -> Status | None:
+        """Return the stopping criterion that holds, or None."""
         if self.epoch >= self.config.epochs or self.optimizer.stalled:
             return "finished"
         patience = self.config.patience
@@ -117,11 +118,11 @@ class RolloutObjective(MomentumObjective):
         return "finished" if self._done() >= self._stage_end else None
 
     def _run_epoch(self) -> Content:
-        """Run one epoch with finite losses, after as many attempts at a lower learning rate as that takes."""
+        """Run one epoch; if its losses are not finite, repeat it at a lower learning rate."""
         while True:
             before = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
             steps, start = self._steps_in_time(), self.seconds_now()
-            # not finite as soon as a step has no finite loss or gradient
+            # NaN if the loss or gradient of any step is not finite
             loss = self.optimizer.run(self._rollout_loss, self.training, steps, self._rate)
             trained = self.seconds_now()
             self.step, self._step_seconds = self.step + steps, (trained - start) / steps
@@ -149,7 +150,7 @@ class RolloutObjective(MomentumObjective):
         return record
 
     def _steps_in_time(self) -> int:
-        """Return the steps of the next epoch: all, or as many as the remaining time allows at the pace so far."""
+        """Return the number of steps of the next epoch, limited by the remaining time."""
         steps = self.epoch_steps
         if math.isinf(self.allowed):
             return steps
@@ -159,30 +160,30 @@ class RolloutObjective(MomentumObjective):
         return max(1, min(steps, int(remaining / self._step_seconds)))
 
     def _rate(self, ahead: int = 0) -> float:
-        """Return the learning rate so many steps ahead, over all steps or minutes, whichever end sooner."""
+        """Return the learning rate `ahead` steps from now."""
         fraction = (self._done(ahead) - self.stage_from) / (self._stage_end - self.stage_from)
         return self.learning_rate_factor * self.learning_rate(fraction)
 
     def _done(self, ahead: int = 0) -> float:
-        """Return the fraction of all steps or minutes that is gone so many steps ahead."""
+        """Return the completed fraction `ahead` steps from now: of all steps or of the allowed time, the larger one."""
         steps = self.config.epochs * self.epoch_steps
         return max((self.step + ahead) / steps, self.fraction(self.seconds))
 
     @property
     def _stage_end(self) -> float:
-        return TUNING.first_stage if self.resting else 1.0
+        return TUNING.first_stage if self.fixed else 1.0
 
     def _release(self, end: Status) -> bool:
-        """Let what rests move where the stage before ended by itself; return whether it does."""
-        if not self.resting or end == "out of time" or not self.epoch:
+        """Start the second part, in which no weights are fixed, and return whether it is not at its end already."""
+        if not self.fixed or end == "out of time" or not self.epoch:
             return False
         self.model.load_state_dict(self.best_weights)
-        self.resting, self.stage_from, self.stage_epoch = [], self._done(), self.epoch
+        self.fixed, self.stage_from, self.stage_epoch = [], self._done(), self.epoch
         self.optimizer = self._optimizer()
         return self._end() is None
 
     def _roll_back(self, weights: Content, optimizer: Content, step: int) -> None:
-        """Undo an epoch whose numbers were not finite, and halve the learning rate from here on."""
+        """Restore the state before a diverged epoch, and halve all further learning rates."""
         self.rollbacks += 1
         self.model.load_state_dict(weights)
         if self.rollbacks > TUNING.rollbacks:

@@ -1,0 +1,163 @@
+"""Parameters of rigid bodies, drives and friction, which a fit to torques estimates, as one vector x (K,)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from spelgen.dynamics.parameters import parameter_table
+from spelgen.dynamics.protocol import motors_of
+from spelgen.fitting.functional_model import NamedTensors
+from spelgen.fitting.torque.samples import SampleBlock
+from spelgen.fitting.torque.tuning import TUNING
+from spelgen.logs.tuning import SAMPLES
+from spelgen.runtime.rigid_body import body_factor
+from spelgen.settings.fits import Adaptation
+
+if TYPE_CHECKING:
+    from spelgen.emission.assemble import ArmModel
+
+MIN_SPEED = SAMPLES.moving
+RIGID_GROUPS = (
+    "bodies", "friction_compensation", "gains", "armature", "offset", "sizes", "effects", "velocities",
+    "load_dependence", "fractions",
+)  # fmt: skip
+"""Groups of parameters (see `ParameterInfo`) of bodies, drives and friction; all others are of residual terms."""
+DAY_GROUPS = ("sizes", "effects", "velocities", "load_dependence", "fractions", "offset")
+"""Groups that differ from day to day."""
+NEGLIGIBLE = -30.0  # logarithm of a friction coefficient that is practically zero
+
+
+class RigidParameters:
+    """Parameters of bodies, drives and friction of a model, by name and as one vector x (K,).
+
+    groups: parameter group per name. initial: values when this object was created.
+    """
+
+    def __init__(self, model: ArmModel) -> None:
+        tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
+        self.groups: dict[str, str] = {}
+        self._tensors: dict[str, torch.Tensor] = {}  # parameters, and buffers that a fit may set
+        self.initial: dict[str, torch.Tensor] = {}
+        for name, info in parameter_table(model).items():
+            if info.kind in RIGID_GROUPS:
+                self.groups[name], self._tensors[name] = info.kind, tensors[name]
+                self.initial[name] = tensors[name].detach().clone()
+        (self.bodies,) = self.names("bodies")
+        (self.compensation,) = self.names("friction_compensation")
+        self._lengths = [tensor.numel() for tensor in self.initial.values()]
+
+    def names(self, *groups: str) -> list[str]:
+        """Return the names of the parameters of these groups."""
+        return [name for name, group in self.groups.items() if group in groups]
+
+    def unflatten(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return views of a vector (K,) by name, each in the shape of its parameter."""
+        parts = zip(self.initial.items(), x.split(self._lengths), strict=True)
+        return {name: part.view_as(tensor) for (name, tensor), part in parts}
+
+    def flatten(self, parameters: NamedTensors) -> torch.Tensor:
+        """Return parameters by name as one vector (K,)."""
+        return torch.cat([parameters[name].flatten() for name in self.initial])
+
+    def write(self, x: torch.Tensor) -> None:
+        """Copy the parameters x (K,) into the model."""
+        with torch.no_grad():
+            for name, part in self.unflatten(x).items():
+                self._tensors[name].copy_(part)
+
+    def mask(self, *groups: str) -> torch.Tensor:
+        """Return a mask (K,) of the parameters of these groups."""
+        tensors = self.initial.items()
+        return (
+            self.flatten({name: torch.full_like(x, self.groups[name] in groups) for name, x in tensors}) > 0
+        )
+
+    def free_mask(self, adapt: Adaptation | None, compensated: torch.Tensor) -> torch.Tensor:
+        """Return a mask (K,) of the parameters that a fit estimates.
+
+        Args:
+            adapt: "load": the last body; "friction": `DAY_GROUPS`; None or "unit": all.
+            compensated: (n,) joints with a friction compensation, which is fixed at all others.
+        """
+        if adapt == "load":
+            free = self.mask()
+            self.unflatten(free)[self.bodies][-1] = True
+            return free
+        free = self.mask(*(DAY_GROUPS if adapt == "friction" else RIGID_GROUPS))
+        self.unflatten(free)[self.compensation].copy_(compensated)
+        return free
+
+
+def joint_torque(model: ArmModel, samples: SampleBlock) -> torch.Tensor:
+    """Return the measured joint torque, (T, n) [Nm, N]."""
+    with torch.no_grad():
+        torque: torch.Tensor = samples.tau @ model.input_matrix(samples.q[:1])[0].mT
+    return torque
+
+
+def limit_friction(model: ArmModel, samples: SampleBlock) -> None:
+    """Limit the nominal friction of each drive to the standard deviation of its torque in the samples.
+
+    Nominal friction is derived from the effort limits of the URDF, which are placeholders in many files. Torque offsets
+    have its unit: they would be confounded with gravity if it were far too large.
+    """
+    rigid, motors = RigidParameters(model), motors_of(model)
+    with torch.no_grad():
+        drive_torque = joint_torque(model, samples) @ torch.linalg.inv(motors)
+        limit = drive_torque.std(dim=0) / model.friction.nominal
+        # the torque of a drive at rest, or of a drive without torque, has no information on its friction
+        informative = (limit > 0) & ((samples.qd @ motors.mT).abs().amax(dim=0) > MIN_SPEED)
+        limit = torch.where(informative, limit, torch.inf)
+        scale = limit.clamp(max=1.0)
+        model.friction.nominal *= scale
+    parameters = dict(rigid.initial)
+    for name in rigid.names("sizes", "effects"):
+        parameters[name] = parameters[name].minimum(limit.log()) - scale.log()
+    for name in rigid.names("offset", "friction_compensation"):
+        parameters[name] = parameters[name] / scale
+    rigid.write(rigid.flatten(parameters))
+
+
+def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+    """Return log-Cholesky parameters (B, 10) after a step that is straight in the inertial parameters.
+
+    The torque is linear in the inertial parameters, not in their log-Cholesky parameters: a Gauss-Newton step that is
+    straight in the latter deviates from the line along which it was computed. With the pseudo-inertia C S C^T,
+    S = T T^T and T = T(raw), the step changes T by X = dT/draw step, and S to first order by
+    T (T^-1 X + (T^-1 X)^T) T^T. This change is added to S, reduced by a factor if S would lose positive definiteness.
+
+    Args:
+        raw: (B, 10) log-Cholesky parameters of B bodies.
+        step: (B, 10) change of the log-Cholesky parameters.
+    """
+    row, column = torch.triu_indices(4, 4)
+    parameters, change = torch.zeros(2, len(raw), 4, 4).double()
+    parameters[:, row, column], change[:, row, column] = raw, step
+    # complex-step derivative: exact to the last digit; forward mode would import torch's compiler, which takes seconds
+    epsilon = 1e-100
+    perturbed = body_factor(torch.complex(parameters, epsilon * change))
+    factor, factor_change = perturbed.real, perturbed.imag / epsilon
+    relative = torch.linalg.solve_triangular(factor, factor_change, upper=True)
+    added = relative + relative.mT
+    min_eigenvalue = torch.linalg.eigvalsh(added)[:, 0]
+    fraction = (TUNING.body_step / (-min_eigenvalue).clamp(min=1e-12)).clamp(max=1.0)
+    factor = factor @ upper_cholesky(torch.eye(4).double() + fraction[:, None, None] * added)
+    return log_cholesky_parameters(factor)
+
+
+def upper_cholesky(matrix: torch.Tensor) -> torch.Tensor:
+    """Return the upper triangular U, (..., n, n), with U U^T equal to the matrix (..., n, n)."""
+    lower: torch.Tensor = torch.linalg.cholesky(matrix.flip(-1, -2))
+    return lower.flip(-1, -2)
+
+
+def log_cholesky_parameters(factor: torch.Tensor) -> torch.Tensor:
+    """Return the log-Cholesky parameters (B, 10) of factors (B, 4, 4): the inverse of `body_factor`."""
+    scale = factor.diagonal(dim1=-2, dim2=-1)
+    radii, mass = scale[:, :3].log(), scale[:, 3:].log()
+    logarithms = torch.cat([radii - mass, 2 * mass], dim=-1)
+    parameters = (factor / scale.unsqueeze(-1)).triu(1) + logarithms.diag_embed()
+    row, column = torch.triu_indices(4, 4)
+    return parameters[:, row, column]

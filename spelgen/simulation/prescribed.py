@@ -1,0 +1,94 @@
+"""Simulate recordings of motions that the arm performs exactly: torques by inverse dynamics, with friction hysteresis.
+
+Prescribed motion needs no controller and no integration, so dry friction may have presliding hysteresis, whose stiff
+bristles an integrator would resolve by microseconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from spelgen.arm.actuation import Drives
+from spelgen.arm.arm import Arm
+from spelgen.dynamics.bristles import BristleReach, bristles_along
+from spelgen.dynamics.joint_friction import DriveFriction
+from spelgen.dynamics.pinocchio_arm import arm_dynamics
+from spelgen.errors import SettingsError
+from spelgen.excitation.trajectory import Motion
+from spelgen.settings.settings import Settings
+from spelgen.simulation.paths import paths
+from spelgen.simulation.protocol import SimulatedLogs, make_friction
+from spelgen.simulation.tracking import Recording, measured, quantized
+from spelgen.simulation.tuning import AS_BUILT
+
+
+def prescribed(
+    arm: Arm,
+    settings: Settings,
+    drives: Drives | None = None,
+    *,
+    motions: Sequence[Motion] = (),
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> SimulatedLogs:
+    """Return one recording per motion; the last `test_fraction` of them are for testing.
+
+    Logged are positions from the encoders after a zero-phase low-pass, velocities by central differences of these, and
+    motor torques with white noise. Raises SettingsError for an arm with a passive joint.
+
+    Args:
+        arm: The arm.
+        settings: `simulation` and `tracking` are used.
+        drives: Input matrix and couplings of motors; None: each motor moves its own joint.
+        motions: Positions with two derivatives, (T, n) each; none: as `tracking.paths` specifies.
+        progress: Called with (recordings done, all) after each recording.
+    """
+    protocol = settings.simulation
+    passive = [joint.name for joint in arm.coordinates if joint.passive]
+    if passive:
+        raise SettingsError(
+            f"the passive joint {passive[0]!r}", element="simulation.protocol", expected="a motor at every joint",
+            do="use the protocol random-inputs: no torque moves this joint along a path",
+        )  # fmt: skip
+    friction = make_friction(arm, settings, drives and drives.speeds)
+    dynamics = arm_dynamics(arm, settings)
+    to_motors = np.eye(len(arm.coordinates)) if drives is None else np.linalg.inv(drives.inputs)
+    if not motions:
+        t = np.arange(round(protocol.duration * protocol.sample_rate) + 1) / protocol.sample_rate
+        motions = paths(arm, settings, t)
+    logs = []
+    for number, motion in enumerate(motions):
+        rng = np.random.default_rng([protocol.seed, number])
+        torque = dynamics.inverse_dynamics(motion.q, motion.qd, motion.qdd)
+        torque = torque + friction_along(friction, arm, motion, protocol.presliding)
+        tau = torque @ to_motors.T
+        tau = tau + protocol.torque_noise * tau.std(axis=0) * rng.standard_normal(tau.shape)
+        states = np.concatenate([motion.q, motion.qd], axis=1)
+        recording = Recording(motion.t, states, quantized(motion.q, settings.tracking), tau)
+        logs.append(measured(recording, settings.tracking, f"motion_{number:02d}"))
+        progress(number + 1, len(motions))
+    trained = len(logs) - min(round(protocol.test_fraction * len(logs)), len(logs) - 1)
+    return SimulatedLogs(logs[:trained], logs[trained:])
+
+
+def friction_along(friction: DriveFriction, arm: Arm, motion: Motion, presliding: float) -> np.ndarray:
+    """Return the friction torque (T, n) [Nm; N] along a motion.
+
+    Maxwell-slip model (Al-Bender, Lampaert, Swevers, IEEE TAC 50:1883, 2005): elements in parallel, each of which
+    sticks up to its own breakaway displacement and then slips. The direction of dry friction is the mean normalised
+    deflection of the elements, in [-1, 1].
+
+    Args:
+        friction: Coefficients of the drives.
+        arm: Its joint types set the scale of displacements.
+        motion: Positions and velocities, (T, n) each.
+        presliding: Largest breakaway displacement [rad]; a tenth of it [m] for prismatic joints. 0: no hysteresis.
+    """
+    if presliding == 0.0:
+        return friction(motion.qd)
+    scale = np.array([1.0 if kind == "revolute" else 0.1 for kind in arm.joint_types])
+    elements = np.geomspace(presliding / AS_BUILT.presliding_span, presliding, AS_BUILT.elements)
+    breakaway = scale[:, None] * elements  # (n, K)
+    deflection = bristles_along(motion.q, BristleReach(breakaway, friction.speeds))  # (T, n, K)
+    return friction.torque(motion.qd, (deflection / breakaway).mean(axis=-1))
