@@ -130,7 +130,7 @@ def test_messages_of_a_second_publisher_are_left_out_with_one_note(tmp_path):
     (log,) = read_logs(bag_of(mixed, tmp_path / "bag"), JOINTS)
     check_read(log)
     assert log.repairs == (
-        f"{len(zeros)} rows of another topic or publisher left out: without a value of one quantity of any joint",
+        f"{len(zeros)} rows of another topic or publisher left out: without values, or with positions only",
     )
 
 

@@ -127,7 +127,7 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[n
     if foreign.any():
         data, rows = data[~foreign], np.asarray(rows)[~foreign]
         count, message = counted(int(foreign.sum()), "row"), "of another topic or publisher left out"
-        repairs += (f"{count} {message}: without a value of one quantity of any joint",)
+        repairs += (f"{count} {message}: without values, or with positions only",)
     if layout.mapping.sample_rate:
         data = np.column_stack([np.arange(len(data)) / layout.mapping.sample_rate, data[:, 1:]])
         return data, repairs

@@ -65,9 +65,9 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
 
 
 def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
-    """Return which rows (T, C) lack a quantity of all joints: those of another topic or publisher, NaN there."""
-    empty = np.isnan(data[:, 1:]).reshape(len(data), -1, joints)
-    return np.asarray(empty.all(axis=2).any(axis=1))
+    """Return which rows (T, C) are of another topic or publisher: nothing, or positions only, of all joints."""
+    empty = np.isnan(data[:, 1 + joints :])
+    return np.asarray(empty.all(axis=1))
 
 
 def clock_start(table: pa.Table, layout: Layout) -> pa.Scalar | None:
