@@ -1,11 +1,33 @@
 """Expands a xacro file, in a process that ``xacro_input`` starts: FILE -> stdout, remarks -> stderr."""
 
+import re
 import sys
 from contextlib import suppress
+from pathlib import Path
+from types import ModuleType
 
 MISSING = 3
 """Exit code where the package xacro is not installed."""
 MEMORY = 2**30  # bytes
+
+
+def _find_packages_above(arguments: ModuleType, path: Path) -> None:
+    """Let $(find PACKAGE) find a package that contains the file, or that lies beside one, without ROS."""
+    installed = arguments._eval_find
+
+    def find(package: str) -> str:
+        for folder in path.parents:
+            for candidate in (folder, folder / package):
+                manifest = candidate / "package.xml"
+                if manifest.is_file():
+                    name = re.search(r"<name>\s*(.*?)\s*</name>", manifest.read_text(errors="replace"))
+                    if name and name[1] == package:
+                        return str(candidate)
+        # a package without its manifest has its name
+        named = [folder for folder in path.parents if folder.name == package]
+        return str(named[0]) if named else str(installed(package))
+
+    arguments._eval_find = find
 
 
 def main(path: str) -> None:
@@ -18,6 +40,7 @@ def main(path: str) -> None:
         import xacro
     except ModuleNotFoundError:
         sys.exit(MISSING)
+    _find_packages_above(xacro.substitution_args, Path(path).resolve())
     try:
         document = xacro.process_file(path)
         for comment in document.childNodes:
