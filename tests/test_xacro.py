@@ -1,6 +1,7 @@
 """*.xacro files are expanded by the package xacro and read like the expanded text; other files are never run."""
 
 import importlib.util
+import shutil
 import subprocess
 import sys
 import time
@@ -120,6 +121,7 @@ class TestExpansion:
         (package / "urdf").mkdir(parents=True)
         if place != "without-manifest":
             (package / "package.xml").write_text("<package><name> my_arm </name></package>")
+        shutil.copytree(arm.parent / "parts", package / "urdf" / "parts")
         (package / "urdf" / "part.xacro").write_bytes(arm.read_bytes())
         other = tmp_path / "ws" / "app" if place == "beside" else package
         (other / "robots").mkdir(parents=True, exist_ok=True)

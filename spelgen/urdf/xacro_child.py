@@ -2,18 +2,18 @@
 
 import re
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from types import ModuleType
 
 MISSING = 3
 """Exit code where the package xacro is not installed."""
 MEMORY = 2**30  # bytes
 
 
-def _find_packages_above(arguments: ModuleType, path: Path) -> None:
+def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path) -> None:
     """Let $(find PACKAGE) find a package that contains the file, or that lies beside one, without ROS."""
-    installed = arguments._eval_find
+    installed = functions["_eval_find"]
 
     def find(package: str) -> str:
         for folder in path.parents:
@@ -25,9 +25,9 @@ def _find_packages_above(arguments: ModuleType, path: Path) -> None:
                         return str(candidate)
         # a package without its manifest has its name
         named = [folder for folder in path.parents if folder.name == package]
-        return str(named[0]) if named else str(installed(package))
+        return str(named[0]) if named else installed(package)
 
-    arguments._eval_find = find
+    functions["_eval_find"] = find
 
 
 def main(path: str) -> None:
@@ -38,9 +38,10 @@ def main(path: str) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     try:
         import xacro
+        from xacro import substitution_args
     except ModuleNotFoundError:
         sys.exit(MISSING)
-    _find_packages_above(xacro.substitution_args, Path(path).resolve())
+    _find_packages_above(vars(substitution_args), Path(path).resolve())
     try:
         document = xacro.process_file(path)
         for comment in document.childNodes:
