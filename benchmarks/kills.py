@@ -23,7 +23,7 @@ from pathlib import Path
 import torch
 
 from spelgen.arm.configured_arm import load_arm
-from spelgen.emission.build import generate
+from spelgen.emission.specify import generate
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.read import write_logs
 from spelgen.simulation.simulate import simulate

@@ -12,8 +12,9 @@ if TYPE_CHECKING:
     from spelgen.design import Design
     from spelgen.dynamics.linear_friction import FrictionModel
     from spelgen.dynamics.tip import tip_kinematics
-    from spelgen.emission.build import build, generate
+    from spelgen.emission.build import build
     from spelgen.emission.loading import load_module
+    from spelgen.emission.specify import generate
     from spelgen.errors import SpelgenError
     from spelgen.evaluation.evaluate import evaluate
     from spelgen.evaluation.results import Results
@@ -37,7 +38,7 @@ _HOME = {
     "ConfiguredArm": "arm.configured_arm",
     "inspect": "certificate.inspection",
     "Inspection": "certificate.inspection",
-    "generate": "emission.build",
+    "generate": "emission.specify",
     "Design": "design",
     "build": "emission.build",
     "load_module": "emission.loading",

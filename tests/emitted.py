@@ -19,7 +19,7 @@ from torch import nn
 
 from spelgen.arm.configured_arm import ConfiguredArm, load_arm
 from spelgen.design import Design
-from spelgen.emission.build import derive_spec
+from spelgen.emission.specify import derive_spec
 from spelgen.emission.text import module_text
 from spelgen.spec import Options
 from spelgen.structure.structure import Structure, derive

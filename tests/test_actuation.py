@@ -13,7 +13,7 @@ from spelgen.certificate.inspection import inspect
 from spelgen.cli.main import app
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
-from spelgen.emission.build import generate
+from spelgen.emission.specify import generate
 from spelgen.errors import SettingsError, SpelgenError
 from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
 from spelgen.logs.windows import Windows

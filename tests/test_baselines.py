@@ -20,7 +20,7 @@ from spelgen.cli.main import app
 from spelgen.dynamics.bristles import moved_bristles
 from spelgen.dynamics.regressor import regressor, urdf_parameters
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
-from spelgen.emission.build import generate
+from spelgen.emission.specify import generate
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.fitted import load_run
 from spelgen.logs.read import Trajectory, read_logs, write_logs

@@ -16,7 +16,8 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.inspection import inspect
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.regressor import regressor, urdf_parameters
-from spelgen.emission.build import build, generate
+from spelgen.emission.build import build
+from spelgen.emission.specify import generate
 from spelgen.fitting.fit import fit
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.jacobian import TorqueJacobian

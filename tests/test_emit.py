@@ -14,7 +14,7 @@ from emitted import GANTRY, built, import_source
 
 from spelgen.certificate.module_check import check
 from spelgen.design import Preset
-from spelgen.emission.build import generate
+from spelgen.emission.specify import generate
 from spelgen.spec import read_facts
 
 ROOT = Path(__file__).parents[1]

@@ -186,7 +186,7 @@ def test_arm_with_a_constant_mass_matrix(tmp_path):
         + joint.format("slide", "prismatic", "b", "c")
         + "</robot>"
     )
-    from spelgen.emission.build import generate
+    from spelgen.emission.specify import generate
 
     model = import_source(generate(urdf), tmp_path / "rp_spel.py").Model()
     q, qd, _, tau = states(2, 20)

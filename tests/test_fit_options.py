@@ -7,7 +7,8 @@ from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
-from spelgen.emission.build import build, generate
+from spelgen.emission.build import build
+from spelgen.emission.specify import generate
 from spelgen.errors import OptionError, SettingsError
 from spelgen.fitting.fit import fit
 from spelgen.fitting.objectives import FitOptions, choose_config

@@ -65,7 +65,7 @@ def test_two_modules_of_the_same_name_do_not_meet(tmp_path):
 def test_a_model_is_shown_in_a_line_and_as_its_structure():
     model = build(ROBOTS / "rpr.urdf")
     count = sum(parameter.numel() for parameter in model.parameters())
-    assert repr(model) == f"<Model of 'rpr' (hybrid, mlp): 3 joints, {count} parameters>"
+    assert repr(model) == f"<Model of 'rpr' (hybrid): 3 joints, {count} parameters>"
     assert "2,3\n    3    C\n    2,3  .    C" in model._repr_html_()
     assert repr(build(ROBOTS / "rpr.urdf", preset="closed-form")).startswith(
         "<Model of 'rpr' (closed-form): "

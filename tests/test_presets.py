@@ -20,7 +20,7 @@ from published_phnode import ByJvp, Published
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.design import Preset, load_design
-from spelgen.emission.build import make_spec
+from spelgen.emission.specify import make_spec
 from spelgen.fitting.rollout import position_difference
 from spelgen.spec import Options
 from tests.lie_group import to_group

@@ -3,7 +3,7 @@
 import pytest
 
 from spelgen.arm.configured_arm import load_arm
-from spelgen.emission.build import generate
+from spelgen.emission.specify import generate
 from spelgen.errors import SpelgenError
 
 TRANSMISSION = """<transmission name="drive"><type>transmission_interface/SimpleTransmission</type>

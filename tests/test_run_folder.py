@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 import spelgen
 from spelgen.cli.main import app
-from spelgen.emission.build import generate
+from spelgen.emission.specify import generate
 from spelgen.errors import ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.exporting.export import export

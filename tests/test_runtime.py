@@ -22,7 +22,8 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.design import PRESET_NAMES, load_design
 from spelgen.dynamics.body_regressor import pseudo_inertia
 from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
-from spelgen.emission.build import build, make_spec
+from spelgen.emission.build import build
+from spelgen.emission.specify import make_spec
 from spelgen.fitting.torque.parameters import log_cholesky_parameters, upper_cholesky
 from spelgen.runtime.derived_mass import DerivedMass
 from spelgen.runtime.encoding import JointEncoding

@@ -3,7 +3,7 @@
 import torch
 from emitted import NETWORKS, ROBOTS, built, import_source
 
-from spelgen.emission.build import generate
+from spelgen.emission.specify import generate
 from spelgen.fitting.objectives import default_objective
 from spelgen.fitting.torque import networks as torque_networks
 from spelgen.fitting.torque.networks import fit_networks

@@ -12,7 +12,7 @@ from REMOVED import require_own_module
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.module_check import check
-from spelgen.emission.build import generate
+from spelgen.emission.specify import generate
 from spelgen.errors import SpelgenError
 from spelgen.fitting.train import train
 from spelgen.logs.read import write_logs

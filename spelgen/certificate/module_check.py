@@ -7,8 +7,8 @@ from pathlib import Path
 
 from spelgen.certificate.verification import Verification
 from spelgen.certificate.verify import verify
-from spelgen.emission.build import arm_of_spec, derive_spec, find_urdf
-from spelgen.emission.loading import parse_spec, read_source
+from spelgen.emission.module_file import parse_spec, read_source
+from spelgen.emission.specify import arm_of_spec, derive_spec, find_urdf
 from spelgen.emission.text import module_text
 from spelgen.structure.structure import derive
 

@@ -58,7 +58,7 @@ def compare(
     """Train presets on the same logs and rank them.
 
     An arm without logs is simulated by the protocol of its settings. The same command resumes an interrupted
-    comparison, and runs only what has changed.
+    comparison, and reruns only changed runs.
     """
     from spelgen.comparison.arms import ablation_designs
     from spelgen.comparison.study import prepare_study, run_study
@@ -100,7 +100,7 @@ def compare(
 
 
 def _comparison(target: Path, data: list[Path] | None, mapping: Path | None) -> Comparison:
-    """Return the comparison of a URDF with these logs, or that of a YAML file."""
+    """Return the comparison of a URDF with these logs, or the comparison in a YAML file."""
     from spelgen.comparison.arms import YAML, ComparedArm, Comparison, load_comparison
 
     if target.suffix not in YAML:

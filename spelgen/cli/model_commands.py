@@ -78,7 +78,7 @@ def build(
     if preset not in PRESET_NAMES and Path(preset).suffix not in (".yaml", ".yml"):
         message = f"{preset!r} is none of {', '.join(PRESET_NAMES)}, nor a YAML file"
         raise typer.BadParameter(message, param_hint="'--preset'")
-    from spelgen.emission.build import make_spec
+    from spelgen.emission.specify import make_spec
     from spelgen.emission.text import module_text
 
     arm = options.load(robot, joints, tip, angle_tolerance)

@@ -100,7 +100,7 @@ def train(
     spec = _specification(module, source, folder if resume else None)
     urdf = None if resume else robot or (None if module is None else _unchanged_urdf(module, spec))
     start = resumed_run(folder, request) if resume else new_run(urdf, request)
-    from spelgen.emission.build import arm_of_spec
+    from spelgen.emission.specify import arm_of_spec
     from spelgen.log_checks.check_logs import require_sound_logs
 
     # the mapping may contain all joints of a URDF, and logs are checked with the arm
@@ -201,7 +201,7 @@ def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -
 
 def _specification(module: Path | None, source: Path | None, resumed: Path | None) -> ModelSpec:
     """Return the specification of the model: of a run that is resumed or adapted, or of a module."""
-    from spelgen.emission.loading import read_spec
+    from spelgen.emission.module_file import read_spec
     from spelgen.fitting.run_folder import RunFolder
 
     folder = resumed or source
@@ -214,7 +214,7 @@ def _specification(module: Path | None, source: Path | None, resumed: Path | Non
 
 def _unchanged_urdf(module: Path, spec: ModelSpec) -> Path | None:
     """Return the URDF near a module, None if it is not the one that the module was built from."""
-    from spelgen.emission.build import find_urdf
+    from spelgen.emission.specify import find_urdf
     from spelgen.urdf.document import urdf_bytes
 
     try:

@@ -20,7 +20,7 @@ from spelgen.comparison.tuning import ComparisonTuning
 from spelgen.dynamics.parameters import parameter_count
 from spelgen.evaluation.drawn_motions import PredictedMotion, predicted_motion
 from spelgen.evaluation.invariants import Invariants, invariants
-from spelgen.evaluation.plain import array, finite, listed
+from spelgen.evaluation.plain import Curve, finite
 from spelgen.evaluation.truth import mass_error, true_mass
 from spelgen.fitting.rollout import loss_scales, position_difference, roll_out, rollout_loss
 from spelgen.logs.trajectory import Trajectory
@@ -73,7 +73,7 @@ class SimulatedFigures:
     invariants: Invariants
     mass_error: float
     step_seconds: float
-    mass: list[list[list[float]]]
+    mass: Curve | None
     example: PredictedMotion | None
 
 
@@ -87,20 +87,19 @@ def simulated_figures(
     steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = spread_windows(testing, steps + 1, decimation)
     # smallest eigenvalue of M: where the arm can be; error of M: where the arm has been
-    low, high = torch.tensor(list(map(working_range, load_arm(truth).arm.coordinates)), dtype=torch.float64).T
+    joints = fit.record.joints
+    ranges = list(map(working_range, load_arm(truth, joints).arm.coordinates))
+    low, high = torch.tensor(ranges, dtype=torch.float64).T
     visited = far.q[:, 0]
     example = predict_example(of_dynamics("", model, far), testing, steps, decimation)
-    mass: list[list[list[float]]] = []
-    if example is not None:
-        # at the rounded positions of result.json, so that the page shows M at the positions that are stored
-        mass = model.mass_matrix(torch.from_numpy(array(listed(example.q)))).tolist()
+    mass = None if example is None else model.mass_matrix(torch.from_numpy(example.q)).numpy()
     return SimulatedFigures(
         sizes=sizes(model),
         train=prediction_loss(model, spread_windows(training, config.window, decimation), substeps),
         test=prediction_loss(model, spread_windows(testing, config.window, decimation), substeps),
         prediction=prediction_loss(model, far, substeps),
         invariants=invariants(model, far, low, high),
-        mass_error=mass_error(model.mass_matrix(visited), true_mass(truth, visited)),
+        mass_error=mass_error(model.mass_matrix(visited), true_mass(truth, visited, joints)),
         step_seconds=step_seconds(model, training, config, decimation),
         mass=mass,
         example=example,

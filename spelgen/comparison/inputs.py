@@ -78,7 +78,7 @@ def arm_inputs(
 ) -> ArmInputs:
     """Return the inputs of an arm's runs; the logs of an arm without logs are simulated into the folder.
 
-    Raises what `load_arm`, `load_mapping`, `read_logs` and `simulate` raise, before anything is trained.
+    Raises the errors of `load_arm`, `load_mapping`, `read_logs` and `simulate`, before anything is trained.
     """
     loaded = load_arm(arm.urdf, arm.joints, arm.tip)
     mapping = log_source(loaded, arm.mapping).mapping

@@ -153,7 +153,7 @@ class Job(Group):
 def run_job(job: Job) -> RunResult:
     """Train and measure, or resume from the checkpoint of an interrupted run; write result.json.
 
-    Raises what `fit` and `evaluate` raise, and KeyboardInterrupt if the process is asked to end.
+    Raises the errors of `fit` and `evaluate`, and KeyboardInterrupt if the process is asked to end.
     """
     finished = job.result()
     if finished is not None:
@@ -190,7 +190,7 @@ def run_job(job: Job) -> RunResult:
 
 
 def _own_checkpoint(job: Job, run: RunFolder) -> bool:
-    """Return whether the folder has a checkpoint of exactly this run; that of another run is discarded."""
+    """Test for a checkpoint of exactly this run in the folder; the checkpoint of another run is discarded."""
     owner = job.folder / "job.json"
     if owner.is_file() and read_json(owner, RunError) == {"key": job.key}:
         return run.config.exists()

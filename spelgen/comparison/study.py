@@ -1,4 +1,4 @@
-"""A comparison from its arms to its results: prepare the inputs, estimate the time, run what is not finished."""
+"""A comparison from its arms to its results: prepare the inputs, estimate the time, run the unfinished jobs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from spelgen.comparison.figures import step_seconds
 from spelgen.comparison.inputs import ArmInputs, Progress, arm_inputs
 from spelgen.comparison.jobs import Job, RunResult, run_job
 from spelgen.comparison.tuning import ComparisonTuning
-from spelgen.design import PRESET_NAMES, load_design
+from spelgen.design import load_design
 from spelgen.errors import RunError, SpelgenError, in_one_line
 from spelgen.evaluation.plain import record
 from spelgen.files import write_json
@@ -28,14 +28,16 @@ from spelgen.tasks import RunTasks
 
 TUNING = ComparisonTuning()
 SCHEMA = 1
-PRESETS_ON_LOGS = ("closed-form", "hybrid")
+PRESETS_ON_LOGS: tuple[str, ...] = ("closed-form", "hybrid")
+# the paper's models are first
+SIMULATED_PRESETS: tuple[str, ...] = ("phnode", "spel", "spel-kan", "minimal", "hybrid", "closed-form")
 
 
 @dataclass(frozen=True)
 class Study:
     """A comparison that is ready to run.
 
-    jobs: all runs. results: those that are finished, by the name of the run. failures: reason, by the name of an arm or
+    jobs: all runs. results: of finished runs, by name. failures: reason, by the name of an arm or
     run. estimates: expected time of the other runs [s], by name.
     """
 
@@ -55,7 +57,7 @@ class Study:
         return arms
 
     def announcement(self, parallel: int) -> str:
-        """Return the number of runs, and an estimate of the time of those that are not finished."""
+        """Return the number of runs, and an estimate of the time of the unfinished ones."""
         counts = [
             counted(len({job.arm for job in self.jobs}), "arm"),
             counted(len({job.design for job in self.jobs}), "preset"),
@@ -144,9 +146,9 @@ def duration(seconds: float) -> str:
 def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) -> list[Job]:
     """Return the runs of an arm, seed by seed, so that an interrupted comparison has all presets of the first seeds."""
     settings = load_settings(inputs.truth or inputs.urdf)
-    protocol, presets, seeds = settings.comparison, PRESET_NAMES, settings.comparison.seeds
-    if inputs.truth is None:
-        presets, seeds = PRESETS_ON_LOGS, 1
+    protocol, simulated = settings.comparison, inputs.truth is not None
+    presets = comparison.presets or (SIMULATED_PRESETS if simulated else PRESETS_ON_LOGS)
+    seeds = comparison.seeds or (protocol.seeds if simulated else 1)
     options = {
         name: value for name, value in comparison.training if name in comparison.training.model_fields_set
     }
@@ -156,9 +158,8 @@ def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) ->
         "training": settings.training.model_copy(update=options),
         "protocol": protocol.model_copy(update={"steps": comparison.steps or protocol.steps}),
     }  # fmt: skip
-    axes = range(comparison.seeds or seeds), range(comparison.splits), comparison.presets or presets
     jobs = []
-    for seed, split, design in product(*axes):
+    for seed, split, design in product(range(seeds), range(comparison.splits), presets):
         run = folder / f"{Path(design).stem}-seed{seed}-split{split}"
         jobs.append(
             Job.model_validate({**shared, "design": design, "seed": seed, "split": split, "folder": run})

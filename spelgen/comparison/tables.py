@@ -1,4 +1,4 @@
-"""Tables and sentences of a comparison: medians over seeds and splits, beside published figures."""
+"""Tables and sentences of a comparison: medians over seeds and splits, and published figures."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFi
 
 
 def arm_sentence(results: Sequence[RunResult]) -> str:
-    """Return one sentence: the best model of an arm, and by which factor its error is smaller than those of others."""
+    """Return one sentence: the best model of an arm, and the factors by which its error is smaller than the others."""
     runs, measure = _by_preset(results), next(iter(results[0].errors))
     errors = {name: error for name, error in _medians(runs, measure).items() if error is not None}
     models = [name for name in errors if name in runs]

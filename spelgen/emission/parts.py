@@ -9,7 +9,6 @@ from spelgen.design import BRISTLE_REACH, SERVO_STRIBECK_ROUNDING
 from spelgen.emission.entry_sums import mean_mass
 from spelgen.emission.source import Call, Code, call
 from spelgen.emission.tuning import TUNING
-from spelgen.runtime.rows import Joint
 from spelgen.spec import JointSpec, LinkSpec, ModelSpec
 
 GENERATOR, JOINTS, LINKS = Code("generator"), Code("JOINTS"), Code("LINKS")
@@ -97,10 +96,17 @@ def _joint(joint: JointSpec) -> Call:
     fields |= {"friction": joint.friction, "armature": joint.armature}
     if joint.gear != 1:
         fields["gear"] = joint.gear
-    limits = Joint(joint.name, joint.joint_type, joint.lower, joint.upper, 1.0, 1.0, 1.0)
-    if (limits.center, limits.half_range) != (joint.center, joint.half_range):
+    if (joint.center, joint.half_range) != _range_of_limits(joint):
         fields["typical_range"] = (joint.center, joint.half_range)
     return call("Joint", joint.name, joint.joint_type, **fields)
+
+
+def _range_of_limits(joint: JointSpec) -> tuple[float, float] | None:
+    """Return center and half range of the limits, as `runtime.rows.Joint` rounds them; None without limits."""
+    if joint.lower is None or joint.upper is None:
+        return None
+    middle, half = (joint.lower + joint.upper) / 2, (joint.upper - joint.lower) / 2
+    return float(f"{middle:.6g}"), float(f"{half:.6g}")
 
 
 def _link(spec: ModelSpec, link: LinkSpec) -> Call:

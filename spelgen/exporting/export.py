@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from spelgen.arm.configured_arm import ConfiguredArm
-from spelgen.emission.build import arm_of_spec
+from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import RunError, suggestion
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting

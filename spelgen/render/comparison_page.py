@@ -68,10 +68,10 @@ def _curves(study: Study, section: ArmSection, inputs: ArmInputs, truth: Path) -
     prediction, mass = [], []
     if examples:
         prediction = trajectory_panels(examples, styles, named_joints(arm.joint_names, arm.joint_types))
-        learned = {name: array(first[name].mass) for name in examples}
+        learned = {name: figures.mass for name, figures in first.items() if figures.mass is not None}
         # all presets have the same test logs, and therefore the same example
         along = next(iter(examples.values()))
-        true = true_mass(truth, torch.from_numpy(along.q)).numpy()
+        true = true_mass(truth, torch.from_numpy(along.q), arm.joint_names).numpy()
         rows, columns = np.tril_indices(len(arm.joint_types))
         entries = {name: m[:, rows, columns].T for name, m in {"true": true, **learned}.items()}
         mass = mass_panels(along.t, entries, {"true": "truth", **styles}, arm.joint_types, width=400)

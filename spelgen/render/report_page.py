@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from jinja2 import TemplateError
 
 from spelgen.arm.configured_arm import ConfiguredArm
-from spelgen.emission.build import arm_of_spec
+from spelgen.emission.specify import arm_of_spec
 from spelgen.emission.text import header
 from spelgen.errors import RunError, SpelgenError, in_one_line
 from spelgen.evaluation.results import Results

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.network_dynamics import NetworkConfiguration, NetworkDynamics
-from spelgen.runtime.parts import Network
+from spelgen.runtime.parts import Network, Parameters
 
 
 class DenseInputDynamics(NetworkDynamics):
@@ -19,7 +19,7 @@ class DenseInputDynamics(NetworkDynamics):
         self.moving = nn.Buffer(torch.eye(3 * self.n).double()[2::3])
         self.input_network = input_network
 
-    def prepare(self) -> dict[str, Any]:
+    def prepare(self) -> dict[str, Parameters]:
         """Return the parameter cache, by part."""
         return super().prepare() | {"input": self.input_network.prepare(self.moving, self.moving.sum(dim=1))}
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.encoding import JointEncoding
-from spelgen.runtime.parts import Friction, Inputs, Intermediates, Mass, Network
+from spelgen.runtime.parts import Friction, Inputs, Intermediates, Mass, Network, Parameters
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
 from spelgen.runtime.rows import Joint
 
@@ -20,7 +20,7 @@ class NetworkConfiguration(NamedTuple):
     encoded: Tensor  # input of the networks, see ``JointEncoding``
     mass: Tensor  # M(q), (..., n, n)
     intermediates: Intermediates  # of the derivatives of M
-    parameters: dict[str, Any]
+    parameters: dict[str, Parameters]
 
 
 class NetworkDynamics(PortHamiltonian):
@@ -41,12 +41,12 @@ class NetworkDynamics(PortHamiltonian):
         self.potential, self.friction = potential, friction
         self.scale = nn.Buffer(torch.full((1, 1), potential_scale, dtype=torch.float64))
 
-    def prepare(self) -> dict[str, Any]:
+    def prepare(self) -> dict[str, Parameters]:
         """Return the parameter cache, by part."""
         potential = self.potential.prepare(self.scale, 0 * self.scale[0])
         return {"mass": self.mass.prepare(), "potential": potential, "friction": self.friction.prepare()}
 
-    def configuration(self, q: Tensor, parameters: dict[str, Any]) -> NetworkConfiguration:
+    def configuration(self, q: Tensor, parameters: dict[str, Parameters]) -> NetworkConfiguration:
         """Return all that depends on q only."""
         encoded = self.encoding.forward(q)
         mass, intermediates = self.mass.forward(encoded, parameters["mass"])

@@ -11,7 +11,11 @@ Row = Sequence[float]
 Rows = Sequence[Sequence[float]]
 Entries = Callable[..., Tensor]  # a symmetric matrix (..., n, n) of its functions and constants (...)
 Layers = tuple[tuple[Tensor, Tensor], ...]  # weights and biases of a network, masked and scaled
+# The types of these differ between models and parts.
 Intermediates = Any  # values of the forward pass that the derivatives of a part need
+Parameters = Any  # parameter cache: all that depends on the parameters only
+Configuration = Any  # configuration cache: all that depends on q only
+Position = Any  # q, (..., n), or the configuration at q
 
 
 class Network(Protocol):
@@ -33,10 +37,10 @@ class Network(Protocol):
 class Mass(Protocol):
     """The mass matrix M(q) and its derivatives."""
 
-    def prepare(self) -> Any:
+    def prepare(self) -> Parameters:
         """Return the parameter cache: all that depends on the parameters only."""
 
-    def forward(self, encoded: Tensor, parameters: Any) -> tuple[Tensor, Intermediates]:
+    def forward(self, encoded: Tensor, parameters: Parameters) -> tuple[Tensor, Intermediates]:
         """Return M(q), (..., n, n), and the intermediates of its derivatives."""
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Intermediates) -> Tensor:
@@ -49,10 +53,10 @@ class Mass(Protocol):
 class Friction(Protocol):
     """The dissipation matrix D(q, qd)."""
 
-    def prepare(self) -> Any:
+    def prepare(self) -> Parameters:
         """Return the parameter cache: all that depends on the parameters only."""
 
-    def forward(self, encoded: Tensor, qd: Tensor, parameters: Any, right: Tensor) -> Tensor:
+    def forward(self, encoded: Tensor, qd: Tensor, parameters: Parameters, right: Tensor) -> Tensor:
         """Return D(q, qd) right, (..., n, k)."""
 
 

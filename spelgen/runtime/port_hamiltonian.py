@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from spelgen.runtime.parts import Inputs
+from spelgen.runtime.parts import Configuration, Inputs, Parameters, Position
 from spelgen.runtime.rows import Joint
 
 
@@ -28,12 +27,12 @@ class PortHamiltonian(nn.Module):
     once for several calls. inputs: how motors drive the joints; None: each input drives its own joint.
     """
 
-    prepare: Callable[..., Any]  # the parameter cache: all that depends on the parameters only
-    configuration: Callable[[Tensor, Any], Any]  # all that depends on q only
+    prepare: Callable[..., Parameters]
+    configuration: Callable[[Tensor, Parameters], Configuration]
     potential_energy: Callable[..., Tensor]  # V, (...) [J]
-    gravity: Callable[[Any], Tensor]  # dV/dq, (..., n) [Nm, N]
-    lagrangian_gradient: Callable[[Any, Tensor], Tensor]  # d/dq of 1/2 qd^T M qd - V
-    nonlinear_effects: Callable[[Any, Tensor], Tensor]  # Coriolis, centrifugal and gravity torque
+    gravity: Callable[[Position], Tensor]  # dV/dq, (..., n) [Nm, N]
+    lagrangian_gradient: Callable[[Position, Tensor], Tensor]  # d/dq of 1/2 qd^T M qd - V
+    nonlinear_effects: Callable[[Position, Tensor], Tensor]  # Coriolis, centrifugal and gravity torque
     friction_torque: Callable[..., Tensor]  # D(q, qd) qd
 
     def __init__(self, joints: Sequence[Joint], inputs: Inputs | None = None) -> None:
@@ -56,7 +55,7 @@ class PortHamiltonian(nn.Module):
         """``torque``, or ``position`` for inputs that are commands of position servos."""
         return "torque"
 
-    def at(self, q: Any, *others: Tensor, prepared: Any = None) -> Any:
+    def at(self, q: Position, *others: Tensor, prepared: Parameters = None) -> Configuration:
         """Return the configuration at q. Raises TypeError or ValueError for a wrong dtype or shape.
 
         Args:
@@ -76,7 +75,7 @@ class PortHamiltonian(nn.Module):
                 raise ValueError(f"got shapes {shapes}, expected the same shape (..., {self.n}), joints last")
         return self.configuration(q, self.prepare() if prepared is None else prepared)
 
-    def mass_matrix(self, q: Any) -> Tensor:
+    def mass_matrix(self, q: Position) -> Tensor:
         """Return M(q), (..., n, n) [kg m^2, kg m, kg]."""
         mass: Tensor = self.at(q).mass
         return mass
@@ -86,37 +85,37 @@ class PortHamiltonian(nn.Module):
         matrix = torch.eye(self.n).to(q) if self.inputs is None else self.inputs.gains()
         return matrix.expand(*q.shape, -1)
 
-    def input_force(self, at: Any, qd: Tensor, tau: Tensor) -> Tensor:
+    def input_force(self, at: Configuration, qd: Tensor, tau: Tensor) -> Tensor:
         """Return G tau, (..., n) [Nm, N]."""
         return tau if self.inputs is None else self.inputs.force(tau)
 
-    def input_torque(self, at: Any, force: Tensor) -> Tensor:
+    def input_torque(self, at: Configuration, force: Tensor) -> Tensor:
         """Return the inputs tau, (..., n), that give this force."""
         return force if self.inputs is None else self.inputs.torque(force)
 
-    def momentum(self, q: Any, qd: Tensor) -> Tensor:
+    def momentum(self, q: Position, qd: Tensor) -> Tensor:
         """Return p = M(q) qd, (..., n)."""
         return applied(self.at(q, qd).mass, qd)
 
-    def velocity(self, q: Any, p: Tensor) -> Tensor:
+    def velocity(self, q: Position, p: Tensor) -> Tensor:
         """Return qd = M(q)^-1 p, (..., n)."""
         # not by a Cholesky factor: its derivative costs several times one more linear solve
         qd: Tensor = torch.linalg.solve(self.at(q, p).mass, p.unsqueeze(-1))
         return qd.squeeze(-1)
 
-    def hamiltonian(self, q: Any, p: Tensor, *state: Tensor) -> Tensor:
+    def hamiltonian(self, q: Position, p: Tensor, *state: Tensor) -> Tensor:
         """Return H, (...) [J]."""
         at = self.at(q, p)
         return 0.5 * (p * self.velocity(at, p)).sum(dim=-1) + self.potential_energy(at, *state)
 
-    def forward_dynamics(self, q: Any, qd: Tensor, tau: Tensor, *state: Tensor | None) -> Tensor:
+    def forward_dynamics(self, q: Position, qd: Tensor, tau: Tensor, *state: Tensor | None) -> Tensor:
         """Return qdd, (..., n), under the input tau; state: that of friction, if the model has one."""
         at = self.at(q, qd, tau)
         force = self.input_force(at, qd, tau) - self.nonlinear_effects(at, qd)
         force = force - self.friction_torque(at, qd, *state)
         return self.velocity(at, force)  # M^-1 times the force
 
-    def inverse_dynamics(self, q: Any, qd: Tensor, qdd: Tensor, *state: Tensor | None) -> Tensor:
+    def inverse_dynamics(self, q: Position, qd: Tensor, qdd: Tensor, *state: Tensor | None) -> Tensor:
         """Return the input tau, (..., n), that gives qdd; state: that of friction, if the model has one."""
         at = self.at(q, qd, qdd)
         force = applied(at.mass, qdd) + self.nonlinear_effects(at, qd)
@@ -124,7 +123,7 @@ class PortHamiltonian(nn.Module):
         return self.input_torque(at, force - self.input_force(at, qd, 0 * qd))
 
     def port_hamiltonian_rhs(
-        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Any, *state: Tensor | None
+        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Parameters, *state: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Return q' and p', (..., n), under the input tau; None: no input."""
         at = self.at(q, p, p if tau is None else tau, prepared=prepared)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from spelgen.runtime.body_chain import ChainConfiguration, chain_of_links
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws, turning
-from spelgen.runtime.parts import Inputs, Row, Rows
+from spelgen.runtime.parts import Configuration, Inputs, Parameters, Row, Rows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
 from spelgen.runtime.position_servo import PositionServo
 from spelgen.runtime.rigid_body import InertialParameters
@@ -23,7 +23,7 @@ class RigidParameters(NamedTuple):
     points: Tensor  # of the bodies in body frames, block diagonal, (4 bodies, 4 bodies)
     armature: Tensor  # inertia of the rotors, part of M, (n, n)
     friction: FrictionConstants
-    residual: Any = None  # of the residual terms
+    residual: Parameters = None  # of the residual terms
 
 
 class RigidConfiguration(NamedTuple):
@@ -34,7 +34,7 @@ class RigidConfiguration(NamedTuple):
     gravity: Tensor  # dV/dq of the bodies, (..., n)
     prepared: RigidParameters
     varied: Tensor | float = 1.0  # factor on friction, (..., n)
-    residual: Any = None  # of the residual terms
+    residual: Configuration = None  # of the residual terms
 
 
 class RigidBodyDynamics(PortHamiltonian):

@@ -1,0 +1,107 @@
+"""From a URDF to the specification of a model, and to its module: the function ``generate``."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.design import PRESET_NAMES, Design, load_design
+from spelgen.emission.plan import plan_model
+from spelgen.emission.text import module_text
+from spelgen.errors import ModuleError
+from spelgen.spec import ModelSpec, Options
+from spelgen.structure.structure import derive
+from spelgen.urdf.robot import Assume
+
+
+def generate(
+    arm: ConfiguredArm | str | Path,
+    preset: str | Path | Design = "hybrid",
+    *,
+    width: int = 64,
+    depth: int = 2,
+    assume: Assume = "kinematics",
+    standalone: bool = False,
+    module: Path | None = None,
+) -> str:
+    """Return the source of the module tailored to an arm; arguments and errors as for `build`.
+
+    Args:
+        standalone: whether the module contains the runtime, and so depends on PyTorch only.
+        module: the file that the source is for; the path of the URDF in it is relative to that file.
+    """
+    spec = make_spec(arm, preset, width=width, depth=depth, assume=assume, module=module)
+    return module_text(spec, standalone=standalone)
+
+
+def make_spec(
+    arm: ConfiguredArm | str | Path,
+    preset: str | Path | Design = "hybrid",
+    *,
+    width: int = 64,
+    depth: int = 2,
+    assume: Assume = "kinematics",
+    module: Path | None = None,
+) -> ModelSpec:
+    """Return the specification of the model tailored to an arm; arguments and errors as for ``generate``."""
+    arm = arm if isinstance(arm, ConfiguredArm) else load_arm(arm)
+    name, design = str(preset), None
+    if preset not in PRESET_NAMES:
+        name = "own" if isinstance(preset, Design) else Path(preset).stem
+        design = load_design(preset)
+    options = Options(
+        preset=name,
+        design=design,
+        assume=assume,
+        joints=arm.joints,
+        tip=arm.tip,
+        angle_tolerance=arm.angle_tolerance,
+        width=width,
+        depth=depth,
+    )
+    spec = derive_spec(arm, options)
+    return spec if module is None else replace(spec, urdf=_path_of_urdf(module, arm.robot.path))
+
+
+def derive_spec(arm: ConfiguredArm, options: Options) -> ModelSpec:
+    """Return the specification of the model of ``arm`` with these options."""
+    return plan_model(
+        arm.arm,
+        derive(arm.arm, options.assume),
+        arm.actuation,
+        options,
+        urdf=arm.robot.path.name,
+        urdf_sha256=arm.robot.digest,
+        drives={item.name: arm.settings.joint(item.name) for item in arm.arm.coordinates},
+        servos=arm.settings.input == "position",
+    )
+
+
+def arm_of_spec(spec: ModelSpec, urdf: str | Path) -> ConfiguredArm:
+    """Return the arm of a specification from its URDF, with the options that the specification was made with."""
+    return load_arm(urdf, spec.options.joints, spec.options.tip, spec.options.angle_tolerance)
+
+
+def find_urdf(module: Path, name: str) -> Path:
+    """Return the URDF ``name`` in the folder of a module, the current one or ``robots/``. Raises ModuleError."""
+    folders = [module.parent, Path(), Path("robots"), module.parent / "robots"]
+    for folder in folders:
+        if (folder / name).is_file():
+            return folder / name
+    raise ModuleError(
+        f"its URDF {name!r} is in none of " + ", ".join(dict.fromkeys(map(str, folders))),
+        file=module,
+        do="name it with --robot",
+    )
+
+
+def _path_of_urdf(module: Path, urdf: Path) -> str:
+    """Return the name of a URDF that ``find_urdf`` finds by it, else the path relative to the module."""
+    try:
+        if find_urdf(module, urdf.name).samefile(urdf):
+            return urdf.name
+    except ModuleError:
+        pass
+    return Path(os.path.relpath(urdf, module.parent)).as_posix()
