@@ -27,7 +27,8 @@ class RunFolder:
 
     spec: specification of the model. urdf, settings: of its robot, where known. mapping: of logs with names and units
     of their own, as --mapping takes it. config: how it was trained. metrics: a line per epoch. checkpoint: everything
-    needed to resume. weights: the best state_dict so far. evaluation: results of `evaluate`. baseline: baselines fitted to the training logs, and the coverage of these.
+    needed to resume. weights: the best state_dict so far. evaluation: results of `evaluate`. baseline:
+    baselines fitted to the training logs, and the coverage of these.
     """
 
     def __init__(self, path: Path | str) -> None:

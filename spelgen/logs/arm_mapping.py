@@ -18,7 +18,7 @@ GivenMapping = LogMapping | Mapping[str, object] | Path | str | None
 
 @runtime_checkable
 class JointNames(Protocol):
-    """Hold the joints whose logs are read, as an arm and a module do. joint_types: "revolute" or "prismatic"."""
+    """Joints whose logs are read: an arm or a module. joint_types: "revolute" or "prismatic"."""
 
     @property
     def joint_names(self) -> Sequence[str]: ...
@@ -68,7 +68,7 @@ LoggedArm = DescribedArm | JointNames | Sequence[str]
 
 
 class LogSource(NamedTuple):
-    """Say whose logs they are. joint_types: "revolute" or "prismatic", None where they are not known."""
+    """Joints of logs and their mapping. joint_types: "revolute" or "prismatic", None if unknown."""
 
     joints: tuple[str, ...]
     joint_types: tuple[str, ...] | None
@@ -76,7 +76,10 @@ class LogSource(NamedTuple):
 
 
 def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
-    """Return what `read_logs` was given. Raises LogError for what is no arm, SettingsError for a wrong mapping."""
+    """Return the joints and the mapping of an argument of `read_logs`.
+
+    Raises LogError for other arguments, SettingsError for a wrong mapping.
+    """
     if isinstance(arm, DescribedArm):
         stated = arm.settings.logs
         log_mapping = stated if mapping is None else _mapping(mapping, list(arm.robot.joint), stated)
@@ -99,7 +102,7 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
 
 
 def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | None = None) -> LogMapping:
-    """Return a mapping as an object; keys that a file or a dict lacks are those of the settings, `stated`."""
+    """Return a mapping as an object; keys that a file or a dict lacks come from the settings, `stated`."""
     if isinstance(mapping, LogMapping):
         return mapping
     if isinstance(mapping, str | Path):

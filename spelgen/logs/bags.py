@@ -20,7 +20,7 @@ from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
 
 ROS1 = ".bag"
 MESSAGE = "sensor_msgs/msg/JointState"
-MEMORY = 2**29  # bytes beside what the messages of a bag take
+MEMORY = 2**29  # bytes in addition to the messages of a bag
 FIELDS = {"q": "position", "qd": "velocity", "tau": "effort"}
 
 
@@ -50,7 +50,7 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 
 def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[tuple[int, Any]]:
-    """Return times [ns] and states by one clock for all: that of the headers and the recorder's may be hours apart."""
+    """Return times [ns] and states by one clock for all: headers and recorder may be hours apart."""
     without = sum(not message.stamp for message in messages)
     if messages and without == len(messages):
         remarks.append("no message has a stamp: times are those at which the recorder received them")
@@ -76,7 +76,7 @@ def _joint_states(path: Path, messages: Sequence[tuple[int, Any]], names: Sequen
                 f"a message with the joints {', '.join(state.name)}", file=path, element=f"message {number}",
                 expected=f"{', '.join(sorted(missing, key=names.index))} in it too",
             )  # fmt: skip
-        values = np.full((len(FIELDS), len(state.name)), np.nan)  # for fields that the message leaves empty
+        values = np.full((len(FIELDS), len(state.name)), np.nan)  # for empty fields of the message
         for k, field in enumerate(FIELDS.values()):
             logged = np.asarray(getattr(state, field), dtype=float)
             if len(logged) not in (0, len(state.name)):
@@ -117,7 +117,7 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
     size = path.stat().st_size
     for file in path.rglob("*"):
         if not file.is_dir():
-            # rosbags opens whatever the folder holds
+            # rosbags opens all files of the folder
             require_regular_file(file, LogError, "files in the folder of a ROS 2 bag")
             size += file.stat().st_size
     is_ros1 = path.suffix == ROS1

@@ -1,4 +1,4 @@
-"""Check logs alone: frozen columns, velocities that are no derivative, degrees, gaps. Nothing is repaired.
+"""Check logs without the robot: frozen columns, velocities that are no derivative, degrees, gaps. Nothing is repaired.
 
 A check is a code, a severity and a function of a subject, registered in CHECKS. Each trajectory is checked by itself,
 so that logs need not lie in memory together. `log_checks` has the checks that take the robot.
@@ -9,38 +9,37 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Generic, Literal, NamedTuple, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.labels import counted
-from spelgen.logs.jumps import held_samples, is_lost, is_outlier, jumps, read_as_words, repeated_rows
+from spelgen.logs.joint_signals import Advice, JointSignals
+from spelgen.logs.jump_checks import (
+    find_dropouts,
+    find_held,
+    find_jumps,
+    find_too_rare,
+    find_unsigned_velocity,
+)
 from spelgen.logs.rates import SLOWEST, is_dense, shows_accelerations
-from spelgen.logs.recording import listed_times, outlier_rows
 from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
 from spelgen.logs.tuning import SIGNALS
 from spelgen.settings.log_mapping import TIMES
 
 DEGREES = 180.0 / np.pi
-TURNS = 4 * np.pi  # [rad] no revolute joint turns further, so what does is in degrees
+TURNS = 4 * np.pi  # [rad] A joint with limits turns less: larger positions are in degrees.
 
 Subject = TypeVar("Subject")
 
 
-class Advice(NamedTuple):
-    """What a check found, and the exact remedy, which the check has tried."""
-
-    message: str
-    do: str
-
-
 @dataclass(frozen=True)
 class Check(Generic[Subject]):
-    """Look for one thing that may be odd about logs.
+    """Search for one fault of logs.
 
-    find: from the subject to the message; None where nothing is odd. severity: logs with an error cannot be trained on.
-    unless: codes of checks, earlier in the list, whose findings explain this one. everywhere: it is odd only where
+    find: from the subject to the message; None without a finding. severity: logs with an error cannot be trained on.
+    unless: codes of checks, earlier in the list, whose findings explain this one. everywhere: it is a fault only if
     all trajectories show it. expected, do: of an error.
     """
 
@@ -55,13 +54,13 @@ class Check(Generic[Subject]):
 
 @dataclass(frozen=True)
 class Findings:
-    """Gather what checks find: notes, and errors, which prevent training."""
+    """Results of checks: notes, and errors, which prevent training."""
 
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
 
     def add(self, check: Check[Any], message: str, where: str, file: Path | None = None) -> None:
-        """Add what a check says; of an error, how to have it accepted."""
+        """Add the message of a check; to an error, how to accept it."""
         if check.severity == "error":
             do = f"{check.do}; --accept {check.code} if it is right"
             error = LogError(message, file=file, element=where, expected=check.expected, do=do)
@@ -73,7 +72,7 @@ class Findings:
 def run_checks(
     checks: Iterable[Check[Subject]], subject: Subject, accepted: Collection[str] = ()
 ) -> list[tuple[Check[Subject], str]]:
-    """Return the checks that find something odd, with their messages; accepted: codes that are passed over."""
+    """Return the checks with a finding, and their messages; accepted: codes that are not checked."""
     results: dict[str, tuple[Check[Subject], str]] = {}
     for check in checks:
         # one cause, one message: degrees are no derivatives either
@@ -106,7 +105,7 @@ def velocity_products(trajectory: Trajectory) -> np.ndarray:
 def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return factors (n,) by which qd must be multiplied to be dq/dt, and correlations (n, n).
 
-    These are 1 where qd of the row's joint is dq/dt of the column's, but for a factor. Both are NaN where one rests.
+    Correlations are 1 if qd of the row's joint is proportional to dq/dt of the column's; NaN if a joint is at rest.
     products: see `velocity_products`.
     """
     n = len(products) // 2
@@ -114,65 +113,6 @@ def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     sizes = np.outer(np.sqrt(qd_squares), np.sqrt(q_squares))
     correlations = products[:n, n:] / np.where(sizes > 1e-12, sizes, np.nan)
     return products[:n, n:].diagonal() / np.where(qd_squares > 0, qd_squares, np.nan), correlations
-
-
-class JointSignals(NamedTuple):
-    """Hold what one trajectory shows of one joint: the subject of the checks of logs alone.
-
-    q, qd: (T,). factor: by what qd must be multiplied to be dq/dt; NaN where it rests. correlations: of qd with dq/dt
-    of every joint; NaN where one rests.
-    """
-
-    trajectory: Trajectory
-    number: int
-    kind: str
-    joints: Sequence[str]
-    q: np.ndarray
-    qd: np.ndarray
-    factor: float
-    correlations: Sequence[float]
-
-    @property
-    def turns(self) -> bool:
-        """Whether the joint may turn on and on."""
-        return self.kind == "continuous" or bool(self.trajectory.mapping.word("period", "q", self.joint))
-
-    @property
-    def measured(self) -> tuple[str, ...]:
-        """The quantities that were measured: neither commands nor differences."""
-        if self.trajectory.u is not None:
-            return ("q",)
-        return self.trajectory.mapping.quantities if self.trajectory.tau.size else ("q",)
-
-    @property
-    def step(self) -> float:
-        """Median of the times between samples [s], 0 of a single sample."""
-        steps = np.diff(self.trajectory.t)
-        return float(np.median(steps)) if steps.size else 0.0
-
-    @property
-    def joint(self) -> str:
-        """Name of the joint."""
-        return self.joints[self.number]
-
-    def signal(self, quantity: str) -> np.ndarray:
-        """Return "q", "qd", "tau" or "u" of the joint, (T,); (0,) if it was not logged."""
-        values: np.ndarray | None = getattr(self.trajectory, quantity)
-        return np.zeros(0) if values is None or not values.size else values[:, self.number]
-
-    @property
-    def correlation(self) -> float:
-        """Of qd and dq/dt."""
-        return self.correlations[self.number]
-
-    def changes_by(self, unit: float) -> bool:
-        """Whether q changes that many times as fast as qd says, as beside a wrong unit."""
-        return self.correlation > SIGNALS.agreement and is_factor(self.factor, unit)
-
-
-def is_factor(value: float, unit: float) -> bool:
-    """Whether a factor is near enough to that of a unit to be it."""
-    return 1 / SIGNALS.unit_factor < value / unit < SIGNALS.unit_factor
 
 
 def find_degrees(signals: JointSignals) -> str | None:
@@ -230,111 +170,17 @@ def time_unit(step: float) -> str | None:
     return None
 
 
-def find_dropouts(signals: JointSignals) -> str | None:
-    """Find samples that are lost, or that leave their neighbours for a moment and return."""
-    for name in signals.measured:
-        values = signals.signal(name)
-        rows = np.flatnonzero(outlier_rows(name, values))
-        if rows.size:
-            first = rows[0]
-            size = values[first] - values[max(first - 1, 0)]
-            what = "falls to 0" if values[first] == 0 else f"leaves its neighbours by {size:.4g}"
-            times = listed_times(signals.trajectory.t[rows])
-            return f"{name} that {what} for a moment, in {counted(len(rows), 'sample')}, at t = {times}"
-    return None
-
-
-def find_jumps(signals: JointSignals) -> str | Advice | None:
-    """Find signals that jump: words of a register read as plain numbers, wrapped angles, joined recordings."""
-    for name in signals.trajectory.quantities:
-        found = _find_words(signals, name)
-        if found is not None:
-            return found
-    sound = ~is_outlier(signals.q, smooth=True)
-    t, q = signals.trajectory.t[sound], signals.q[sound]
-    rows = jumps(t, q)
-    if not rows.size:
-        return None
-    size = q[rows[0] + 1] - q[rows[0]]
-    count = counted(len(rows), "time")
-    return f"q that jumps by {size:.4g} between two samples, {count}, at t = {listed_times(t[rows])}"
-
-
-def _find_words(signals: JointSignals, name: str) -> Advice | None:
-    """Find words of a register, or wrapped angles, in "q", "qd", "tau" or "u" of the joint."""
-    mapping, values = signals.trajectory.mapping, signals.signal(name)
-    scale, offset = mapping.scale(name, signals.joint), mapping.offset(name, signals.joint)
-    turn = None if signals.kind == "prismatic" or name not in ("q", "u") else 2 * np.pi / abs(scale)
-    # one lost sample or outlier makes two jumps, which no register explains
-    values = values[~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))]
-    word = read_as_words((values - offset) / scale, turn)
-    if word is None:
-        return None
-    # commands may jump: only if they come near the positions by it are they words
-    if name == "u":
-        q = signals.q[~is_lost(signals.signal("u"))]
-        if np.std(word.values * scale + offset - q) > SIGNALS.near_position * np.std(values - q):
-            return None
-    unit = mapping.unit(name, signals.joint) or ("as logged" if turn is None else "rad")
-    size, count = float(f"{word.value:.9g}"), counted(word.jumps, "time")
-    what = "words with a sign bit" if word.key == "sign_bit" else "a register or an angle that starts again"
-    line = f"joints: {{{signals.joint}: {{{word.key}: {{{name}: {size!r}}}}}}}"
-    return Advice(
-        f"{name} that jumps by {size:.6g} ({unit}), {count}: {what}",
-        f"write '{line}' under 'logs' in the robot's YAML",
-    )
-
-
-def find_held(signals: JointSignals) -> str | None:
-    """Find signals that change too rarely for fits, whatever the rate of the rows is."""
-    rate = signals.trajectory.sample_rate
-    for name in signals.measured:
-        often = held_samples(signals.signal(name))
-        if often > 1:
-            return (
-                f"{name} that changes {rate / often:.3g} times a second in rows at {rate:.3g} Hz: "
-                f"each value lasts {often} samples"
-            )
-    return None
-
-
-def find_too_rare(signals: JointSignals) -> str | None:
-    """Find held signals from which no acceleration can be computed; arms under servos need none."""
-    rate = signals.trajectory.sample_rate
-    if signals.trajectory.u is not None or not shows_accelerations(rate):
-        return None
-    held = [held_samples(signals.signal(name)) for name in signals.measured]
-    return None if shows_accelerations(rate / max(held)) else find_held(signals)
-
-
-def find_unsigned_velocity(signals: JointSignals) -> str | None:
-    """Find velocities that are the magnitude of dq/dt."""
-    trajectory, qd = signals.trajectory, signals.qd
-    lowest, highest = sorted((abs(qd.min()), abs(qd.max())))
-    # noise of a joint at rest has both signs
-    if trajectory.mapping.velocity == "differentiated" or lowest > SIGNALS.unsigned * highest or len(qd) < 3:
-        return None
-    speed = np.gradient(signals.q, trajectory.t)
-    backward, forward = sorted((-np.quantile(speed, 0.02), np.quantile(speed, 0.98)))
-    if backward < SIGNALS.unsigned * forward or abs(qd).std() == 0:
-        return None
-    agreement = np.corrcoef(np.abs(speed), np.abs(qd))[0, 1]
-    if not agreement > SIGNALS.unsigned_agreement:
-        return None
-    return f"qd that is the magnitude of dq/dt: from {qd.min():.3g} to {qd.max():.3g} while q goes both ways"
-
-
 def find_no_torques(signals: JointSignals) -> str | None:
     """Find recordings in which every joint's torque is 0 all the time."""
     trajectory = signals.trajectory
-    # told once, and not of each joint
+    # reported once, and not for each joint
     if signals.number or not trajectory.tau.size or trajectory.tau.any() or not np.ptp(trajectory.q):
         return None
     return "torques that are all 0 while the arm moves"
 
 
 def find_wrong_velocity(signals: JointSignals) -> str | None:
-    """Find velocities that are not the positions' derivative, and say what else they may be."""
+    """Find velocities that are not the derivative of the positions, and a joint or a sign that fits better."""
     factor, correlation, tolerance = signals.factor, signals.correlation, 1 - SIGNALS.agreement
     # times in another unit have been found at the first joint
     if signals.step > SIGNALS.slowest_step:
@@ -374,20 +220,6 @@ def find_gaps(trajectory: Trajectory) -> str | None:
     return f"{counted(gaps, 'gap')} in time, up to {np.diff(trajectory.t).max():.3g} s long; no window crosses one"
 
 
-def find_repeated_rows(trajectory: Trajectory) -> str | None:
-    """Find rows that repeat the row before while the arm moves."""
-    signals = np.concatenate([getattr(trajectory, name) for name in trajectory.quantities], axis=1)
-    repeats, _ = repeated_rows(signals, trajectory.q.shape[1])
-    count = int(np.count_nonzero(repeats))
-    if count <= SIGNALS.repeats * len(trajectory):
-        return None
-    rate = trajectory.sample_rate * (1 - count / len(trajectory))
-    return (
-        f"{count} of {len(trajectory)} rows repeat the row before while the arm moves: {rate:.3g} Hz remain; "
-        "'dropouts: dropped' under 'logs' leaves them out"
-    )
-
-
 def find_low_rate(trajectory: Trajectory) -> str | None:
     """Find a sample rate at which accelerations are hardly seen; arms under servos do without."""
     rate = trajectory.sample_rate
@@ -405,7 +237,6 @@ def find_low_rate(trajectory: Trajectory) -> str | None:
 CLOCK_CHECKS = [
     Check("gap", "info", find_gaps),
     Check("low-rate", "warning", find_low_rate),
-    Check("repeated-rows", "warning", find_repeated_rows),
 ]
 # reported when a log is read: each repair is a message of its own
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
@@ -491,7 +322,7 @@ class LogChecks:
         self._results.setdefault((group, result), []).append((message, where, trajectory.file))
 
     def findings(self) -> Findings:
-        """Return what is odd: a sentence for each joint and check, of clocks for each message."""
+        """Return the findings: one for each joint and check; for clocks, one for each message."""
         summary = Findings()
         for (_, result), occurrences in self._results.items():
             # a joint that rests in one motion and moves in another is no oddity
@@ -507,7 +338,7 @@ class LogChecks:
 def check(
     trajectories: Iterable[Trajectory], joints: Sequence[str], joint_types: Sequence[str]
 ) -> list[Diagnostic]:
-    """Return what is odd about the logs, nothing repaired.
+    """Return the findings of the checks of logs; nothing is repaired.
 
     Raises LogError when revolute joints look recorded in degrees, unless units are declared, and when a
     position or a velocity never changes while the other one does.

@@ -1,7 +1,8 @@
 """Detect jumps of logged signals: lost samples, outliers, wrapped angles, register words, repeated rows.
 
 Every function takes one signal (T,) or the columns of a log (T, C). Nothing here depends on the format of the log or on
-the robot. A step is the difference between neighbouring samples, the usual step the median of those that are not 0.
+the robot. A step is the difference between neighbouring samples, the typical step the median
+of the steps that are not 0.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from spelgen.logs.tuning import TUNING
 
 
 def jump_count(values: np.ndarray, period: float) -> int:
-    """Return how many steps of a signal (T,) are longer than half a period."""
+    """Return the number of steps of a signal (T,) that are longer than half a period."""
     return int(np.count_nonzero(np.abs(np.diff(values)) > period / 2))
 
 
@@ -38,7 +39,7 @@ def signed(words: np.ndarray, sign_bit: float) -> np.ndarray:
 
 
 def is_lost(values: np.ndarray) -> np.ndarray:
-    """Return which samples (T,) are exactly 0 between samples far from 0, which loggers write for a missing value."""
+    """Return a mask (T,) of samples that are exactly 0 between samples far from 0: missing values of loggers."""
     lost = np.zeros(len(values), bool)
     logged = np.flatnonzero(values)
     if not logged.size or logged[-1] - logged[0] == len(logged) - 1:
@@ -51,10 +52,10 @@ def is_lost(values: np.ndarray) -> np.ndarray:
 
 
 def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
-    """Return which samples (T,) are lost, or leave their neighbours for a moment and return.
+    """Return a mask (T,) of lost samples and of outliers.
 
-    smooth: True for positions, whose steps are alike from sample to sample; torques and velocities may step, so that
-    their outliers must also lie beyond all other samples by half the range of these.
+    smooth: True for positions, whose steps change gradually; torques and velocities may step, so that
+    their outliers must also exceed all other samples by half their range.
     """
     outliers = is_lost(values)
     if len(values) < TUNING.jump_window:
@@ -84,7 +85,7 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
 
 
 def jumps(t: np.ndarray, q: np.ndarray, limit: float = TUNING.fastest) -> np.ndarray:
-    """Return the rows after which a position (T,) jumps: faster than `limit` [rad/s, m/s], far beyond its usual steps.
+    """Return the rows after which a position (T,) jumps: faster than `limit` [rad/s, m/s] and typical steps.
 
     Steps across gaps in time are no jumps: an arm may be moved meanwhile.
     """
@@ -98,11 +99,11 @@ def jumps(t: np.ndarray, q: np.ndarray, limit: float = TUNING.fastest) -> np.nda
 
 
 def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]:
-    """Return which rows of a log (T, C) repeat the row before while the arm moves, and how often each row is written.
+    """Return a mask (T,) of rows of a log (T, C) that repeat the row before in a motion, and the copies of each row.
 
     positions: the number of first columns that are positions. A row is a repeat if the position then makes up for it:
     the step that follows k equal rows is as large as k steps of the motion after it. Rows of an arm at rest are kept,
-    one of so many where all rows of the motion are repeated.
+    one of n if all rows of the motion are written n times.
     """
     none = np.zeros(len(columns), bool)
     starts = np.flatnonzero(np.append(True, (np.diff(columns, axis=0) != 0).any(axis=1)))
@@ -126,7 +127,7 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
 
 
 def held_samples(values: np.ndarray) -> int:
-    """Return how many samples each value of a signal (T,) lasts while it changes quickly: 1 of a sound signal."""
+    """Return the number of samples that a value of a quickly changing signal (T,) lasts: 1 of a sound signal."""
     changes = np.flatnonzero(np.diff(values))
     if len(changes) < TUNING.jump_window:
         return 1

@@ -1,4 +1,4 @@
-"""Read MCAP files without an end: those of a recorder that was killed have no summary and no index.
+"""Read MCAP files without an end: a recorder that was killed writes no summary and no index.
 
 Records follow one another: an operation code (1 byte), a length (8 bytes) and a body. https://mcap.dev/spec
 """
@@ -44,7 +44,7 @@ def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _unpacked(chunk: bytes) -> bytes:
-    """Return the records of a chunk; of one that is cut off as many as there are."""
+    """Return the records of a chunk; if it is cut off, the ones before the cut."""
     if len(chunk) < 40:
         return b""
     size = _number("<Q", chunk, 16)

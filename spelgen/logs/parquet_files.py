@@ -26,11 +26,11 @@ LARGEST_NORMALISED = 100.001  # single precision
 
 
 def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the one table of a file. A file that spelgen wrote is read as such, whatever the mapping says."""
+    """Return the one table of a file. The mapping does not apply to files that spelgen wrote."""
     schema = pa.parquet.read_schema(file)
     layout = table_layout(schema, joints, mapping, file)
     columns = stored_columns(layout, schema.names)
-    # pre-buffering would hold the compressed file in memory beside the table
+    # pre-buffering would hold the compressed file in memory in addition to the table
     return [(layout, pa.parquet.read_table(file, columns=columns, pre_buffer=False))]
 
 
@@ -38,7 +38,7 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
     """Return the tables of all files, with columns by the data set's names of motors.
 
     Raises LogError if there are no files, a joint is not among the motors, or positions are normalised and no
-    calibration tells their scale.
+    calibration states their scale.
     """
     info = read_json(folder / INFO, LogError)
     states, actions = _motor_names(folder, info, STATE), _motor_names(folder, info, ACTION)
@@ -84,7 +84,7 @@ def _with_scale(
     """Return the mapping with the unit of positions, and remarks on it.
 
     LeRobot stores -100..100 of each motor's calibrated range by default, and degrees or radians on request; the data
-    set does not state which. Raises LogError if values are in the former range, and nothing tells their scale.
+    set does not state which. Raises LogError if values are in the former range, and no calibration states their scale.
     """
     largest = 0.0
     for file in files:

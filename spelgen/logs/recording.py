@@ -23,7 +23,7 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
     """Return a trajectory of these rows (T, C) in SI units, velocities differentiated if none were logged.
 
     Wrapped angles and overflowed registers are unwrapped, and rows that are written several times are read once,
-    before anything is differentiated; with 'dropouts: dropped' lost rows and outliers are left out, too.
+    before anything is differentiated; with 'dropouts: dropped' lost rows and outliers are removed, too.
     """
     mapping, remarks = layout.mapping, layout.remarks
     data, wraps = _without_wraps(data, mapping.signals(layout.joints), mapping)
@@ -57,7 +57,7 @@ def _without_wraps(
         count = jump_count(logged, period)
         result = unwrapped(logged, period)
         if quantity == "u":
-            # a command is near the position, whatever revolution the two registers count from
+            # a command is close to the position, although the two registers may count from different revolutions
             result = result - period * np.round(np.median(result - values["q", joint]) / period)
         # without a jump, an angle beyond half a turn is as good as one within it
         elif count or abs(period - 2 * pi) > TUNING.limit_of_turn:
@@ -75,20 +75,26 @@ def _without_wraps(
 def _without_repeats(
     data: np.ndarray, positions: int, mapping: LogMapping
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return rows (T, C) without repeats, if every row is written several times or repeats are to be dropped."""
-    repeats, often = repeated_rows(data[:, 1:], positions)
-    count = np.count_nonzero(repeats)
-    if not count or (often == 1 and mapping.dropouts == "kept"):
+    """Return rows (T, C) without repeats if every row is written several times or repeats are dropped; and a note."""
+    repeats, copies = repeated_rows(data[:, 1:], positions)
+    count = int(np.count_nonzero(repeats))
+    if count <= TUNING.repeats * len(data):
         return data, ()
     rate = (len(data) - 1 - count) / (data[-1, 0] - data[0, 0])
-    which = f"every row is written {often} times" if often > 1 else f"{count} rows repeat the row before"
+    which = (
+        f"every row is written {copies} times"
+        if copies > 1
+        else f"{count} rows repeat the row before in motion"
+    )
+    if copies == 1 and mapping.dropouts == "kept":
+        return data, (f"{which}: 'dropouts: dropped' under 'logs' leaves them out, {rate:.3g} Hz remain",)
     return data[~repeats], (f"{which}: repeats were left out, {rate:.3g} Hz remain",)
 
 
 def _without_outliers(
     data: np.ndarray, signals: Sequence[tuple[str, str]]
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return rows (T, C) without samples that are lost or leave their neighbours, and which these were."""
+    """Return rows (T, C) without lost samples and outliers, and a message that lists them."""
     outliers = np.zeros(len(data), bool)
     found = []
     for (quantity, joint), values in zip(signals, data[:, 1:].T, strict=True):
@@ -104,7 +110,7 @@ def _without_outliers(
 
 
 def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
-    """Return which samples (T,) of "q", "qd" or "tau" are lost or outliers; a velocity may be 0 for a moment."""
+    """Return a mask (T,) of lost samples and outliers of "q", "qd" or "tau"; a velocity may be 0 for a moment."""
     rows = is_outlier(values, smooth=quantity == "q")
     return np.asarray(rows & (values != 0)) if quantity == "qd" else rows
 
@@ -117,7 +123,7 @@ def listed_times(t: np.ndarray) -> str:
 
 
 def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return values (T, C) of these rows of a file with increasing times, and what was mended for that.
+    """Return values (T, C) of these rows of a file with increasing times, and messages on repairs.
 
     Rows are sorted if positions become smoother by it, and of equal rows of one time the first is kept. Times of a
     coarse clock are reconstructed. Raises LogError for a clock that starts again, or that is too coarse.
@@ -183,7 +189,7 @@ def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:
 
 
 def _roughness(positions: np.ndarray) -> float:
-    """Return the way that joints go from row to row, each relative to its range."""
+    """Return the sum of the distances from row to row, each joint relative to its range."""
     ranges = np.ptp(positions, axis=0)
     length = np.abs(np.diff(positions, axis=0)).sum(axis=0)
     return float((length / np.where(ranges > 0, ranges, 1.0)).sum())
@@ -207,7 +213,7 @@ def _pieces(t: np.ndarray) -> Iterator[slice]:
 
 
 def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
-    """Return what is logged so much later [s], (T, n), held at the ends of each gap-free piece."""
+    """Return values (T, n) without their delay [s], constant at the ends of each gap-free piece."""
     if not delay:
         return values
     from scipy.interpolate import CubicSpline  # takes long to import, as in `low_pass`

@@ -1,6 +1,6 @@
 """Draft the mapping of a log that nobody has described, by the names and the first values of its columns.
 
-Units that neither names nor times state remain SI: the checks of logs find degrees, and state what to write.
+Units that neither names nor times state remain SI: the checks of logs find degrees, and state the lines to write.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ COMMANDED = {
 }
 COMMANDED |= {"action", "demand"}
 NOT_MEASURED = COMMANDED | {"error", "std"}
-# units as names state them: what a mapping calls them, and the quantity that they imply
+# units in names, with their word in a mapping, per quantity that they imply
 UNITS = {
     "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "ns": "ns"},
     "q": {"deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad",
@@ -72,7 +72,7 @@ class ColumnName(NamedTuple):
 
 
 def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False) -> Suggestion:
-    """Return how a file may be read. commands: positions are commanded, and neither velocities nor torques read.
+    """Return a draft of the mapping of a file. commands: positions are commanded, and no velocities or torques read.
 
     Raises LogError if the file cannot be opened, or has no column of times.
     """
@@ -89,7 +89,7 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     if not found["t"]:
         got = f"only the columns {shortened([x.name for x in columns], TUNING.listed)}"
         raise LogError(got, file=file, expected="one of times, called t or time")
-    # the stamp of the measurement before that of its receipt; else the fewest words, as the plain clock has
+    # the stamp of the measurement before the time of its receipt; else the fewest words, as the plain clock has
     clock = min(found.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))
     order = _order_in_cells(table, joints)
     by_joint = {quantity: _by_joint(named, joints, order) for quantity, named in found.items()}
@@ -171,7 +171,7 @@ def _by_quantity(
 def _units(
     clock: ColumnName, by_joint: Mapping[str, Mapping[str, ColumnName]], table: pa.Table
 ) -> dict[str, str]:
-    """Return the units of times and quantities that names state; that of times by their steps, otherwise."""
+    """Return the units of times and quantities that names state, else the unit that fits the steps of times."""
     units = {"t": UNITS["t"].get(clock.unit) or _unit_of_times(clock.name, table) or "s"}
     for quantity, named in by_joint.items():
         for column in named.values():
@@ -213,7 +213,7 @@ def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
 
 
 def _names(table: pa.Table) -> list[str]:
-    """Return the names of all columns, and for columns of lists those of their elements; none that occurs twice."""
+    """Return the names of all columns, for columns of lists the names of their elements; no name that occurs twice."""
     names: list[str] = []
     for number, name in enumerate(table.column_names):
         if table.column_names.count(name) > 1:

@@ -10,7 +10,7 @@ class LogTuning:
     """Reading, cutting, filtering and differentiation of logs."""
 
     # [B] Numbers that a fit keeps of all logs together: 25 minutes of seven joints at 1 kHz, or 76,000 samples of a
-    # torque fit, about as many as its last iterations use. Windows of five samples take five times the memory.
+    # torque fit, about the number that its last iterations use. Windows of five samples take five times the memory.
     kept_bytes: int = 2**28
     # [1] Largest number of samples of a segment of logs that exceed `kept_bytes`: 16 s at 1 kHz, long compared with
     # filter transients.
@@ -45,6 +45,8 @@ class LogTuning:
     fastest: float = 40.0
     # [rad] Difference from one revolution within which a period is one revolution.
     limit_of_turn: float = 1e-6
+    # [1] Fraction of repeated rows that has no effect on a fit.
+    repeats: float = 0.02
     # [1] Rows of one time but different states that are an accident of a logger.
     few_repeats: int = 10
     # [1] Fraction of such rows from which on the clock is too coarse.
@@ -96,10 +98,8 @@ class SignalCheckTuning:
     slowest_step: float = 0.5
     # [1] Velocity of the rarer sign relative to the fastest one, below which it may be the magnitude of a velocity.
     unsigned: float = 0.05
-    # [1] Correlation from which on a magnitude is that of dq/dt.
+    # [1] Correlation from which on a signal is the magnitude of dq/dt.
     unsigned_agreement: float = 0.9
-    # [1] Fraction of repeated rows that has no effect on a fit.
-    repeats: float = 0.02
     # [1] Remaining distance of commands from positions, relative to the former one, if words are decoded correctly.
     near_position: float = 0.3
 

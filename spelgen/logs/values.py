@@ -40,7 +40,7 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
             logged[k] = signed(logged[k], sign_bit)
     factors = np.array([unit, *starmap(mapping.scale, signals)])
     offsets = np.array([0.0, *starmap(mapping.offset, signals)])
-    # what overflows is told below, with its row
+    # an overflow is reported below, with its row
     with np.errstate(over="ignore", invalid="ignore"):
         data: np.ndarray = np.stack(logged, axis=1) * factors + offsets
     largest = np.full(data.shape[1], TUNING.largest_value)
@@ -65,7 +65,7 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
 
 
 def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
-    """Return which rows (T, C) are of another topic or publisher: nothing, or positions only, of all joints."""
+    """Return a mask (T,) of rows (T, C) of another topic or publisher: without values, or with positions only."""
     empty = np.isnan(data[:, 1 + joints :])
     return np.asarray(empty.all(axis=1))
 
@@ -77,14 +77,14 @@ def clock_start(table: pa.Table, layout: Layout) -> pa.Scalar | None:
     is_stamp = pa.types.is_temporal(_column(first_row, layout.columns[0]).type)
     if pa.types.is_integer(times.type) or pa.types.is_floating(times.type):
         first = times[0].as_py()
-        # seconds since 1970 leave floating-point numbers no digits for what follows
+        # floating-point seconds since 1970 have too few digits
         if first is not None and (is_stamp or TUNING.longest_clock < abs(first) < np.inf):
             return times[0]
     return None
 
 
 def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
-    """Return the times as plain numbers, and their unit [s]. Raises LogError for dates beyond what Arrow counts."""
+    """Return the times as plain numbers, and their unit [s]. Raises LogError for dates beyond the range of Arrow."""
     name = layout.columns[0]
     times = _column(table, name)
     if pa.types.is_duration(times.type):
@@ -114,7 +114,7 @@ def _column(table: pa.Table, name: str) -> Column:
     if is_text:
         bare = pa.compute.replace_substring_regex(lists.cast(pa.string()), r"^.*[\[(]\s*|\s*[\])].*$", "")
         lists = pa.compute.split_pattern_regex(bare, r"[,;\s]+")
-    # Arrow raises for an index beyond a list, where a missing number is what it means
+    # Arrow raises for an index beyond a list, although a number is only missing
     long_enough = pa.compute.greater(pa.compute.list_value_length(lists), index)
     lists = pa.compute.if_else(long_enough, lists, pa.scalar(None, lists.type))
     elements = pa.compute.list_element(lists, index)
@@ -128,7 +128,7 @@ def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray
         floats = values.cast(pa.float64(), safe=not pa.types.is_integer(values.type))
         return np.asarray(floats.to_numpy(zero_copy_only=False))
     except (pa.ArrowException, ValueError) as error:
-        # Arrow does not say which row
+        # Arrow does not state the row
         texts = values.to_pylist() if pa.types.is_string(values.type) else []
         for index, text in enumerate(texts):
             if text and not is_number(text):
