@@ -27,6 +27,7 @@ def chain(
     bodies = tuple(
         Body(
             f"j{i + 1}",
+            f"l{i + 1}",
             kind,
             i - 1,
             i,

@@ -27,7 +27,7 @@ def body(name="a", kind="revolute", **changes):
         "translation": (0, 0, 0),
         "inertia": point(1),
     }
-    return Body(name=name, kind=kind, **(known | changes))
+    return Body(name=name, link=f"link of {name}", kind=kind, **(known | changes))
 
 
 def point(mass, x=0.0):

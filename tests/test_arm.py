@@ -171,7 +171,7 @@ class TestChain:
         arm = make_arm(robot(joint("f", "0", "1", kind), joint("a", "1", "2")))
         assert (arm.joint_names, arm.locked) == (("a",), ("f",))
         assert [x.message for x in arm.diagnostics if x.code == "locked-joint"] == [
-            f"a {kind} joint that is not part of the chain: held fixed at its origin"
+            f"a {kind} joint that is not part of the chain: fixed at its origin"
         ]
         arm = make_arm(robot(joint("a", "0", "2"), joint("f", "2", "1", "floating")))
         assert arm.locked == ("f",)

@@ -74,7 +74,7 @@ def test_a_preset_of_your_own(rpr, robots, tmp_path, monkeypatch):
     own = asdict(load_design("spel")) | {"dissipation": "dense-3n", "about": "Friction of all joints."}
     (tmp_path / "mine.yaml").write_text("".join(f"{key}: {value}\n" for key, value in own.items()))
     source = generate(rpr, "mine.yaml")
-    options = load_module(source).facts.options
+    options = load_module(source).spec.options
     assert (options.preset, options.design.dissipation) == ("mine", "dense-3n")
     (tmp_path / "module.py").write_text(source, encoding="utf-8")
     (tmp_path / "mine.yaml").unlink()  # the module knows how it was made

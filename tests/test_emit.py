@@ -14,12 +14,13 @@ from emitted import GANTRY, built, import_source
 
 from spelgen.certificate.module_check import check
 from spelgen.design import Preset
+from spelgen.emission.module_file import read_spec
 from spelgen.emission.specify import generate
-from spelgen.spec import read_facts
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = Path(__file__).parent / "golden"
-
+PRESETS = get_args(Preset)
+FORMS = pytest.mark.parametrize("standalone", [False, True], ids=["thin", "standalone"])
 
 # What emitted modules use of torch: reading the whole of it takes mypy many times as long, for the same types.
 MYPY = """[mypy]
@@ -30,16 +31,13 @@ follow_imports_for_stubs = True
 [mypy-torch,torch.types,torch._tensor,torch._C.*,torch._ops,torch.nn.*,torch.functional,torch.linalg.*,torch.autograd.*]
 follow_imports = normal
 """
-PRESETS = ("hybrid", "spel", "spel-kan", "phnode", "closed-form")
 
 
-@pytest.mark.parametrize(
-    ("robot", "preset"), [("two_link", "hybrid"), *(("rpr", p) for p in get_args(Preset))]
-)
+@pytest.mark.parametrize(("robot", "preset"), [("two_link", "hybrid"), *(("rpr", p) for p in PRESETS)])
 def test_golden_text(robot, preset, request):
-    """What is tailored to the arm; ``pytest --update`` writes the golden copies anew."""
+    """Thin modules equal their golden copies; ``pytest --update`` rewrites these."""
     path = GOLDEN / f"{robot}_{preset.replace('-', '_')}.py"
-    text = tailored(built(robot, preset=preset)[0])
+    text = built(robot, preset=preset)[0]
     if request.config.getoption("--update"):
         path.write_text(text, encoding="utf-8")
     expected = path.read_text(encoding="utf-8")
@@ -47,10 +45,21 @@ def test_golden_text(robot, preset, request):
     assert text == expected, "\n".join(difference)
 
 
-def tailored(source: str) -> str:
-    """A module without the runtime, which is tested where it stands."""
-    start, end = source.index("# ---- spelgen's runtime"), source.index("class Model(")
-    return source[:start] + source[end:]
+def test_a_standalone_module_contains_the_text_of_the_thin_one(tmp_path):
+    """The arm, its model and the specification are the same lines in both forms, in the same order."""
+    for preset in PRESETS:
+        thin, standalone = (built("rpr", preset=preset, standalone=x)[0] for x in (False, True))
+        arm, model = thin.split("\n\n\nclass Model(")
+        rows = arm[arm.index("# Positions [rad, m]") :]
+        assert rows in standalone
+        assert standalone.endswith(f"\n\n\nclass Model({model}")
+        assert "spelgen.runtime" not in standalone
+
+
+PROGRAM = """from spelgen import generate
+for standalone in (False, True):
+    print(generate("robots/ur10e.urdf", standalone=standalone))
+"""
 
 
 def test_same_bytes_under_any_hash_seed_and_from_any_folder(tmp_path):
@@ -58,7 +67,7 @@ def test_same_bytes_under_any_hash_seed_and_from_any_folder(tmp_path):
     texts = set()
     for seed, folder in (("1", ROOT), ("2", tmp_path / "elsewhere")):
         run = subprocess.run(
-            [sys.executable, "-c", "from spelgen import generate; print(generate('robots/ur10e.urdf'))"],
+            [sys.executable, "-c", PROGRAM],
             cwd=folder,
             env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": str(ROOT)},
             capture_output=True,
@@ -70,10 +79,14 @@ def test_same_bytes_under_any_hash_seed_and_from_any_folder(tmp_path):
 
 
 def test_emitted_code_is_held_to_the_rules_of_written_code(tmp_path):
-    # the runtime's parts are checked where they stand: here each preset once, and tailored parts of all sizes
-    for robot, preset in [*(("rpr", preset) for preset in PRESETS), ("panda", "hybrid")]:
-        text = built(robot, preset=preset)[0]
-        (tmp_path / f"{robot}_{preset}.py".replace("-", "_")).write_text(text, encoding="utf-8")
+    for robot, preset in [
+        *(("rpr", preset) for preset in PRESETS),
+        ("panda", "hybrid"),
+        ("six_dof", "minimal"),
+    ]:
+        for form in ("thin", "standalone"):
+            text = built(robot, preset=preset, standalone=form == "standalone")[0]
+            (tmp_path / f"{robot}_{preset}_{form}.py".replace("-", "_")).write_text(text, encoding="utf-8")
     urdf = tmp_path / "gantry.urdf"
     urdf.write_text(GANTRY, encoding="utf-8")
     (tmp_path / "gantry.py").write_text(generate(urdf), encoding="utf-8")
@@ -116,40 +129,37 @@ HOSTILE = [
 ]
 
 
-def test_no_text_of_the_urdf_becomes_code(tmp_path):
-    """Hostile joint names end as identifiers and as JSON strings of docstring and facts, and come back from there
-    unharmed.
-    """
+@FORMS
+def test_no_text_of_the_urdf_becomes_code(tmp_path, standalone):
+    """With hostile names the syntax tree is that of plain names, except for string constants."""
     from xml.sax.saxutils import quoteattr
 
-    links = "".join(f'<link name="l{k}"/>' for k in range(len(HOSTILE) + 1))
-    joints = "".join(
-        f'<joint name={quoteattr(name)} type="continuous"><parent link="l{k}"/><child link="l{k + 1}"/>'
-        f'<origin xyz="0.1 0 0.2" rpy="{k % 2} 0 0"/><axis xyz="0 0 1"/></joint>'
-        for k, name in enumerate(HOSTILE)
-    )
-    urdf = tmp_path / "hostile.urdf"
-    urdf.write_text(f"<robot name={quoteattr(HOSTILE[0])}>{links}{joints}</robot>", encoding="utf-8")
-    text = generate(urdf)
+    def written(robot, names, file):
+        links = "".join(f'<link name="l{k}"/>' for k in range(len(names) + 1))
+        joints = "".join(
+            f'<joint name={quoteattr(name)} type="continuous"><parent link="l{k}"/><child link="l{k + 1}"/>'
+            f'<origin xyz="0.1 0 0.2" rpy="{k % 2} 0 0"/><axis xyz="0 0 1"/></joint>'
+            for k, name in enumerate(names)
+        )
+        urdf = tmp_path / f"{file}.urdf"
+        urdf.write_text(f"<robot name={quoteattr(robot)}>{links}{joints}</robot>", encoding="utf-8")
+        return generate(urdf, standalone=standalone)
+
+    text = written(HOSTILE[0], HOSTILE, "hostile")
+    plain = written("plain", [f"joint{k}" for k in range(len(HOSTILE))], "plain")
+    shapes = []
+    for source in (text, plain):
+        tree = ast.parse(source)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                node.value = ""
+        shapes.append(ast.dump(tree))
+    assert shapes[0] == shapes[1]
     path = tmp_path / "hostile_spel.py"
     model = import_source(text, path).Model()
-    tree = ast.parse(text)
-    strings = {
-        node.value
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Constant) and isinstance(node.value, str)
-    }
-    docstrings = {
-        ast.get_docstring(node, clean=False)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
-    }
-    for string in strings - docstrings:
-        assert string not in HOSTILE or string.isidentifier()
-    assert all(name.isidentifier() for name in model.joint_names)
-    assert len(set(model.joint_names)) == len(HOSTILE)
-    assert read_facts(path).joints == tuple(HOSTILE)
-    assert read_facts(path).robot == HOSTILE[0]
+    assert model.joint_names == tuple(HOSTILE)
+    assert read_spec(path).joint_names == tuple(HOSTILE)
+    assert read_spec(path).robot == HOSTILE[0]
 
 
 def test_check_tells_a_changed_urdf_from_a_fresh_one(tmp_path):
@@ -167,4 +177,4 @@ def test_check_tells_a_changed_urdf_from_a_fresh_one(tmp_path):
     assert f"{urdf} has changed since the module was built" in changed.reasons
     shutil.copy(ROOT / "robots" / "rpr.urdf", urdf)
     module.write_text(module.read_text() + "\n# edited\n", encoding="utf-8")
-    assert check(module).reasons == ("the module's text differs from what `spelgen build` writes now",)
+    assert check(module).reasons == ("the text of the module differs from that of `spelgen build`",)

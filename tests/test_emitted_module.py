@@ -23,6 +23,7 @@ from emitted import (
 )
 from fuzzing import MINUTES
 
+from spelgen.design import PRESET_NAMES
 from spelgen.dynamics.equations import runge_kutta
 from spelgen.settings.settings import load_settings
 from tests.lie_group import from_group, to_group
@@ -94,14 +95,8 @@ def test_the_bound_keeps_zeros_and_relations_and_is_inactive_at_nominal_values(r
     for entry in structure.entries:
         if entry.kind == "zero":
             assert (mass[:, entry.row, entry.column] == 0).all()
-    functions, constants = (
-        torch.eye(len(part.function_mean)).double(),
-        torch.eye(len(part.raw_constants)).double(),
-    )
-    none = torch.zeros(len(constants), len(functions)).double()
-    by_constant = part.entries(none.mT.unbind(), constants.unbind())
-    by_function = part.entries(functions.unbind(), none.unbind())
-    basis = torch.cat([by_constant, by_function]).flatten(1)
+    terms = len(part.function_mean) + len(part.raw_constants)
+    basis = part.entries(*torch.eye(terms, dtype=torch.float64).unbind()).flatten(1)
     residual = mass.flatten(1) - mass.flatten(1) @ torch.linalg.pinv(basis) @ basis
     assert residual.abs().max() < 1e-9 * mass.abs().max()
     nominal = exact_model(robot, tmp_path)
@@ -198,12 +193,11 @@ def test_arm_with_a_constant_mass_matrix(tmp_path):
     assert torch.allclose(model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau)), tau)
 
 
-def test_a_module_imports_only_torch(tmp_path):
-    """Each preset runs in a process that can import neither spelgen nor its dependencies except torch."""
-    presets = {"hybrid": None, "hybrid_kan": "kan", "spel": None, "phnode": None}
-    for name, net in presets.items():
-        source = built("panda", preset=name.removesuffix("_kan"), net=net)[0]
-        (tmp_path / f"panda_{name}.py").write_text(source)
+def test_a_standalone_module_imports_only_torch(tmp_path):
+    """Each preset, standalone, runs in a process that can import neither spelgen nor its dependencies except torch."""
+    names = [preset.replace("-", "_") for preset in PRESET_NAMES]
+    for name, preset in zip(names, PRESET_NAMES, strict=True):
+        (tmp_path / f"panda_{name}.py").write_text(built("panda", preset=preset, standalone=True)[0])
     program = (
         "import importlib, sys\n"
         "for name in ('spelgen', 'numpy', 'scipy', 'sympy', 'flint', 'pinocchio', 'lxml', 'yaml', 'jinja2'):\n"
@@ -215,10 +209,10 @@ def test_a_module_imports_only_torch(tmp_path):
         "    print(*m.forward_dynamics(q, q, q).shape)\n"
     )
     run = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", program, *presets],
+        [sys.executable, "-W", "ignore", "-c", program, *names],
         cwd=tmp_path,
         capture_output=True,
         text=True,
         check=False,
     )
-    assert run.stdout.split() == ["7"] * len(presets), run.stderr
+    assert run.stdout.split() == ["7"] * len(names), run.stderr

@@ -9,6 +9,7 @@ import pinocchio as pin
 import pytest
 import torch
 import typer
+from planar_model import JOINTS, write_module
 from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
@@ -20,12 +21,14 @@ from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.emission.build import build
 from spelgen.emission.loading import load_module
+from spelgen.emission.specify import generate
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.rollout import rollout
 from spelgen.evaluation.subject import read_test_logs
 from spelgen.evaluation.tables import table
 from spelgen.evaluation.torque import coarse_torques, torque_errors
+from spelgen.fitting.fitted import load_run
 from spelgen.fitting.train import train
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
@@ -33,8 +36,6 @@ from spelgen.logs.read import Trajectory, read_logs, write_logs
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.settings.fits import Rollout
 
-STAND_IN = Path(__file__).with_name("planar_model.py")
-JOINTS = ("shoulder", "elbow")
 UR10E = [
     f"{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ]
@@ -155,11 +156,12 @@ def motions(model, count=4, samples=25, rate=20.0, seed=0) -> list[Trajectory]:
 def run(tmp_path_factory) -> Path:
     """A run whose best model is the one that made the logs."""
     folder = tmp_path_factory.mktemp("run")
-    model = load_module(STAND_IN)
+    module = write_module(folder)
+    model = load_module(module)
     for role, seed in (("train", 0), ("test", 1)):
         write_logs(folder / "logs" / f"{role}.parquet", motions(model, seed=seed), JOINTS)
     config = Rollout(epochs=1, optimizer="adamw", batch=32, learning_rate=1e-12, momentum_steps=0)
-    train(STAND_IN, [folder / "logs"], folder / "run", config)
+    train(module, [folder / "logs"], folder / "run", config)
     return folder / "run"
 
 
@@ -178,7 +180,7 @@ def test_the_true_model_is_perfect_and_its_baseline_is_not(run):
         assert horizon.seconds == pytest.approx(horizon.steps / 20)
         assert horizon.errors["model"].mean_relative_rms < 1e-4
         assert horizon.errors["velocity stays constant"].mean_relative_rms > 0.3
-    assert result.parameters == 7
+    assert result.parameters == sum(x.numel() for x in load_run(run).model.parameters())
     assert result.torque == {}  # 20 Hz is too sparse for accelerations
 
 
@@ -208,7 +210,7 @@ def test_the_same_run_and_logs_give_the_same_file(run):
         assert shown.exit_code == 0, shown.output
         files.append((run / "evaluation.json").read_bytes())
     assert files[0] == files[1]
-    assert "stand_in on 4 test trajectories; * marks the best of a row" in shown.stdout
+    assert "planar on 4 test trajectories; * marks the best of a row" in shown.stdout
     found = json.loads(files[0], parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
     assert found["schema"] == 10
     shown = found["traces"]["trajectories"]
@@ -257,10 +259,8 @@ def test_what_is_no_run_is_refused(run, tmp_path):
 @pytest.mark.usefixtures("short_epochs")
 def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
     """End to end on a URDF: its own dynamics made the logs, so the URDF baseline is perfect."""
-    from spelgen.emission import build as pipeline
-
     module = cart.with_name("cart_model.py")
-    module.write_text(pipeline.generate(cart))
+    module.write_text(generate(cart))
     names = load_module(module).joint_names
     dynamics = urdf_dynamics(cart, names)
     for role, seed in (("train", 0), ("test", 1)):
@@ -279,8 +279,6 @@ def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
 
 def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
     """No run, no file of logs: an arm, arrays, and whatever else predicts; the filter reaches torques too."""
-    from spelgen.emission.build import build
-
     arm = load_arm(cart)
     model, dynamics = build(arm, preset="closed-form"), urdf_dynamics(cart, ["slide", "swing"])
     logs = motions(dynamics, count=2, samples=130, rate=100.0)
@@ -304,8 +302,6 @@ def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
 
 def test_mimic_joints_have_baselines_tips_and_predictions(cart):
     """The pendulum follows the slider: its own dynamics made the logs, in single precision the model is judged too."""
-    from spelgen.emission.build import build
-
     mimic = '<axis xyz="0 -1 0"/><mimic joint="slide" multiplier="2" offset="0.1"/>'
     cart.write_text(CART.replace('<axis xyz="0 -1 0"/>', mimic))
     arm = load_arm(cart)

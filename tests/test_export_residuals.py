@@ -28,9 +28,9 @@ PARTS = {
 RESIDUALS = "residuals."
 
 
-def with_parts(robot, *parts, net=None):
+def with_parts(robot, *parts):
     """A hybrid model with modified bodies and only these residual terms."""
-    model, moved = build(arm_of(robot), "hybrid", net=net), moved_model(robot, "hybrid")
+    model, moved = build(arm_of(robot), "hybrid"), moved_model(robot, "hybrid")
     names = tuple(PARTS[part] for part in parts)
     with torch.no_grad():
         for name, parameter in model.named_parameters():

@@ -16,7 +16,7 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines import registry
 from spelgen.baselines.baseline import Baseline
 from spelgen.baselines.predictor import Predictor
-from spelgen.emission import build as pipeline
+from spelgen.emission import specify
 from spelgen.emission.loading import load_module
 from spelgen.errors import RunError
 from spelgen.exporting import exported
@@ -58,15 +58,15 @@ def test_a_preset(robots, tmp_path, monkeypatch):
     text = (presets / "minimal.yaml").read_text(encoding="utf-8")
     (presets / "toy.yaml").write_text(text.replace("dissipation: per-joint", "dissipation: dense-n"))
     monkeypatch.setattr(design, "PRESETS", presets)
-    for module in (design, pipeline):
+    for module in (design, specify):
         monkeypatch.setattr(module, "PRESET_NAMES", (*design.PRESET_NAMES, "toy"))
     path = tmp_path / "toy.py"
-    path.write_text(pipeline.generate(robots / "two_link.urdf", "toy"), encoding="utf-8")
+    path.write_text(specify.generate(robots / "two_link.urdf", "toy"), encoding="utf-8")
     model = load_module(path)
     for parameter in model.parameters():
         torch.nn.init.normal_(parameter)
     q = torch.zeros(1, 2, dtype=torch.float64)
-    assert model.facts.options.preset == "toy"
+    assert model.spec.options.preset == "toy"
     assert model.dissipation(q, q)[0, 0, 1] != 0  # not of each joint by itself
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from emitted import random_model
+from planar_model import JOINTS, Model, true_model, write_module
 
 import spelgen
 from spelgen.errors import LogError, RunError
@@ -19,15 +20,12 @@ from spelgen.logs.windows import Windows, cut_windows
 from spelgen.settings.fits import MomentumFit, Rollout, TorqueFit
 from tests.test_closed_form import FOLLOWED
 from tests.test_training import (
-    JOINTS,
     QUICK,
-    STAND_IN,
     Oscillator,
     lines,
     motions,
     quick,
     random_windows,
-    truth,
 )
 
 
@@ -39,8 +37,9 @@ def same(first: torch.nn.Module, second: torch.nn.Module) -> bool:
 @pytest.mark.usefixtures("short_epochs")
 def test_a_fit_in_memory_is_that_of_files(tmp_path):
     write_logs(tmp_path / "train.parquet", motions(), JOINTS)
-    filed = train(STAND_IN, [tmp_path / "train.parquet"], tmp_path / "filed", QUICK)
-    model = spelgen.load_module(STAND_IN)
+    module = write_module(tmp_path)
+    filed = train(module, [tmp_path / "train.parquet"], tmp_path / "filed", QUICK)
+    model = spelgen.load_module(module)
     found = spelgen.fit(model, motions(), QUICK)
     assert found.model is model
     assert (found.status, found.epochs, found.best_validation) == ("finished", 6, filed.best_validation)
@@ -49,10 +48,10 @@ def test_a_fit_in_memory_is_that_of_files(tmp_path):
     names = {path.name for path in (tmp_path / "saved").iterdir()}
     assert names == {path.name for path in (tmp_path / "filed").iterdir()}
     assert lines(tmp_path / "saved") == lines(tmp_path / "filed")
-    for name in ("config.json", "module.py"):
+    for name in ("config.json", "spec.json"):
         assert (tmp_path / "saved" / name).read_bytes() == (tmp_path / "filed" / name).read_bytes()
     again = train(
-        STAND_IN,
+        module,
         [tmp_path / "train.parquet"],
         tmp_path / "saved",
         quick(epochs=7),
@@ -66,7 +65,7 @@ def test_the_seed_orders_batches():
     logs, held = motions(), motions(2, seed=1)
     weights = []
     for seed in (0, 0, 1):
-        model = spelgen.load_module(STAND_IN)
+        model = Model()
         spelgen.fit(model, logs, quick(epochs=2), seed=seed, validation=held)
         weights.append(torch.cat([x.detach().flatten() for x in model.parameters()]))
     assert torch.equal(weights[0], weights[1])
@@ -74,7 +73,7 @@ def test_the_seed_orders_batches():
 
 
 def test_a_saved_fit_is_loaded_as_it_was(tmp_path):
-    found = spelgen.fit(spelgen.load_module(STAND_IN), motions(), quick(epochs=2), seed=3)
+    found = spelgen.fit(spelgen.load_module(write_module(tmp_path)), motions(), quick(epochs=2), seed=3)
     folder = found.save(tmp_path / "run")
     loaded = spelgen.load_run(folder)
     assert same(loaded.model, found.model)
@@ -98,7 +97,7 @@ def test_a_saved_fit_is_loaded_as_it_was(tmp_path):
 
 
 def test_what_was_used_is_recorded_and_nothing_else(tmp_path):
-    found = spelgen.fit(spelgen.load_module(STAND_IN), motions(), Rollout(epochs=1, momentum_steps=0))
+    found = spelgen.fit(Model(), motions(), Rollout(epochs=1, momentum_steps=0))
     assert found.record.objective == "rollout"
     assert found.record.options == {
         "window": 5, "stride": 1, "momentum_steps": 0, "optimizer": "lbfgs", "weight_decay": 2e-5,
@@ -110,7 +109,7 @@ def test_what_was_used_is_recorded_and_nothing_else(tmp_path):
 
 def test_validation_may_be_given():
     logs = motions()
-    found = spelgen.fit(spelgen.load_module(STAND_IN), logs[:4], quick(epochs=1), validation=logs[4:])
+    found = spelgen.fit(Model(), logs[:4], quick(epochs=1), validation=logs[4:])
     assert found.record.training == [x.name for x in logs[:4]]
     assert found.record.validation == [x.name for x in logs[4:]]
     assert found.record.validation_fraction is None
@@ -118,12 +117,12 @@ def test_validation_may_be_given():
 
 def test_one_trajectory_alone_is_enough():
     (log,) = motions(count=1, samples=60)
-    found = spelgen.fit(spelgen.load_module(STAND_IN), log, quick(epochs=1))
+    found = spelgen.fit(Model(), log, quick(epochs=1))
     assert found.record.training == ["motion_0"]
 
 
 def test_logs_that_cannot_be_fitted_are_told():
-    model = spelgen.load_module(STAND_IN)
+    model = Model()
     with pytest.raises(LogError, match="got no logs, expected a trajectory or more"):
         spelgen.fit(model, [])
     (log,) = motions(count=1)
@@ -142,12 +141,12 @@ def swings(seed: int, rate=200.0) -> Trajectory:
         -(speed**2) * np.sin(speed * t + phase),
     )
     with torch.no_grad():
-        tau = truth().inverse_dynamics(*(torch.from_numpy(x) for x in (q, qd, qdd))).numpy()
+        tau = true_model().inverse_dynamics(*(torch.from_numpy(x) for x in (q, qd, qdd))).numpy()
     return Trajectory(t[:, 0], q, qd, tau, f"swing_{seed}")
 
 
 def test_torques_are_fitted_predicted_and_scored():
-    model, test = spelgen.load_module(STAND_IN), swings(9)
+    model, test = Model(), swings(9)
     found = spelgen.fit(model, [swings(seed) for seed in range(3)], TorqueFit(weight_decay=0.0))
     assert (found.epochs, found.history, found.config.objective) == (0, [], "torque")
     assert [note.code for note in found.diagnostics].count("torque-fit") == 1
@@ -167,7 +166,7 @@ def test_torques_are_fitted_predicted_and_scored():
 def test_the_filter_reaches_torques():
     logs = [swings(seed) for seed in range(2)]
     fits = [
-        spelgen.fit(spelgen.load_module(STAND_IN), logs, TorqueFit(evaluations=20), preprocessing=each)
+        spelgen.fit(Model(), logs, TorqueFit(evaluations=20), preprocessing=each)
         for each in (Preprocessing(), Preprocessing(cutoff=3.0), Preprocessing(cutoff=0.0))
     ]
     assert [x.preprocessing.cutoff for x in fits] == [8.0, 3.0, 0.0]
@@ -179,21 +178,23 @@ def test_predictions_at_gaps_are_not_numbers():
     log = swings(0)
     t = log.t.copy()
     t[1:] += 1.0  # the first sample stands alone
-    found = spelgen.fit(spelgen.load_module(STAND_IN), [swings(1), swings(2)], TorqueFit(evaluations=20))
+    found = spelgen.fit(Model(), [swings(1), swings(2)], TorqueFit(evaluations=20))
     tau = found.predict(Trajectory(t, log.q, log.qd, log.tau, "gap"))
     assert np.isnan(tau[0]).all() and np.isfinite(tau[1:]).all()
 
 
 def test_a_fit_tells_what_it_is():
-    found = spelgen.fit(spelgen.load_module(STAND_IN), motions(), MomentumFit(momentum_steps=20))
-    told = f"<Fit of 'stand_in' to momentum: finished after 0 epochs, validation loss {found.best_validation:.3g}>"
+    found = spelgen.fit(Model(), motions(), MomentumFit(momentum_steps=20))
+    told = (
+        f"<Fit of 'Model' to momentum: finished after 0 epochs, validation loss {found.best_validation:.3g}>"
+    )
     assert repr(found) == told
     assert "momentum steps" in found._repr_html_()
 
 
 def test_a_fit_to_torques_tells_their_error(tmp_path):
     log = swings(1)
-    found = spelgen.fit(spelgen.load_module(STAND_IN), log, TorqueFit(evaluations=20))
+    found = spelgen.fit(spelgen.load_module(write_module(tmp_path)), log, TorqueFit(evaluations=20))
     nmse = found.torque_nmse
     assert list(nmse) == list(found.model.joint_names)
     judged = spelgen.evaluate(found, log, steps=(1,), seconds=()).torque["model"]
@@ -236,15 +237,13 @@ def test_dopri5_is_the_exact_solution():
 @pytest.mark.usefixtures("short_epochs")
 def test_windows_are_fitted_by_dopri5():
     config = Rollout(epochs=2, momentum_steps=0, solver="dopri5", optimizer="lbfgs")
-    found = spelgen.fit(spelgen.load_module(STAND_IN), motions(), config)
-    plain = spelgen.fit(
-        spelgen.load_module(STAND_IN), motions(), Rollout(epochs=2, momentum_steps=0, substeps=8)
-    )
+    found = spelgen.fit(Model(), motions(), config)
+    plain = spelgen.fit(Model(), motions(), Rollout(epochs=2, momentum_steps=0, substeps=8))
     assert found.record.config.solver == "dopri5"
     assert found.best_validation == pytest.approx(plain.best_validation, rel=0.05)
     windows = cut_windows(motions(), 5, measured=False)
     scales = loss_scales(windows, ("revolute", "revolute"))
-    assert rollout_loss(truth(), windows, scales, 1, "dopri5") < 1e-12
+    assert rollout_loss(true_model(), windows, scales, 1, "dopri5") < 1e-12
 
 
 @pytest.mark.usefixtures("short_epochs")

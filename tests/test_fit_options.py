@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from planar_model import JOINTS, write_module
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
@@ -17,7 +18,7 @@ from spelgen.logs.read import write_logs
 from spelgen.settings.fits import CONFIGS, OWNERS, MomentumFit, Rollout, TorqueFit, fit_config
 from spelgen.settings.settings import load_settings
 from spelgen.settings.training import TrainingSettings
-from tests.test_training import JOINTS, STAND_IN, motions
+from tests.test_training import motions
 
 VALUES = {
     "prior": {"bodies": 1.0}, "adapt": "friction", "evaluations": 40, "weight_decay": 0.1, "urdf_weight": 0.5,
@@ -144,11 +145,12 @@ def test_the_command_line_names_the_flag(robots, tmp_path):
         told
         == "Error: --objective: momentum belongs to models of networks alone, this is one of rigid bodies"
     )
-    told = refused(STAND_IN, *data, "--set", "evaluations=40")
+    networks = write_module(tmp_path, "networks.py")
+    told = refused(networks, *data, "--set", "evaluations=40")
     assert told == "Error: --set evaluations: belongs to the objective torque, this fits rollout"
-    told = refused(STAND_IN, *data, "--set", "torque_first=false")
+    told = refused(networks, *data, "--set", "torque_first=false")
     assert told == "Error: --set torque_first: with the objective rollout belongs to models of rigid bodies"
-    told = refused(STAND_IN, *data, "--set", "optimizer=lbfgs", "--set", "batch=4")
+    told = refused(networks, *data, "--set", "optimizer=lbfgs", "--set", "batch=4")
     assert told == "Error: --set batch: belongs to the optimizer adamw, this is lbfgs"
     assert not (tmp_path / "run").exists()
 
@@ -156,7 +158,16 @@ def test_the_command_line_names_the_flag(robots, tmp_path):
 def test_a_run_goes_on_with_its_own_options(tmp_path):
     logs, run = tmp_path / "train.parquet", tmp_path / "run"
     write_logs(logs, motions(), JOINTS)
-    train = ["train", str(STAND_IN), "--data", str(logs), "-o", str(run), "--set", "progress=false"]
+    train = [
+        "train",
+        str(write_module(tmp_path)),
+        "--data",
+        str(logs),
+        "-o",
+        str(run),
+        "--set",
+        "progress=false",
+    ]
     first = ["--set", "momentum_steps=20", "--set", "epochs=1", "--set", "window=6"]
     assert CliRunner().invoke(app, [*train, *first]).exit_code == 0
     again = [*train, "--resume"]

@@ -21,6 +21,7 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.formula_files import latex, sympy_source
 from spelgen.certificate.formula_text import text
 from spelgen.certificate.formulas import WRITABLE, formulas
+from spelgen.certificate.inspection import inspect
 from spelgen.certificate.numeric_samples import with_random_inertias
 from spelgen.files import write_text
 from spelgen.structure.expansion import Budget, Expansion
@@ -119,8 +120,8 @@ def test_sympy_proves_each_expression(robot):
 
 
 def test_python_users_get_sympy(robots):
-    """Names and shapes of the result of `load_arm(path).formulas()`, which SymPy can process further."""
-    found = load_arm(robots / "rpr.urdf").formulas()
+    """Names and shapes of the result of `inspect(path).closed_forms()`, which SymPy can process further."""
+    found = inspect(robots / "rpr.urdf").closed_forms()
     q1, q2, q3 = found.q
     names = {symbol.name: symbol for symbol in found.base_parameters}
     m2r, hz2r, ixx3r, ixy3 = (names[name] for name in ("m2R", "hz2R", "Ixx3R", "Ixy3"))
@@ -133,7 +134,7 @@ def test_python_users_get_sympy(robots):
     assert found.mass_matrix.shape == (3, 3) and found.mass_matrix[0, 0] == m11
     assert repr(found) == "<Formulas of 'rpr': 7 written, in 11 base parameters>"
     assert "M32</td>" in found._repr_html_() and "$m_{2R}$" in found._repr_html_()
-    one = load_arm(robots / "rpr.urdf").formulas((2, 2))
+    one = inspect(robots / "rpr.urdf").closed_forms((2, 2))
     assert (one.entries, one.potential, one.mass_matrix) == ({(2, 2): m2r}, None, None)
 
 

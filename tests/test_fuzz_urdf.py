@@ -9,7 +9,7 @@ import pytest
 from fuzzing import FEW, MINUTES, fuzz
 from hypothesis import strategies as st
 
-from spelgen.certificate import inspection as pipeline
+from spelgen.certificate.inspection import inspect
 from spelgen.errors import SpelgenError
 
 ROOT = Path(__file__).parents[1]
@@ -136,7 +136,7 @@ def shuffled(source: bytes, draw: random.Random) -> bytes:
 def require_answer(path: Path) -> bool:
     """Whether a structure was derived; if not, that it was refused as users may expect."""
     try:
-        found = pipeline.inspect(path)
+        found = inspect(path)
     except SpelgenError as error:
         lines = str(error).split("\n")
         assert lines

@@ -18,8 +18,8 @@ CARRIED = {"__future__", "collections", "functools", "math", "torch", "typing"}
 ROWS = """
 version errors labels listing tasks templates runtime files
 urdf settings arm design spec
-structure dynamics
-certificate emission logs pipeline
+structure dynamics emission
+certificate logs
 identification excitation simulation
 log_checks baselines
 fitting
@@ -39,13 +39,13 @@ OURS = {f"spelgen.{name}" for name in LAYERS}
 SYMBOLIC = {"sympy", "flint", "spelgen.arm", "spelgen.structure"}
 PLAIN = {"spelgen.arm.actuation"}  # G by the files, without the exact arithmetic of its folder
 DERIVING = ("urdf.", "arm.", "structure.", "emission.", "certificate.")
-DERIVES = [x for x in LAYERS if x.startswith(DERIVING) and x != "emission.loading"]
+MODELS = {f"emission.{name}" for name in ("assemble", "build", "loading")}  # models in memory
+DERIVES = [x for x in LAYERS if x.startswith(DERIVING) and x not in MODELS]
 OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "page", "scene")}
 LEAST_SQUARES = ("fitting.fit", "fitting.train")  # fit least squares as well, whose base parameters are exact
 FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.")) and x not in LEAST_SQUARES]
 NEVER = {
     "spec": {"sympy", "flint", "torch"},
-    "pipeline.generate": {"torch"},
     **{name: {"torch"} for name in DERIVES},
     **{name: SYMBOLIC for name in [*FITS, *sorted(OF_A_RUN)]},
 }

@@ -178,7 +178,7 @@ def test_outliers_of_any_size_are_named_and_dropped_on_request(arm, tmp_path, fo
         (log,) = read_logs(file, joints)
         told = errors([log], arm)
         times = ", ".join(f"{x:.4g}" for x in columns["t"][rows])
-        assert f"joint {joint!r}: got {quantity} that leaves its neighbours by " in told
+        assert f"joint {joint!r}: got {quantity} that deviates from its neighbours by " in told
         assert f"in 4 samples, at t = {times} s" in told
         (kept,) = read_logs(file, joints, {"dropouts": "dropped"})
         assert np.setdiff1d(columns["t"], kept.t) == pytest.approx(columns["t"][rows])
@@ -216,7 +216,7 @@ def test_frames_that_are_written_twice_now_and_then_are_counted_and_dropped_on_r
     file = written(log, tmp_path / "log.csv")
     (kept,) = read_logs(file, joints)
     (note,) = kept.repairs
-    assert "rows repeat the row before in motion: 'dropouts: dropped' under 'logs' leaves them out" in note
+    assert "rows repeat the row before in motion: 'dropouts: dropped' under 'logs' removes them" in note
     # where all joints reverse, a repeat is no step behind
     count = int(note.split(" rows ")[0])
     assert 0.95 * len(repeats) < count <= len(repeats)

@@ -11,7 +11,7 @@ import pyarrow.parquet
 import pytest
 import torch
 
-from spelgen.emission.build import generate
+from spelgen.emission.specify import generate
 from spelgen.errors import LogError, RunError, SpelgenErrors
 from spelgen.fitting.fit import RunOptions, fit
 from spelgen.fitting.run_folder import RunFolder

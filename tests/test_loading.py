@@ -1,86 +1,178 @@
-"""A module is loaded from its file or its text; text that is no emitted module is refused."""
+"""Modules are read, never executed; text that `spelgen build` did not write is refused."""
 
+import json
+import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from emitted import built
+from planar_model import write_module
 
 from spelgen.emission.build import build
 from spelgen.emission.loading import load_module
+from spelgen.emission.module_file import read_spec
+from spelgen.emission.text import module_text
 from spelgen.errors import ModuleError
 
 ROBOTS = Path(__file__).parents[1] / "robots"
-STAND_IN = Path(__file__).parent / "planar_model.py"
+REMEDY = "expected a module written by this version of `spelgen build`; build it again"
 
 
-def test_a_file_and_its_text_give_the_same_model():
-    source = STAND_IN.read_text(encoding="utf-8")
-    models = [load_module(STAND_IN), load_module(str(STAND_IN)), load_module(source)]
+@pytest.fixture
+def module(tmp_path) -> Path:
+    return write_module(tmp_path)
+
+
+def refusal(path: Path | str) -> str:
+    with pytest.raises(ModuleError) as caught:
+        load_module(path)
+    return str(caught.value)
+
+
+def test_a_file_and_its_text_give_the_same_model(module):
+    text = module.read_text(encoding="utf-8")
+    models = [load_module(module), load_module(str(module)), load_module(text)]
     for model in models:
-        assert model.source == source
-        assert (model.facts.robot, model.joint_names) == ("stand_in", ("shoulder", "elbow"))
-        assert torch.equal(model.inertia, models[0].inertia)
-    assert not torch.equal(load_module(source, seed=1).inertia, models[0].inertia)
+        assert (model.spec.robot, model.joint_names) == ("planar", ("shoulder", "elbow"))
+        assert model.spec == read_spec(module)
+        for name, weight in model.state_dict().items():
+            assert torch.equal(weight, models[0].state_dict()[name])
+    name = "potential.weights.0"
+    assert not torch.equal(load_module(text, seed=1).state_dict()[name], models[0].state_dict()[name])
 
 
-def test_a_traceback_shows_the_text_of_a_module_in_memory():
-    model = load_module(STAND_IN.read_text(encoding="utf-8"))
-    with pytest.raises(AttributeError) as caught:
-        model.gravity(None)
-    assert "torque = " in str(caught.traceback[-1].statement)
+def test_both_forms_give_the_same_specification(tmp_path):
+    specs = []
+    for standalone in (False, True):
+        path = tmp_path / f"{standalone}.py"
+        path.write_text(built("rpr", standalone=standalone)[0], encoding="utf-8")
+        specs.append(load_module(path).spec)
+    assert specs[0] == specs[1]
+
+
+def test_line_ends_of_another_system_are_accepted(module):
+    module.write_bytes(module.read_bytes().replace(b"\n", b"\r\n"))
+    assert load_module(module).n == 2
+
+
+@pytest.mark.parametrize("standalone", [False, True])
+@pytest.mark.parametrize("edit", ["append", "insert", "number"])
+def test_an_edited_module_is_refused_and_not_executed(tmp_path, standalone, edit):
+    """A line with a side effect at either end, and a changed number that the specification does not state."""
+    path, mark = tmp_path / "module.py", tmp_path / "mark"
+    text = built("rpr", standalone=standalone)[0]
+    effect = f"open({str(mark)!r}, 'w').close()\n"
+    changed = {
+        "append": text + effect,
+        "insert": text.replace("\nimport torch\n", f"\nimport torch\n{effect}", 1),
+        "number": text.replace("mass=5.01", "mass=5.02", 1),
+    }[edit]
+    assert changed != text
+    path.write_text(changed, encoding="utf-8")
+    message = (
+        f"got a module that was edited, or written by another version of spelgen, {REMEDY}, or use the edited one "
+        "from Python: `from MODULE import Model; spelgen.fit(Model(), logs)`"
+    )
+    assert refusal(path) == f"{path}: {message}"
+    assert refusal(changed) == message
+    assert not mark.exists()
+
+
+def test_the_remedy_for_an_edited_module_works(tmp_path):
+    """`from MODULE import Model` gives a model that `spelgen.fit` accepts; a run folder cannot keep it."""
+    import spelgen
+    from spelgen.errors import RunError
+    from spelgen.settings.fits import Rollout
+    from tests.test_training import motions
+
+    path = write_module(tmp_path, "edited.py")
+    path.write_text(path.read_text().replace("width=4", "width=5"))
+    sys.path.insert(0, str(tmp_path))
+    try:
+        from edited import Model
+    finally:
+        sys.path.remove(str(tmp_path))
+    model = Model()
+    before = torch.cat([x.detach().flatten() for x in model.parameters()])
+    found = spelgen.fit(model, motions(), Rollout(epochs=1, momentum_steps=5))
+    assert found.epochs == 1
+    assert not torch.equal(before, torch.cat([x.detach().flatten() for x in model.parameters()]))
+    with pytest.raises(RunError, match="a model without a specification, which a run folder cannot keep"):
+        found.save(tmp_path / "run")
 
 
 def test_what_is_no_module_is_refused(tmp_path):
     path = tmp_path / "module.py"
-    with pytest.raises(ModuleError) as caught:
-        load_module(path)
-    assert str(caught.value) == f"{path}: no such file; build it with `spelgen build`"
-    path.write_text("x = 1\n")
-    with pytest.raises(ModuleError, match=r"got no facts of spelgen in it \(StopIteration\)"):
-        load_module(path)
-    facts = STAND_IN.read_text().split("class Model")[0]
-    path.write_text(
-        f"{facts}\nclass Model(nn.Module):\n    n = 1\n    def __init__(self, seed): super().__init__()\n"
+    assert refusal(path) == f"{path}: no such file; build it with `spelgen build`"
+    for text, reason in (
+        ("x = 1\n", ""),
+        ("1 / 0\n", ""),
+        ("def\n", " (SyntaxError)"),
+        ("SPEC = f'{1}'\n", ""),
+        ("(" * 10_000, " ("),
+        ("x = '\0'\n", " ("),
+    ):
+        path.write_text(text)
+        told = refusal(path)
+        assert told.startswith(f"{path}: got no specification of spelgen in it{reason}"), told
+        assert told.endswith(f"{REMEDY}, or check the path") and "\n" not in told
+    path.write_bytes(b"\xff\xfe")
+    assert refusal(path).startswith(f"{path}: got no specification of spelgen in it (UnicodeDecodeError)")
+
+
+def test_a_module_of_an_earlier_version_is_refused_with_what_to_do(module, tmp_path):
+    """Modules had their facts, and a runtime, where the specification is now; formats have numbers."""
+    old = tmp_path / "old.py"
+    old.write_text(f'open({str(tmp_path / "mark")!r}, "w")\nFACTS = """{{"format": 8}}"""\n')
+    assert refusal(old) == (
+        f"{old}: got a module of an earlier version of spelgen, {REMEDY} with `spelgen build`, and train it again"
     )
-    with pytest.raises(ModuleError, match="got a class Model without joint_names, joint_types, mass_matrix"):
-        load_module(path)
-    path.write_text(f"{facts}\n1 / 0\n")
-    message = r"import fails \(ZeroDivisionError: division by zero\); build it again"
-    with pytest.raises(ModuleError, match=message):
-        load_module(path)
-    with pytest.raises(ModuleError, match=f"^{message}"):
-        load_module(f"{facts}\n1 / 0\n")
+    assert not (tmp_path / "mark").exists()
+    text = module.read_text(encoding="utf-8")
+    assert text.count('"format":9') == 1
+    for version in ("8", "10", '"9"', "null"):
+        module.write_text(text.replace('"format":9', f'"format":{version}'), encoding="utf-8")
+        shown = version.replace('"', "'").replace("null", "None")
+        assert refusal(module) == (
+            f"{module}: got a specification of format {shown}, expected 9, of this version; build the module again "
+            "with `spelgen build`, and train it again"
+        )
 
 
-def test_two_modules_of_the_same_name_do_not_meet(tmp_path):
-    for folder, n in (("a", 3), ("b", 4)):
-        (tmp_path / folder).mkdir()
-        text = STAND_IN.read_text().replace("    n = 2\n", f"    n = {n}\n")
-        (tmp_path / folder / "module.py").write_text(text)
-    models = [load_module(tmp_path / folder / "module.py") for folder in ("a", "b")]
-    assert [model.n for model in models] == [3, 4]
-    assert not list(tmp_path.rglob("__pycache__"))
+def test_a_specification_is_checked_like_any_file(module):
+    """Also if the rest of the module is the text of what it states."""
+    spec = read_spec(module)
+    joint = replace(spec.joints[0], armature=float("nan"))
+    module.write_text(module_text(replace(spec, joints=(joint, *spec.joints[1:]))), encoding="utf-8")
+    assert "NaN is no number of a specification" in refusal(module)
+    content = json.loads(spec.to_json()) | {"mass": 1}
+    text = module.read_text(encoding="utf-8").partition('SPEC = r"""')[0]
+    module.write_text(f'{text}SPEC = r"""{json.dumps(content)}"""\n', encoding="utf-8")
+    assert "got no specification of a model (keys or values of other types)" in refusal(module)
+
+
+def test_loading_needs_no_symbolic_algebra(module):
+    """In a process in which nothing that derives structure can be imported."""
+    program = (
+        "import sys\n"
+        "for name in ('sympy', 'flint', 'spelgen.structure', 'spelgen.emission.plan', 'spelgen.arm.arm'):\n"
+        "    sys.modules[name] = None\n"
+        "import spelgen.emission.loading as loading\n"
+        "print(loading.load_module(sys.argv[1]).n)\n"
+    )
+    command = [sys.executable, "-c", program, str(module)]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.stdout == "2\n", run.stderr
 
 
 def test_a_model_is_shown_in_a_line_and_as_its_structure():
     model = build(ROBOTS / "rpr.urdf")
     count = sum(parameter.numel() for parameter in model.parameters())
     assert repr(model) == f"<Model of 'rpr' (hybrid): 3 joints, {count} parameters>"
-    assert "2,3\n    3    C\n    2,3  .    C" in model._repr_html_()
+    assert "2,3\n     2  3    C\n     3  2,3  0    C" in model._repr_html_()
     assert repr(build(ROBOTS / "rpr.urdf", preset="closed-form")).startswith(
         "<Model of 'rpr' (closed-form): "
-    )
-
-
-def test_a_module_written_before_says_what_to_rebuild(tmp_path):
-    path = tmp_path / "module.py"
-    text = STAND_IN.read_text(encoding="utf-8")
-    line = '  "format": 8,\n'
-    assert line in text
-    path.write_text(text.replace(line, ""), encoding="utf-8")
-    with pytest.raises(ModuleError) as caught:
-        load_module(path)
-    assert str(caught.value) == (
-        f"{path}: got a module of another version of spelgen, expected a module written by this version of"
-        " `spelgen build`; build it again from stand_in.urdf with `spelgen build`, and train it again"
     )

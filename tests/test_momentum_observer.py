@@ -1,15 +1,13 @@
 """The momentum observer estimates constant and changing external torques from past samples only."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
+from planar_model import Model
 
 from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.baselines.predictor import Solver
 from spelgen.dynamics.protocol import VelocityState
-from spelgen.emission.loading import load_module
 from spelgen.evaluation import momentum_observer
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.momentum_observer import observe, past_steps, without_past
@@ -19,7 +17,6 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows
 
-STAND_IN = Path(__file__).with_name("planar_model.py")
 RATE = 100.0
 OFFSET = torch.tensor([0.6, -0.4], dtype=torch.float64)  # Nm that are not logged
 UNFILTERED = Preprocessing(cutoff=0, decimation=1)
@@ -27,7 +24,7 @@ UNFILTERED = Preprocessing(cutoff=0, decimation=1)
 
 def motions(count=4, seconds=3.0, offset=OFFSET, after=0.0) -> list[Trajectory]:
     """Simulate the stand-in under smooth torques, and from a time on [s] an offset that is not logged."""
-    model = load_module(STAND_IN)
+    model = Model()
     generator = torch.Generator().manual_seed(0)
     t = torch.arange(round(seconds * RATE) + 1) / RATE
     phases, speeds = (torch.rand(count, 1, 2, generator=generator, dtype=torch.float64) for _ in "ab")
@@ -40,7 +37,7 @@ def motions(count=4, seconds=3.0, offset=OFFSET, after=0.0) -> list[Trajectory]:
 
 
 def test_a_constant_torque_is_found():
-    model, past = load_module(STAND_IN), past_steps(RATE)
+    model, past = Model(), past_steps(RATE)
     windows = cut_windows(motions(), past + 51, 20, measured=False)
     ahead, disturbance = observe(model, windows, past)
     torch.testing.assert_close(disturbance, OFFSET.expand_as(disturbance), atol=0.01, rtol=0)
@@ -52,7 +49,7 @@ def test_a_step_is_followed_with_the_time_constant(monkeypatch, time_constant):
     """Some time after a torque begins the observer, long at work, has found 1 - exp(-time / time constant) of it."""
     tuning = EvaluationTuning(observer_time_constant=time_constant)
     monkeypatch.setattr(momentum_observer, "TUNING", tuning)
-    model, log = load_module(STAND_IN), motions(count=1, after=2.0)[0]
+    model, log = Model(), motions(count=1, after=2.0)[0]
     for since in (0.02, 0.05, 0.1):
         past = round((2.0 + since) * RATE)
         windows = cut_windows([log[: past + 2]], past + 2, measured=False)
@@ -62,7 +59,7 @@ def test_a_step_is_followed_with_the_time_constant(monkeypatch, time_constant):
 
 
 def test_it_depends_only_on_past_samples():
-    model, past = load_module(STAND_IN), past_steps(RATE)
+    model, past = Model(), past_steps(RATE)
     windows = cut_windows(motions(), past + 21, 20, measured=False)
     _, before = observe(model, windows, past)
     for values in (windows.q, windows.qd):
@@ -71,19 +68,27 @@ def test_it_depends_only_on_past_samples():
     torch.testing.assert_close(observe(model, windows, past)[1], before)
 
 
+class InVelocities:
+    """The arm as dynamics without momenta."""
+
+    def __init__(self) -> None:
+        self.model = Model()
+
+    def forward_dynamics(self, *state: torch.Tensor) -> torch.Tensor:
+        return self.model.forward_dynamics(*torch.broadcast_tensors(*state))
+
+
 def test_models_in_velocities_are_observed():
-    model, past = load_module(STAND_IN), past_steps(RATE)
+    model, past = Model(), past_steps(RATE)
     windows = cut_windows(motions(), past + 51, 20, measured=False)
-    ahead, disturbance = observe(VelocityState(model), windows, past)
+    ahead, disturbance = observe(VelocityState(InVelocities()), windows, past)
     mass = model.mass_matrix(ahead.q[:, 0])
     missing = torch.linalg.solve(mass, OFFSET.expand_as(disturbance).unsqueeze(-1)).squeeze(-1)
     torch.testing.assert_close(disturbance, missing, atol=0.15, rtol=0.15)
 
 
 def test_rollouts_with_the_estimate_are_compared_with_open_loop():
-    result = evaluate(
-        load_module(STAND_IN), motions(), preprocessing=UNFILTERED, steps=(), seconds=(0.1, 0.5)
-    )
+    result = evaluate(Model(), motions(), preprocessing=UNFILTERED, steps=(), seconds=(0.1, 0.5))
     for horizon in result.horizons:
         error = {name: x.mean_relative_rms for name, x in horizon.errors.items()}
         assert list(error) == [MODEL, observed(MODEL), CONSTANT_VELOCITY]
@@ -91,9 +96,7 @@ def test_rollouts_with_the_estimate_are_compared_with_open_loop():
         assert error[MODEL] < error[CONSTANT_VELOCITY]
     text = " ".join(result.text().split())
     assert "+ observer: with the constant disturbance" in text
-    whole = evaluate(
-        load_module(STAND_IN), motions(seconds=0.5), preprocessing=UNFILTERED, steps=(), seconds=(0.45,)
-    )
+    whole = evaluate(Model(), motions(seconds=0.5), preprocessing=UNFILTERED, steps=(), seconds=(0.45,))
     assert list(whole.horizons[0].errors) == [MODEL, CONSTANT_VELOCITY]
     assert "no observer over 0.45 s: the longest trajectory has 50 steps" in {
         x.message for x in whole.diagnostics
@@ -101,7 +104,7 @@ def test_rollouts_with_the_estimate_are_compared_with_open_loop():
 
 
 def test_a_diverged_window_affects_no_other():
-    model = load_module(STAND_IN)
+    model = Model()
     windows = cut_windows(motions(), 11, 60, measured=False)
     solver = Solver(model, 1)
     sound = solver(windows)

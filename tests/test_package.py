@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 import spelgen
-from spelgen.emission import build as pipeline
 
 ROOT = Path(__file__).parents[1]
 
@@ -58,7 +57,7 @@ def test_installed_command_builds_the_same_module(installed, robots, tmp_path):
         shutil.copy(path, tmp_path)
     command = [sys.executable, "-m", "spelgen", "build", "rpr.urdf", "-o", "module.py"]
     subprocess.run(command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(installed)}, check=True)
-    assert (tmp_path / "module.py").read_text(encoding="utf-8") == pipeline.generate(robots / "rpr.urdf")
+    assert (tmp_path / "module.py").read_text(encoding="utf-8") == spelgen.generate(robots / "rpr.urdf")
 
 
 def test_every_name_of_the_api_is_there():

@@ -1,6 +1,7 @@
 """Each preset is the model that its paper writes down; see test_contracts.py for properties that all presets share."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -22,11 +23,11 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.design import Preset, load_design
 from spelgen.emission.specify import make_spec
 from spelgen.fitting.rollout import position_difference
-from spelgen.spec import Options
 from tests.lie_group import to_group
 
 ROOT = Path(__file__).parents[1]
 PRESETS = ["phnode", "spel", "spel-kan", "hybrid"]
+KAN = replace(NETWORKS, net="kan")
 ROBOTS = ("two_link", "rpr", "six_dof")
 each_robot = pytest.mark.parametrize("robot", ROBOTS)
 
@@ -45,15 +46,13 @@ def test_presets_are_the_files():
     files = {path.stem for path in (ROOT / "spelgen" / "presets").glob("*.yaml")}
     assert {name for name in get_args(Preset) if name in files} == files
     for name in files:
-        assert make_spec(load_arm(ROOT / "robots" / "rpr.urdf"), Options(preset=name)).design == load_design(
-            name
-        )
+        assert make_spec(load_arm(ROOT / "robots" / "rpr.urdf"), name).design == load_design(name)
 
 
 @pytest.mark.parametrize("robot", ["rpr", "six_dof", "panda"])
 def test_kan_outputs_depend_only_on_their_own_joints(robot, tmp_path):
-    model = random_model(robot, tmp_path, seed=2, net="kan")
-    outputs = built(robot, net="kan")[1].outputs
+    model = random_model(robot, tmp_path, seed=2, design=KAN)
+    outputs = built(robot)[1].outputs
     q = states(model.n)[0]
     network = model.mass.network
     before = outputs_alone(network, network_inputs(model, q))
@@ -85,7 +84,7 @@ def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
 @pytest.mark.parametrize("net", ["mlp", "kan"])
 def test_networks_read_rotation_matrices(net, part, tmp_path):
     """Layer by layer as in the papers, on the varying entries of the 9 numbers of R and the 3 of r."""
-    owner = random_model("rpr", tmp_path, seed=5, preset="phnode", net=net)
+    owner = random_model("rpr", tmp_path, seed=5, design=replace(load_design("phnode"), net=net))
     model, encoding = owner.get_submodule(part), owner.encoding
     q = states(3)[0]
     parts = to_group(owner.joint_types, q)
@@ -131,13 +130,15 @@ def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset
 @pytest.mark.parametrize("net", ["mlp", "kan"])
 def test_phnode_is_its_three_axis_model_held_by_bearings(net, tmp_path):
     """H = 1/2 p^T M^-1 p over 3 n axes: for motion only along z, p_z is that momentum of the n x n module."""
-    model = frictionless(random_model("six_dof", tmp_path, seed=7, preset="phnode", net=net))
+    model = frictionless(
+        random_model("six_dof", tmp_path, seed=7, design=replace(load_design("phnode"), net=net))
+    )
     n = model.n
     q, qd, _, _ = states(n)
 
     def inverse_mass(at: torch.Tensor) -> torch.Tensor:
         pose = model.at(at)
-        return model.mass.inverse(pose.encoded, pose.prepared["mass"])
+        return model.mass.inverse(pose.encoded, pose.parameters["mass"])
 
     inverse = inverse_mass(q).detach()
     assert torch.linalg.eigvalsh(inverse)[:, 0].min() > 0

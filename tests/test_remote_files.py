@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
+from spelgen.emission.specify import make_spec
 from spelgen.errors import LogError, SpelgenError
 from spelgen.files import local
 from spelgen.fitting.run_folder import RunFolder
@@ -63,12 +64,14 @@ def test_a_run_and_its_logs_may_be_remote(robots, tmp_path, memory):
     )
 
 
-def test_local_removal_removes_the_remote_file(memory):
+def test_local_removal_removes_the_remote_file(robots, memory):
     memory.pipe("/old/run/config.json", b"{}")
     run = RunFolder("memory://old/run")
     assert run.config.read_text() == "{}"
-    run.start("source", None, force=True)
-    assert memory.find("/old/run") == ["/old/run/module.py"]
+    spec = make_spec(robots / "two_link.urdf", "closed-form")
+    run.start(spec, None, force=True)
+    assert memory.find("/old/run") == ["/old/run/spec.json"]
+    assert run.read_spec() == spec
 
 
 def test_addresses_without_files_are_refused(memory, tmp_path):

@@ -11,14 +11,14 @@ from html_page import Page
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.design import PRESETS
-from spelgen.emission import build as pipeline
-from spelgen.emission.loading import load_module
+from spelgen.emission.build import build
+from spelgen.emission.specify import make_spec
 from spelgen.errors import RunError
+from spelgen.fitting.fitted import load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.render.report_page import render_report, write_report
 from spelgen.render.run_facts import commands
 from spelgen.settings.fits import Rollout
-from spelgen.spec import read_facts
 
 
 def errors(share, tip=None):
@@ -75,13 +75,18 @@ EVALUATION = {
 }  # fmt: skip
 
 
+def write_model(folder: Path, model) -> None:
+    """Write spec.json and model.pt."""
+    (folder / "spec.json").write_text(model.spec.to_json(), encoding="utf-8")
+    torch.save(model.state_dict(), folder / "model.pt")
+
+
 @pytest.fixture
 def run(robots, tmp_path) -> Path:
     """A complete run folder, but for the training."""
     folder = tmp_path / "run"
     folder.mkdir()
-    (folder / "module.py").write_text(pipeline.generate(robots / "rpr.urdf"), encoding="utf-8")
-    torch.save(load_module(folder / "module.py").state_dict(), folder / "model.pt")
+    write_model(folder, build(robots / "rpr.urdf"))
     config = {
         "schema": 2, "robot": "rpr", "preset": "hybrid", "joints": ["joint1", "joint2", "joint3"],
         "objective": "rollout", "config": Rollout(epochs=30).record(rigid_bodies=False), "data_digest": "d" * 64,
@@ -137,9 +142,8 @@ def test_numbers_are_those_of_the_run(run):
 def test_a_run_of_a_custom_preset_names_the_file_that_it_needs(run, robots, tmp_path):
     preset = tmp_path / "mine.yaml"
     preset.write_text((PRESETS / "minimal.yaml").read_text())
-    module = pipeline.generate(load_arm(robots / "rpr.urdf", joints=["joint1", "joint2"]), preset)
-    (run / "module.py").write_text(module, encoding="utf-8")
-    first = commands(RunFolder(run), read_facts(run / "module.py"), None)[0]
+    spec = make_spec(load_arm(robots / "rpr.urdf", joints=["joint1", "joint2"]), preset)
+    first = commands(RunFolder(run), spec, None)[0]
     assert first == "spelgen build rpr.urdf --preset mine.yaml --joints joint1,joint2 -o module.py"
 
 
@@ -174,7 +178,7 @@ def test_learned_constants_are_those_of_the_weights(run):
     state["raw_armature"] += math.log(3.0)
     torch.save(state, run / "model.pt")
     page = render_report(run)
-    for start in load_module(run / "module.py").armature.tolist():
+    for start in load_run(run).model.armature.tolist():
         assert f"{3 * start:.3g} " in page
 
 
@@ -190,9 +194,9 @@ def test_missing_parts_are_reported(run, lacking, said):
     assert said in render_report(run)
 
 
-def test_a_run_of_only_a_module_has_a_report(run):
+def test_a_run_of_only_a_specification_has_a_report(run):
     for path in run.iterdir():
-        if path.name != "module.py":
+        if path.name != "spec.json":
             path.unlink()
     Page(render_report(run))
 
@@ -215,7 +219,7 @@ def test_a_folder_without_a_run_is_refused_with_a_remedy(tmp_path):
     with pytest.raises(RunError) as told:
         write_report(tmp_path / "nothing")
     assert str(told.value).endswith(
-        "got no run, expected a folder with module.py; make one with `spelgen train`"
+        "got no run, expected a folder with spec.json; make one with `spelgen train`"
     )
     assert not (tmp_path / "nothing").exists()
 
@@ -233,18 +237,17 @@ def test_names_from_files_are_escaped(run):
 
 @pytest.mark.parametrize("preset", ["closed-form", "spel", "spel-kan", "phnode"])
 def test_a_run_of_any_preset_has_its_page(run, robots, preset):
-    (run / "module.py").write_text(pipeline.generate(robots / "rpr.urdf", preset, width=8), encoding="utf-8")
+    write_model(run, build(robots / "rpr.urdf", preset, width=8))
     (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
     (run / "robot.yaml").write_bytes((robots / "rpr.yaml").read_bytes())
-    torch.save(load_module(run / "module.py").state_dict(), run / "model.pt")
     text = render_report(run)
     page = Page(text)
     assert "canvas" in page.tags and len(text) < 2_000_000
     told = " ".join(" ".join(page.text).split())
     assert ("Masses, centres of mass" in told) == (preset == "closed-form")
     assert f"Preset {preset} ," in told
-    build = told[told.index(f"spelgen build RUN/robot.urdf --preset {preset} ") :]
-    assert "--width 8 -o module.py spelgen train module.py --robot RUN/robot.urdf --data LOGS" in build
+    command = told[told.index(f"spelgen build RUN/robot.urdf --preset {preset} ") :]
+    assert "--width 8 -o module.py spelgen train module.py --robot RUN/robot.urdf --data LOGS" in command
     units = {"Nm": "joint1", "N": "joint2"}
     for unit, joint in units.items():
         assert f"Torque of {joint}" in text and f"torque [{unit}]" in text

@@ -26,7 +26,7 @@ SECONDS, MEGABYTES = 10, 1000
 # line of what it tells, its processor time is that of the fork and of the imports.
 SERVER = """
 import json, os, resource, signal, sys
-import spelgen.emission.build
+import spelgen.emission.specify
 from spelgen.cli.main import main
 
 def run(folder, told, *arguments):

@@ -32,7 +32,7 @@ from spelgen.fitting.torque.networks import adapt_networks
 from spelgen.fitting.torque.parameters import (
     NEGLIGIBLE,
     RIGID_GROUPS,
-    RigidParameters,
+    ParameterVector,
     step_in_inertial_parameters,
 )
 from spelgen.fitting.torque.prior import ESTIMATED_GROUPS, ParameterPrior, prior_covariance, update_widths
@@ -142,7 +142,7 @@ def test_the_prior_knows_every_weight(emitted):
     """What it knows nothing of would be taken for something else in silence."""
     module = emitted["six_dof"][0]
     model = module.Model()
-    rigid = RigidParameters(model)
+    rigid = ParameterVector(model)
     assert set(rigid.groups) == {*dict(model.named_parameters()), "raw_friction_compensation"}
     assert set(rigid.groups.values()) == set(RIGID_GROUPS) - {"gains"}
     assert prior_covariance(GaussianPrior(), rigid.initial, rigid.groups).diagonal().min() > 0

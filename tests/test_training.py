@@ -6,7 +6,6 @@ import math
 import multiprocessing
 import os
 import re
-import shutil
 import signal
 import time
 import types
@@ -16,14 +15,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from planar_model import JOINTS, Model, true_model, write_module
 from rich.console import Console
 
 from spelgen.emission.loading import load_module
+from spelgen.emission.module_file import read_spec
 from spelgen.errors import LogError, ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.subject import read_test_logs
 from spelgen.fitting.dataset import TrainingData, prepare_data
-from spelgen.fitting.fit import RunOptions
+from spelgen.fitting.fit import RunOptions, fit
 from spelgen.fitting.objective import FitRequest
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW
 from spelgen.fitting.progress import TrainingProgress
@@ -37,6 +38,7 @@ from spelgen.fitting.rollout import (
     roll_out,
     rollout_loss,
 )
+from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.train import train
 from spelgen.fitting.tuning import WindowTuning
 from spelgen.fitting.window.rollout import RolloutObjective
@@ -46,8 +48,6 @@ from spelgen.logs.windows import Windows, cut_windows
 from spelgen.settings.fits import MomentumFit, Rollout
 from spelgen.settings.log_mapping import LogMapping
 
-STAND_IN = Path(__file__).with_name("planar_model.py")
-JOINTS = ("shoulder", "elbow")
 ADAMW = {"optimizer": "adamw", "batch": 32, "learning_rate": 1e-2}
 QUICK = Rollout(epochs=6, momentum_steps=20, **ADAMW)
 
@@ -58,16 +58,6 @@ def quick(**changed) -> Rollout:
     if options["optimizer"] != "adamw":
         options = {name: x for name, x in options.items() if name not in ("batch", "learning_rate")}
     return Rollout(**options)
-
-
-def truth():
-    """A planar model with other parameters than the trained one."""
-    model = load_module(STAND_IN)
-    with torch.no_grad():
-        model.inertia.copy_(torch.tensor([0.4, -0.5, -1.0]))
-        model.weight.copy_(torch.tensor([3.0, 1.0]))
-        model.damping.copy_(torch.tensor([-1.5, -2.5]))
-    return model.requires_grad_(False)
 
 
 def motions(count=6, samples=21, seed=0, rate=20.0) -> list[Trajectory]:
@@ -82,12 +72,18 @@ def _motions(count: int, samples: int, seed: int, rate: float) -> tuple[Trajecto
     q = 4 * torch.rand(count, 1, 2, generator=random, dtype=torch.float64) - 2
     tau = torch.randint(-2, 3, (count, samples, 2), generator=random).double()
     start = Windows(dt, q.expand(-1, samples, -1), torch.zeros(count, samples, 2).double(), tau[:, :-1])
-    predicted_q, predicted_qd = roll_out(truth(), start, 16)
+    predicted_q, predicted_qd = roll_out(true_model(), start, 16)
     t = torch.cat([torch.zeros(count, 1), dt.cumsum(dim=1)], dim=1)
     positions = torch.cat([q, predicted_q], dim=1)
     velocities = torch.cat([torch.zeros(count, 1, 2), predicted_qd], dim=1)
     rows = zip(t.numpy(), positions.numpy(), velocities.numpy(), tau.numpy(), strict=True)
     return tuple(Trajectory(*row, name=f"motion_{k}") for k, row in enumerate(rows))
+
+
+@pytest.fixture(scope="module")
+def module(tmp_path_factory) -> Path:
+    """The module of the arm."""
+    return write_module(tmp_path_factory.mktemp("module"))
 
 
 @pytest.fixture(scope="module")
@@ -165,8 +161,8 @@ def test_the_geodesic_distance_is_that_of_the_rotation_matrices(angle):
 def test_the_true_model_has_no_loss():
     windows = cut_windows(motions(), 5, measured=False)
     scales = loss_scales(windows, ("revolute", "revolute"))
-    assert rollout_loss(truth(), windows, scales, 4) < 1e-12
-    assert rollout_loss(load_module(STAND_IN), windows, scales, 4) > 0.1
+    assert rollout_loss(true_model(), windows, scales, 4) < 1e-12
+    assert rollout_loss(Model(), windows, scales, 4) > 0.1
 
 
 def test_the_weak_form_tends_to_zero_with_the_step():
@@ -175,7 +171,7 @@ def test_the_weak_form_tends_to_zero_with_the_step():
     for rate in (200.0, 100.0):
         windows = cut_windows(motions(rate=rate), 2, measured=False)
         scales = loss_scales(windows, ("revolute", "revolute"))
-        losses.append(momentum_loss(truth(), windows, scales).sqrt().item())
+        losses.append(momentum_loss(true_model(), windows, scales).sqrt().item())
     assert losses[0] < 0.01
     assert losses[0] / losses[1] < 0.4
 
@@ -185,38 +181,37 @@ def test_standing_still_has_loss_one(monkeypatch):
         return tuple(x[:, :1].expand_as(x[:, 1:]) for x in (windows.q, windows.qd))
 
     monkeypatch.setattr("spelgen.fitting.rollout.roll_out", still)
-    model, windows = load_module(STAND_IN), cut_windows(motions(), 5, measured=False)
+    model, windows = Model(), cut_windows(motions(), 5, measured=False)
     assert rollout_loss(model, windows, loss_scales(windows, model.joint_types), 1) == pytest.approx(1.0)
 
 
 def test_stiff_friction_gets_more_substeps():
-    model = truth()
+    model = true_model()
     windows = cut_windows(motions(), 5, measured=False)
     scales = loss_scales(windows, model.joint_types)
     gentle = choose_substeps(model, windows, scales)
-    model.damping += 5.0  # decays within a few milliseconds, samples are 50 ms apart
+    model.friction.log += 5.0  # decays within a few milliseconds, samples are 50 ms apart
     stiff = choose_substeps(model, windows, scales)
     assert gentle < stiff
     once, twice, fine, finer = (probed(model, windows, scales, k) for k in (1, 2, stiff, 2 * stiff))
     assert integration_error(fine, finer) < 0.03 <= integration_error(once, twice)
 
 
-def test_training_finds_the_true_parameters(logs, tmp_path):
-    config = quick(epochs=15, momentum_steps=200)
-    result = train(STAND_IN, [logs], tmp_path / "run", config)
-    model = load_module(tmp_path / "run" / "module.py")
-    model.load_state_dict(torch.load(tmp_path / "run" / "model.pt", weights_only=True))
+def test_training_finds_the_true_parameters():
+    """Of a user's own model, which has no specification."""
+    model = Model()
+    result = fit(model, motions(), quick(epochs=15, momentum_steps=200))
     assert result.status == "finished"
     assert result.best_validation < 1e-4
-    for name, value in truth().state_dict().items():
+    for name, value in true_model().state_dict().items():
         torch.testing.assert_close(model.state_dict()[name], value, atol=0.05, rtol=0)
 
 
-def test_the_run_folder_tells_what_was_done(logs, tmp_path):
-    result = train(STAND_IN, [logs], tmp_path / "run", quick(epochs=2))
+def test_the_run_folder_tells_what_was_done(module, logs, tmp_path):
+    result = train(module, [logs], tmp_path / "run", quick(epochs=2))
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names == {
-        "module.py",
+        "spec.json",
         "config.json",
         "metrics.jsonl",
         "checkpoint.pt",
@@ -229,7 +224,9 @@ def test_the_run_folder_tells_what_was_done(logs, tmp_path):
     assert (
         [record["epoch"] for record in lines(tmp_path / "run")] == [1, 2] == list(range(1, result.epochs + 1))
     )
-    assert result.parameters == 7
+    weights = load_module(module).parameters()
+    assert result.parameters == sum(weight.numel() for weight in weights)
+    assert read_spec(module).to_json() == (tmp_path / "run" / "spec.json").read_text().strip()
 
 
 class Interrupted(TrainingProgress):
@@ -241,16 +238,16 @@ class Interrupted(TrainingProgress):
 
 
 @pytest.mark.parametrize(("optimizer", "steps"), [("adamw", 20), ("lbfgs", 3)])
-def test_resuming_repeats_what_would_have_been(logs, tmp_path, monkeypatch, optimizer, steps):
+def test_resuming_repeats_what_would_have_been(module, logs, tmp_path, monkeypatch, optimizer, steps):
     monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", WindowTuning(epoch_steps=steps))
     config = quick(optimizer=optimizer, momentum_steps=20 if optimizer == "adamw" else 0)
     straight, broken = tmp_path / "straight", tmp_path / "broken"
-    train(STAND_IN, [logs], straight, config)
+    train(module, [logs], straight, config)
     with monkeypatch.context() as patch:
         patch.setattr("spelgen.fitting.fit.TrainingProgress", Interrupted)
-        assert train(STAND_IN, [logs], broken, config).status == "interrupted"
+        assert train(module, [logs], broken, config).status == "interrupted"
     assert len(lines(broken)) == 3
-    result = train(STAND_IN, [logs], broken, config, options=RunOptions(resume=True))
+    result = train(module, [logs], broken, config, options=RunOptions(resume=True))
     assert result.status == "finished"
     assert len(lines(straight)) > 3
     assert lines(broken) == lines(straight)
@@ -272,15 +269,15 @@ def equal(first, second) -> bool:
 
 
 @pytest.mark.usefixtures("short_epochs")
-def test_resuming_drops_epochs_after_the_checkpoint(logs, tmp_path):
-    train(STAND_IN, [logs], tmp_path / "run", QUICK)
+def test_resuming_drops_epochs_after_the_checkpoint(module, logs, tmp_path):
+    train(module, [logs], tmp_path / "run", QUICK)
     with (tmp_path / "run" / "metrics.jsonl").open("a") as file:
         file.write('{"epoch": 7, "step')  # killed while writing
-    train(STAND_IN, [logs], tmp_path / "run", QUICK, options=RunOptions(resume=True))
+    train(module, [logs], tmp_path / "run", QUICK, options=RunOptions(resume=True))
     assert [record["epoch"] for record in lines(tmp_path / "run")] == [1, 2, 3, 4, 5, 6]
 
 
-def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(logs, tmp_path, monkeypatch):
+def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(module, logs, tmp_path, monkeypatch):
     calls = []
 
     def blown_up_once(model, windows, scales, substeps, solver):
@@ -289,7 +286,7 @@ def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(logs, tmp_path, m
         return loss * math.nan if sum(calls) == 25 and calls[-1] else loss
 
     monkeypatch.setattr("spelgen.fitting.window.rollout.rollout_loss", blown_up_once)
-    result = train(STAND_IN, [logs], tmp_path / "run", QUICK)
+    result = train(module, [logs], tmp_path / "run", QUICK)
     records = lines(tmp_path / "run")
     assert result.status == "finished"
     assert [record["rollbacks"] for record in records] == [0, 1, 1, 1, 1, 1]
@@ -299,14 +296,14 @@ def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(logs, tmp_path, m
 
 @pytest.mark.usefixtures("short_epochs")
 @pytest.mark.parametrize("optimizer", ["adamw", "lbfgs"])
-def test_numbers_that_never_recover_end_the_run(logs, tmp_path, monkeypatch, optimizer):
+def test_numbers_that_never_recover_end_the_run(module, logs, tmp_path, monkeypatch, optimizer):
     def blown_up(model, windows, scales, substeps, solver):
         loss = rollout_loss(model, windows, scales, substeps)
         return loss * math.nan if torch.is_grad_enabled() else loss
 
     monkeypatch.setattr("spelgen.fitting.window.rollout.rollout_loss", blown_up)
     with pytest.raises(RunError) as caught:
-        train(STAND_IN, [logs], tmp_path / "run", quick(optimizer=optimizer))
+        train(module, [logs], tmp_path / "run", quick(optimizer=optimizer))
     assert str(caught.value) == (
         f"{tmp_path}/run: losses that are not finite, after 8 attempts at half the learning rate each; "
         "check units and signs of the logs; the best model so far is kept in model.pt"
@@ -314,8 +311,8 @@ def test_numbers_that_never_recover_end_the_run(logs, tmp_path, monkeypatch, opt
 
 
 @pytest.mark.usefixtures("short_epochs")
-def test_mapped_logs_train_as_plain_ones_do(logs, tmp_path):
-    plain = train(STAND_IN, [logs], tmp_path / "plain", QUICK)
+def test_mapped_logs_train_as_plain_ones_do(module, logs, tmp_path):
+    plain = train(module, [logs], tmp_path / "plain", QUICK)
     names = {"t": "ms", "trajectory": "run", "q": "pos {joint}", "qd": "vel {joint}", "tau": "cur {joint}"}
     text = {
         "columns": names,
@@ -331,11 +328,11 @@ def test_mapped_logs_train_as_plain_ones_do(logs, tmp_path):
     np.savez(tmp_path / "train.npz", **columns)
     mapping = LogMapping.model_validate(text)
     mapped = train(
-        STAND_IN, [tmp_path / "train.npz"], tmp_path / "run", QUICK, options=RunOptions(mapping=mapping)
+        module, [tmp_path / "train.npz"], tmp_path / "run", QUICK, options=RunOptions(mapping=mapping)
     )
     assert mapped.best_validation == pytest.approx(plain.best_validation, rel=1e-6)
     again = train(
-        STAND_IN,
+        module,
         [tmp_path / "train.npz"],
         tmp_path / "run",
         quick(epochs=7),
@@ -348,30 +345,30 @@ def test_mapped_logs_train_as_plain_ones_do(logs, tmp_path):
     )
 
 
-def test_early_stop_and_time_limit(logs, tmp_path):
+def test_early_stop_and_time_limit(module, logs, tmp_path):
     stuck = quick(learning_rate=1e-30, patience=2, momentum_steps=0)
-    result = train(STAND_IN, [logs], tmp_path / "stuck", stuck)
+    result = train(module, [logs], tmp_path / "stuck", stuck)
     assert (result.status, result.epochs) == ("stopped early", 2)
     for momentum_steps in (0, 1000):
         hurried = quick(max_minutes=1e-6, momentum_steps=momentum_steps)
-        result = train(STAND_IN, [logs], tmp_path / f"late{momentum_steps}", hurried)
+        result = train(module, [logs], tmp_path / f"late{momentum_steps}", hurried)
         assert (result.status, result.epochs) == ("out of time", 0)
 
 
-def until_a_signal(logs: Path, folder: Path) -> None:
+def until_a_signal(module: Path, logs: Path, folder: Path) -> None:
     """Run a training without end in a process of its own, and write to `told` how it ended."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever runs the tests may ignore it
     with folder.with_name("told").open("w") as told:
         os.dup2(told.fileno(), 2)
         config = Rollout(epochs=100000, batch=32, patience=100000, momentum_steps=0, optimizer="adamw")
-        told.write(train(STAND_IN, [logs], folder, config).status)
+        told.write(train(module, [logs], folder, config).status)
 
 
 @pytest.mark.usefixtures("short_epochs")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_leaves_a_usable_run(logs, tmp_path, number):
+def test_a_signal_leaves_a_usable_run(module, logs, tmp_path, number):
     folder = tmp_path / "run"
-    child = multiprocessing.get_context("fork").Process(target=until_a_signal, args=(logs, folder))
+    child = multiprocessing.get_context("fork").Process(target=until_a_signal, args=(module, logs, folder))
     child.start()
     deadline = time.monotonic() + 60
     while not (folder / "metrics.jsonl").exists() and child.is_alive() and time.monotonic() < deadline:
@@ -382,67 +379,65 @@ def test_a_signal_leaves_a_usable_run(logs, tmp_path, number):
     assert child.exitcode == 0, told
     assert told.endswith("interrupted")
     assert "Traceback" not in told
-    load_module(folder / "module.py").load_state_dict(torch.load(folder / "model.pt", weights_only=True))
+    fitted_model(RunFolder(folder))
     epoch = torch.load(folder / "checkpoint.pt", weights_only=True)["epoch"]
     config = Rollout(epochs=epoch + 1, batch=32, patience=100000, momentum_steps=0, optimizer="adamw")
-    assert train(STAND_IN, [logs], folder, config, options=RunOptions(resume=True)).epochs == epoch + 1
+    assert train(module, [logs], folder, config, options=RunOptions(resume=True)).epochs == epoch + 1
     assert not list(folder.glob(".*"))  # no partial file remains
 
 
-def test_a_run_is_not_overwritten_unasked(logs, tmp_path):
+def test_a_run_is_not_overwritten_unasked(module, logs, tmp_path):
     config = quick(epochs=1)
-    train(STAND_IN, [logs], tmp_path / "run", config)
+    train(module, [logs], tmp_path / "run", config)
     before = (tmp_path / "run" / "model.pt").read_bytes()
     with pytest.raises(RunError) as caught:
-        train(STAND_IN, [logs], tmp_path / "run", config)
+        train(module, [logs], tmp_path / "run", config)
     assert str(caught.value) == (
         f"{tmp_path}/run: there is a run in this folder; --resume it, --force to replace it, or -o another"
     )
     assert (tmp_path / "run" / "model.pt").read_bytes() == before
-    train(STAND_IN, [logs], tmp_path / "run", config, seed=5, options=RunOptions(force=True))
+    train(module, [logs], tmp_path / "run", config, seed=5, options=RunOptions(force=True))
     assert json.loads((tmp_path / "run" / "config.json").read_text())["seed"] == 5
 
 
-def test_a_run_is_resumed_only_as_it_was_started(logs, tmp_path):
-    train(STAND_IN, [logs], tmp_path / "run", quick(epochs=1))
+def test_a_run_is_resumed_only_as_it_was_started(module, logs, tmp_path):
+    train(module, [logs], tmp_path / "run", quick(epochs=1))
     with pytest.raises(RunError) as caught:
-        train(STAND_IN, [logs], tmp_path / "run", quick(batch=16), seed=1, options=RunOptions(resume=True))
+        train(module, [logs], tmp_path / "run", quick(batch=16), seed=1, options=RunOptions(resume=True))
     assert str(caught.value) == (
         f"{tmp_path}/run: got batch 16 instead of 32, seed 1 instead of 0, "
         "expected the settings the run was started with; or start a new run"
     )
     write_logs(tmp_path / "other.parquet", motions(seed=1), JOINTS)
     with pytest.raises(RunError) as caught:
-        train(
-            STAND_IN, [tmp_path / "other.parquet"], tmp_path / "run", QUICK, options=RunOptions(resume=True)
-        )
+        train(module, [tmp_path / "other.parquet"], tmp_path / "run", QUICK, options=RunOptions(resume=True))
     assert str(caught.value) == (
         f"{tmp_path}/run: other logs than the run was started with; give the same --data or start a new run"
     )
     with pytest.raises(RunError) as caught:
-        train(STAND_IN, [logs], tmp_path / "none", QUICK, options=RunOptions(resume=True))
+        train(module, [logs], tmp_path / "none", QUICK, options=RunOptions(resume=True))
     assert str(caught.value) == (
         f"{tmp_path}/none: got no such run, expected a folder with config.json; spelgen train"
     )
 
 
-def test_nothing_is_written_when_the_logs_are_bad(tmp_path):
+def test_nothing_is_written_when_the_logs_are_bad(module, tmp_path):
     (tmp_path / "bad.csv").write_text("t,q_shoulder\n0,0\n")
     with pytest.raises(LogError):
-        train(STAND_IN, [tmp_path / "bad.csv"], tmp_path / "run", QUICK)
+        train(module, [tmp_path / "bad.csv"], tmp_path / "run", QUICK)
     assert not (tmp_path / "run").exists()
 
 
 def test_a_changed_urdf_stays_out_of_the_run(logs, tmp_path):
-    module = Path(shutil.copy(STAND_IN, tmp_path / "module.py"))
-    (tmp_path / "stand_in.urdf").write_text("<robot/>")
+    module = write_module(tmp_path)
+    (tmp_path / "planar.urdf").write_text("<robot/>")
     result = train(module, [logs], tmp_path / "run", quick(epochs=1))
     assert "changed-urdf" in [note.code for note in result.diagnostics]
     assert not (tmp_path / "run" / "robot.urdf").exists()
     with pytest.raises(
         ModuleError, match="another URDF than the module was built from; build the module again"
     ):
-        train(module, [logs], tmp_path / "new", QUICK, urdf=tmp_path / "stand_in.urdf")
+        train(module, [logs], tmp_path / "new", QUICK, urdf=tmp_path / "planar.urdf")
     assert not (tmp_path / "new").exists()
 
 
@@ -452,7 +447,7 @@ def prepared(logs: Path) -> TrainingData:
 
 def loop_of(logs: Path, config: Rollout) -> RolloutObjective:
     request = FitRequest(
-        load_module(STAND_IN), read_logs([logs], JOINTS), config, Preprocessing(), 0.25, 0, None, RunOptions(),
+        Model(), read_logs([logs], JOINTS), config, Preprocessing(), 0.25, 0, None, RunOptions(),
         time.monotonic(), None,
     )  # fmt: skip
     loop = RolloutObjective(request)
@@ -482,7 +477,7 @@ def test_the_learning_rate_rises_and_falls(logs, tmp_path):
     assert rates[-1] == pytest.approx(0.01 * QUICK.learning_rate, rel=0.1)
 
 
-def test_few_windows_are_taken_all_at_once(logs, tmp_path):
+def test_few_windows_are_taken_all_at_once():
     """L-BFGS comes nearer in as many steps, and a weight decay of its own is what it gets."""
     config = Rollout(momentum_steps=0, epochs=6)
     assert config.resolved(100).record(rigid_bodies=False).keys() & {"batch", "learning_rate"} == set()
@@ -493,13 +488,8 @@ def test_few_windows_are_taken_all_at_once(logs, tmp_path):
     assert Rollout(weight_decay=0.5).resolved(100).weight_decay == 0.5
     losses = {}
     for optimizer in ("adamw", "lbfgs"):
-        train(
-            STAND_IN,
-            [logs],
-            tmp_path / optimizer,
-            quick(momentum_steps=0, optimizer=optimizer),
-        )
-        losses[optimizer] = lines(tmp_path / optimizer)[-1]["best"]
+        found = fit(Model(), motions(), quick(momentum_steps=0, optimizer=optimizer))
+        losses[optimizer] = found.history[-1]["best"]
     assert losses["lbfgs"] < 0.5 * losses["adamw"]
 
 
@@ -521,10 +511,8 @@ def test_the_line_search_turns_back_from_numbers_that_blow_up():
     assert max(tried) >= 2
 
 
-def test_the_objective_momentum_predicts_no_windows(logs, tmp_path):
-    result, start = (
-        train(STAND_IN, [logs], tmp_path / f"{k}", MomentumFit(momentum_steps=k, **ADAMW)) for k in (200, 1)
-    )
+def test_the_objective_momentum_predicts_no_windows():
+    result, start = (fit(Model(), motions(), MomentumFit(momentum_steps=k, **ADAMW)) for k in (200, 1))
     assert (result.status, result.epochs, result.steps) == ("finished", 0, 0)
     assert result.best_validation < 0.5 * start.best_validation
 

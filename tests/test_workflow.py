@@ -10,7 +10,7 @@ import yaml
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
-from spelgen.spec import read_facts
+from spelgen.fitting.run_folder import RunFolder
 
 OWN = ("two_link", "rpr", "scara", "six_dof", "panda", "ur10e")
 OTHERS = ("drm_2link", "interbotix_px100", "dobot_mg400", "franka_fr3")
@@ -70,7 +70,7 @@ def test_a_tip_in_the_settings_applies_to_every_command(robots, tmp_path, monkey
     settings |= {"tip": "link2", "training": FEW_STEPS}
     settings["simulation"]["trajectories"] = 2
     run_workflow(robots / "rpr.urdf", tmp_path, settings, monkeypatch)
-    assert tuple(read_facts("run/module.py").joints) == ("joint1", "joint2")
+    assert RunFolder("run").read_spec().joint_names == ("joint1", "joint2")
 
 
 def test_the_commands_of_the_readme_work(robots, tmp_path, monkeypatch):

@@ -8,12 +8,12 @@ import time
 
 import numpy as np
 import pytest
-from REMOVED import require_own_module
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.module_check import check
-from spelgen.emission.specify import generate
+from spelgen.emission.specify import arm_of_spec, derive_spec, generate
 from spelgen.errors import SpelgenError
+from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.train import train
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
@@ -226,5 +226,8 @@ def test_a_module_built_from_xacro_trains_with_its_robot(arm, tmp_path):
     config = Rollout(epochs=1, momentum_steps=0)
     fit = train(tmp_path / "module.py", [tmp_path / "log.parquet"], tmp_path / "run", config, urdf=arm)
     assert not [x for x in fit.diagnostics if x.code in ("no-urdf", "changed-urdf", "no-regularizer")]
-    assert read_urdf(tmp_path / "run" / "robot.urdf").digest == fit.model.facts.urdf_sha256
-    require_own_module(tmp_path / "run" / "module.py", tmp_path / "run" / "robot.urdf")
+    assert read_urdf(tmp_path / "run" / "robot.urdf").digest == fit.model.spec.urdf_sha256
+    spec = RunFolder(tmp_path / "run").read_spec()
+    assert (
+        derive_spec(arm_of_spec(spec, tmp_path / "run" / "robot.urdf"), spec.options).outputs == spec.outputs
+    )

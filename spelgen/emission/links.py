@@ -89,6 +89,9 @@ def _about_center(
     x, y, z = hx / m, hy / m, hz / m
     steiner = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
     inertia = [value - m * part for value, part in zip(tensor, steiner, strict=True)]
+    # rounding errors of an inertia that was made consistent
+    noise = max(map(abs, inertia)) / 10 ** (DIGITS + 3)
+    inertia = [value if abs(value) > noise else Fraction(0) for value in inertia]
     cx, cy, cz = _rounded((x, y, z), DIGITS)
     xx, xy, xz, yy, yz, zz = _rounded(inertia, DIGITS)
     return _rounded([m], DIGITS)[0], (cx, cy, cz), (xx, xy, xz, yy, yz, zz)

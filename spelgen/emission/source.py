@@ -32,10 +32,10 @@ def call(callee: str, *positional: object, **named: object) -> Call:
     return Call(callee, (*arguments, *named.items()))
 
 
-def filled(start: str, value: object, indent: int) -> str:
-    """Return ``start`` and ``value``, in one line if it fits, else with several items per line."""
+def filled(start: str, value: object, indent: int, reserved: int = 0) -> str:
+    """Return ``start`` and ``value``, in one line if it and ``reserved`` characters fit, else in several."""
     text = start + flat(value)
-    if indent + len(text) < WIDTH or not _items(value) or _alike(value):
+    if indent + len(text) + reserved < WIDTH or not _items(value) or _alike(value):
         return text
     inner = " " * (indent + _STEP)
     opening, closing = "{}" if _is_dict(value) else "()"

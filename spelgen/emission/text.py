@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from textwrap import wrap
+from textwrap import fill, wrap
 
 from spelgen.emission.entry_sums import Sums, entry_sums, term_names
 from spelgen.emission.parts import ModelParts, model_parts
@@ -95,7 +95,8 @@ def header(spec: ModelSpec) -> str:
     if not spec.started_from_urdf:
         lines.append("The URDF has no physically consistent inertials: initial links have 1 kg each.")
     example = _EXAMPLE.format(module=module_name(spec), n=len(spec.joints))
-    return "\n\n".join(["\n".join(lines), example, _picture(spec), _joint_table(spec)])
+    about = fill(" ".join(lines), WIDTH, break_long_words=False, break_on_hyphens=False)
+    return "\n\n".join([about, example, _picture(spec), _joint_table(spec)])
 
 
 def module_name(spec: ModelSpec) -> str:
@@ -147,7 +148,7 @@ def _rows(spec: ModelSpec, parts: ModelParts) -> list[str]:
         lines = [*(f"# {line}" for line in _COMMENTS[name]), f"{name} = ("]
         for number, row in enumerate(rows, start=1):
             end = f"  # {letter}{number}: {about[f'{letter}{number}']}" if about else ""
-            lines.append(f"    {filled('', row, 4)},{end}")
+            lines.append(f"    {filled('', row, 4, len(end))},{end}")
         statements.append("\n".join([*lines, f"){SKIP}"]))
     return statements
 

@@ -20,7 +20,7 @@ def find_dropouts(signals: JointSignals) -> str | None:
         if rows.size:
             first = rows[0]
             size = values[first] - values[max(first - 1, 0)]
-            what = "falls to 0" if values[first] == 0 else f"leaves its neighbours by {size:.4g}"
+            what = "falls to 0" if values[first] == 0 else f"deviates from its neighbours by {size:.4g}"
             times = listed_times(signals.trajectory.t[rows])
             return f"{name} that {what} for a moment, in {counted(len(rows), 'sample')}, at t = {times}"
     return None

@@ -87,7 +87,7 @@ def _without_repeats(
         else f"{count} rows repeat the row before in motion"
     )
     if copies == 1 and mapping.dropouts == "kept":
-        return data, (f"{which}: 'dropouts: dropped' under 'logs' leaves them out, {rate:.3g} Hz remain",)
+        return data, (f"{which}: 'dropouts: dropped' under 'logs' removes them, {rate:.3g} Hz remain",)
     return data[~repeats], (f"{which}: repeats were left out, {rate:.3g} Hz remain",)
 
 

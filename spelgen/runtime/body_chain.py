@@ -15,7 +15,7 @@ from spelgen.runtime.rows import Joint, Link, vector
 
 
 class ChainConfiguration(NamedTuple):
-    """Four points per body at a position q, in the base frame, multiplied by the square roots of their masses."""
+    """Four points per body at a position q, in the base frame, times the square roots of their masses."""
 
     place: Tensor  # positions, (..., 3, bodies, 4)
     mass: Tensor  # square roots of the masses, (..., 1, bodies, 4)
@@ -27,11 +27,11 @@ class ChainConfiguration(NamedTuple):
 class BodyChain(nn.Module):
     """Bodies that rotate about or translate along axes, each carried by another body or by the base.
 
-    Twists are (angular, linear) in the base frame (Featherstone, Rigid Body Dynamics Algorithms, 2008); frames
-    are 4 x 4 matrices (Uicker, J. Appl. Mech. 34:418, 1967). The inertia of a body is that of four points: the
-    columns (position, 1) * sqrt(mass) of a root of its pseudo-inertia. Only the frames are computed one body
-    after the other; sums over carrying or carried bodies are products with a mask, which takes the fewest
-    operations.
+    Twists are (angular, linear) in the base frame (Featherstone, Rigid Body Dynamics Algorithms, 2008);
+    frames are 4 x 4 matrices (Uicker, J. Appl. Mech. 34:418, 1967). The inertia of a body is that of four
+    points: the columns (position, 1) * sqrt(mass) of a root of its pseudo-inertia. Only the frames are
+    computed one body after the other; sums over carrying or carried bodies are products with a mask, which
+    takes the fewest operations.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class BodyChain(nn.Module):
         return ChainConfiguration(place, mass, axes, jacobian, (self.base * mass).flatten(-3))
 
     def motion(self, at: ChainConfiguration, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return velocities of the points, (..., 3, bodies, 4), twists, and rates of axes (Featherstone, 2.31)."""
+        """Return velocities of points, (..., 3, bodies, 4), twists, and axis rates (Featherstone, 2.31)."""
         rates = qd @ self.ratios.mT
         velocity = torch.unflatten(applied(at.jacobian.mT, rates), -1, (3, -1, 4))
         twists = (at.axes * rates.unsqueeze(-2)) @ self.carriers

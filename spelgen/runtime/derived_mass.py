@@ -61,7 +61,7 @@ class DerivedMass(nn.Module):
         return self.constant_scale * self.raw_constants
 
     def _by_outputs(self) -> Tensor:
-        """Return dM / d output for each output of the network, then M at zero outputs, (outputs + 1, n, n)."""
+        """Return dM / d output per output of the network, then M at zero outputs, (outputs + 1, n, n)."""
         functions = torch.cat([torch.diag(self.function_scale), self.function_mean.unsqueeze(-1)], dim=1)
         constants = F.pad(self.constants().unsqueeze(-1), (len(functions), 0))
         return self.entries(*functions.unbind(), *constants.unbind())

@@ -11,7 +11,7 @@ from spelgen.runtime.rows import Joint, vector
 
 
 class JointEncoding(nn.Module):
-    """Two numbers per joint, (..., 2 n): first cos q of all joints, then sin q; if prismatic, the scaled q and 0."""
+    """Two numbers per joint, (..., 2 n): first cos q of all joints, then sin q; prismatic: scaled q, 0."""
 
     def __init__(self, joints: Sequence[Joint]) -> None:
         super().__init__()

@@ -140,5 +140,5 @@ class FrictionLaws(nn.Module):
 
 
 def turning(velocity: Tensor, width: Tensor) -> Tensor:
-    """Return 1 / sqrt(velocity^2 + width^2), (..., n): times the velocity, a sign that is smooth over this width."""
+    """Return 1 / sqrt(velocity^2 + width^2), (..., n): times the velocity, a smooth sign of this width."""
     return torch.rsqrt(velocity * velocity + width**2)

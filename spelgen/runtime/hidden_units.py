@@ -23,7 +23,7 @@ def hidden_units(outputs: Sequence[tuple[int, ...]], width: int, min_units: int)
     ideal = [width * counts[group] / len(outputs) for group in groups]
     units = [max(min_units, round(share)) for share in ideal]
     index = range(len(groups))
-    # after rounding the sum may differ from the width by some units: the largest differences are corrected first
+    # after rounding the sum may differ from the width: the largest differences are corrected first
     while sum(units) > width and max(units) > min_units:
         units[max(index, key=lambda k: units[k] - ideal[k] if units[k] > min_units else -width)] -= 1
     while sum(units) < width:

@@ -12,8 +12,8 @@ from spelgen.runtime.port_hamiltonian import applied
 class MotorInputs(nn.Module):
     """A constant G, (n, n): torque of each joint, its rows, per input of each motor, its columns.
 
-    A joint without a motor is passive. trained: rows of G, true for gains that are trained; such a gain keeps its
-    sign.
+    A joint without a motor is passive. trained: rows of G, true for gains that are trained; such a gain
+    keeps its sign.
     """
 
     parameter_groups = (("raw_gains", "gains", "1"),)

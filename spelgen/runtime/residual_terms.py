@@ -112,12 +112,12 @@ class ResidualTerms(nn.Module):
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
     def _by_entry(self, sizes: Tensor) -> Tensor:
-        """Return the contributions of functions and constants with these values to M, (functions + constants, n, n)."""
+        """Return the contribution of each function and constant to M, (functions + constants, n, n)."""
         rows = torch.diag(sizes).unbind()
         return self.entries(*rows)
 
     def bounds(self, armature: Tensor) -> Tensor:
-        """Return the bounds of the functions and constants, (functions + constants,), for an armature matrix (n, n).
+        """Return the bounds of functions and constants, (functions + constants,), for an armature (n, n).
 
         armature - diag(d) is positive semi-definite for d = 1 / (row sums of |armature^-1|), and so is
         diag(d) - R if no row of |R| / sqrt(d d^T) has a sum above one: both by diagonal dominance.

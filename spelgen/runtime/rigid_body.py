@@ -29,10 +29,10 @@ def pseudo_inertia(link: Link) -> Tensor:
 
 
 class InertialParameters(nn.Module):
-    """Inertial parameters that are physically consistent for all values of the trained parameters, which start at zero.
+    """Inertial parameters that are physically consistent for all trained parameters; these start at zero.
 
-    The pseudo-inertia of a body is [[S, m c], [(m c)^T, m]], S the second moments of mass in its joint's frame.
-    It is C T T^T C^T, with C and T upper triangular, and C C^T that of the link as given. T is a function of
+    The pseudo-inertia of a body is [[S, m c], [(m c)^T, m]], S the second moments in its joint's frame. It
+    is C T T^T C^T, with C and T upper triangular, and C C^T that of the link as given. T is a function of
     log-Cholesky parameters (Rucker and Wensing, IEEE RA-L 7:4352, 2022): logarithms of mass and of the extent
     along three axes, relative to the given ones, and shear and center of mass in units of the extents.
     """
@@ -50,5 +50,5 @@ class InertialParameters(nn.Module):
         self.raw = nn.Parameter(torch.zeros(len(links), 10, dtype=torch.float64))
 
     def forward(self) -> Tensor:
-        """Return C T of each body, (bodies, 4, 4): its columns are four points with the inertia of the body."""
+        """Return C T of each body, (bodies, 4, 4): the columns are four points with its inertia."""
         return self.factors @ body_factor(torch.unflatten(self.raw @ self.triangle, -1, (4, 4)))

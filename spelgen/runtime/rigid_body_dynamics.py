@@ -89,7 +89,7 @@ class RigidBodyDynamics(PortHamiltonian):
 
     @property
     def inertial_parameters(self) -> Tensor:
-        """(m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of each body about the origin of its joint's frame, (bodies, 10)."""
+        """(m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of bodies about the origin of their joints, (bodies, 10)."""
         root = self.bodies.forward()
         row, column = torch.triu_indices(4, 4)
         xx, xy, xz, x, yy, yz, y, zz, z, m = (root @ root.mT)[..., row, column].unbind(dim=-1)
@@ -162,7 +162,7 @@ class RigidBodyDynamics(PortHamiltonian):
         return qd @ self.motors.mT, at.gravity @ self.loads
 
     def friction_torque(self, q: Tensor | RigidConfiguration, qd: Tensor, *state: Tensor | None) -> Tensor:
-        """Return the friction torque, C^T f(C qd), (..., n) [Nm, N]; state: see ``FrictionConstants.torque``."""
+        """Return the friction torque C^T f(C qd), (..., n) [Nm, N]; state: see ``FrictionConstants``."""
         at: RigidConfiguration = self.at(q, qd)
         torque = at.varied * at.prepared.friction.torque(*self._at_motors(at, qd), *state)
         return torque if self.motors is None else torque @ self.motors
@@ -185,7 +185,7 @@ class RigidBodyDynamics(PortHamiltonian):
 
         Near the smoothing velocity friction is up to 7.4 % larger than without z, far above it the same.
         """
-        # tanh reaches its limit within a few widths: the slow end of an algebraic sign would be a stiff transient
+        # tanh reaches its limit within a few widths: an algebraic sign would be a stiff transient
         direction = (self._motor(qd) / self.friction.prepare().coulomb_smoothing_velocity).tanh()
         return direction.unsqueeze(-1) * self.friction.reach
 

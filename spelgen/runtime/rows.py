@@ -49,7 +49,7 @@ class Joint(NamedTuple):
 
 
 class Link(NamedTuple):
-    """A rigid body that a joint moves, in the frame of that joint: z is the axis of rotation or translation."""
+    """A rigid body that a joint moves, in the frame of that joint: z is its axis."""
 
     name: str
     parent: str | None  # the link that carries it; None: the base

@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def symmetric(*rows: Sequence[Tensor | float]) -> Tensor:
-    """Return the symmetric matrix, (..., n, n), with these rows of its lower triangle; entries are (...) or numbers."""
+    """Return the symmetric matrix, (..., n, n), of the rows of its lower triangle: (...) or numbers."""
     n = len(rows)
     entries = [rows[max(i, j)][min(i, j)] for i in range(n) for j in range(n)]
     like = next(entry for entry in entries if isinstance(entry, Tensor))

@@ -1,79 +1,75 @@
-r"""Port-Hamiltonian model of an arm with 3 joints, written by `spelgen build`.
+r"""Port-Hamiltonian model of an arm with 3 joints, by `spelgen build`.
 
-45 learned functions of q make M^-1 over all axes.
-The potential energy depends on joints 1-3.
-Sizes and starting values are the URDF's inertials.
+Robot "rpr". Networks of the whole M^-1 over three axes per joint, V, D and G. V depends on joints 1-3.
 
-Mass matrix: the joints each entry depends on, C where it is constant, . where it is always zero.
+    import torch
+    from rpr_spel import Model
 
-    2,3
-    3    C
-    2,3  .    C
+    model = Model()  # trained: model.load_state_dict(torch.load("run/model.pt"))
+    q, qd, tau = torch.zeros(3, 100, 3, dtype=torch.float64)  # any batch, joints last
+    M = model.mass_matrix(q)  # (100, 3, 3)
+    qdd = model.forward_dynamics(q, qd, tau)  # (100, 3)
+    tau = model.inverse_dynamics(q, qd, qdd)
+    V = model.potential_energy(q)  # (100,) [J]
+    H = model.hamiltonian(q, model.momentum(q, qd))
 
-Joints, in the order of q, qd and tau:
+Mass matrix: numbers of the joints that each entry depends on; C constant, 0 always zero
 
-    1  "joint1"  revolute   rad, Nm  -2.96706 .. 2.96706
-    2  "joint2"  prismatic  m, N     0.305 .. 1.27
-    3  "joint3"  revolute   rad, Nm  -2.96706 .. 2.96706
+     1  2,3
+     2  3    C
+     3  2,3  0    C
+
+Joints, in the order of q, qd and tau
+
+     1  "joint1"  revolute   -2.96706 .. 2.96706 rad, Nm
+     2  "joint2"  prismatic  0.305 .. 1.27 m, N
+     3  "joint3"  revolute   -2.96706 .. 2.96706 rad, Nm
 """
 
-from __future__ import annotations
-
-import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
-
 import torch
-import torch.nn.functional as F
-from torch import Tensor, nn
+from spelgen.runtime import DenseFriction, DenseInputDynamics, DenseMass, Joint, MaskedMLP
 
-FACTS = r"""{"format": 8, "robot": "rpr", "urdf": "rpr.urdf",
- "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "ff9f8c624e611d175366c0257bfed2191becdfef33f20d0062bafbb1d287fcf3",
- "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
-  "preset": "phnode", "tip": null, "width": 64},
- "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
-
-
-# ---- this arm; `Model`, at the end of the file, is made of these parts ----
+# Positions [rad, m], speed [rad/s, m/s], friction [Nm, N], armature [kg m^2, kg].
+JOINTS = (
+    Joint("joint1", "revolute", lower=-2.96706, upper=2.96706, speed=3.0, friction=0.4, armature=2.19),
+    Joint("joint2", "prismatic", lower=0.305, upper=1.27, speed=1.0, friction=0.4, armature=0.782),
+    Joint("joint3", "revolute", lower=-2.96706, upper=2.96706, speed=6.0, friction=0.4, armature=0.106),
+)  # fmt: skip
 
 
-def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction, Network]:
-    """Return what this arm's `Model` is made of, with random weights of this seed."""
-    joints = Joints(
-        revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
-        speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
-    )  # fmt: skip
-    generator = torch.Generator().manual_seed(seed)
-    network = Network(
-        generator, ((0.02, 1.0, 0.518), (0.02, 1.0, 0.518)), hidden=(((0, 1, 2), 64),),
-        outputs=(((0, 1, 2), 45),),
-    )  # fmt: skip
-    mass = Mass(
-        joints, mean=((139.887,), (-0.00167665, 5.33), (-0.00154309, 0.0, 0.0101411)), network=network
-    )
-    potential = Network(
-        generator, ((0.02, 0.02, 1.0), (0.02, 0.02, 1.0)), hidden=(((0, 1, 2), 32),),
-        outputs=(((0, 1, 2), 1),),
-    )  # fmt: skip
-    network = Network(
-        generator, ((0.1, 0.1, 0.1), (0.1, 0.1, 0.1), (1.0, 1.0, 1.0)), hidden=(((0, 1, 2), 64),),
-        outputs=(((0, 1, 2), 45),),
-    )  # fmt: skip
-    friction = Friction(joints, network, axes=3)
-    network = Network(
-        generator, ((1.0, 1.0, 1.0), (1.0, 1.0, 1.0)), hidden=(((0, 1, 2), 64),), outputs=(((0, 1, 2), 9),)
-    )
-    return (joints, mass, potential, 0.703291, friction, network)
-
-
-class Model(DenseInput):
-    """The arm's dynamics: 45 learned functions of q make M^-1 over all axes."""
-
-    n = 3
-    joint_names = ("joint1", "joint2", "joint3")
-    joint_types = ("revolute", "prismatic", "revolute")
+class Model(DenseInputDynamics):
+    """Networks of the whole M^-1 over three axes per joint, V, D and G."""
 
     def __init__(self, seed: int = 0, dtype: torch.dtype = torch.float64) -> None:
-        super().__init__(*make_parts(seed))
+        generator = torch.Generator().manual_seed(seed)
+        super().__init__(
+            joints=JOINTS,
+            mass=DenseMass(
+                JOINTS, mean=((139.887,), (-0.00167665, 5.33), (-0.00154309, 0.0, 0.0101411)),
+                network=MaskedMLP(
+                    generator, JOINTS, scales=((0.02, 1.0, 0.518), (0.02, 1.0, 0.518)),
+                    outputs=(("joint1", "joint2", "joint3"),) * 45, width=64, depth=2,
+                ),
+            ),
+            potential=MaskedMLP(
+                generator, JOINTS, scales=((0.02, 0.02, 1.0), (0.02, 0.02, 1.0)),
+                outputs=(("joint1", "joint2", "joint3"),), width=32, depth=2,
+            ),
+            potential_scale=0.703291,
+            friction=DenseFriction(
+                JOINTS, axes=3,
+                network=MaskedMLP(
+                    generator, JOINTS, scales=((0.1, 0.1, 0.1), (0.1, 0.1, 0.1), (1.0, 1.0, 1.0)),
+                    outputs=(("joint1", "joint2", "joint3"),) * 45, width=64, depth=2,
+                ),
+            ),
+            input_network=MaskedMLP(
+                generator, JOINTS, scales=((1.0, 1.0, 1.0), (1.0, 1.0, 1.0)),
+                outputs=(("joint1", "joint2", "joint3"),) * 9, width=64, depth=2,
+            ),
+        )  # fmt: skip
         self.to(dtype)
+
+
+# The specification, for `spelgen train` and `spelgen check`; they refuse a module that was edited.
+SPEC = r"""{"constants":[{"basis":[[2,2,1.0]],"scale":0.0101411,"start":0.0101411},{"basis":[[1,1,1.0]],"scale":5.33,"start":5.33}],"design":{"dissipation":"dense-3n","encoding":"lie-group","input":"dense-3n","mass":"dense-3n","memory":"none","net":"mlp","potential":"dense"},"entries":[[0,0,"varying",[1,2]],[1,0,"varying",[2]],[1,1,"constant",[]],[2,0,"varying",[1,2]],[2,1,"zero",[]],[2,2,"constant",[]]],"format":9,"gravity":[0.0,0.0,-9.81],"inputs":[],"joints":[{"armature":2.19,"center":0.0,"friction":0.4,"gear":1.0,"half_range":2.96706,"joint_type":"revolute","lower":-2.96706,"mass_sensitivity":0.02,"name":"joint1","potential_sensitivity":0.02,"speed":3.0,"upper":2.96706},{"armature":0.782,"center":0.7875,"friction":0.4,"gear":1.0,"half_range":0.4825,"joint_type":"prismatic","lower":0.305,"mass_sensitivity":1.0,"name":"joint2","potential_sensitivity":0.02,"speed":1.0,"upper":1.27},{"armature":0.106,"center":0.0,"friction":0.4,"gear":1.0,"half_range":2.96706,"joint_type":"revolute","lower":-2.96706,"mass_sensitivity":0.518,"name":"joint3","potential_sensitivity":1.0,"speed":6.0,"upper":2.96706}],"links":[],"margin":0.08,"motor_speeds":[],"options":{"angle_tolerance":0.002,"assume":"kinematics","depth":2,"design":null,"joints":null,"preset":"phnode","tip":null,"width":64},"outputs":[{"basis":[[1,0,1.0]],"joints":[0,1,2],"mean":-0.00167665,"scale":1.36528},{"basis":[[2,0,1.0]],"joints":[0,1,2],"mean":-0.00154309,"scale":0.0595527},{"basis":[[0,0,1.0]],"joints":[0,1,2],"mean":139.887,"scale":12.6351}],"potential":[0,1,2],"potential_scale":0.703291,"robot":"rpr","servos":[],"started_from_urdf":true,"urdf":"rpr.urdf","urdf_sha256":"aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d"}"""  # noqa: E501

@@ -1,89 +1,100 @@
-r"""Port-Hamiltonian model of an arm with 3 joints, written by `spelgen build`.
+r"""Port-Hamiltonian model of an arm with 3 joints, by `spelgen build`.
 
-3 learned functions of q and 2 constants make the mass matrix.
-The potential energy depends on joints 1-3.
-Sizes and starting values are the URDF's inertials.
+Robot "rpr". 3 learned functions of q and 2 constants make M; networks of V and D. V depends on joints 1-3.
 
-Mass matrix: the joints each entry depends on, C where it is constant, . where it is always zero.
+    import torch
+    from rpr_spel import Model
 
-    2,3
-    3    C
-    2,3  .    C
+    model = Model()  # trained: model.load_state_dict(torch.load("run/model.pt"))
+    q, qd, tau = torch.zeros(3, 100, 3, dtype=torch.float64)  # any batch, joints last
+    M = model.mass_matrix(q)  # (100, 3, 3)
+    qdd = model.forward_dynamics(q, qd, tau)  # (100, 3)
+    tau = model.inverse_dynamics(q, qd, qdd)
+    V = model.potential_energy(q)  # (100,) [J]
+    H = model.hamiltonian(q, model.momentum(q, qd))
 
-Joints, in the order of q, qd and tau:
+Mass matrix: numbers of the joints that each entry depends on; C constant, 0 always zero
 
-    1  "joint1"  revolute   rad, Nm  -2.96706 .. 2.96706
-    2  "joint2"  prismatic  m, N     0.305 .. 1.27
-    3  "joint3"  revolute   rad, Nm  -2.96706 .. 2.96706
+     1  2,3
+     2  3    C
+     3  2,3  0    C
+
+Joints, in the order of q, qd and tau
+
+     1  "joint1"  revolute   -2.96706 .. 2.96706 rad, Nm
+     2  "joint2"  prismatic  0.305 .. 1.27 m, N
+     3  "joint3"  revolute   -2.96706 .. 2.96706 rad, Nm
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
-
 import torch
-import torch.nn.functional as F
-from torch import Tensor, nn
+from spelgen.runtime import (
+    Constant,
+    DenseFriction,
+    DerivedMass,
+    Function,
+    Joint,
+    MaskedKAN,
+    NetworkDynamics,
+    joints_of,
+    symmetric,
+)
+from torch import Tensor
 
-FACTS = r"""{"format": 8, "robot": "rpr", "urdf": "rpr.urdf",
- "urdf_sha256": "aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d",
- "spec_sha256": "b34ffe42189815605795657a6b69ae13a0a2197d9cd43de1cd541741dc6aed55",
- "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
-  "preset": "spel-kan", "tip": null, "width": 64},
- "joints": {"joint1": "revolute", "joint2": "prismatic", "joint3": "revolute"}}"""
+# Positions [rad, m], speed [rad/s, m/s], friction [Nm, N], armature [kg m^2, kg].
+JOINTS = (
+    Joint("joint1", "revolute", lower=-2.96706, upper=2.96706, speed=3.0, friction=0.4, armature=2.19),
+    Joint("joint2", "prismatic", lower=0.305, upper=1.27, speed=1.0, friction=0.4, armature=0.782),
+    Joint("joint3", "revolute", lower=-2.96706, upper=2.96706, speed=6.0, friction=0.4, armature=0.106),
+)  # fmt: skip
+
+# The learned functions of q, and the joints that each depends on.
+FUNCTIONS = (
+    Function(("joint1", "joint2", "joint3"), mean=-0.00167665, scale=1.36528),  # f1: M21 [kg m]
+    Function(("joint1", "joint2", "joint3"), mean=-0.00154309, scale=0.0595527),  # f2: M31 [kg m^2]
+    Function(("joint1", "joint2", "joint3"), mean=139.887, scale=12.6351),  # f3: M11 [kg m^2]
+)  # fmt: skip
+
+# The trained constants, in units of scale.
+CONSTANTS = (
+    Constant(initial=0.0101411, scale=0.0101411),  # c1: M33 [kg m^2]
+    Constant(initial=5.33, scale=5.33),  # c2: M22 [kg]
+)  # fmt: skip
 
 
-# ---- this arm; `Model`, at the end of the file, is made of these parts ----
-
-
-def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
-    """Return M without armature, (..., n, n), by its functions f(q) and its constants c."""
-    # f1(q1-3), f2(q1-3), f3(q1-3)
-    f1, f2, f3 = f
-    c1, c2 = c
+def mass_entries(f1: Tensor, f2: Tensor, f3: Tensor, c1: Tensor, c2: Tensor) -> Tensor:
+    """Return M without armature, (..., n, n), from functions of q and constants."""
     return symmetric([f3], [f1, c2], [f2, 0, c1])
 
 
-def make_parts(seed: int) -> tuple[Joints, Mass, Network, float, Friction]:
-    """Return what this arm's `Model` is made of, with random weights of this seed."""
-    joints = Joints(
-        revolute=(True, False, True), center=(0.0, 0.7875, 0.0), reach=(2.96706, 0.4825, 2.96706),
-        speed=(3.0, 1.0, 6.0), friction=(0.4, 0.4, 0.4), armature=(2.19, 0.782, 0.106),
-    )  # fmt: skip
-    generator = torch.Generator().manual_seed(seed)
-    network = Network(
-        generator, ((0.02, 1.0, 0.518), (0.02, 1.0, 0.518)), hidden=(((0, 1, 2), 16),),
-        outputs=(((0, 1, 2), 3),),
-    )  # fmt: skip
-    mass = Mass(
-        joints, mass_entries,
-        functions=((-0.00167665, 1.36528), (-0.00154309, 0.0595527), (139.887, 12.6351)),
-        constants=((0.0101411, 0.0101411), (5.33, 5.33)), net=network, margin=0.08,
-    )  # fmt: skip
-    potential = Network(
-        generator, ((0.02, 0.02, 1.0), (0.02, 0.02, 1.0)), hidden=(((0, 1, 2), 8),), outputs=(((0, 1, 2), 1),)
-    )
-    network = Network(
-        generator, ((0.1, 0.1, 0.1), (0.1, 0.1, 0.1), (1.0, 1.0, 1.0)), hidden=(((0, 1, 2), 16),),
-        outputs=(((0, 1, 2), 6),),
-    )  # fmt: skip
-    friction = Friction(joints, network, axes=1)
-    return (joints, mass, potential, 0.703291, friction)
-
-
 class Model(NetworkDynamics):
-    """The arm's dynamics: 3 learned functions of q and 2 constants make the mass matrix."""
-
-    n = 3
-    joint_names = ("joint1", "joint2", "joint3")
-    joint_types = ("revolute", "prismatic", "revolute")
+    """3 learned functions of q and 2 constants make M; networks of V and D."""
 
     def __init__(self, seed: int = 0, dtype: torch.dtype = torch.float64) -> None:
-        super().__init__(*make_parts(seed))
+        generator = torch.Generator().manual_seed(seed)
+        super().__init__(
+            joints=JOINTS,
+            mass=DerivedMass(
+                JOINTS, mass_entries, functions=FUNCTIONS, constants=CONSTANTS, margin=0.08,
+                network=MaskedKAN(
+                    generator, JOINTS, scales=((0.02, 1.0, 0.518), (0.02, 1.0, 0.518)),
+                    outputs=joints_of(FUNCTIONS), width=16, depth=2, min_units=2,
+                ),
+            ),
+            potential=MaskedKAN(
+                generator, JOINTS, scales=((0.02, 0.02, 1.0), (0.02, 0.02, 1.0)),
+                outputs=(("joint1", "joint2", "joint3"),), width=8, depth=2,
+            ),
+            potential_scale=0.703291,
+            friction=DenseFriction(
+                JOINTS, axes=1,
+                network=MaskedKAN(
+                    generator, JOINTS, scales=((0.1, 0.1, 0.1), (0.1, 0.1, 0.1), (1.0, 1.0, 1.0)),
+                    outputs=(("joint1", "joint2", "joint3"),) * 6, width=16, depth=2,
+                ),
+            ),
+        )  # fmt: skip
         self.to(dtype)
 
-    @property
-    def armature(self) -> Tensor:
-        """Armature, the drives' part of M's diagonal, (n,) [kg m^2, kg]."""
-        return self.mass.armature()
+
+# The specification, for `spelgen train` and `spelgen check`; they refuse a module that was edited.
+SPEC = r"""{"constants":[{"basis":[[2,2,1.0]],"scale":0.0101411,"start":0.0101411},{"basis":[[1,1,1.0]],"scale":5.33,"start":5.33}],"design":{"dissipation":"dense-n","encoding":"lie-group","input":"derived","mass":"derived","memory":"none","net":"kan","potential":"dense"},"entries":[[0,0,"varying",[1,2]],[1,0,"varying",[2]],[1,1,"constant",[]],[2,0,"varying",[1,2]],[2,1,"zero",[]],[2,2,"constant",[]]],"format":9,"gravity":[0.0,0.0,-9.81],"inputs":[],"joints":[{"armature":2.19,"center":0.0,"friction":0.4,"gear":1.0,"half_range":2.96706,"joint_type":"revolute","lower":-2.96706,"mass_sensitivity":0.02,"name":"joint1","potential_sensitivity":0.02,"speed":3.0,"upper":2.96706},{"armature":0.782,"center":0.7875,"friction":0.4,"gear":1.0,"half_range":0.4825,"joint_type":"prismatic","lower":0.305,"mass_sensitivity":1.0,"name":"joint2","potential_sensitivity":0.02,"speed":1.0,"upper":1.27},{"armature":0.106,"center":0.0,"friction":0.4,"gear":1.0,"half_range":2.96706,"joint_type":"revolute","lower":-2.96706,"mass_sensitivity":0.518,"name":"joint3","potential_sensitivity":1.0,"speed":6.0,"upper":2.96706}],"links":[],"margin":0.08,"motor_speeds":[],"options":{"angle_tolerance":0.002,"assume":"kinematics","depth":2,"design":null,"joints":null,"preset":"spel-kan","tip":null,"width":64},"outputs":[{"basis":[[1,0,1.0]],"joints":[0,1,2],"mean":-0.00167665,"scale":1.36528},{"basis":[[2,0,1.0]],"joints":[0,1,2],"mean":-0.00154309,"scale":0.0595527},{"basis":[[0,0,1.0]],"joints":[0,1,2],"mean":139.887,"scale":12.6351}],"potential":[0,1,2],"potential_scale":0.703291,"robot":"rpr","servos":[],"started_from_urdf":true,"urdf":"rpr.urdf","urdf_sha256":"aaacb65e5fa6a4caf626114ddf8869514f479b568dae43957e41214d3c6eff8d"}"""  # noqa: E501

@@ -1,92 +1,102 @@
-r"""Port-Hamiltonian model of an arm with 2 joints, written by `spelgen build`.
+r"""Port-Hamiltonian model of an arm with 2 joints, by `spelgen build`.
 
-2 rigid bodies with trained inertial parameters;
-residual networks, zero unless a fit selects them: 1 learned function of q and 2 constants in M.
-The potential energy depends on joints 1,2.
-Sizes and starting values are the URDF's inertials.
+Robot "two_link". 2 rigid bodies with trained inertial parameters, friction, and residual terms. Residual
+terms are zero until a fit selects them; in M: 1 learned function of q and 2 constants. V depends on joints
+1,2.
 
-Mass matrix: the joints each entry depends on, C where it is constant, . where it is always zero.
+    import torch
+    from two_link_spel import Model
 
-    2
-    2   C
+    model = Model()  # trained: model.load_state_dict(torch.load("run/model.pt"))
+    q, qd, tau = torch.zeros(3, 100, 2, dtype=torch.float64)  # any batch, joints last
+    M = model.mass_matrix(q)  # (100, 2, 2)
+    qdd = model.forward_dynamics(q, qd, tau)  # (100, 2)
+    tau = model.inverse_dynamics(q, qd, qdd)
+    V = model.potential_energy(q)  # (100,) [J]
+    H = model.hamiltonian(q, model.momentum(q, qd))
 
-Joints, in the order of q, qd and tau:
+Mass matrix: numbers of the joints that each entry depends on; C constant, 0 always zero
 
-    1  "joint1"  revolute   rad, Nm  -3.14159 .. 3.14159
-    2  "joint2"  revolute   rad, Nm  -3.14159 .. 3.14159
+     1  2
+     2  2   C
+
+Joints, in the order of q, qd and tau
+
+     1  "joint1"  revolute   -3.14159 .. 3.14159 rad, Nm
+     2  "joint2"  revolute   -3.14159 .. 3.14159 rad, Nm
 """
 
-from __future__ import annotations
-
-import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
-
 import torch
-import torch.nn.functional as F
-from torch import Tensor, nn
+from spelgen.runtime import (
+    FrictionLaws,
+    Function,
+    Joint,
+    Link,
+    MaskedMLP,
+    ResidualDynamics,
+    ResidualTerms,
+    joints_of,
+    symmetric,
+)
+from torch import Tensor
 
-FACTS = r"""{"format": 8, "robot": "two_link", "urdf": "two_link.urdf",
- "urdf_sha256": "d5393c842e189b72219c5ce02e115de571a94cd406b48898ea64b5431a395232",
- "spec_sha256": "231d901ddafe1d0a943e789643a0f16797c6eb31653efc1ebba8377f99a82be3",
- "options": {"angle_tolerance": 0.002, "assume": "kinematics", "depth": 2, "design": null, "joints": null,
-  "preset": "hybrid", "tip": null, "width": 64},
- "joints": {"joint1": "revolute", "joint2": "revolute"}}"""
+# Positions [rad, m], speed [rad/s, m/s], friction [Nm, N], armature [kg m^2, kg].
+JOINTS = (
+    Joint("joint1", "revolute", lower=-3.14159, upper=3.14159, speed=10.0, friction=1.0, armature=0.1),
+    Joint("joint2", "revolute", lower=-3.14159, upper=3.14159, speed=10.0, friction=1.0, armature=0.1),
+)  # fmt: skip
+
+# In the frame of the joint, z along its axis; position and rotation: of this frame in the parent's [m].
+# mass [kg], center_of_mass [m], inertia about it: xx, xy, xz, yy, yz, zz [kg m^2].
+LINKS = (
+    Link(
+        "link1", parent=None, joint="joint1", position=(0.0, 0.0, 0.0), mass=1.0,
+        center_of_mass=(0.5, 0.0, 0.0), inertia=(0.6, 0.0, 0.0, 0.6, 0.0, 1.0),
+    ),
+    Link(
+        "link2", parent="link1", joint="joint2", position=(1.0, 0.0, 0.0), mass=1.0,
+        center_of_mass=(0.5, 0.0, 0.0), inertia=(0.6, 0.0, 0.0, 0.6, 0.0, 1.0),
+    ),
+)  # fmt: skip
+
+# The learned functions of q, and the joints that each depends on.
+FUNCTIONS = (
+    Function(("joint2",)),  # f1: M11, M21 [kg m^2]
+)  # fmt: skip
 
 
-# ---- this arm; `Model`, at the end of the file, is made of these parts ----
-
-
-def mass_entries(f: Sequence[Tensor], c: Sequence[Tensor]) -> Tensor:
-    """Return R, what M has beside rigid bodies, (..., n, n), by its functions f(q) and its constants c."""
-    # f1(q2)
-    (f1,) = f
-    c1, c2 = c
+def mass_entries(f1: Tensor, c1: Tensor, c2: Tensor) -> Tensor:
+    """Return the residual of M, (..., n, n), from functions of q and constants."""
     m11 = 2 * f1 + c2
     return symmetric([m11], [f1, c1])
 
 
-def make_parts(seed: int) -> tuple[ResidualTerms, BodyChain, InertialParameters, FrictionLaws, Row]:
-    """Return what this arm's `Model` is made of, with random weights of this seed."""
-    joints = Joints(
-        revolute=(True, True), center=(0.0, 0.0), reach=(3.14159, 3.14159), speed=(10.0, 10.0),
-        friction=(1.0, 1.0), armature=(0.1, 0.1),
-    )  # fmt: skip
-    generator = torch.Generator().manual_seed(seed)
-    network = Network(generator, ((0.02, 1.0), (0.02, 1.0)), hidden=(((1,), 64),), outputs=(((1,), 1),))
-    potential = Network(
-        generator, ((1.0, 0.307), (1.0, 0.307)), hidden=(((0, 1), 32),), outputs=(((0, 1), 1),)
-    )
-    residuals = ResidualTerms(
-        joints, (1.0, 1.0), mass_entries, functions=1, constants=2, network=network, potential=potential,
-        scale=10.8194,
-    )  # fmt: skip
-    chain = BodyChain(
-        n=2, gravity=(0.0, -9.81, 0.0), parent=(-1, 0), joint=(0, 1), revolute=(True, True), ratio=(1.0, 1.0),
-        offset=(0.0, 0.0),
-        placement=(
-            ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)),
-            ((1.0, 0.0, 0.0, 1.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)),
-        ),
-    )  # fmt: skip
-    bodies = InertialParameters(
-        (0.75, 0.0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.1, 0.0, 1.0),
-        (0.75, 0.0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.1, 0.0, 1.0),
-    )  # fmt: skip
-    friction = FrictionLaws(
-        friction=joints.friction, speed=joints.speed,
-        reach=((0.0001, 0.0004, 0.0016, 0.0064, 0.025, 0.1), (0.0001, 0.0004, 0.0016, 0.0064, 0.025, 0.1)),
-    )  # fmt: skip
-    return (residuals, chain, bodies, friction, joints.armature)
-
-
 class Model(ResidualDynamics):
-    """The arm's dynamics: 2 rigid bodies with trained inertial parameters, and residual networks."""
-
-    n = 2
-    joint_names = ("joint1", "joint2")
-    joint_types = ("revolute", "revolute")
+    """2 rigid bodies with trained inertial parameters, friction, and residual terms."""
 
     def __init__(self, seed: int = 0, dtype: torch.dtype = torch.float64) -> None:
-        super().__init__(*make_parts(seed))
+        generator = torch.Generator().manual_seed(seed)
+        super().__init__(
+            joints=JOINTS,
+            links=LINKS,
+            gravity=(0.0, -9.81, 0.0),
+            friction=FrictionLaws(
+                JOINTS, breakaway={"revolute": (0.0001, 0.0004, 0.0016, 0.0064, 0.025, 0.1)},
+            ),
+            residuals=ResidualTerms(
+                JOINTS, mass_entries, functions=1, constants=2, potential_scale=10.8194,
+                network=MaskedMLP(
+                    generator, JOINTS, scales=((0.02, 1.0), (0.02, 1.0)), outputs=joints_of(FUNCTIONS),
+                    width=64, depth=2, min_units=4,
+                ),
+                potential=MaskedMLP(
+                    generator, JOINTS, scales=((1.0, 0.307), (1.0, 0.307)), outputs=(("joint1", "joint2"),),
+                    width=32, depth=2,
+                ),
+            ),
+        )  # fmt: skip
         self.to(dtype)
+
+
+# The specification, for `spelgen train` and `spelgen check`; they refuse a module that was edited.
+SPEC = r"""{"constants":[{"basis":[[1,1,1.0]],"scale":1.25,"start":1.25},{"basis":[[0,0,1.0]],"scale":1.0,"start":1.0}],"design":{"dissipation":"constants","encoding":"joint","input":"derived","mass":"closed-form","memory":"bristles","net":"mlp","potential":"closed-form"},"entries":[[0,0,"varying",[1]],[1,0,"varying",[1]],[1,1,"constant",[]]],"format":9,"gravity":[0.0,-9.81,0.0],"inputs":[],"joints":[{"armature":0.1,"center":0.0,"friction":1.0,"gear":1.0,"half_range":3.14159,"joint_type":"revolute","lower":-3.14159,"mass_sensitivity":0.02,"name":"joint1","potential_sensitivity":1.0,"speed":10.0,"upper":3.14159},{"armature":0.1,"center":0.0,"friction":1.0,"gear":1.0,"half_range":3.14159,"joint_type":"revolute","lower":-3.14159,"mass_sensitivity":1.0,"name":"joint2","potential_sensitivity":0.307,"speed":10.0,"upper":3.14159}],"links":[{"center_of_mass":[0.5,0.0,0.0],"inertia":[0.6,0.0,0.0,0.6,0.0,1.0],"joint":0,"joint_type":"revolute","mass":1.0,"name":"link1","offset":0.0,"parent":-1,"position":[0.0,0.0,0.0],"ratio":1.0,"rotation":[[1.0,0.0,0.0],[0.0,1.0,0.0],[0.0,0.0,1.0]]},{"center_of_mass":[0.5,0.0,0.0],"inertia":[0.6,0.0,0.0,0.6,0.0,1.0],"joint":1,"joint_type":"revolute","mass":1.0,"name":"link2","offset":0.0,"parent":0,"position":[1.0,0.0,0.0],"ratio":1.0,"rotation":[[1.0,0.0,0.0],[0.0,1.0,0.0],[0.0,0.0,1.0]]}],"margin":0.07,"motor_speeds":[],"options":{"angle_tolerance":0.002,"assume":"kinematics","depth":2,"design":null,"joints":null,"preset":"hybrid","tip":null,"width":64},"outputs":[{"basis":[[0,0,2.0],[1,0,1.0]],"joints":[1],"mean":1.2652,"scale":0.343656}],"potential":[0,1],"potential_scale":10.8194,"robot":"two_link","servos":[],"started_from_urdf":true,"urdf":"two_link.urdf","urdf_sha256":"d5393c842e189b72219c5ce02e115de571a94cd406b48898ea64b5431a395232"}"""  # noqa: E501

@@ -21,9 +21,10 @@ from spelgen.fitting.torque.linearization import (
     RigidProjection,
     concatenate_blocks,
 )
-from spelgen.fitting.torque.parameters import RigidParameters, joint_torque, step_in_inertial_parameters
+from spelgen.fitting.torque.parameters import ParameterVector, joint_torque, step_in_inertial_parameters
 from spelgen.fitting.torque.samples import SampleBlock, TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
+from spelgen.runtime.inputs import MotorInputs
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
@@ -69,8 +70,10 @@ class TorqueJacobian:
         self, model: ArmModel, samples: TorqueSamples, terms: Mapping[int, LinearTerms] = NO_TERMS
     ) -> None:
         self.model, self.samples, self.terms = model, samples, terms
-        self.rigid = RigidParameters(model)
+        self.rigid = ParameterVector(model)
         self._of_bodies = self.rigid.mask("bodies")
+        inputs = model.inputs
+        self._gain_rows = inputs.gain_rows if isinstance(inputs, MotorInputs) else torch.zeros(0).long()
         self._motors = motors_of(model)
         self._affects = self._motors != 0  # (n, n): whether a drive affects a joint's torque
         self._affected = self._affected_joints()
@@ -106,7 +109,7 @@ class TorqueJacobian:
         ones = torch.ones(self.model.n).double()
         for name in self.rigid.names("gains"):  # logarithms of joint torque per logged torque
             change = parameters[name] - self.rigid.initial[name]
-            return ones.expand(*change.shape[:-1], -1).index_copy(-1, self.model.gain_rows, (-change).exp())
+            return ones.expand(*change.shape[:-1], -1).index_copy(-1, self._gain_rows, (-change).exp())
         return ones
 
     def normal_equations(self, x: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -233,7 +236,7 @@ class TorqueJacobian:
                 continue
             rows = self._affects
             if self.rigid.groups[name] == "gains":
-                rows = rows[self.model.gain_rows]
+                rows = rows[self._gain_rows]
             masks.append(rows.repeat_interleave(tensor[0].numel(), dim=0))
         return torch.cat(masks)
 

@@ -29,8 +29,8 @@ DAY_GROUPS = ("sizes", "effects", "velocities", "load_dependence", "fractions", 
 NEGLIGIBLE = -30.0  # logarithm of a friction coefficient that is practically zero
 
 
-class RigidParameters:
-    """Parameters of bodies, drives and friction of a model, by name and as one vector x (K,).
+class ParameterVector:
+    """Maps the parameters of bodies, drives and friction of a model to one vector x (K,), and back.
 
     groups: parameter group per name. initial: values when this object was created.
     """
@@ -103,7 +103,7 @@ def limit_friction(model: ArmModel, samples: SampleBlock) -> None:
     Nominal friction is derived from the effort limits of the URDF, which are placeholders in many files. Torque offsets
     have its unit: they would be confounded with gravity if it were far too large.
     """
-    rigid, motors = RigidParameters(model), motors_of(model)
+    rigid, motors = ParameterVector(model), motors_of(model)
     with torch.no_grad():
         drive_torque = joint_torque(model, samples) @ torch.linalg.inv(motors)
         limit = drive_torque.std(dim=0) / model.friction.nominal

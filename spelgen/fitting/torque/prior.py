@@ -13,7 +13,7 @@ from functools import cached_property
 
 import torch
 
-from spelgen.fitting.torque.parameters import RigidParameters
+from spelgen.fitting.torque.parameters import ParameterVector
 from spelgen.settings.fits import GaussianPrior
 
 ESTIMATED_GROUPS = ("armature", "bodies", "offset")
@@ -35,7 +35,7 @@ class ParameterPrior:
     (K,).
     """
 
-    rigid: RigidParameters
+    rigid: ParameterVector
     widths: GaussianPrior
     hyperprior: GaussianPrior
     mean: torch.Tensor

@@ -15,7 +15,7 @@ from spelgen.dynamics.residuals import idle_residuals
 from spelgen.errors import Diagnostic
 from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.torque.fit import TorqueSolution
-from spelgen.fitting.torque.parameters import RigidParameters
+from spelgen.fitting.torque.parameters import ParameterVector
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TorqueReportTuning
 
@@ -117,7 +117,7 @@ def _inertia(model: ArmModel, q: torch.Tensor, covariance: torch.Tensor) -> tupl
         q: (T, n) positions [rad, m].
         covariance: (K, K) of the rigid parameters, propagated to first order.
     """
-    parameters = RigidParameters(model).initial
+    parameters = ParameterVector(model).initial
 
     def diagonal(*tensors: torch.Tensor) -> torch.Tensor:
         """Return the mean diagonal of M, (n,), for parameters in the order of their names."""
