@@ -194,7 +194,7 @@ def test_times_of_a_coarse_clock_are_reconstructed_where_rows_are_evenly_spaced(
     assert log.sample_rate == pytest.approx(100, rel=0.01)
     assert np.abs(log.t - log.t[0] - T).max() < tick
     assert "too coarse for the rows: times were reconstructed" in log.repairs[0]
-    # a rate that the mapping states holds whatever the times are
+    # the rate of the mapping replaces the times
     (log,) = read_logs(path, JOINTS, {"sample_rate": 100})
     check_read(log)
 

@@ -60,7 +60,7 @@ def errors(logs, arm) -> str:
 
 
 def advised(text: str) -> LogMapping:
-    """The mapping that the one line of an error asks for."""
+    """The mapping in the one line of an error."""
     (line,) = re.findall(r"write '(.*)' under 'logs'", text)
     return LogMapping.model_validate(yaml.safe_load(line))
 
@@ -195,7 +195,7 @@ def test_rows_that_are_written_several_times_are_read_once_with_their_own_rate(a
     assert log.sample_rate == pytest.approx(250 / often, rel=0.01)
     assert log.repairs[0].startswith(f"every row is written {often} times: ")
     assert log.q == pytest.approx(columns_of(columns, "q", joints)[::often])
-    # of some columns alone nothing can be left out
+    # rows of which only some columns are held cannot be removed
     some = {name: x[held] if name.startswith("tau") else x for name, x in columns.items()}
     (log,) = read_logs(written(some, tmp_path / "some.csv"), joints)
     told = f"tau that changes {250 / often:.3g} times a second in rows at 250 Hz: each value lasts {often} samples"

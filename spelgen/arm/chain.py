@@ -172,7 +172,7 @@ def _longest(robot: Robot) -> Chain:
         jaws = ", ".join(repr(chain[-1].name) for chain in longest)
         message = f"{jaws} slide side by side at the end of the chain: taken as a gripper's and locked"
         return Chain(longest[0][:-1], (_remark(longest[0][-1], "info", message),))
-    # joints without an effort limit, 0 in the file, are those that nothing drives
+    # nothing drives a joint without an effort limit, which is 0 in the file
     driven = [chain for chain in longest if all(joint.effort is not None for joint in chain)]
     if len(driven) == 1:
         message = f"{len(longest)} chains of {length} joints: the only one with effort limits of all joints is taken"

@@ -19,7 +19,7 @@ from spelgen.settings.values import Group, Number, Positive
 
 _MILLI = 1e-3
 TIMES = {unit: _MILLI**power for power, unit in enumerate(("s", "ms", "us", "ns"))}
-# what a value is multiplied with to be in SI units, which are not listed themselves
+# factors to SI units, which are not listed themselves
 LENGTHS = {"deg": pi / 180, "turns": 2 * pi, "mm": _MILLI}
 SPEEDS = {f"{name}/s": scale for name, scale in LENGTHS.items()} | {"rpm": 2 * pi / 60}
 SCALES = {**LENGTHS, **SPEEDS, "mNm": _MILLI, "mA": _MILLI}
@@ -83,7 +83,7 @@ class JointColumns(Group):
 
 
 class JointUnits(Group):
-    """Units of one joint's columns; None: those of all joints."""
+    """Units of one joint's columns; None: the units of all joints."""
 
     q: Position | None = None
     qd: Velocity | None = None
@@ -123,7 +123,7 @@ class MotorCalibration(Group):
 
 
 class JointLog(Group):
-    """How one joint is logged.
+    """Mapping of one joint.
 
     name: the joint's name in the log; None: the URDF's. counts_per_turn, counts_per_metre: of the joint.
     sign: -1 where the log's sense is the opposite of the URDF's, of position, velocity and torque.
@@ -155,14 +155,14 @@ class JointLog(Group):
 class LogMapping(Group):
     """From a log's columns to t, q, qd, tau in SI units, or to t, q and the commanded positions u.
 
-    input: "position" where joints are commanded positions: u is read, and neither qd nor tau are.
-    topic: of the ROS 2 bag, where it holds several with joint states. velocity: "differentiated" where the
-    log has none. torque_delay: how much later than positions a log shows torques [s], see what `spelgen logs` suggests.
-    accept: codes of errors in logs that are right as they are. dropouts: "dropped" leaves out rows in which a signal
-    falls to 0 or leaves its neighbours for a moment, and rows that repeat the row before. sample_rate [Hz]: rows of a
-    recording are evenly spaced by it, whatever their times are. calibration: of motors by their names in the log, the
-    content of LeRobot's calibration file, for the unit "normalised".
-    Files that spelgen wrote itself are read as they are, whatever stands here.
+    input: "position" if positions are commanded: u is read, and neither qd nor tau are.
+    topic: of the ROS bag, if it has several with joint states. velocity: "differentiated" if the log has none.
+    torque_delay: delay of torques after positions in the log [s]; `spelgen logs` suggests it.
+    accept: codes of errors in logs that are correct. dropouts: "dropped" removes rows in which a signal
+    falls to 0 or deviates from its neighbours for a moment, and rows that repeat the row before. sample_rate [Hz]: rows
+    of a recording are evenly spaced by it; their times are ignored. calibration: of motors by their names in the log,
+    the content of LeRobot's calibration file, for the unit "normalised".
+    The mapping does not apply to files that spelgen wrote.
     """
 
     topic: str | None = None
@@ -191,7 +191,7 @@ class LogMapping(Group):
         return list(product(self.quantities, joints))
 
     def joint(self, name: str) -> JointLog:
-        """Return how a joint is logged, by its URDF name."""
+        """Return the mapping of a joint, by its URDF name."""
         return self.joints.get(name, JointLog())
 
     def log_name(self, joint: str) -> str:
@@ -210,7 +210,7 @@ class LogMapping(Group):
         return self.model_copy(update={"columns": LogColumns(**named)})
 
     def with_joint_columns(self, columns: Mapping[str, Mapping[str, str | None]]) -> LogMapping:
-        """Return the mapping with these columns of joints, by joint and quantity."""
+        """Return the mapping with these columns of joints, per joint and quantity."""
         joints = dict(self.joints)
         for joint, names in columns.items():
             logged = self.joint(joint)
@@ -240,14 +240,14 @@ class LogMapping(Group):
         return size
 
     def unit(self, quantity: str, joint: str) -> str | None:
-        """Return the unit of "q", "qd", "tau" or "u" of a joint, None where none was said; u is measured as q is."""
+        """Return the unit of "q", "qd", "tau" or "u" of a joint, None without one; u has the unit of q."""
         unit: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
         if unit is None and quantity == "u":
             return self.unit("q", joint)
         return unit
 
     def scale(self, quantity: str, joint: str) -> float:
-        """Return what a logged value is multiplied with, sign included."""
+        """Return the factor of a logged value, sign included."""
         logged, unit = self.joint(joint), self.unit(quantity, joint)
         factor = SCALES.get(unit or "", 1.0)
         if quantity == "tau" and logged.gain is not None:
@@ -262,14 +262,14 @@ class LogMapping(Group):
         return logged.sign * factor
 
     def offset(self, quantity: str, joint: str) -> float:
-        """Return what is added after that."""
+        """Return the offset that is added after that."""
         logged = self.joint(joint)
         if quantity == "tau":
             return logged.torque_offset
         return logged.offset if quantity in ("q", "u") else 0.0
 
     def misfits(self, joints: Sequence[str], joint_types: Sequence[str] | None = None) -> list[SettingsError]:
-        """Return what the mapping lacks for these joints, or says of them that cannot be; empty where it fits."""
+        """Return errors of keys that the mapping lacks for these joints, or that contradict them; empty if it fits."""
         errors = []
         kinds: Sequence[str | None] = joint_types or [None] * len(joints)
         for joint, kind in zip(joints, kinds, strict=True):

@@ -12,7 +12,7 @@ MEMORY = 2**30  # bytes
 
 
 def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path) -> None:
-    """Let $(find PACKAGE) find a package that contains the file, or that lies beside one, without ROS."""
+    """Let $(find PACKAGE) find a package above the file, or next to a folder above it, without ROS."""
     installed = functions["_eval_find"]
 
     def find(package: str) -> str:
