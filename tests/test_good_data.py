@@ -10,10 +10,12 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 import pytest
+import torch
 
 from spelgen.arm.configured_arm import load_arm
-from spelgen.errors import LogError, SpelgenError
+from spelgen.errors import LogError, RunError, SpelgenError
 from spelgen.excitation.design import excite
+from spelgen.fitting.run_folder import _require_finite
 from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.checks import check
 from spelgen.logs.mcap import mcap_messages
@@ -340,3 +342,10 @@ def test_a_mapping_file_drops_nothing_that_the_settings_state(robots, tmp_path):
     (log,) = read_logs(tmp_path / "log.csv", load_arm(tmp_path / "x.urdf"), tmp_path / "m.yaml")
     np.testing.assert_allclose(log.q, Q * [1, -1] + [0, 0.5], atol=1e-9)
     np.testing.assert_allclose(log.u, log.q)
+
+
+def test_weights_of_servos_without_effort_limits_are_accepted(tmp_path):
+    _require_finite({"servo.limit": torch.tensor([float("inf"), 5.0])}, tmp_path)
+    for name, value in (("servo.limit", float("nan")), ("servo.log_kp", float("inf"))):
+        with pytest.raises(RunError, match="no finite numbers"):
+            _require_finite({name: torch.tensor([value])}, tmp_path)
