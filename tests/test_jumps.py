@@ -265,3 +265,31 @@ def test_quick_but_sound_signals_have_no_jumps():
 
 def columns_of(columns, quantity, joints):
     return np.stack([columns[f"{quantity}_{joint}"] for joint in joints], axis=1)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_wrapped_commands_of_servos_are_unwrapped_with_their_positions(robots, tmp_path, form):
+    """Position and command wrap at different rows, and may start a revolution apart."""
+    for number, name in enumerate(ROBOTS):
+        text = (robots / f"{name}.urdf").read_text().replace('type="revolute"', 'type="continuous"')
+        (tmp_path / f"{name}.urdf").write_text(text)
+        (tmp_path / f"{name}.yaml").write_text("input: position\n")
+        arm = load_arm(tmp_path / f"{name}.urdf")
+        t = 0.02 * np.arange(1500)
+        columns = {"t": t}
+        for k, joint in enumerate(arm.arm.joint_names):
+            u = 3.0 + 0.8 * (k + number) * t + 0.4 * np.sin(t + k)
+            columns |= {f"u_{joint}": u, f"q_{joint}": u - 0.1 * np.cos(t)}
+        wrapped = dict(columns)
+        for joint, kind in zip(arm.arm.joint_names, arm.arm.joint_types, strict=True):
+            if kind == "revolute":
+                for quantity in ("q", "u"):
+                    angle = columns[f"{quantity}_{joint}"]
+                    wrapped[f"{quantity}_{joint}"] = (angle + np.pi) % (2 * np.pi) - np.pi
+        (log,) = read_logs(written(wrapped, tmp_path / f"log{number}.{form}"), arm)
+        followed = columns_of(columns, "u", arm.arm.joint_names) - columns_of(
+            columns, "q", arm.arm.joint_names
+        )
+        assert log.u is not None
+        assert log.u - log.q == pytest.approx(followed, abs=1e-9)
+        assert np.abs(np.diff(log.q, axis=0)).max() < 0.2
