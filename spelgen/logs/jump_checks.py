@@ -60,7 +60,7 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
     unit = mapping.unit(name, signals.joint) or ("as logged" if turn is None else "rad")
     size, count = float(f"{word.value:.9g}"), counted(word.jumps, "time")
     what = "words with a sign bit" if word.key == "sign_bit" else "a register or an angle that starts again"
-    line = f"joints: {{{signals.joint}: {{{word.key}: {{{name}: {size!r}}}}}}}"
+    line = f"joints: {{{signals.joint}: {{{word.key}: {{{name}: {size:.9g}}}}}}}"
     return Advice(
         f"{name} that jumps by {size:.6g} ({unit}), {count}: {what}",
         f"write '{line}' under 'logs' in the robot's YAML",
