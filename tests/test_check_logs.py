@@ -375,8 +375,8 @@ def test_times_in_milliseconds_are_refused(loaded, log):
     with pytest.raises(SpelgenError) as caught:
         require_sound_logs([replace(log, t=1000 * log.t)], loaded)
     assert str(caught.value) == (
-        "trajectory motion, joint 'joint1': got a sample every 9.99 s, expected times in seconds; write "
-        "'units: {t: ms}' (us, ns) under 'logs' in the robot's YAML; --accept time-unit if it is right"
+        "trajectory motion, joint 'joint1': got a sample every 9.99 s, 100.1 Hz if times are in ms, expected times in "
+        "seconds; write 'units: {t: ms}' under 'logs' in the robot's YAML; --accept time-unit if it is right"
     )
 
 

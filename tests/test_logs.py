@@ -176,7 +176,7 @@ BAD = {
     ),
     "repeated-column": (
         "t,q_a,q_a,qd_a,tau_a\n0,0,0,0,0\n",
-        "{}: column q_a: got the same column twice, expected it once",
+        "{}: column q_a: got the same name for the columns 2, 3, expected it once; rename one of them",
     ),
     "text": (
         HEADER + "0,zero,0,0\n",
@@ -210,7 +210,7 @@ def test_missing_files_and_folders_are_told_at_once(tmp_path):
     csv(tmp_path / "log.txt", "")
     with pytest.raises(SpelgenErrors) as caught:
         read_logs([tmp_path / "none.csv", tmp_path / "empty", tmp_path / "log.txt"], JOINTS)
-    kinds = ".parquet, .csv, .npz, .mcap, .db3, the folder of a ROS 2 bag or of a LeRobot data set"
+    kinds = ".parquet, .csv, .npz, .mcap, .db3, .bag, the folder of a ROS 2 bag or of a LeRobot data set"
     assert str(caught.value).splitlines() == [
         f"{tmp_path}/none.csv: got no such file or folder, expected a log; check the path",
         f"{tmp_path}/empty: got a folder without logs, expected {kinds}",

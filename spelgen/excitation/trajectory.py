@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import cos, pi
+from math import cos, nan, pi
 
 import numpy as np
 import torch
@@ -19,9 +19,8 @@ from spelgen.excitation.tuning import TUNING
 from spelgen.urdf.robot import Joint
 
 BETWEEN = cos(pi / TUNING.grid)  # of a series' largest value, what a grid shows at least
-# where the URDF names no limit, and for endless joints: [rad/s, m/s], and [rad, m] to both sides of 0
+# [rad/s, m/s] of joints without a velocity limit
 SPEEDS = {"revolute": TUNING.usual_speed, "prismatic": TUNING.sliding_speed}
-REACHES = {"revolute": pi, "prismatic": TUNING.sliding_reach}
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,17 +33,22 @@ class MotionBounds:
 
 
 def motion_bounds(
-    arm: Arm, reach: float, speed: float, joints: Mapping[str, Joint] | None = None
+    arm: Arm,
+    reach: float,
+    speed: float,
+    joints: Mapping[str, Joint] | None = None,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
 ) -> MotionBounds:
     """Return the arm's limits, of the range the middle part `reach`, of the velocity limits the part `speed`.
 
     joints: of the URDF, by name; then joints that follow others by <mimic> keep their limits too.
-    Raises ArmError where a joint has no room between its limits.
+    ranges: of joints by name, in place of their limits; continuous joints without one use half a turn to both sides.
+    Raises ArmError if a joint has no range, or no room in it.
     """
     limits, speeds = np.zeros((len(arm.coordinates), 2)), np.zeros(len(arm.coordinates))
     for k, coordinate in enumerate(arm.coordinates):
-        half = REACHES[coordinate.kind]
-        limits[k] = sorted(coordinate.limits or (-half, half))
+        default = (-pi, pi) if coordinate.continuous else (nan, nan)
+        limits[k] = sorted((ranges or {}).get(coordinate.name) or coordinate.limits or default)
         speeds[k] = coordinate.velocity or SPEEDS[coordinate.kind]
     for body in arm.bodies:
         k, factor = body.coordinate, float(body.multiplier)
@@ -58,7 +62,13 @@ def motion_bounds(
             speeds[k] = min(speeds[k], follower.velocity / abs(factor))
     errors: list[SpelgenError] = []
     for coordinate, (low, high) in zip(arm.coordinates, limits, strict=True):
-        if not low < high:
+        if np.isnan(low):
+            line = f"simulation: {{positions: {{{coordinate.name}: [LOWEST, HIGHEST]}}}}"
+            errors.append(ArmError(
+                "no position limits", element=f"joint {coordinate.name!r}", expected="a range to move in",
+                do=f"write '{line}' into the robot's YAML",
+            ))  # fmt: skip
+        elif not low < high:
             errors.append(ArmError(
                 f"the limits {low:g} .. {high:g}", element=f"joint {coordinate.name!r}",
                 expected="room to move", do="correct them, or omit the joint by --joints",

@@ -30,8 +30,6 @@ class ExcitationTuning:
     grid: int = 40
     # [m/s] Speed limit of sliding joints for which the URDF has none.
     sliding_speed: float = 0.25
-    # [m] Range on both sides of 0 of sliding joints for which the URDF has none.
-    sliding_reach: float = 0.5
 
 
 TUNING = ExcitationTuning()

@@ -53,7 +53,10 @@ def check_logs(
     checked: TorqueLogs | ServoLogs = TorqueLogs(arm, mapping or arm.settings.logs)
     if arm.settings.input == "position":
         checked = ServoLogs(arm)
-    log_checks = LogChecks(joints, arm.arm.joint_types)
+    types = [
+        "continuous" if x.kind == "revolute" and x.limits is None else x.kind for x in arm.arm.coordinates
+    ]
+    log_checks = LogChecks(joints, types)
     measured: list[Statistics] = []
     examples: list[Trajectory] = []
     # one after another: a stream of logs may be larger than memory

@@ -135,7 +135,8 @@ def find_stop(joint: JointEvidence) -> str | None:
 def find_one_way(joint: JointEvidence) -> str | None:
     """Find joints that move one way only: dry friction is then one number with the load of the joint."""
     slower, faster = sorted((-joint.report.low["qd"], joint.report.high["qd"]))
-    if slower >= TUNING.one_way * faster:
+    # of a velocity that is not dq/dt nothing follows for the motion
+    if slower >= TUNING.one_way * faster or not (joint.report.velocity_correlation or 0.0) > TUNING.seen:
         return None
     unit = UNITS[joint.coordinate.kind].velocity
     return (

@@ -18,7 +18,7 @@ GivenMapping = LogMapping | Mapping[str, object] | Path | str | None
 
 @runtime_checkable
 class JointNames(Protocol):
-    """Hold the joints whose logs are read, as an arm and a module do. joint_types: "revolute" or "prismatic"."""
+    """Joints whose logs are read: an arm or a module. joint_types: "revolute" or "prismatic"."""
 
     @property
     def joint_names(self) -> Sequence[str]: ...
@@ -26,12 +26,30 @@ class JointNames(Protocol):
     def joint_types(self) -> Sequence[str]: ...
 
 
-@runtime_checkable
-class DescribedArm(Protocol):
-    """Hold what of a loaded arm says how its logs are named."""
+class LimitedJoint(Protocol):
+    """Joint of an arm with its position limits, None if it has none."""
 
     @property
-    def arm(self) -> JointNames: ...
+    def name(self) -> str: ...
+    @property
+    def kind(self) -> str: ...
+    @property
+    def limits(self) -> tuple[float, float] | None: ...
+
+
+class LimitedJoints(JointNames, Protocol):
+    """Joints of an arm."""
+
+    @property
+    def coordinates(self) -> Sequence[LimitedJoint]: ...
+
+
+@runtime_checkable
+class DescribedArm(Protocol):
+    """Loaded arm with the settings that describe its logs."""
+
+    @property
+    def arm(self) -> LimitedJoints: ...
     @property
     def robot(self) -> Robot: ...
     @property
@@ -50,7 +68,7 @@ LoggedArm = DescribedArm | JointNames | Sequence[str]
 
 
 class LogSource(NamedTuple):
-    """Say whose logs they are. joint_types: "revolute" or "prismatic", None where they are not known."""
+    """Joints of logs and their mapping. joint_types: "revolute" or "prismatic", None if unknown."""
 
     joints: tuple[str, ...]
     joint_types: tuple[str, ...] | None
@@ -58,10 +76,18 @@ class LogSource(NamedTuple):
 
 
 def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
-    """Return what `read_logs` was given. Raises LogError for what is no arm, SettingsError for a wrong mapping."""
+    """Return the joints and the mapping of an argument of `read_logs`.
+
+    Raises LogError for other arguments, SettingsError for a wrong mapping.
+    """
     if isinstance(arm, DescribedArm):
-        mapping = arm.settings.logs if mapping is None else mapping
-        log_mapping = _mapping(mapping, list(arm.robot.joint))
+        stated = arm.settings.logs
+        log_mapping = stated if mapping is None else _mapping(mapping, list(arm.robot.joint), stated)
+        if arm.settings.input == "position":
+            log_mapping = log_mapping.model_copy(update={"input": "position"})
+        turning = [x.name for x in arm.arm.coordinates if x.kind == "revolute" and x.limits is None]
+        # an angle without limits may be logged in any interval of one turn
+        log_mapping = log_mapping.with_turns(turning)
         return LogSource(tuple(arm.arm.joint_names), tuple(arm.arm.joint_types), log_mapping)
     if isinstance(arm, JointNames):
         joints = tuple(arm.joint_names)
@@ -75,9 +101,26 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
     raise LogError(repr(arm), element="read_logs", expected=expected)
 
 
-def _mapping(mapping: GivenMapping, joints: Sequence[str]) -> LogMapping:
+def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | None = None) -> LogMapping:
+    """Return a mapping as an object; keys that a file or a dict lacks come from the settings, `stated`."""
     if isinstance(mapping, LogMapping):
         return mapping
     if isinstance(mapping, str | Path):
-        return load_mapping(mapping, joints)
-    return validated(LogMapping, dict(mapping or {}), Document(Path("mapping"), None))
+        given = load_mapping(mapping, joints)
+    else:
+        given = validated(LogMapping, dict(mapping or {}), Document(Path("mapping"), None))
+    if stated is None:
+        return given
+    keys = _merged(stated.model_dump(exclude_unset=True), given.model_dump(exclude_unset=True))
+    return LogMapping.model_validate(keys)
+
+
+def _merged(stated: Mapping[str, object], given: Mapping[str, object]) -> dict[str, object]:
+    """Return the keys of two groups, and of the groups in them; a key of both has the value of the second."""
+    result = dict(stated)
+    for key, value in given.items():
+        below = result.get(key)
+        if isinstance(value, Mapping) and isinstance(below, Mapping):
+            value = _merged(below, value)
+        result[key] = value
+    return result

@@ -1,4 +1,4 @@
-"""Filter signals with zero phase, bring them to other times, and differentiate recordings of positions alone."""
+"""Filter signals with zero phase, bring them to other times, and differentiate recorded positions."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def low_passed(t: np.ndarray, signals: np.ndarray, cutoff: float) -> np.ndarray:
 
 
 def interpolated(t: np.ndarray, signals: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Return signals (T, ...) at times t at other times, on a cubic; as they are where these are the same times."""
+    """Return signals (T, ...) at times t at other times, on a cubic; unchanged if the times are the same."""
     if len(t) == len(times) and np.abs(t - times).max() < 1e-6 / _mean_rate(t):
         return signals
     from scipy.interpolate import CubicSpline
@@ -102,6 +102,6 @@ def derivative(q: np.ndarray, rate: float, order: int) -> np.ndarray:
 
     samples = q.shape[-2]
     width = 2 * round(TUNING.derivative_span * rate / 2) + 1
-    # the filter takes odd widths alone: above a cubic's four samples, and no more than there are
+    # an uneven width above the four samples of a cubic, at most the number of samples
     width = min(max(5, width), samples - 1 + samples % 2)
     return np.asarray(savgol_filter(q, width, 3, deriv=order, delta=1 / rate, axis=-2))

@@ -135,6 +135,8 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str
         options |= record.options | asdict(record.preprocessing)
         for key, value in _changed(options, defaults).items():
             train += f" --set {shlex.quote(f'{key}={value}')}"
+        if run.mapping.exists():
+            train += f" --mapping RUN/{run.mapping.name}"
         lines.append(train)
     return [*lines, "spelgen evaluate RUN2 --data LOGS", "spelgen report RUN2"]
 

@@ -1,7 +1,8 @@
 """Describe how a user's logs are named and measured: the group `logs` of a sidecar file, or a mapping file of its own.
 
 q = sign * unit * value + offset, and so is u, a commanded position; qd = sign * unit * value,
-tau = sign * gain * unit * value + torque_offset.
+tau = sign * gain * unit * value + torque_offset. Before that, words of a register become values by `sign_bit` and
+`period`.
 """
 
 from __future__ import annotations
@@ -18,15 +19,19 @@ from spelgen.settings.values import Group, Number, Positive
 
 _MILLI = 1e-3
 TIMES = {unit: _MILLI**power for power, unit in enumerate(("s", "ms", "us", "ns"))}
-# what a value is multiplied with to be in SI units, which are not listed themselves
+# factors to SI units, which are not listed themselves
 LENGTHS = {"deg": pi / 180, "turns": 2 * pi, "mm": _MILLI}
 SPEEDS = {f"{name}/s": scale for name, scale in LENGTHS.items()} | {"rpm": 2 * pi / 60}
 SCALES = {**LENGTHS, **SPEEDS, "mNm": _MILLI, "mA": _MILLI}
 CURRENTS = ("A", "mA")
 COUNTS = ("counts", "counts/s")
+NORMALISED = (
+    "normalised"  # -100..100 of the calibrated range of a motor, as LeRobot stores positions by default
+)
+SERVO_TURN = 4096  # counts in a revolution of the servos that LeRobot calibrates
 ONLY = {  # units that a joint of this kind cannot have
     "revolute": ("m", "mm", "m/s", "mm/s", "N"),
-    "prismatic": ("rad", "deg", "turns", "rad/s", "deg/s", "turns/s", "rpm", "Nm", "mNm"),
+    "prismatic": ("normalised", "rad", "deg", "turns", "rad/s", "deg/s", "turns/s", "rpm", "Nm", "mNm"),
 }
 
 LONGEST_DELAY = 1.0  # s
@@ -36,6 +41,9 @@ Accepted = Literal[
     "frozen",
     "time-unit",
     "dropouts",
+    "jumps",
+    "held-samples",
+    "velocity-without-sign",
     "no-torques",
     "torque-sense",
     "torque-unit",
@@ -50,7 +58,7 @@ Accepted = Literal[
 """Errors of `spelgen logs` that someone who knows better can accept, by their codes."""
 
 Time = Literal["s", "ms", "us", "ns"]
-Position = Literal["rad", "deg", "turns", "counts", "m", "mm"]
+Position = Literal["rad", "deg", "turns", "counts", "normalised", "m", "mm"]
 Velocity = Literal["rad/s", "deg/s", "turns/s", "rpm", "counts/s", "m/s", "mm/s"]
 Effort = Literal["Nm", "mNm", "N", "A", "mA"]
 
@@ -80,7 +88,7 @@ class JointColumns(Group):
 
 
 class JointUnits(Group):
-    """Units of one joint's columns; None: as for all joints."""
+    """Units of one joint's columns; None: the units of all joints."""
 
     q: Position | None = None
     qd: Velocity | None = None
@@ -94,13 +102,40 @@ class LogUnits(JointUnits):
     t: Time = "s"
 
 
+class JointWords(Group):
+    """Sizes of one joint's words, in logged units; None: its values are no words."""
+
+    q: Positive | None = None
+    qd: Positive | None = None
+    tau: Positive | None = None
+    u: Positive | None = None
+
+
+class MotorCalibration(Group):
+    """Calibration of one motor, as LeRobot writes it: the range of motion [counts], and whether it is mirrored."""
+
+    range_min: Number
+    range_max: Number
+    drive_mode: Literal[0, 1] = 0
+    homing_offset: Number = 0.0
+    id: int = 0
+
+    @model_validator(mode="after")
+    def _has_range(self) -> MotorCalibration:
+        if not self.range_min < self.range_max:
+            raise ValueError("a range_max above range_min")
+        return self
+
+
 class JointLog(Group):
-    """How one joint is logged.
+    """Mapping of one joint.
 
     name: the joint's name in the log; None: the URDF's. counts_per_turn, counts_per_metre: of the joint.
     sign: -1 where the log's sense is the opposite of the URDF's, of position, velocity and torque.
     offset: the joint's position where the log says 0 [rad, m]. gain: torque per logged unit, e.g. gear x
     motor constant [Nm/A]; negative where current and velocity have opposite senses. torque_offset [Nm, N].
+    period: at which values start again, e.g. 65536 counts of a 16-bit register, 360 degrees of an angle; joints without
+    position limits have one turn. sign_bit: from it on, a value is minus its excess, as 32768 + x of a servo is -x.
     """
 
     name: str | None = None
@@ -112,6 +147,8 @@ class JointLog(Group):
     offset: Number = 0.0
     gain: Number | None = None
     torque_offset: Number = 0.0
+    period: JointWords = JointWords()
+    sign_bit: JointWords = JointWords()
 
     @model_validator(mode="after")
     def _moves(self) -> JointLog:
@@ -123,12 +160,14 @@ class JointLog(Group):
 class LogMapping(Group):
     """From a log's columns to t, q, qd, tau in SI units, or to t, q and the commanded positions u.
 
-    input: "position" where joints are commanded positions: u is read, and neither qd nor tau are.
-    topic: of the ROS 2 bag, where it holds several with joint states. velocity: "differentiated" where the
-    log has none. torque_delay: how much later than positions a log shows torques [s], see what `spelgen logs` suggests.
-    accept: codes of errors in logs that are right as they are. dropouts: "dropped" leaves out rows in which a signal
-    fell to 0 for a moment.
-    Files that spelgen wrote itself are read as they are, whatever stands here.
+    input: "position" if positions are commanded: u is read, and neither qd nor tau are.
+    topic: of the ROS bag, if it has several with joint states. velocity: "differentiated" if the log has none.
+    torque_delay: delay of torques after positions in the log [s]; `spelgen logs` suggests it.
+    accept: codes of errors in logs that are correct. dropouts: "dropped" removes rows in which a signal
+    falls to 0 or deviates from its neighbours for a moment, and rows that repeat the row before. sample_rate [Hz]: rows
+    of a recording are evenly spaced by it; their times are ignored. calibration: of motors by their names in the log,
+    the content of LeRobot's calibration file, for the unit "normalised".
+    The mapping does not apply to files that spelgen wrote.
     """
 
     topic: str | None = None
@@ -140,6 +179,8 @@ class LogMapping(Group):
     joints: dict[str, JointLog] = Field(default={})
     accept: tuple[Accepted, ...] = ()
     dropouts: Literal["kept", "dropped"] = "kept"
+    sample_rate: Positive | None = None
+    calibration: dict[str, MotorCalibration] = Field(default={})
 
     @property
     def quantities(self) -> tuple[str, ...]:
@@ -155,7 +196,7 @@ class LogMapping(Group):
         return list(product(self.quantities, joints))
 
     def joint(self, name: str) -> JointLog:
-        """Return how a joint is logged, by its URDF name."""
+        """Return the mapping of a joint, by its URDF name."""
         return self.joints.get(name, JointLog())
 
     def log_name(self, joint: str) -> str:
@@ -174,54 +215,82 @@ class LogMapping(Group):
         return self.model_copy(update={"columns": LogColumns(**named)})
 
     def with_joint_columns(self, columns: Mapping[str, Mapping[str, str | None]]) -> LogMapping:
-        """Return the mapping with these columns of joints, by joint and quantity."""
+        """Return the mapping with these columns of joints, per joint and quantity."""
         joints = dict(self.joints)
         for joint, names in columns.items():
             logged = self.joint(joint)
             joints[joint] = logged.model_copy(update={"columns": logged.columns.model_copy(update=names)})
         return self.model_copy(update={"joints": joints})
 
+    def with_turns(self, joints: Sequence[str]) -> LogMapping:
+        """Return the mapping with a period of one turn for positions of these joints, unless they have one."""
+        changed = dict(self.joints)
+        for joint in joints:
+            logged = self.joint(joint)
+            turns = {
+                x: 2 * pi / abs(self.scale(x, joint)) for x in ("q", "u") if not self.word("period", x, joint)
+            }
+            period = logged.period.model_copy(update=turns)
+            changed[joint] = logged.model_copy(update={"period": period})
+        return self.model_copy(update={"joints": changed})
+
+    def in_si(self) -> LogMapping:
+        """Return the mapping of a file in SI units with plain names: of this one only input and turns remain."""
+        turning = [name for name in self.joints if self.word("period", "q", name)]
+        return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
+
+    def word(self, key: Literal["period", "sign_bit"], quantity: str, joint: str) -> float | None:
+        """Return the period or the sign bit of a joint's quantity in logged units, None if it has none."""
+        size: float | None = getattr(getattr(self.joint(joint), key), quantity)
+        return size
+
     def unit(self, quantity: str, joint: str) -> str | None:
-        """Return the unit of "q", "qd", "tau" or "u" of a joint, None where none was said; u is measured as q is."""
+        """Return the unit of "q", "qd", "tau" or "u" of a joint, None without one; u has the unit of q."""
         unit: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
         if unit is None and quantity == "u":
             return self.unit("q", joint)
         return unit
 
     def scale(self, quantity: str, joint: str) -> float:
-        """Return what a logged value is multiplied with, sign included."""
+        """Return the factor of a logged value, sign included."""
         logged, unit = self.joint(joint), self.unit(quantity, joint)
         factor = SCALES.get(unit or "", 1.0)
         if quantity == "tau" and logged.gain is not None:
             factor *= logged.gain
+        elif unit == NORMALISED:
+            motor = self.calibration[self.log_name(joint)]
+            counts = (motor.range_max - motor.range_min) / 200
+            factor = (1 - 2 * motor.drive_mode) * counts * 2 * pi / (logged.counts_per_turn or SERVO_TURN)
         elif unit in COUNTS:
             turn = logged.counts_per_turn
             factor = 2 * pi / turn if turn else 1.0 / (logged.counts_per_metre or 1.0)
         return logged.sign * factor
 
     def offset(self, quantity: str, joint: str) -> float:
-        """Return what is added after that."""
+        """Return the offset that is added after that."""
         logged = self.joint(joint)
         if quantity == "tau":
             return logged.torque_offset
         return logged.offset if quantity in ("q", "u") else 0.0
 
     def misfits(self, joints: Sequence[str], joint_types: Sequence[str] | None = None) -> list[SettingsError]:
-        """Return what the mapping lacks for these joints, or says of them that cannot be; empty where it fits."""
+        """Return errors of keys that the mapping lacks for these joints, or that contradict them; empty if it fits."""
         errors = []
         kinds: Sequence[str | None] = joint_types or [None] * len(joints)
         for joint, kind in zip(joints, kinds, strict=True):
             for quantity in self.quantities:
                 unit = self.unit(quantity, joint)
-                expected = self._missing(unit, self.joint(joint), kind)
+                expected = self._missing(unit, self.log_name(joint), self.joint(joint), kind)
                 if expected:
                     where = f"logs: joint {joint!r}, {quantity}"
                     errors.append(SettingsError(f"the unit {unit}", element=where, expected=expected))
         return errors
 
-    def _missing(self, unit: str | None, logged: JointLog, kind: str | None) -> str | None:
+    def _missing(self, unit: str | None, joint: str, logged: JointLog, kind: str | None) -> str | None:
         if unit in CURRENTS and logged.gain is None:
             return "a gain beside it"
+        if unit == NORMALISED and joint not in self.calibration:
+            return f"the content of LeRobot's calibration file as 'calibration', with {joint!r} in it"
         if unit in COUNTS:
             # of a joint whose kind is not known either will do
             in_turns = logged.counts_per_turn if kind != "prismatic" else None

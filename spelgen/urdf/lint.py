@@ -15,8 +15,14 @@ _UNIT_AXIS = 1e-3
 
 
 def lint(robot: Robot) -> list[Diagnostic]:
-    """Return the warnings on inertials, joints and rigid groups, in no particular order."""
-    return [*_lint_inertials(robot), *_lint_placeholders(robot), *_lint_joints(robot), *_lint_groups(robot)]
+    """Return the diagnostics of inertials, joints, rigid groups and limits, in no particular order."""
+    warnings = [
+        *_lint_inertials(robot),
+        *_lint_placeholders(robot),
+        *_lint_joints(robot),
+        *_lint_groups(robot),
+    ]
+    return [*warnings, *_unlimited(robot)]
 
 
 def _warning(code: str, where: str, line: int, message: str) -> Diagnostic:
@@ -97,6 +103,27 @@ def _lint_joint(joint: Joint) -> Iterator[Diagnostic]:
     if joint.lower is not None and joint.upper is not None and joint.lower > joint.upper:
         message = f"lower {joint.lower:g} is above upper {joint.upper:g}: perhaps the two were swapped"
         yield _warning("lower-above-upper", f"{where} limit", joint.line, message)
+
+
+def _unlimited(robot: Robot) -> Iterator[Diagnostic]:
+    """Name all limits that moving joints do not have, once: every later step treats them as unlimited."""
+    lacking: dict[str, list[str]] = {"position": [], "velocity": [], "effort": []}
+    joints = [joint for joint in robot.joints if joint.moves and joint.mimic is None]
+    for joint in joints:
+        if joint.type != "continuous" and (joint.lower is None or joint.upper is None):
+            lacking["position"].append(joint.name)
+        if joint.velocity is None:
+            lacking["velocity"].append(joint.name)
+        if joint.effort is None:
+            lacking["effort"].append(joint.name)
+    texts = []
+    for limit, names in lacking.items():
+        which = "all joints" if len(names) == len(joints) else ", ".join(names)
+        if names:
+            texts.append(f"{limit} of {which}")
+    if texts:
+        message = f"no limits of {'; '.join(texts)}: absent, 0, inf, nan and huge limits mean unlimited"
+        yield Diagnostic("info", "unlimited", "robot", joints[0].line, message)
 
 
 def _lint_groups(robot: Robot) -> Iterator[Diagnostic]:
