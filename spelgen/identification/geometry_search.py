@@ -46,11 +46,21 @@ def compare_readings(problem: GeometryProblem, factors: Sequence[np.ndarray] = (
         if min(tried, key=_rank).cost > best.cost - GEOMETRY.needed:
             break
         fits = [*tried, unchanged]
-    best = min(fits, key=_rank)
-    if best.cost > unchanged.cost - GEOMETRY.needed:
+    likely = _likely(unchanged, fits)
+    if not likely:
         return Comparison(unchanged, _rescaled(coarse, unchanged, factors))
-    likely = sorted((fit for fit in fits if fit.cost < best.cost + GEOMETRY.ambiguous), key=_rank)
-    return _confirmed(problem, likely[: GEOMETRY.named])
+    finer = problem.thinned(GEOMETRY.confirming_samples)
+    unchanged = finer.fit(problem.unchanged)
+    confirmed = [finer.fit(fit.hypothesis) for fit in likely[: GEOMETRY.named]]
+    return Comparison(unchanged, _likely(unchanged, confirmed))
+
+
+def _likely(unchanged: Fit, fits: Sequence[Fit]) -> tuple[Fit, ...]:
+    """Return the fits about as good as the best one, if it is significantly better than the unchanged log."""
+    best = min(fit.cost for fit in fits)
+    if best > unchanged.cost - GEOMETRY.needed:
+        return ()
+    return tuple(sorted((fit for fit in fits if fit.cost < best + GEOMETRY.ambiguous), key=_rank))
 
 
 def _rescaled(problem: GeometryProblem, unchanged: Fit, factors: Sequence[np.ndarray]) -> tuple[Fit, ...]:
@@ -61,19 +71,6 @@ def _rescaled(problem: GeometryProblem, unchanged: Fit, factors: Sequence[np.nda
     fits = [problem.fit(hypothesis) for hypothesis in _scaled(problem.unchanged, factors)]
     best = min(fits, key=_rank, default=unchanged)
     return (best,) if best.cost < unchanged.cost else ()
-
-
-def _confirmed(problem: GeometryProblem, likely: Sequence[Fit]) -> Comparison:
-    """Return the likely readings that are better on more samples, too."""
-    finer = problem.thinned(GEOMETRY.confirming_samples)
-    unchanged = finer.fit(problem.unchanged)
-    fits = [finer.fit(fit.hypothesis) for fit in likely]
-    best = min(fit.cost for fit in fits)
-    if best > unchanged.cost - GEOMETRY.needed:
-        return Comparison(unchanged, ())
-    return Comparison(
-        unchanged, tuple(sorted((fit for fit in fits if fit.cost < best + GEOMETRY.ambiguous), key=_rank))
-    )
 
 
 def _rank(fit: Fit) -> float:

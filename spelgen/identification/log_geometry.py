@@ -15,15 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from spelgen.arm.arm import Arm
-from spelgen.dynamics.body_regressor import chain_regressor
-from spelgen.dynamics.linear_friction import FrictionModel
 from spelgen.dynamics.regressor import body_chain
+from spelgen.identification.drive_hints import drive_rows
 from spelgen.identification.inertial_prior import InertialPrior, inertial_prior
-from spelgen.identification.tuning import GEOMETRY, TUNING
-from spelgen.logs.tuning import SAMPLES
+from spelgen.identification.least_squares import block_products, varying
+from spelgen.identification.tuning import GEOMETRY
 
-FRICTION = FrictionModel(coulomb_smoothing_velocity=SAMPLES.moving)
-ARMATURE, VISCOUS, COULOMB = range(3)  # order of the effects of `FRICTION`
+ARMATURE, VISCOUS, COULOMB = range(3)  # order of the friction effects of `drive_rows`
 Vector3 = tuple[float, float, float]
 
 
@@ -105,13 +103,14 @@ class Fit:
     """Least squares with the prior under a hypothesis.
 
     cost: negative log posterior up to a constant. misfit: its part from the torque residual. parameters: (K,), inertial
-    parameters first. errors: (n,) mean squared residual of each joint, relative to the variance of its torque.
+    parameters first. covariance: (K, K), posterior. errors: (n,) mean squared residual of each joint, relative to the variance of its torque.
     """
 
     hypothesis: Hypothesis
     cost: float
     misfit: float
     parameters: np.ndarray
+    covariance: np.ndarray
     errors: np.ndarray
 
 
@@ -157,55 +156,22 @@ class GeometryProblem:
         key = hypothesis.motion_key
         if key not in self._equations:
             q, qd, qdd, _ = hypothesis.signals(self.samples)
-            chain = body_chain(self.arm, hypothesis.gravity)
-            friction = FRICTION.columns(qd, qdd, None, self.speeds)
-            rows = np.concatenate([chain_regressor(chain, q, qd, qdd), friction], axis=2)
-            by_joint = rows.swapaxes(0, 1)
+            rows = drive_rows(body_chain(self.arm, hypothesis.gravity), q, qd, qdd, self.speeds)
             if len(self._equations) >= GEOMETRY.kept:
                 self._equations.pop(next(iter(self._equations)))
-            self._equations[key] = Equations(rows, by_joint.swapaxes(1, 2) @ by_joint)
+            self._equations[key] = Equations(rows, block_products(rows, 1)[:, 0])
         return self._equations[key]
 
     def fit(self, hypothesis: Hypothesis) -> Fit:
-        """Return the fit under a hypothesis: least squares, reweighted by the noise and by the scale of the prior."""
+        """Return the fit that minimises the cost.
+
+        The noise of a joint is marginalised: its log likelihood is -N / 2 log(residual sum of squares), minimised by
+        reweighting. The prior is a Student t: `scale` is its weight of iteratively reweighted least squares.
+        """
         rows, normal = self.equations(hypothesis)
         tau = hypothesis.signals(self.samples).tau
-        right = np.einsum("snk,sn->nk", rows, tau)
-        total = np.square(tau).sum(axis=0)
-        # a torque that never changes states nothing about the dynamics
-        variance = np.where(varying(tau), len(tau) * tau.var(axis=0), np.inf)
-        return self._solved(hypothesis, normal, right, total, variance)
-
-    def step(self, fit: Fit, columns: np.ndarray) -> np.ndarray:
-        """Return the Gauss-Newton step (D,) of parameters with the torque Jacobian `columns` (S, n, D)."""
-        rows, _ = self.equations(fit.hypothesis)
-        tau = fit.hypothesis.signals(self.samples).tau
-        variance = np.where(varying(tau), tau.var(axis=0), np.inf)
-        weights = 1.0 / ((fit.errors + GEOMETRY.error_floor) * variance)
-        joined = np.concatenate([rows, columns], axis=2) * np.sqrt(weights)[:, None]
-        flat = joined.reshape(-1, joined.shape[2])
-        matrix = flat.T @ flat * (self._count / len(tau))
-        bodies = len(self._prior.mean)
-        matrix[:bodies, :bodies] += self._prior.precision
-        residual = (tau - rows @ fit.parameters) * np.sqrt(weights)
-        vector = flat.T @ residual.ravel() * (self._count / len(tau))
-        vector[:bodies] += self._prior.precision @ (self._prior.mean - fit.parameters[:bodies])
-        return np.asarray((inverse(matrix) @ vector)[-columns.shape[2] :])
-
-    def _solved(
-        self,
-        hypothesis: Hypothesis,
-        normal: np.ndarray,
-        right: np.ndarray,
-        total: np.ndarray,
-        variance: np.ndarray,
-    ) -> Fit:
-        """Minimise the cost. normal, right: Y^T Y (n, K, K) and Y^T tau (n, K); total: sums of tau^2, (n,).
-
-        variance: (n,) sums of squares of tau about its mean. The noise of a joint is marginalised: its log likelihood
-        is -N / 2 log(residual sum of squares). The prior is a Student t: `scale` is its weight of iteratively
-        reweighted least squares.
-        """
+        right, total = np.einsum("snk,sn->nk", rows, tau), np.square(tau).sum(axis=0)
+        variance = len(tau) * _variance(tau)
         prior, bodies = self._prior, len(self._prior.mean)
         precision, mean = np.zeros(normal.shape[1:]), np.zeros(normal.shape[-1])
         precision[:bodies, :bodies], mean[:bodies] = prior.precision, prior.mean
@@ -213,7 +179,7 @@ class GeometryProblem:
         for _ in range(GEOMETRY.iterations):
             weights = self._count / ((errors + GEOMETRY.error_floor) * variance)
             matrix = np.tensordot(weights, normal, 1)
-            # a joint at rest has no friction to be seen
+            # the friction of a joint at rest is not identifiable
             ridge = 1e-9 * np.diag(matrix) + 1e-9
             ridge[:bodies] = 0.0
             covariance = inverse(matrix + scale * precision + np.diag(ridge))
@@ -225,7 +191,22 @@ class GeometryProblem:
         misfit = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
         cost = misfit + prior.freedom * float(np.log1p(distance / prior.freedom))
         cost += self._implausible(x, covariance, normal)
-        return Fit(hypothesis, cost, misfit, x, errors)
+        return Fit(hypothesis, cost, misfit, x, covariance, errors)
+
+    def step(self, fit: Fit, columns: np.ndarray) -> np.ndarray:
+        """Return the Gauss-Newton step (D,) of parameters with the torque Jacobian `columns` (S, n, D)."""
+        rows, _ = self.equations(fit.hypothesis)
+        tau = fit.hypothesis.signals(self.samples).tau
+        weights = 1.0 / ((fit.errors + GEOMETRY.error_floor) * _variance(tau))
+        joined = np.concatenate([rows, columns], axis=2) * np.sqrt(weights)[:, None]
+        flat = joined.reshape(-1, joined.shape[2])
+        matrix = flat.T @ flat * (self._count / len(tau))
+        bodies = len(self._prior.mean)
+        matrix[:bodies, :bodies] += self._prior.precision
+        residual = (tau - rows @ fit.parameters) * np.sqrt(weights)
+        vector = flat.T @ residual.ravel() * (self._count / len(tau))
+        vector[:bodies] += self._prior.precision @ (self._prior.mean - fit.parameters[:bodies])
+        return np.asarray((inverse(matrix) @ vector)[-columns.shape[2] :])
 
     def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
         """Return the cost of rotor inertias below 0 and of friction that drives its joint, on average of the log.
@@ -248,9 +229,9 @@ class GeometryProblem:
         return float(np.minimum(odds, bounds).sum())
 
 
-def varying(tau: np.ndarray) -> np.ndarray:
-    """Whether torques (S, n) vary by more than the rounding of a constant, (n,)."""
-    return np.asarray(tau.std(axis=0) > TUNING.negligible * np.abs(tau).max(axis=0))
+def _variance(tau: np.ndarray) -> np.ndarray:
+    """Return the variance (n,) of torques (S, n); infinite of a constant, which does not depend on the dynamics."""
+    return np.asarray(np.where(varying(tau), tau.var(axis=0), np.inf))
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:

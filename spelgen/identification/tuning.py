@@ -57,7 +57,7 @@ class DriveHintTuning:
     # [1] Shifts of the torque in samples of 10 ms: delays of loggers and field buses; longer ones may be due to
     # friction.
     shifts: tuple[int, ...] = (-3, -2, -1, 0, 1, 2, 3)
-    # [1] The form with friction state is ignored if its squared residual exceeds that of the other form by this
+    # [1] The form with friction state is ignored if its squared residual exceeds the other form's by this
     # factor (recorded arms: 0.3 to 0.8).
     unlikely_form: float = 2.0
     # [1] Probability outside a delay's interval: a log without delay must not get one.
@@ -66,7 +66,7 @@ class DriveHintTuning:
     samples: int = 1500
     # [1] Smallest number of samples for hints and errors.
     fewest_samples: int = 400
-    # [1] Largest number of trajectories; of more, whole ones are left out.
+    # [1] Largest number of trajectories; of more, only an even part is used.
     trajectories: int = 8
 
 
@@ -106,9 +106,8 @@ class GeometryTuning:
     changes: int = 3
     # Readings that a message names at most.
     named: int = 3
-    rare: float = (
-        1.0  # cost of a change that is rarer than a wrong sense or order, of two that explain as much
-    )
+    # Cost of a change that is rarer than a wrong sense or order.
+    rare: float = 1.0
     # For comparing all hypotheses.
     samples: int = 200
     # Regressors in memory, of about 1 MB.

@@ -14,7 +14,8 @@ from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.drive_samples import DriveLog, DriveSamples
 from spelgen.identification.geometry_search import compare_readings
-from spelgen.identification.log_geometry import GeometryProblem, MotionSamples, varying
+from spelgen.identification.least_squares import varying
+from spelgen.identification.log_geometry import GeometryProblem, MotionSamples
 from spelgen.identification.torque_delay import delay_of
 from spelgen.identification.tuning import HINTS
 from spelgen.listing import Listing, number
@@ -44,10 +45,10 @@ def check_logs(
 ) -> LogReport:
     """Report all about the logs of an arm, read once, one trajectory after another; nothing is repaired or raised.
 
-    The report's `errors` prevent training. mapping: that of the logs, by default from the arm's settings; units that
-    it declares and errors that it accepts are not checked. The arm's input matrix converts logged torques to those of
-    the joints. Raises LogError without any trajectory, or with one of another number of joints, and
-    where an arm's settings say 'input: position', without commands.
+    The report's `errors` prevent training. mapping: of the logs, by default from the arm's settings; units that
+    it declares and errors that it accepts are not checked. The arm's input matrix converts logged torques to joint
+    torques. Raises LogError without any trajectory, for another number of joints, and without commands if the
+    arm's settings have 'input: position'.
     """
     joints = arm.arm.joint_names
     checked: TorqueLogs | ServoLogs = TorqueLogs(arm, mapping or arm.settings.logs)

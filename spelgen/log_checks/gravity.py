@@ -22,9 +22,9 @@ class GravityFit:
     """Gravity in the torque of one joint.
 
     explained: part of the torque's variance, in addition to friction and the joint's own acceleration, that some
-    inertial values explain as gravity (0..1); None where gravity never loads the joint, where the torque never
-    changes, or where there is too little to tell. factor: by what the URDF's gravity torque must be multiplied to
-    fit best, correlation: of both, beside the same. relative_deviation: the standard deviation of the URDF's,
+    inertial values explain as gravity (0..1); None if gravity never loads the joint, if the torque never changes,
+    or with too few samples. factor: ratio to the URDF's gravity torque by least squares, correlation: with the URDF's
+    gravity torque, both after projection. relative_deviation: standard deviation of the URDF's gravity torque,
     relative to the torque's.
     """
 

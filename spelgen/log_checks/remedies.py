@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
+import yaml
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Arm
@@ -51,8 +50,8 @@ def settings_lines(
     if joints:
         texts.append(f"'joints: {_flow(joints)}' under 'logs' in the robot's YAML")
     if reading.gravity != unchanged.gravity:
-        vector = _flow([float(f"{x:.5g}") for x in reading.gravity])
-        texts.append(f"'gravity: {vector}' in the robot's YAML (then build the model again)")
+        gravity = _flow({"gravity": list(map(_number, reading.gravity))})[1:-1]
+        texts.append(f"'{gravity}' in the robot's YAML (then build the model again)")
     return " and ".join(texts)
 
 
@@ -82,27 +81,24 @@ def _joint_keys(
         keys["sign"] = -present.sign
     gain = float(reading.torque_scale[k] / unchanged.torque_scale[k]) / sign
     if gain != 1.0:
-        keys["gain"] = float(f"{(present.gain or 1.0) * gain:.6g}")
+        keys["gain"] = _number((present.gain or 1.0) * gain)
         if present.torque_offset:
             keys["torque_offset"] = present.torque_offset * gain * sign
     if reading.offset[k] != unchanged.offset[k]:
-        keys["offset"] = float(f"{reading.offset[k]:.6g}")
+        keys["offset"] = _number(reading.offset[k])
     return keys
 
 
 def _flow(value: object) -> str:
     """Return a value as YAML in one line."""
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_flow(key)}: {_flow(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_flow, value)) + "]"
-    if isinstance(value, float):
-        return f"{value:.10g}"
-    text = str(value)
-    # a name that YAML would read as something else is quoted
-    is_plain = isinstance(value, int) or re.fullmatch(r"[A-Za-z][\w.-]*", text, re.ASCII)
-    is_word = text.lower() in ("true", "false", "yes", "no", "on", "off", "null", "y", "n")
-    return text if is_plain and not is_word else json.dumps(text)
+    text: str = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=float("inf"))
+    return text.strip()
+
+
+def _number(value: float) -> float:
+    """Return a number with five digits; an integer if it is one."""
+    rounded = float(f"{value:.5g}")
+    return int(rounded) if rounded.is_integer() else rounded
 
 
 def described(reading: Hypothesis, unchanged: Hypothesis, arm: Arm) -> tuple[str, str]:

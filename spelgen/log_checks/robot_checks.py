@@ -76,16 +76,11 @@ def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) 
     seen: list[float] = []
     factors = []
     for k, joint in enumerate(joints):
-        fit = joint.report.gravity
-        # a factor of a joint that gravity hardly loads is chance, unless its torque is nothing but gravity
-        is_loaded = joint.gravity_in_torque()[1] > TUNING.seen
-        if (
-            not undeclared[k]
-            or fit.factor is None
-            or not (is_loaded or (fit.correlation or 0.0) > SIGNALS.agreement)
-        ):
+        factor, correlation = joint.report.gravity.factor, joint.report.gravity.correlation or 0.0
+        # the factor of a joint that gravity hardly loads is chance, unless its torque is only gravity
+        is_known = joint.gravity_in_torque()[1] > TUNING.seen or correlation > SIGNALS.agreement
+        if factor is None or not (is_known and undeclared[k]):
             continue
-        factor = fit.factor
         seen.append(factor)
         if not 1 / TUNING.unusual_factor < factor < TUNING.unusual_factor:
             single = np.ones(len(joints))

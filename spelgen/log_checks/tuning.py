@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class LogCheckTuning:
-    """Thresholds of notes and errors about logs beside their robot."""
+    """Thresholds of notes and errors about logs and their robot."""
 
     # [rad, m] A position limit may be exceeded by this much: rounding.
     limit_rounding: float = 1e-3

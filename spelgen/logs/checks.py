@@ -187,14 +187,15 @@ def find_wrong_velocity(signals: JointSignals) -> str | None:
         return None
     if np.isnan(correlation) or (correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance):
         return None
-    advice = "check units, signs and the order of the joints"
-    if abs(factor + 1) <= tolerance:
-        advice = "its sign is the opposite of that of q"
+    advice = ""
+    if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
+        # the velocity is right up to its sense, so that q differentiated has no more errors than q
+        advice = "; its sense is opposite: write 'velocity: differentiated' under 'logs' in the robot's YAML"
     for joint, fit in zip(signals.joints, signals.correlations, strict=True):
         if fit > max(SIGNALS.agreement, correlation):
-            advice = f"it fits q of joint {joint!r}"
+            advice = f"; it is the derivative of q of joint {joint!r}: check the names of the columns"
             break
-    return f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}; {advice}"
+    return f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}{advice}"
 
 
 def find_constant_torque(signals: JointSignals) -> str | None:
