@@ -36,6 +36,12 @@ class ConfiguredArm:
         sources = (self.robot, self.arm, self.actuation, self.settings)
         return tuple(item for source in sources for item in source.diagnostics)
 
+    @property
+    def turning_joints(self) -> tuple[str, ...]:
+        """Names of the revolute joints without position limits."""
+        joints = self.arm.coordinates
+        return tuple(x.name for x in joints if x.kind == "revolute" and x.limits is None)
+
     def __repr__(self) -> str:
         joints = counted(len(self.arm.coordinates), "joint")
         return f"<Arm {self.arm.name!r}: {joints} of {self.robot.path.name}>"

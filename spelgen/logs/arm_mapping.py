@@ -26,30 +26,14 @@ class JointNames(Protocol):
     def joint_types(self) -> Sequence[str]: ...
 
 
-class LimitedJoint(Protocol):
-    """Joint of an arm with its position limits, None if it has none."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def kind(self) -> str: ...
-    @property
-    def limits(self) -> tuple[float, float] | None: ...
-
-
-class LimitedJoints(JointNames, Protocol):
-    """Joints of an arm."""
-
-    @property
-    def coordinates(self) -> Sequence[LimitedJoint]: ...
-
-
 @runtime_checkable
 class DescribedArm(Protocol):
-    """Loaded arm with the settings that describe its logs."""
+    """Loaded arm with the settings that describe its logs. turning_joints: revolute, without position limits."""
 
     @property
-    def arm(self) -> LimitedJoints: ...
+    def arm(self) -> JointNames: ...
+    @property
+    def turning_joints(self) -> Sequence[str]: ...
     @property
     def robot(self) -> Robot: ...
     @property
@@ -85,9 +69,8 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
         log_mapping = stated if mapping is None else _mapping(mapping, list(arm.robot.joint), stated)
         if arm.settings.input == "position":
             log_mapping = log_mapping.model_copy(update={"input": "position"})
-        turning = [x.name for x in arm.arm.coordinates if x.kind == "revolute" and x.limits is None]
         # an angle without limits may be logged in any interval of one turn
-        log_mapping = log_mapping.with_turns(turning)
+        log_mapping = log_mapping.with_turns(arm.turning_joints)
         return LogSource(tuple(arm.arm.joint_names), tuple(arm.arm.joint_types), log_mapping)
     if isinstance(arm, JointNames):
         joints = tuple(arm.joint_names)
@@ -111,16 +94,13 @@ def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | 
         given = validated(LogMapping, dict(mapping or {}), Document(Path("mapping"), None))
     if stated is None:
         return given
-    keys = _merged(stated.model_dump(exclude_unset=True), given.model_dump(exclude_unset=True))
-    return LogMapping.model_validate(keys)
+    return LogMapping.model_validate(
+        _merged(stated.model_dump(exclude_unset=True), given.model_dump(exclude_unset=True))
+    )
 
 
-def _merged(stated: Mapping[str, object], given: Mapping[str, object]) -> dict[str, object]:
+def _merged(stated: object, given: object) -> object:
     """Return the keys of two groups, and of the groups in them; a key of both has the value of the second."""
-    result = dict(stated)
-    for key, value in given.items():
-        below = result.get(key)
-        if isinstance(value, Mapping) and isinstance(below, Mapping):
-            value = _merged(below, value)
-        result[key] = value
-    return result
+    if isinstance(stated, Mapping) and isinstance(given, Mapping):
+        return {**stated, **{key: _merged(stated.get(key), value) for key, value in given.items()}}
+    return given

@@ -190,11 +190,8 @@ def _chosen_topic(topics: set[str], present: set[str], topic: str | None, path: 
         listed = ", ".join(sorted(present)) or "(none)"
         got, expected, do = f"only the topics {listed}", f"one of {MESSAGE}", None
     elif topic is None and len(topics) > 1:
-        got, expected, do = (
-            f"joint states on the topics {names}",
-            "one of them",
-            "name it by 'topic' under 'logs'",
-        )
+        got, expected = f"joint states on the topics {names}", "one of them"
+        do = "name it by 'topic' under 'logs'"
     elif topic not in (None, *topics):
         got, expected, do = f"no joint states on {topic}", f"one of {names}", None
     else:

@@ -18,14 +18,7 @@ from spelgen.logs.parquet_files import LEROBOT, PARQUET
 from spelgen.logs.tables import LogFormat, LogTable, reading
 from spelgen.settings.log_mapping import LogMapping
 
-PACKED = {
-    ".zstd": "zstd -d",
-    ".zst": "zstd -d",
-    ".gz": "gunzip",
-    ".xz": "unxz",
-    ".bz2": "bunzip2",
-    ".zip": "unzip",
-}
+UNPACK = {".zstd": "zstd -d", ".zst": "zstd -d", ".gz": "gunzip", ".xz": "unxz", ".bz2": "bunzip2"}
 FORMATS: list[LogFormat] = [PARQUET, CSV, NPZ, BAG, LEROBOT]
 
 
@@ -68,7 +61,7 @@ def log_files(
 
 def _unpacking(path: Path) -> str | None:
     """Return the remedy for a packed file, None for other files."""
-    command = PACKED.get(path.suffix)
+    command = UNPACK.get(path.suffix)
     return None if command is None else f"unpack it: {command} {path.name}"
 
 

@@ -98,17 +98,19 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
     """Return the table of one recording of the archive, or of the only one."""
     for quantity in mapping.quantities:
         # a joint's column may belong to a matrix `q` (T, n)
-        matrix = getattr(mapping.columns, quantity).replace("{joint}", "").rstrip("_")
+        pattern: str = getattr(mapping.columns, quantity)
+        matrix = pattern.replace("{joint}", "").rstrip("_")
         if matrix in arrays.names and arrays[matrix].ndim == 2:
             names = [mapping.log_name(joint) for joint in joints]
-            elements = {}
-            for name, index in zip(names, _matrix_columns(arrays, matrix, names), strict=True):
-                elements[getattr(mapping.columns, quantity).replace("{joint}", name)] = f"{matrix}[{index}]"
-            # a joint may have the column of another one
-            named = {joint: mapping.column(quantity, joint) for joint in joints}
-            mapping = mapping.with_joint_columns(
-                {joint: {quantity: elements.get(column, column)} for joint, column in named.items()}
-            )
+            places = dict(zip(names, _matrix_columns(arrays, matrix, names), strict=True))
+            columns_of: dict[str, str] = {}
+            for joint, name in zip(joints, names, strict=True):
+                columns_of[joint] = mapping.column(quantity, joint)
+                # a joint may have the column of another one
+                for owner in (name, *names):
+                    if pattern.replace("{joint}", owner) == columns_of[joint]:
+                        columns_of[joint] = f"{matrix}[{places[owner]}]"
+            mapping = mapping.with_joint_columns({joint: {quantity: x} for joint, x in columns_of.items()})
     # only names: the type of an array is known once it is read
     schema = pa.schema([(name, pa.null()) for name in arrays.names])
     layout = table_layout(schema, joints, mapping, arrays.file)

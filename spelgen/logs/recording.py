@@ -81,14 +81,12 @@ def _without_repeats(
     if count <= TUNING.repeats * len(data):
         return data, ()
     rate = (len(data) - 1 - count) / (data[-1, 0] - data[0, 0])
-    which = (
-        f"every row is written {copies} times"
-        if copies > 1
-        else f"{count} rows repeat the row before in motion"
-    )
-    if copies == 1 and mapping.dropouts == "kept":
-        return data, (f"{which}: 'dropouts: dropped' under 'logs' removes them, {rate:.3g} Hz remain",)
-    return data[~repeats], (f"{which}: repeats were left out, {rate:.3g} Hz remain",)
+    message = f"every row is written {copies} times"
+    if copies == 1:
+        message = f"{count} rows repeat the row before in motion"
+        if mapping.dropouts == "kept":
+            return data, (f"{message}: 'dropouts: dropped' under 'logs' removes them, {rate:.3g} Hz remain",)
+    return data[~repeats], (f"{message}: repeats were left out, {rate:.3g} Hz remain",)
 
 
 def _without_outliers(

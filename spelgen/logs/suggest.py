@@ -30,19 +30,9 @@ WORDS = {
 }  # fmt: skip
 # set points have the names of the measurements that they prescribe
 COMMANDED = {
-    "target",
-    "desired",
-    "des",
-    "d",
-    "command",
-    "commanded",
-    "cmd",
-    "reference",
-    "ref",
-    "setpoint",
-    "goal",
-}
-COMMANDED |= {"action", "demand"}
+    "target", "desired", "des", "d", "command", "commanded", "cmd", "reference", "ref", "setpoint", "goal", "action",
+    "demand",
+}  # fmt: skip
 NOT_MEASURED = COMMANDED | {"error", "std"}
 # units in names, with their word in a mapping, per quantity that they imply
 UNITS = {

@@ -25,9 +25,8 @@ SPEEDS = {f"{name}/s": scale for name, scale in LENGTHS.items()} | {"rpm": 2 * p
 SCALES = {**LENGTHS, **SPEEDS, "mNm": _MILLI, "mA": _MILLI}
 CURRENTS = ("A", "mA")
 COUNTS = ("counts", "counts/s")
-NORMALISED = (
-    "normalised"  # -100..100 of the calibrated range of a motor, as LeRobot stores positions by default
-)
+# -100..100 of the calibrated range of a motor, as LeRobot stores positions by default
+NORMALISED = "normalised"
 SERVO_TURN = 4096  # counts in a revolution of the servos that LeRobot calibrates
 ONLY = {  # units that a joint of this kind cannot have
     "revolute": ("m", "mm", "m/s", "mm/s", "N"),
@@ -37,24 +36,10 @@ ONLY = {  # units that a joint of this kind cannot have
 LONGEST_DELAY = 1.0  # s
 
 Accepted = Literal[
-    "degrees",
-    "frozen",
-    "time-unit",
-    "dropouts",
-    "jumps",
-    "held-samples",
-    "velocity-without-sign",
-    "no-torques",
-    "torque-sense",
-    "torque-unit",
-    "torque-beyond-drive",
-    "torque-order",
-    "joint-sense",
-    "joint-order",
-    "joint-zero",
-    "gravity",
-    "gravity-compensated",
-]
+    "degrees", "frozen", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign", "no-torques",
+    "torque-sense", "torque-unit", "torque-beyond-drive", "torque-order", "joint-sense", "joint-order", "joint-zero",
+    "gravity", "gravity-compensated",
+]  # fmt: skip
 """Errors of `spelgen logs` that someone who knows better can accept, by their codes."""
 
 Time = Literal["s", "ms", "us", "ns"]
@@ -227,9 +212,8 @@ class LogMapping(Group):
         changed = dict(self.joints)
         for joint in joints:
             logged = self.joint(joint)
-            turns = {
-                x: 2 * pi / abs(self.scale(x, joint)) for x in ("q", "u") if not self.word("period", x, joint)
-            }
+            unstated = [x for x in ("q", "u") if not self.word("period", x, joint)]
+            turns = {x: 2 * pi / abs(self.scale(x, joint)) for x in unstated}
             period = logged.period.model_copy(update=turns)
             changed[joint] = logged.model_copy(update={"period": period})
         return self.model_copy(update={"joints": changed})
