@@ -85,6 +85,8 @@ def training_facts(
         facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"
         if record.options.get("solver", "rk4") == "rk4":
             facts["integrator"] = f"rk4, {counted(last['substeps'], 'step')} between samples"
+    if record.notes:
+        facts["notes"] = "; ".join(record.notes)
     if record.options.get("momentum_steps"):
         facts["start"] = f"{record.options['momentum_steps']:,} steps on the momentum along the logs"
     return facts
