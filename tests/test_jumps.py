@@ -206,6 +206,19 @@ def test_rows_that_are_written_several_times_are_read_once_with_their_own_rate(a
         assert [x.message for x in notes] == [told] * len(joints)
 
 
+@pytest.mark.parametrize("rate", [100.0, 60.0, 27.0])
+def test_the_newest_state_written_at_a_rate_that_is_no_multiple_of_its_own(arm, tmp_path, rate):
+    """Each state is written two or three times, three or four times, ...: it is read once."""
+    columns, joints = motion(arm, 5, rate=250.0), arm.arm.joint_names
+    newest = np.floor(np.arange(len(columns["t"])) * rate / 250 + 1e-9)
+    first = np.searchsorted(newest, newest)
+    log = {name: x if name == "t" else x[first] for name, x in columns.items()}
+    (found,) = read_logs(written(log, tmp_path / "log.csv"), joints)
+    assert len(found) == pytest.approx(len(np.unique(newest)), rel=0.02)
+    # a state at which all joints reverse may be read twice
+    assert np.mean((np.diff(found.q, axis=0) != 0).any(axis=1)) > 0.98
+
+
 def test_frames_that_are_written_twice_now_and_then_are_counted_and_dropped_on_request(arm, tmp_path):
     columns, joints = motion(arm, 5, rate=30.0, seconds=60), arm.arm.joint_names
     random = np.random.default_rng(0)

@@ -103,27 +103,22 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
 
     positions: the number of first columns that are positions. A row is a repeat if the position then makes up for it:
     the step that follows k equal rows is as large as k steps of the motion after it. Rows of an arm at rest are kept,
-    one of n if all rows of the motion are written n times.
+    one of n if rows of the motion are written n times.
     """
-    none = np.zeros(len(columns), bool)
     starts = np.flatnonzero(np.append(True, (np.diff(columns, axis=0) != 0).any(axis=1)))
-    lengths = np.diff(starts)
-    if len(starts) < 4 or not (lengths > 1).any():
-        return none, 1
-    steps = np.abs(np.diff(columns[starts, :positions], axis=0))  # at the end of each block but the last
-    speeds = steps[1:] / lengths[1:, None]
-    quantum = np.min(np.where(steps > 0, steps, np.inf), axis=0)
-    makes_up = (steps[:-1] > 2.5 * quantum) & (steps[:-1] > 0.6 * lengths[:-1, None] * speeds)
-    blocks = makes_up.any(axis=1)
-    if not (blocks & (lengths[:-1] > 1)).any():
-        return none, 1
-    often = int(np.median(lengths[:-1][blocks]))
-    index = np.arange(len(columns)) - np.repeat(starts, np.diff(np.append(starts, len(columns))))
-    if often > 1:
-        return index % often != 0, often
+    lengths = np.diff(np.append(starts, len(columns)))
     is_held = np.zeros(len(starts), bool)
-    is_held[:-2] = blocks
-    return (index > 0) & np.repeat(is_held, np.diff(np.append(starts, len(columns)))), 1
+    index = np.arange(len(columns)) - np.repeat(starts, lengths)
+    if len(starts) < 4 or not index.any():
+        return np.repeat(is_held, lengths), 1
+    steps = np.abs(np.diff(columns[starts, :positions], axis=0))  # at the end of each block but the last
+    speeds = steps[1:] / lengths[1:-1, None]
+    quantum = np.min(np.where(steps > 0, steps, np.inf), axis=0)
+    makes_up = (steps[:-1] > 2.5 * quantum) & (steps[:-1] > 0.6 * lengths[:-2, None] * speeds)
+    is_held[:-2] = makes_up.any(axis=1)
+    often = int(np.median(lengths[is_held])) if is_held.any() else 1
+    repeats = np.repeat(is_held, lengths) & (index > 0)
+    return repeats | (index % often != 0), often
 
 
 def held_samples(values: np.ndarray) -> int:
