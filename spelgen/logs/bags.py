@@ -185,17 +185,22 @@ def _without_end(
 
 def _chosen_topic(topics: set[str], present: set[str], topic: str | None, path: Path) -> str:
     """Return the topic of joint states that was asked for, or the only one."""
-    names = ", ".join(sorted(topics))
+    if topic in topics:
+        return topic
+    if topic is None and len(topics) == 1:
+        return topics.pop()
+    names, do = ", ".join(sorted(topics)), None
     if not topics:
         listed = ", ".join(sorted(present)) or "(none)"
-        got, expected, do = f"only the topics {listed}", f"one of {MESSAGE}", None
-    elif topic is None and len(topics) > 1:
-        got, expected = f"joint states on the topics {names}", "one of them"
-        do = "name it by 'topic' under 'logs'"
-    elif topic not in (None, *topics):
-        got, expected, do = f"no joint states on {topic}", f"one of {names}", None
+        got, expected = f"only the topics {listed}", f"one of {MESSAGE}"
+    elif topic is None:
+        got, expected, do = (
+            f"joint states on the topics {names}",
+            "one of them",
+            "name it by 'topic' under 'logs'",
+        )
     else:
-        return topic or topics.pop()
+        got, expected = f"no joint states on {topic}", f"one of {names}"
     raise LogError(got, file=path, expected=expected, do=do)
 
 

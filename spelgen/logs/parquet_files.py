@@ -92,13 +92,15 @@ def _with_scale(
             states = pa.parquet.read_table(file, columns=[STATE])[STATE].combine_chunks()
             values = np.abs(states.flatten().to_numpy(zero_copy_only=False))
             largest = max(largest, float(values.max(initial=0.0)))
-    is_normalised = np.pi * 2 < largest <= LARGEST_NORMALISED
-    unstated = [joint for joint in joints if mapping.unit("q", joint) is None]
-    if not is_normalised:
+    if not 2 * np.pi < largest <= LARGEST_NORMALISED:
         return mapping, ()
+    unstated = [joint for joint in joints if mapping.unit("q", joint) is None]
     if not unstated:
         unit = mapping.unit("q", joints[0])
-        doubt = f"positions within -100..100: right as {unit}, unless they are LeRobot's normalised values"
+        doubt = (
+            f"positions within -100..100: right as {unit}, unless they are LeRobot's normalised values, which "
+            "'units: {q: normalised}' and 'calibration' under 'logs' convert"
+        )
         return mapping, (doubt,) if unit == "deg" else ()
     found = mapping.calibration or _calibration(folder)
     if not all(mapping.log_name(joint) in found for joint in unstated):

@@ -113,7 +113,8 @@ def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
     motors = dataset_motors(folder)
     lines = [
         f"# Drafted from the motors of {json.dumps(folder.name)}: check it.",
-        "# LeRobot stores -100..100 of the calibrated range, or degrees: 'units: {q: deg}'.",
+        "# LeRobot stores degrees, 'units: {q: deg}', or -100..100 of the calibrated range:",
+        "# 'units: {q: normalised}' and 'calibration:' with the content of the robot's calibration file.",
         "joints:",
     ]
     missing = []

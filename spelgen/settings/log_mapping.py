@@ -40,7 +40,7 @@ Accepted = Literal[
     "torque-sense", "torque-unit", "torque-beyond-drive", "torque-order", "joint-sense", "joint-order", "joint-zero",
     "gravity", "gravity-compensated",
 ]  # fmt: skip
-"""Errors of `spelgen logs` that someone who knows better can accept, by their codes."""
+"""Codes of errors of `spelgen logs` that a user can accept."""
 
 Time = Literal["s", "ms", "us", "ns"]
 Position = Literal["rad", "deg", "turns", "counts", "normalised", "m", "mm"]
@@ -49,7 +49,7 @@ Effort = Literal["Nm", "mNm", "N", "A", "mA"]
 
 
 class LogColumns(Group):
-    """Names of the columns; `{joint}` stands for the joint's `name`, `{trajectory}` (NPZ) for any text."""
+    """Names of the columns. `{joint}` is replaced by the joint's `name`, `{trajectory}` (NPZ) by any text."""
 
     t: str = "t"
     trajectory: str = "trajectory"
@@ -64,7 +64,7 @@ PLAIN = LogColumns().model_dump()
 
 
 class JointColumns(Group):
-    """Columns of one joint that follow no pattern."""
+    """Names of the columns of one joint, in place of the pattern of all joints."""
 
     q: str | None = None
     qd: str | None = None
@@ -116,9 +116,9 @@ class JointLog(Group):
     """Mapping of one joint.
 
     name: the joint's name in the log; None: the URDF's. counts_per_turn, counts_per_metre: of the joint.
-    sign: -1 where the log's sense is the opposite of the URDF's, of position, velocity and torque.
-    offset: the joint's position where the log says 0 [rad, m]. gain: torque per logged unit, e.g. gear x
-    motor constant [Nm/A]; negative where current and velocity have opposite senses. torque_offset [Nm, N].
+    sign: -1 if the log's sense is the opposite of the URDF's, of position, velocity and torque.
+    offset: the joint's position at the logged position 0 [rad, m]. gain: torque per logged unit, e.g. gear x
+    motor constant [Nm/A]; negative if current and velocity have opposite senses. torque_offset [Nm, N].
     period: at which values start again, e.g. 65536 counts of a 16-bit register, 360 degrees of an angle; joints without
     position limits have one turn. sign_bit: from it on, a value is minus its excess, as 32768 + x of a servo is -x.
     """
