@@ -114,15 +114,6 @@ def draw_fault(arm: Arm, kind: str, rng: np.random.Generator) -> Hypothesis:
     }[kind]
 
 
-def logged(samples: MotionSamples, right: Hypothesis) -> MotionSamples:
-    """Return the samples as a log has them whose right reading this is."""
-    motion, torque = np.argsort(right.motion_source), np.argsort(right.torque_source)
-    q = (samples.q - right.offset) / right.motion_scale
-    qd, qdd = samples.qd / right.motion_scale, samples.qdd / right.motion_scale
-    tau = samples.tau / right.torque_scale
-    return MotionSamples(q[:, motion], qd[:, motion], qdd[:, motion], tau[:, torque])
-
-
 def is_same(one: Hypothesis, other: Hypothesis) -> bool:
     """Whether two readings are the same but for small angles."""
     turn = np.angle(np.exp(1j * (one.offset - other.offset)))
@@ -145,7 +136,7 @@ def result_of(
     if kind == "gravity":  # the log is right, and the settings state another gravity
         chain, ideal = replace(chain, gravity=right.gravity), replace(ideal, gravity=right.gravity)
         right = Hypothesis.unchanged(arm.arm)
-    wrong = logged(samples, right)
+    wrong = right.logged(samples)
     comparison = compare_readings(GeometryProblem(chain, wrong, drives.speeds, SECONDS))
     named = [is_same(fit.hypothesis, right) for fit in comparison.better]
     if any(named):

@@ -193,6 +193,22 @@ def test_another_unit_is_offered_as_gain(arm):
     np.testing.assert_allclose(np.log(gains), np.log(0.003), atol=np.log(2))
 
 
+def test_a_link_with_a_mistyped_mass_is_named(arm):
+    """One mass of the URDF is six times too large, and its tensor about the centre of mass is right."""
+    moments = [np.linalg.norm(np.array(body.inertia[1:4], dtype=float)) for body in arm.arm.bodies]
+    # the first joint of these arms is vertical: its body's first moment is invisible
+    k = 1 + int(np.argmax(moments[1:]))
+    body = arm.arm.bodies[k]
+    heavy = replace(body, inertia=(*(6 * float(x) for x in body.inertia[:4]), *body.inertia[4:]))
+    mistyped = replace(arm.arm, bodies=(*arm.arm.bodies[:k], heavy, *arm.arm.bodies[k + 1 :]))
+    log = recorded(arm, 10)
+    report = check_logs([log], replace(arm, arm=mistyped))
+    assert report.errors == ()
+    (note,) = (x for x in report.findings if x.code == "urdf-inertials")
+    assert note.where == f"link {body.link!r}"
+    assert not [x for x in check_logs([log], arm).findings if x.code == "urdf-inertials"]
+
+
 def test_training_refuses_it_unless_it_is_accepted(arm):
     wrong = flipped(recorded(arm, 7), 1, True, False)
     with pytest.raises(SpelgenError, match="--accept joint-sense"):

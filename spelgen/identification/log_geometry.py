@@ -8,6 +8,7 @@ explain the torques equally well.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -39,20 +40,6 @@ class MotionSamples(NamedTuple):
         return MotionSamples(*(column[::stride] for column in self))
 
 
-class Columns(NamedTuple):
-    """Scales and offsets from the columns of a log to n joints, (n,) each; see `Hypothesis`."""
-
-    motion_scale: np.ndarray
-    torque_scale: np.ndarray
-    offset: np.ndarray
-
-    def logged(self, samples: MotionSamples) -> MotionSamples:
-        """Return the samples in the units, senses and zeros of the log."""
-        q, qd, qdd, tau = samples
-        scale = self.motion_scale
-        return MotionSamples((q - self.offset) / scale, qd / scale, qdd / scale, tau / self.torque_scale)
-
-
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
     """A reading of the columns of n joints, and a gravity.
@@ -71,13 +58,12 @@ class Hypothesis:
     gravity: Vector3
 
     @classmethod
-    def unchanged(cls, arm: Arm, columns: Columns | None = None) -> Hypothesis:
-        """Return the hypothesis of the unchanged log. columns: of its mapping; None: SI units and no offsets."""
+    def unchanged(cls, arm: Arm) -> Hypothesis:
+        """Return the hypothesis of the unchanged log, in SI units and without offsets."""
         joints = len(arm.coordinates)
-        order = np.arange(joints)
-        scales = columns or Columns(np.ones(joints), np.ones(joints), np.zeros(joints))
+        order, ones = np.arange(joints), np.ones(joints)
         x, y, z = map(float, arm.gravity)
-        return cls((), order, order, *scales, gravity=(x, y, z))
+        return cls((), order, order, ones, ones, np.zeros(joints), gravity=(x, y, z))
 
     @property
     def motion_key(self) -> tuple[bytes, Vector3]:
@@ -90,12 +76,13 @@ class Hypothesis:
         q, qd, qdd = (x[:, self.motion_source] * self.motion_scale for x in samples[:3])
         return MotionSamples(q + self.offset, qd, qdd, samples.tau[:, self.torque_source] * self.torque_scale)
 
-
-class Equations(NamedTuple):
-    """Rows (S, n, K) of bodies, then of friction, and their products Y^T Y, (n, K, K)."""
-
-    rows: np.ndarray
-    normal: np.ndarray
+    def logged(self, samples: MotionSamples) -> MotionSamples:
+        """Return the columns of the log that this hypothesis reads as `samples`."""
+        motion, torque = np.argsort(self.motion_source), np.argsort(self.torque_source)
+        q = (samples.q - self.offset) / self.motion_scale
+        qd, qdd = samples.qd / self.motion_scale, samples.qdd / self.motion_scale
+        tau = samples.tau / self.torque_scale
+        return MotionSamples(q[:, motion], qd[:, motion], qdd[:, motion], tau[:, torque])
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +90,8 @@ class Fit:
     """Least squares with the prior under a hypothesis.
 
     cost: negative log posterior up to a constant. misfit: its part from the torque residual. parameters: (K,), inertial
-    parameters first. covariance: (K, K), posterior. errors: (n,) mean squared residual of each joint, relative to the variance of its torque.
+    parameters first. covariance: (K, K), posterior. errors: (n,) mean squared residual of each joint, relative to the
+    variance of its torque.
     """
 
     hypothesis: Hypothesis
@@ -123,7 +111,7 @@ class GeometryProblem:
         samples: MotionSamples,
         speeds: np.ndarray,
         seconds: float,
-        columns: Columns | None = None,
+        unchanged: Hypothesis | None = None,
     ) -> None:
         """Prepare the problem of an arm with n joints.
 
@@ -132,14 +120,14 @@ class GeometryProblem:
             samples: of its motion, with torques at the joints.
             speeds: C (n, n) of the motors, see `Drives`.
             seconds: duration of the logs [s], which limits the number of independent errors.
-            columns: scales and offsets of the mapping of the logs.
+            unchanged: scales and offsets of the mapping of the logs; None: SI units and no offsets.
         """
         self.arm, self.speeds = arm, speeds
-        self.samples = samples if columns is None else columns.logged(samples)
-        self.unchanged = Hypothesis.unchanged(arm, columns)
+        self.unchanged = unchanged or Hypothesis.unchanged(arm)
+        self.samples = self.unchanged.logged(samples)
         self._prior: InertialPrior = inertial_prior(arm)
         self._count = float(np.clip(seconds / GEOMETRY.correlation_time, 1.0, GEOMETRY.max_errors))
-        self._equations: dict[tuple[bytes, Vector3], Equations] = {}
+        self._equations: dict[tuple[bytes, Vector3], tuple[np.ndarray, np.ndarray]] = {}
 
     def thinned(self, count: int) -> GeometryProblem:
         """Return the problem on at most `count` samples."""
@@ -149,17 +137,20 @@ class GeometryProblem:
 
     def torque(self, hypothesis: Hypothesis, parameters: np.ndarray) -> np.ndarray:
         """Return the torques (S, n) of parameters (K,) under a hypothesis."""
-        return np.asarray(self.equations(hypothesis).rows @ parameters)
+        return np.asarray(self.equations(hypothesis)[0] @ parameters)
 
-    def equations(self, hypothesis: Hypothesis) -> Equations:
-        """Return the regressor under a hypothesis; the last ones are kept."""
+    def equations(self, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
+        """Return the regressor Y (S, n, K) under a hypothesis, and Y^T Y per joint, (n, K, K); the last ones are kept.
+
+        The columns are the inertial parameters of the bodies, then friction and rotor inertias.
+        """
         key = hypothesis.motion_key
         if key not in self._equations:
             q, qd, qdd, _ = hypothesis.signals(self.samples)
             rows = drive_rows(body_chain(self.arm, hypothesis.gravity), q, qd, qdd, self.speeds)
             if len(self._equations) >= GEOMETRY.kept:
                 self._equations.pop(next(iter(self._equations)))
-            self._equations[key] = Equations(rows, block_products(rows, 1)[:, 0])
+            self._equations[key] = rows, block_products(rows, 1)[:, 0]
         return self._equations[key]
 
     def fit(self, hypothesis: Hypothesis) -> Fit:
@@ -207,6 +198,28 @@ class GeometryProblem:
         vector = flat.T @ residual.ravel() * (self._count / len(tau))
         vector[:bodies] += self._prior.precision @ (self._prior.mean - fit.parameters[:bodies])
         return np.asarray((inverse(matrix) @ vector)[-columns.shape[2] :])
+
+    def wrong_links(self, fit: Fit) -> Iterator[tuple[int, float, float]]:
+        """Yield bodies whose first moment is far from the URDF's, its ratio to the URDF's, and standard deviations.
+
+        The ratio is along the direction of the URDF's first moment. A body counts only if the difference is visible in
+        the torques: small and distant bodies compensate for each other.
+        """
+        visible = GEOMETRY.visible * float(self.samples.tau.std(axis=0).max())
+        gravity = float(np.linalg.norm(fit.hypothesis.gravity))
+        for k in range(len(self.arm.bodies)):
+            block = slice(10 * k + 1, 10 * k + 4)
+            stated, moment = self._prior.mean[block], fit.parameters[block]
+            length = float(np.linalg.norm(stated))
+            torque = float(np.linalg.norm(moment - stated)) * gravity
+            if not length or torque < visible:
+                continue
+            axis = stated / length
+            ratio = float(axis @ moment) / length
+            deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis)) / length
+            is_far = not 1 / GEOMETRY.wrong_moment < ratio < GEOMETRY.wrong_moment
+            if is_far and abs(ratio - 1) > GEOMETRY.certain * deviation:
+                yield k, ratio, deviation
 
     def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
         """Return the cost of rotor inertias below 0 and of friction that drives its joint, on average of the log.

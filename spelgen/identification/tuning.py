@@ -124,6 +124,12 @@ class GeometryTuning:
     right_angle: float = 3.0
     # [rad] zero offsets and tilts of the base below are warnings.
     serious_angle: float = 0.17
+    # [1] Ratio of a first moment to the URDF's that errors of a CAD model do not explain.
+    wrong_moment: float = 2.5
+    # [1] Standard deviations by which such a ratio must differ from 1.
+    certain: float = 4.0
+    # [1] of the largest joint torque's standard deviation: smaller gravity torques of a body are not visible.
+    visible: float = 0.5
     # [1] of the URDF's gravity: with less in all joints it is compensated.
     compensated: float = 0.5
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -15,13 +15,13 @@ from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.drive_samples import DriveLog, DriveSamples
 from spelgen.identification.geometry_search import compare_readings
 from spelgen.identification.least_squares import varying
-from spelgen.identification.log_geometry import GeometryProblem, MotionSamples
+from spelgen.identification.log_geometry import Fit, GeometryProblem, MotionSamples
 from spelgen.identification.torque_delay import delay_of
 from spelgen.identification.tuning import HINTS
 from spelgen.listing import Listing, number
 from spelgen.log_checks.check_servo_logs import ServoLogs
 from spelgen.log_checks.gravity import fit_gravity, joined, state_samples
-from spelgen.log_checks.remedies import GEOMETRY_CODES, geometry_finding, mapped_columns
+from spelgen.log_checks.remedies import GEOMETRY_CODES, Remedies, mapped_reading
 from spelgen.log_checks.report import JointReport, LogReport, joint_report, percent, signal_tables
 from spelgen.log_checks.robot_checks import CHECKS, WITHOUT_GRAVITY, JointEvidence, torque_factors
 from spelgen.log_checks.statistics import Statistics, statistics
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from spelgen.arm.configured_arm import ConfiguredArm
     from spelgen.settings.log_mapping import LogMapping
 
-COUPLED, WRONG_VELOCITY = "coupled-motors", "velocity-is-no-derivative"
-ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED, *GEOMETRY_CODES}
+COUPLED, WRONG_VELOCITY, WRONG_LINK = "coupled-motors", "velocity-is-no-derivative", "urdf-inertials"
+ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED, WRONG_LINK, *GEOMETRY_CODES}
 
 
 def check_logs(
@@ -130,14 +130,15 @@ class TorqueLogs:
             completed.append(replace(report, gravity=gravity))
         evidence = list(map(JointEvidence, self._arm.arm.coordinates, completed))
         # with wrong velocities friction is wrong too, and hints about drives would be wrong with wrong torques
-        is_sound = not summary.errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
+        has_errors = bool(summary.errors)
+        is_sound = not has_errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
         moving = self._moving.samples()
         is_right = not is_sound or self._is_read_right(moving, motion, evidence, accepted, summary)
         if is_sound and is_right and moving is not None:
             self._check_drives(moving, summary)
         for joint in evidence:
             passed = accepted | {code for code in UNIT_CODES if self._is_declared(joint.coordinate.name)}
-            if not is_right:  # one cause, one message
+            if has_errors or not is_right:  # one cause, one message
                 passed |= {"torque-beyond-drive", WITHOUT_GRAVITY}
             where = f"joint {joint.coordinate.name!r}"
             for check, message in run_checks(CHECKS, joint, passed):
@@ -167,13 +168,15 @@ class TorqueLogs:
             samples = MotionSamples(moving.q, moving.qd, moving.qdd, moving.tau)
         if len(samples.q) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
             return True
-        columns = mapped_columns(arm, self._mapping, self._drives)
-        problem = GeometryProblem(arm, samples, self._drives.speeds, self._seconds, columns)
+        reading = mapped_reading(arm, self._mapping, self._drives)
+        problem = GeometryProblem(arm, samples, self._drives.speeds, self._seconds, reading)
         undeclared = [not self._is_declared(name) for name in arm.joint_names]
         comparison = compare_readings(problem, torque_factors(joints, undeclared))
+        if not comparison.better:
+            summary.notes.extend(_link_notes(problem, comparison.unchanged))
         if not comparison.better or set(comparison.codes) <= accepted:
             return True
-        finding = geometry_finding(comparison, arm, self._mapping, by_name=self._is_bag)
+        finding = Remedies(problem.unchanged, arm, self._mapping, self._is_bag).finding(comparison)
         if isinstance(finding, Diagnostic):
             summary.notes.append(finding)
         else:
@@ -187,6 +190,16 @@ class TorqueLogs:
             summary.notes.append(_coupling_hint(self._arm, *late.coupling))
         else:
             summary.notes.extend(late.notes)
+
+
+def _link_notes(problem: GeometryProblem, fit: Fit) -> Iterator[Diagnostic]:
+    """Yield a warning for each link whose inertials in the URDF are far from the log's."""
+    for k, ratio, deviation in problem.wrong_links(fit):
+        message = (
+            f"its first moment (mass times centre of mass) is {ratio:.2f} +- {deviation:.2f} times the URDF's by "
+            "least squares: check its mass and centre of mass in the URDF"
+        )
+        yield Diagnostic("warning", WRONG_LINK, f"link {problem.arm.bodies[k].link!r}", None, message)
 
 
 def _coupling_hint(arm: ConfiguredArm, coupling: Coupling, remaining: float) -> Diagnostic:
