@@ -82,12 +82,12 @@ def long_pieces(trajectory: Trajectory, gap: float) -> list[Trajectory]:
 def _columns(
     piece: Trajectory, pauses: bool, cutoff: float | None, reach: BristleReach | None
 ) -> list[np.ndarray]:
-    """Return q, qd, qdd, tau, and z where a reach is given, of the selected samples of a piece."""
+    """Return q, qd, qdd, tau (T, n), and z (T, n, K) if a reach is given, of the selected samples of a piece."""
     rate, times, t = piece.sample_rate, piece.t, regular_times(piece.t, FREQUENCY)
     is_denser = rate > 1.5 * FREQUENCY
 
     def sampled(signals: np.ndarray) -> np.ndarray:
-        """Return signals at the piece's own times at regular times, through the filter."""
+        """Return signals (T, ...) of the piece's own times at the regular times, filtered."""
         if cutoff is None:
             return resampled(times, signals, t, rate)
         # filtered at the higher of the two rates: frequencies above half the lower rate are removed by then

@@ -67,14 +67,14 @@ def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndar
 
 @lru_cache(maxsize=8)  # logs of a robot have few rates
 def _sections(rate: float, cutoff: float) -> np.ndarray:
-    """Return the filter's second-order sections: to design them takes as long as to filter a minute of a joint."""
+    """Return the filter's second-order sections (S, 6), whose design takes as long as filtering a minute of a joint."""
     from scipy.signal import butter
 
     return np.asarray(butter(TUNING.filter_order, cutoff, fs=rate, output="sos"))
 
 
 def regular_times(t: np.ndarray, frequency: float) -> np.ndarray:
-    """Return the times of a regular rate [Hz] within the times t."""
+    """Return the times of a regular rate [Hz] within the times t (T,)."""
     return np.arange(t[0], t[-1], 1.0 / frequency)
 
 

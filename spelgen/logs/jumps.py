@@ -189,7 +189,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
 
 
 def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
-    """Return sizes of registers in logged units: 2^k turns, and 2^k steps if the signal has a grid."""
+    """Return sizes of registers of a signal (T,) in logged units: 2^k turns, and 2^k steps if the signal has a grid."""
     sizes = [] if turn is None else [turn * 2.0**k for k in range(9)]
     levels = np.unique(values)
     differences = np.diff(levels)
@@ -204,6 +204,6 @@ def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
 
 
 def _usual(sizes: np.ndarray) -> float:
-    """Return the median of the steps that are not 0; infinite if there is none."""
+    """Return the median of the sizes (T,) that are not 0; infinite if there is none."""
     moving = sizes[sizes > 0]
     return float(np.median(moving)) if moving.size else np.inf

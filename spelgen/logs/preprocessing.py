@@ -41,9 +41,9 @@ class Preprocessing:
                 raise SettingsError(repr(getattr(self, name)), element=name, expected=expected)
 
     def resolved(self, rates: Iterable[float]) -> Preprocessing:
-        """Return the same with all decided for windows of logs with these sample rates [Hz], as it is kept with a run.
+        """Return the options resolved for windows of logs with these sample rates [Hz], as a run keeps them.
 
-        A cutoff that stays None is that of logs too slow to be filtered unasked.
+        The cutoff remains None for logs that are too slow to be filtered by default.
         """
         rates = list(rates)
         cutoff, decimation = self.cutoff, self.decimation or 1

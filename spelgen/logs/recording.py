@@ -114,7 +114,7 @@ def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
 
 
 def listed_times(t: np.ndarray) -> str:
-    """Return the first times [s] of a list as text, and the number of the others."""
+    """Return the first times (T,) [s] of a list as text, and the number of the others."""
     shown = ", ".join(f"{x:.4g}" for x in t[: TUNING.listed].tolist())
     more = len(t) - TUNING.listed
     return f"{shown} s" + (f" and {more} more" if more > 0 else "")
@@ -187,7 +187,7 @@ def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:
 
 
 def _roughness(positions: np.ndarray) -> float:
-    """Return the sum of the distances from row to row, each joint relative to its range."""
+    """Return the sum of the distances between rows (T, n), each joint relative to its range."""
     ranges = np.ptp(positions, axis=0)
     length = np.abs(np.diff(positions, axis=0)).sum(axis=0)
     return float((length / np.where(ranges > 0, ranges, 1.0)).sum())
@@ -204,7 +204,7 @@ def require_increasing_times(t: np.ndarray, rows: Sequence[int] | np.ndarray, la
 
 
 def _pieces(t: np.ndarray) -> Iterator[slice]:
-    """Yield the gap-free pieces of two samples or more; of a lone sample no window is cut."""
+    """Yield the gap-free pieces of two samples or more of times (T,); of a lone sample no window is cut."""
     for start, stop in pairwise(gap_ends(t)):
         if stop - start > 1:
             yield slice(start, stop)

@@ -106,7 +106,7 @@ class Trajectory:
 
     @property
     def regular_steps(self) -> np.ndarray:
-        """Times between samples [s], but gaps: a pause of a minute would halve the rate."""
+        """Times (T,) [s] between samples, but gaps: a pause of a minute would halve the rate."""
         steps = np.diff(self.t)
         return steps[steps <= GAP * np.median(steps)] if steps.size else steps
 
@@ -190,12 +190,12 @@ def split_at_gaps(
 
 
 def joined_column(trajectories: Sequence[Trajectory], name: str) -> np.ndarray:
-    """Return a column of all trajectories, one after the other, by its name: t, q, qd, tau or u."""
+    """Return a column of all trajectories joined, (T,) or (T, n), by its name: t, q, qd, tau or u."""
     return np.concatenate([getattr(x, name) for x in trajectories])
 
 
 def set_aside(items: Sequence[T], numbers: np.ndarray) -> tuple[list[T], list[T]]:
-    """Return the items without these numbers, and the items with them, in their order."""
+    """Return the items without these numbers (k,), and the items with them, in their order."""
     remaining: list[T] = []
     chosen: list[T] = []
     chosen_numbers = set(numbers.tolist())
