@@ -65,6 +65,7 @@ bench: $(TOOLS) ## run every script of benchmarks/
 
 golden: $(TOOLS) ## rewrite the golden files after an intended change; read the diff before committing
 	$(BIN)/python -m pytest -q tests/test_emit.py::test_golden_text --update
+	$(BIN)/python tests/settings_page.py --write
 
 # Where pip finds no build of torch for the CPU alone (UV_FIND_LINKS), NVIDIA's packages are locked too.
 LOCK = .lock-venv/bin/uv pip compile --quiet --upgrade --generate-hashes --no-annotate --no-header \

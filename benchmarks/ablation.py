@@ -31,15 +31,15 @@ from real_logs import first, mean, samples_of, torque_of, trained
 from recordings import folder_of
 
 import spelgen
-from spelgen.dynamics.residuals import residual_torque
-from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
+from spelgen.dynamics.parameters import residual_torque
 from spelgen.fitting.torque import fit as torque_fit
-from spelgen.fitting.torque import joint_functions, residual_stage, stages
-from spelgen.fitting.torque import prior as torque_prior
+from spelgen.fitting.torque import joint_functions, stages
+from spelgen.fitting.torque import parameters as torque_prior
 from spelgen.fitting.torque import problem as torque_problem
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.linearization import RigidProjection
 from spelgen.fitting.torque.tuning import SELECTION, TUNING
+from spelgen.fitting.tuning import TUNING as DAMPING
 from spelgen.logs.tuning import SAMPLES
 
 NEVER = float("inf")
@@ -142,13 +142,13 @@ def mechanisms() -> list[Mechanism]:
         Mechanism("subset of samples first", tuned(TUNING, initial_samples=2**40)),
         Mechanism("steps in inertial parameters", tuned(DAMPING, min_gain_ratio=-NEVER)),
         Mechanism("alternations with residual terms", tuned(TUNING, alternations=1)),
-        Mechanism("variable projection", ((residual_stage, "refit_terms", alternately),)),
+        Mechanism("variable projection", ((stages, "refit_terms", alternately),)),
         Mechanism("residual terms", tuned(SELECTION, standard_errors=NEVER)),
         Mechanism("orthogonalization of terms", ((RigidProjection, "orthogonalize", not_orthogonalized),)),
         Mechanism("significance of residual terms", tuned(SELECTION, standard_errors=0.0)),
         Mechanism("gaps between blocks", tuned(SELECTION, gap=0.0)),
         Mechanism("minimum error reduction", tuned(SELECTION, min_reduction=0.0)),
-        Mechanism("networks in residual terms", ((residual_stage, "select_networks", lambda *_: iter(())),)),
+        Mechanism("networks in residual terms", ((stages, "select_networks", lambda *_: iter(())),)),
     ]
 
 

@@ -47,12 +47,12 @@ from torch import Tensor, nn
 from torch.func import grad, jvp
 
 import spelgen
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
-from spelgen.dynamics.linear_friction import FrictionModel
-from spelgen.dynamics.pinocchio_urdf import drives_known, urdf_dynamics
+from spelgen.dynamics.friction import FrictionModel
+from spelgen.dynamics.pinocchio_dynamics import drives_known, urdf_dynamics
 from spelgen.emission.build import build
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.logs.dynamics_samples import DynamicsSamples
@@ -112,7 +112,7 @@ def table(cases: Iterator[Case]) -> None:
     )
     print(f"{'':18}" + "".join(f"{x:>12}" for x in head) + "    fits [s]")
     for case in cases:
-        arm, training = load_arm(case.urdf).arm, case.training
+        arm, training = load_arm(case.urdf).chain, case.training
         plain = least_squares_torque(arm, training, FrictionModel())
         row = [
             of_the_urdf(case.urdf, arm),
@@ -145,19 +145,19 @@ def states_ahead(folder: Path) -> None:
 def splits(folder: Path) -> Iterator[Split]:
     """The arms of the reference logs, with the splits that its README gives."""
     urdf = folder / "ur10e" / "ur10e.urdf"
-    arm = load_arm(urdf).arm
+    arm = load_arm(urdf).chain
     logs = {x: read(folder / "ur10e" / f"{x}.parquet", arm) for x in (*TRAINING, *TESTS)}
     yield "UR10e, nine", urdf, [logs[x] for x in TRAINING], [logs[x] for x in TESTS]
     urdf = panda_urdf(folder)
-    whole = read(folder / "panda" / "exciting_traj1.parquet", load_arm(urdf).arm)
+    whole = read(folder / "panda" / "exciting_traj1.parquet", load_arm(urdf).chain)
     yield "Panda", urdf, [first(whole, 12.0)], [after(whole, 12.0)]
     for name, seconds in SPLITS.items():
         urdf = folder / name / f"{name}.urdf"
         (log,) = (folder / name).glob("*.parquet")
-        whole = read(log, load_arm(urdf).arm)
+        whole = read(log, load_arm(urdf).chain)
         yield name, urdf, [first(whole, seconds)], [after(whole, seconds)]
     urdf = folder / "shanghai" / "shanghai.urdf"
-    arm = load_arm(urdf).arm
+    arm = load_arm(urdf).chain
     each = [read(log, arm) for log in sorted((folder / "shanghai").glob("*.parquet"))]
     for k, test in enumerate(each):
         yield f"shanghai {k + 1}", urdf, [x for x in each if x is not test], [test]
@@ -220,14 +220,14 @@ def recorded(model: Any, effects: Sequence[str], seed: int, noise: float = 0.0) 
     return DynamicsSamples("simulated", q, qd, qdd, tau, z)
 
 
-def of_the_urdf(urdf: Path, arm: Arm) -> Torque:
+def of_the_urdf(urdf: Path, arm: Chain) -> Torque:
     """The URDF as it is, with the settings' drives where there are any."""
     names = [x.name for x in arm.coordinates]
     dynamics = urdf_dynamics(urdf, names, drives=drives_known(urdf, names))
     return torque_of(dynamics)
 
 
-def best_ridge(arm: Arm, training: Sequence[DynamicsSamples]) -> Torque:
+def best_ridge(arm: Chain, training: Sequence[DynamicsSamples]) -> Torque:
     """Least squares with the penalty that meets held-out blocks best."""
     seen, held = ([part(x, out) for x in training] for out in (False, True))
 

@@ -31,8 +31,7 @@ from spelgen.exporting.casadi_export import called_by_state, casadi_functions
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.entry_points import ENTRY_POINTS
-from spelgen.exporting.mjcf_export import check_mjcf
-from spelgen.exporting.mjcf_file import mjcf_text
+from spelgen.exporting.mjcf_export import check_mjcf, mjcf_text
 from spelgen.exporting.model_expressions import expression_functions
 from spelgen.exporting.onnx_export import called_by_onnx, onnx_model, onnx_session
 from spelgen.exporting.parity import Called, Parity, check_parity
@@ -195,7 +194,7 @@ def latency(robot: str = "ur10e") -> None:
             show(name, lambda: session.run(None, states))  # noqa: B023
     print("Pinocchio, Python")
     arm = load_arm(ROBOTS / f"{robot}.urdf")
-    rigid = pinocchio_model(arm.arm, arm.settings)
+    rigid = pinocchio_model(arm.chain, arm.settings)
     data, x = rigid.createData(), np.full(rigid.nv, 0.3)
     show("rnea", lambda: pin.rnea(rigid, data, x, x, x))
     show("aba", lambda: pin.aba(rigid, data, x, x, x))

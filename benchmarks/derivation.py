@@ -59,7 +59,7 @@ def lagrange(joints: int) -> None:
 def main() -> None:
     """Print the table."""
     panda = ROBOTS / "panda.urdf"
-    print(f"panda, URDF to structure      {median_seconds(lambda: derive(load_arm(panda).arm)):8.3f} s")
+    print(f"panda, URDF to structure      {median_seconds(lambda: derive(load_arm(panda).chain)):8.3f} s")
     for joints in (6, 7, 8, 10, 12):
         arm = random_arm(joints, 0)
         print(f"random geometry, {joints:>2} joints    {median_seconds(lambda arm=arm: derive(arm)):8.3f} s")

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 import spelgen
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.pinocchio_arm import pinocchio_model
 from spelgen.errors import ArmError
 from spelgen.logs.dynamics_samples import DynamicsSamples
@@ -93,7 +93,7 @@ class FigarohDynamics:
         return self.constants[12 * self.n : 13 * self.n]
 
 
-def figaroh_dynamics(arm: Arm, settings: Any, samples: Sequence[DynamicsSamples]) -> FigarohDynamics:
+def figaroh_dynamics(arm: Chain, settings: Any, samples: Sequence[DynamicsSamples]) -> FigarohDynamics:
     """Identify an arm. Raises ImportError without figaroh, ArmError for arms with mimic joints."""
     from figaroh.tools.qrdecomposition import QRDecomposer
     from figaroh.tools.regressor import RegressorBuilder, RegressorConfig, eliminate_non_dynaffect
@@ -138,8 +138,8 @@ def main() -> None:
         return
     loaded = spelgen.load_arm(options.urdf)
     samples = dynamics_samples(spelgen.read_logs(options.logs, loaded))
-    dynamics = figaroh_dynamics(loaded.arm, loaded.settings, samples)
-    for joint, name in enumerate(loaded.arm.joint_names):
+    dynamics = figaroh_dynamics(loaded.chain, loaded.settings, samples)
+    for joint, name in enumerate(loaded.chain.joint_names):
         missed, torque = [], []
         for x in samples:
             states = [torch.from_numpy(np.ascontiguousarray(y)) for y in (x.q, x.qd, x.qdd)]

@@ -46,7 +46,7 @@ def main() -> None:
         settings = "input: position\n" if asked.servos else URDF.with_suffix(".yaml").read_text()
         urdf.with_suffix(".yaml").write_text(settings)
         arm = load_arm(urdf)
-        joints = [coordinate.name for coordinate in arm.arm.coordinates]
+        joints = [coordinate.name for coordinate in arm.chain.coordinates]
         write_logs(folder / "train.parquet", simulate(arm, trajectories=4).train, joints)
         source = generate(arm, "closed-form") if asked.servos else generate(arm, "spel", width=4, depth=1)
         (folder / "module.py").write_text(source)

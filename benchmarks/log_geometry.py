@@ -28,8 +28,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from truth import Case, Truth, record_log, wrong_urdf
 
-from spelgen.arm.arm import Arm
-from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.arm.arm import Chain
+from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.identification.drive_samples import DriveLog
 from spelgen.identification.geometry_search import compare_readings
 from spelgen.identification.log_geometry import GeometryProblem, Hypothesis, MotionSamples
@@ -51,9 +51,7 @@ NEAR = 0.2  # rad, and of the size of gravity: angles that are found within it a
 RESULTS = ("named", "with others", "invisible", "missed", "wrong")
 
 
-def draw_log(
-    urdf: Path, number: int, folder: Path
-) -> tuple[Case, ConfiguredArm, ConfiguredArm, MotionSamples]:
+def draw_log(urdf: Path, number: int, folder: Path) -> tuple[Case, Arm, Arm, MotionSamples]:
     """Return a case, the arm of its wrong URDF, the true arm, and samples of its log."""
     rng = np.random.default_rng([number, *urdf.stem.encode()])
     case = Case(
@@ -76,7 +74,7 @@ def draw_log(
     if settings.exists():
         given.with_suffix(".yaml").write_bytes(settings.read_bytes())
     arm, true = load_arm(given), load_arm(urdf)
-    collected = DriveLog(arm.arm.joint_types, arm.actuation.drives(), Preprocessing())
+    collected = DriveLog(arm.chain.joint_types, arm.actuation.drives(), Preprocessing())
     for log in record_log(Truth(case, urdf, rng), case, rng):
         collected.add(log)
     samples = collected.samples()
@@ -84,12 +82,12 @@ def draw_log(
     return case, arm, true, MotionSamples(samples.q, samples.qd, samples.qdd, samples.tau)
 
 
-def draw_fault(arm: Arm, kind: str, rng: np.random.Generator) -> Hypothesis:
+def draw_fault(arm: Chain, kind: str, rng: np.random.Generator) -> Hypothesis:
     """Return the reading that mends a fault of a kind."""
     right, n = Hypothesis.unchanged(arm), len(arm.coordinates)
     sign, offset, order = np.ones(n), np.zeros(n), rng.permutation(n)
     sign[rng.integers(n)] = -1.0
-    turning = [k for k, x in enumerate(arm.coordinates) if x.kind == "revolute"]
+    turning = [k for k, x in enumerate(arm.coordinates) if x.joint_type == "revolute"]
     angle = np.pi / 2 * rng.choice([1, 2, -1])
     if kind == "zero, any angle":
         angle = rng.uniform(0.3, np.pi) * rng.choice([1, -1])
@@ -128,14 +126,12 @@ def is_same(one: Hypothesis, other: Hypothesis) -> bool:
     )
 
 
-def result_of(
-    arm: ConfiguredArm, true: ConfiguredArm, samples: MotionSamples, kind: str, right: Hypothesis
-) -> str:
+def result_of(arm: Arm, true: Arm, samples: MotionSamples, kind: str, right: Hypothesis) -> str:
     """Return the result for a fault, one of `RESULTS`."""
-    drives, chain, ideal = arm.actuation.drives(), arm.arm, true.arm
+    drives, chain, ideal = arm.actuation.drives(), arm.chain, true.chain
     if kind == "gravity":  # the log is right, and the settings state another gravity
         chain, ideal = replace(chain, gravity=right.gravity), replace(ideal, gravity=right.gravity)
-        right = Hypothesis.unchanged(arm.arm)
+        right = Hypothesis.unchanged(arm.chain)
     wrong = right.logged(samples)
     comparison = compare_readings(GeometryProblem(chain, wrong, drives.speeds, SECONDS))
     named = [is_same(fit.hypothesis, right) for fit in comparison.better]
@@ -172,14 +168,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
             with tempfile.TemporaryDirectory() as folder:
                 case, arm, true, samples = draw_log(urdf, number, Path(folder))
             unchanged = compare_readings(
-                GeometryProblem(arm.arm, samples, arm.actuation.drives().speeds, SECONDS)
+                GeometryProblem(arm.chain, samples, arm.actuation.drives().speeds, SECONDS)
             )
             clean["false" if unchanged.better else "silent"] += 1
             rng = np.random.default_rng([number, 1])
             for fault in range(options.faults):
                 kind = KINDS[(fault + number) % len(KINDS)]
-                right = draw_fault(arm.arm, kind, rng)
-                if is_same(right, Hypothesis.unchanged(arm.arm)):
+                right = draw_fault(arm.chain, kind, rng)
+                if is_same(right, Hypothesis.unchanged(arm.chain)):
                     continue
                 result = result_of(arm, true, samples, kind, right)
                 by_kind[kind][result] += 1

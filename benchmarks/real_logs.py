@@ -31,12 +31,12 @@ from delan_characters import read_characters, write_arm
 from recordings import folder_of, panda_urdf
 
 import spelgen
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.predictor import Solver
 from spelgen.dynamics.bristles import bristle_reach, reach_of
-from spelgen.dynamics.linear_friction import FrictionModel
-from spelgen.dynamics.regressor import regressor
+from spelgen.dynamics.friction import FrictionModel
+from spelgen.dynamics.regressor_dynamics import regressor
 from spelgen.emission.build import build
 from spelgen.errors import LogError
 from spelgen.evaluation.horizons import end_errors
@@ -78,7 +78,7 @@ def main() -> None:
 
 def ur10e(folder: Path) -> None:
     urdf = folder / "ur10e.urdf"
-    arm = load_arm(urdf).arm
+    arm = load_arm(urdf).chain
     logs = {name: read(folder / f"{name}.parquet", arm) for name in (*TRAINING, *TESTS, OUTSIDE, *LOADED)}
     since = time.perf_counter()
     fit = trained(urdf, [logs[name] for name in TRAINING])
@@ -115,7 +115,7 @@ def table(
     print()
 
 
-def few(urdf: Path, arm: Arm, long: Trajectory, tests: Sequence[Trajectory]) -> None:
+def few(urdf: Path, arm: Chain, long: Trajectory, tests: Sequence[Trajectory]) -> None:
     print(f"Trained on the first seconds of {long.name}: mean nMSE of the nine, pauses included\n")
     head = ("best ridge", "closed-form", "(moving)")
     print(f"{'seconds':26}" + "".join(f"{x:>15}" for x in head))
@@ -130,7 +130,7 @@ def few(urdf: Path, arm: Arm, long: Trajectory, tests: Sequence[Trajectory]) -> 
     print()
 
 
-def ridge(arm: Arm, samples: Sequence[DynamicsSamples], size: float) -> Torque:
+def ridge(arm: Chain, samples: Sequence[DynamicsSamples], size: float) -> Torque:
     """Return the torque of least squares with a penalty: so many times the squared length of each column."""
     friction = FrictionModel()
 
@@ -221,7 +221,7 @@ def relative_error(dynamics: Any, windows: Windows) -> float:
 
 
 def panda(folder: Path, urdf: Path) -> None:
-    arm = load_arm(urdf).arm
+    arm = load_arm(urdf).chain
     whole = read(folder / "exciting_traj1.parquet", arm)
     fit = trained(urdf, [first(whole, 12.0)])
     training, test = samples_of(fit, [first(whole, 12.0)]), samples_of(fit, [after(whole, 12.0)])
@@ -277,7 +277,7 @@ def samples_of(fit: Fit, logs: Sequence[Trajectory], *, pauses: bool = False) ->
     return dynamics_samples(logs, pauses=pauses, preprocessing=fit.preprocessing, reach=reach)
 
 
-def read(path: Path, arm: Arm) -> Trajectory:
+def read(path: Path, arm: Chain) -> Trajectory:
     (trajectory,) = read_logs([path], [coordinate.name for coordinate in arm.coordinates])
     return trajectory
 
@@ -294,7 +294,7 @@ def torque_of(dynamics: Any) -> Torque:
     return partial(predicted_torques, dynamics)
 
 
-def least_squares_torque(arm: Arm, training: Sequence[DynamicsSamples], friction: FrictionModel) -> Torque:
+def least_squares_torque(arm: Chain, training: Sequence[DynamicsSamples], friction: FrictionModel) -> Torque:
     return torque_of(least_squares(arm, training, LeastSquares("range", friction=friction)).dynamics)
 
 

@@ -25,11 +25,11 @@ import numpy as np
 from mujoco import minimize, rollout
 
 import spelgen
-from spelgen.arm.arm import Arm
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.arm import Chain
+from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.registry import command_followers
+from spelgen.dynamics.body_regressor import about_center, quaternion
 from spelgen.dynamics.protocol import motors_of
-from spelgen.dynamics.rigid_bodies import about_center, quaternion
 from spelgen.emission.assemble import ArmModel
 from spelgen.evaluation.replay import replays
 from spelgen.exporting.tuning import TUNING as EXPORT_TUNING
@@ -114,7 +114,7 @@ class PositionActuators:
     of ``delay`` [s] ago plus ``offset`` (n,) [rad, m].
     """
 
-    arm: Arm
+    arm: Chain
     untrained: ArmModel
     drives: np.ndarray
     offset: np.ndarray
@@ -158,7 +158,9 @@ class PositionActuators:
                 fullinertia=tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]],
             )
             parents.append(element)
-            kind = mujoco.mjtJoint.mjJNT_HINGE if body.kind == "revolute" else mujoco.mjtJoint.mjJNT_SLIDE
+            kind = (
+                mujoco.mjtJoint.mjJNT_HINGE if body.joint_type == "revolute" else mujoco.mjtJoint.mjJNT_SLIDE
+            )
             element.add_joint(
                 name=body.name,
                 type=kind,
@@ -186,10 +188,10 @@ def _positions(model: mujoco.MjModel, q: np.ndarray, qd: np.ndarray, commands: n
     return np.asarray(states[:, steps - 1 :: steps, 1 : 1 + n])
 
 
-def fit_position_actuators(arm: ConfiguredArm, windows: ServoWindows, trained: ArmModel) -> PositionActuators:
+def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -> PositionActuators:
     """Fit to windows, starting from the drives of a ``trained`` model of the arm. Exits if joints are coupled."""
-    n = len(arm.arm.coordinates)
-    if len(arm.arm.bodies) > n or (motors_of(trained).numpy() != np.eye(n)).any():
+    n = len(arm.chain.coordinates)
+    if len(arm.chain.bodies) > n or (motors_of(trained).numpy() != np.eye(n)).any():
         sys.exit("got coupled joints, expected a motor for each joint and a joint for each body")
     servo, friction = trained.servo.prepare(), trained.friction.prepare()
     # kv includes the damping of the joint: they differ only while the torque is limited
@@ -197,8 +199,8 @@ def fit_position_actuators(arm: ConfiguredArm, windows: ServoWindows, trained: A
     start = np.stack([row.detach().numpy() for row in rows])
     is_known = trained.servo.trained.numpy() == 0
     untrained = spelgen.build(arm, "closed-form").requires_grad_(False)
-    initial = PositionActuators(arm.arm, untrained, start, np.zeros(n), float(trained.servo.delay))
-    steps = max(steps_between(log, FIT_STEP) for log, _ in windows.parts)
+    initial = PositionActuators(arm.chain, untrained, start, np.zeros(n), float(trained.servo.delay))
+    steps = max(steps_between(log, FIT_STEP) for log, _ in windows.rows)
     windows = replace(windows, steps=steps)
     q, qd = windows.q.numpy(), windows.qd.numpy()
 
@@ -216,7 +218,7 @@ def fit_position_actuators(arm: ConfiguredArm, windows: ServoWindows, trained: A
         model.opt.timestep = 1 / windows.rate / steps
         commands = windows.commands(candidate.delay).numpy() + candidate.offset
         error = _positions(model, q[:, 0], qd[:, 0], commands) - q[:, 1:]
-        return error[:, windows.settling :].ravel()
+        return error[:, windows.burn_in :].ravel()
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.stack([errors(column) for column in x.T], axis=1)

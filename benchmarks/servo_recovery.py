@@ -65,11 +65,11 @@ def simulated(model: Any, u: torch.Tensor, dead_zone: float, limit: torch.Tensor
     return torch.stack(found, dim=1)
 
 
-def recordings(arm: spelgen.ConfiguredArm, asked: argparse.Namespace) -> Iterator[list[Trajectory]]:
+def recordings(arm: spelgen.Arm, asked: argparse.Namespace) -> Iterator[list[Trajectory]]:
     """Of each seed, as encoders see them."""
     model = spelgen.build(arm, "closed-form")
     t = np.arange(0, asked.seconds, 1 / RATE)
-    limit = torch.tensor([x.effort or float("inf") for x in arm.arm.coordinates]).double()
+    limit = torch.tensor([x.effort or float("inf") for x in arm.chain.coordinates]).double()
     every = [
         [commands(np.random.default_rng((seed, k)), t, model.n) for k in range(RECORDINGS)]
         for seed in range(asked.seeds)
@@ -91,13 +91,13 @@ def recordings(arm: spelgen.ConfiguredArm, asked: argparse.Namespace) -> Iterato
 
 
 def in_mujoco(
-    urdf: Path, arm: spelgen.ConfiguredArm, u: list[np.ndarray], limit: np.ndarray, backlash: float
+    urdf: Path, arm: spelgen.Arm, u: list[np.ndarray], limit: np.ndarray, backlash: float
 ) -> np.ndarray:
     """Positions (B, T, n), as `simulated`."""
     # MuJoCo is an extra
     from servo_mujoco import arm_with_servos, positions
 
-    joints = [x.name for x in arm.arm.coordinates]
+    joints = [x.name for x in arm.chain.coordinates]
     kp = np.linspace(1.0, SMALLEST, len(joints)) * KP
     ratios = {"kd": LAG, "armature": ARMATURE, "dry": DRY}
     model = arm_with_servos(urdf, joints, kp, ratios, limit, backlash)

@@ -43,7 +43,7 @@ from figaroh_identification import figaroh_dynamics
 import spelgen
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import memory_along
-from spelgen.dynamics.regressor import regressor
+from spelgen.dynamics.regressor_dynamics import regressor
 from spelgen.errors import SpelgenError
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.objective import torque_delay
@@ -103,7 +103,7 @@ class Truth:
         self.case = case
         self.bodies = spelgen.build(urdf, "closed-form")
         n = self.bodies.n
-        self.arm = spelgen.load_arm(urdf).arm
+        self.arm = spelgen.load_arm(urdf).chain
         coordinates = self.arm.coordinates
         self.lower = np.array([_limit(x.lower, -2.0) for x in coordinates])
         self.upper = np.array([_limit(x.upper, 2.0) for x in coordinates])
@@ -400,7 +400,7 @@ def fit_figaroh(urdf: Path, logs: list[spelgen.Trajectory]) -> Fitted:
     loaded = spelgen.load_arm(urdf)
     delay = spelgen.identify(loaded, logs).torque_delay.delay
     samples = dynamics_samples(logs, preprocessing=spelgen.Preprocessing(torque_delay=delay))
-    dynamics = figaroh_dynamics(loaded.arm, loaded.settings, samples)
+    dynamics = figaroh_dynamics(loaded.chain, loaded.settings, samples)
     return Fitted(dynamics, dynamics.inertial_parameters, dynamics.armature)
 
 

@@ -1,120 +1,86 @@
 """spelgen: a URDF in, a PyTorch model of the arm's dynamics with its exact structure out."""
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from spelgen.version import __version__
+from spelgen.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import ConfiguredArm, load_arm
-    from spelgen.certificate.inspection import Inspection, inspect
-    from spelgen.certificate.module_check import check
-    from spelgen.design import Design
-    from spelgen.dynamics.linear_friction import FrictionModel
-    from spelgen.dynamics.tip import tip_kinematics
-    from spelgen.emission.build import build
-    from spelgen.emission.loading import load_module
-    from spelgen.emission.specify import generate
-    from spelgen.errors import SpelgenError
-    from spelgen.evaluation.evaluate import evaluate
-    from spelgen.evaluation.results import Results
-    from spelgen.evaluation.rollout import rollout
-    from spelgen.excitation.design import excite
-    from spelgen.exporting.export import export
-    from spelgen.fitting.fit import Fit, RunOptions, fit, load_run
-    from spelgen.identification.identification import Identification, LeastSquares
-    from spelgen.identification.identify import identify
-    from spelgen.log_checks.check_logs import check_logs
-    from spelgen.logs.preprocessing import Preprocessing
-    from spelgen.logs.read import read_logs, write_logs
-    from spelgen.logs.trajectory import Trajectory
-    from spelgen.settings.fits import GaussianPrior, MomentumFit, Rollout, TorqueFit
-    from spelgen.simulation.as_built import as_built
-    from spelgen.simulation.simulate import simulate
+    from spelgen.arm.configured_arm import Arm as Arm
+    from spelgen.arm.configured_arm import load_arm as load_arm
+    from spelgen.certificate.inspection import Inspection as Inspection
+    from spelgen.certificate.inspection import inspect as inspect
+    from spelgen.certificate.module_check import check as check
+    from spelgen.design import Design as Design
+    from spelgen.dynamics.friction import FrictionModel as FrictionModel
+    from spelgen.dynamics.tip import tip_kinematics as tip_kinematics
+    from spelgen.emission.build import build as build
+    from spelgen.emission.loading import load_module as load_module
+    from spelgen.emission.specify import generate as generate
+    from spelgen.errors import SpelgenError as SpelgenError
+    from spelgen.evaluation.evaluate import evaluate as evaluate
+    from spelgen.evaluation.results import Results as Results
+    from spelgen.evaluation.rollout import rollout as rollout
+    from spelgen.excitation.design import excite as excite
+    from spelgen.exporting.export import export as export
+    from spelgen.fitting.fit import Fit as Fit
+    from spelgen.fitting.fit import RunOptions as RunOptions
+    from spelgen.fitting.fit import fit as fit
+    from spelgen.fitting.fit import load_run as load_run
+    from spelgen.identification.identification import Identification as Identification
+    from spelgen.identification.identification import LeastSquares as LeastSquares
+    from spelgen.identification.identify import identify as identify
+    from spelgen.log_checks.check_logs import check_logs as check_logs
+    from spelgen.logs.preprocessing import Preprocessing as Preprocessing
+    from spelgen.logs.read import read_logs as read_logs
+    from spelgen.logs.read import write_logs as write_logs
+    from spelgen.logs.trajectory import Trajectory as Trajectory
+    from spelgen.settings.fits import GaussianPrior as GaussianPrior
+    from spelgen.settings.fits import MomentumFit as MomentumFit
+    from spelgen.settings.fits import Rollout as Rollout
+    from spelgen.settings.fits import TorqueFit as TorqueFit
+    from spelgen.simulation.as_built import as_built as as_built
+    from spelgen.simulation.simulate import simulate as simulate
 
-
-_HOME = {
-    "load_arm": "arm.configured_arm",
-    "ConfiguredArm": "arm.configured_arm",
-    "inspect": "certificate.inspection",
-    "Inspection": "certificate.inspection",
-    "generate": "emission.specify",
-    "Design": "design",
-    "build": "emission.build",
-    "load_module": "emission.loading",
-    "check": "certificate.module_check",
-    "read_logs": "logs.read",
-    "write_logs": "logs.read",
-    "Trajectory": "logs.trajectory",
-    "check_logs": "log_checks.check_logs",
-    "Preprocessing": "logs.preprocessing",
-    "simulate": "simulation.simulate",
-    "as_built": "simulation.as_built",
-    "excite": "excitation.design",
-    "identify": "identification.identify",
-    "LeastSquares": "identification.identification",
-    "FrictionModel": "dynamics.linear_friction",
-    "Identification": "identification.identification",
-    "fit": "fitting.fit",
-    "Fit": "fitting.fitted",
-    "RunOptions": "fitting.objective",
-    "load_run": "fitting.fitted",
-    "GaussianPrior": "settings.fits",
-    "TorqueFit": "settings.fits",
-    "MomentumFit": "settings.fits",
-    "Rollout": "settings.fits",
-    "rollout": "evaluation.rollout",
-    "evaluate": "evaluation.evaluate",
-    "Results": "evaluation.results",
-    "tip_kinematics": "dynamics.tip",
-    "export": "exporting.export",
-    "SpelgenError": "errors",
+# Names of the API by the module that defines them; a module is imported at the first use of a name (PEP 562), so that
+# `import spelgen` is fast.
+_MODULES = {
+    "arm.configured_arm": "load_arm Arm",
+    "certificate.inspection": "inspect Inspection",
+    "emission.specify": "generate",
+    "design": "Design",
+    "emission.build": "build",
+    "emission.loading": "load_module",
+    "certificate.module_check": "check",
+    "logs.read": "read_logs write_logs",
+    "logs.trajectory": "Trajectory",
+    "log_checks.check_logs": "check_logs",
+    "logs.preprocessing": "Preprocessing",
+    "simulation.simulate": "simulate",
+    "simulation.as_built": "as_built",
+    "excitation.design": "excite",
+    "identification.identify": "identify",
+    "identification.identification": "LeastSquares Identification",
+    "dynamics.friction": "FrictionModel",
+    "fitting.fit": "fit",
+    "fitting.fitted": "Fit load_run",
+    "fitting.objective": "RunOptions",
+    "settings.fits": "GaussianPrior TorqueFit MomentumFit Rollout",
+    "evaluation.rollout": "rollout",
+    "evaluation.evaluate": "evaluate",
+    "evaluation.results": "Results",
+    "dynamics.tip": "tip_kinematics",
+    "exporting.export": "export",
+    "errors": "SpelgenError",
 }
-"""The file that each name of the API lives in; loaded on first use (PEP 562), so `import spelgen` stays fast."""
+_HOME = {name: module for module, names in _MODULES.items() for name in names.split()}
 
-__all__ = [
-    "ConfiguredArm",
-    "Design",
-    "Fit",
-    "FrictionModel",
-    "GaussianPrior",
-    "Identification",
-    "Inspection",
-    "LeastSquares",
-    "MomentumFit",
-    "Preprocessing",
-    "Results",
-    "Rollout",
-    "RunOptions",
-    "SpelgenError",
-    "TorqueFit",
-    "Trajectory",
-    "__version__",
-    "as_built",
-    "build",
-    "check",
-    "check_logs",
-    "evaluate",
-    "excite",
-    "export",
-    "fit",
-    "generate",
-    "identify",
-    "inspect",
-    "load_arm",
-    "load_module",
-    "load_run",
-    "read_logs",
-    "rollout",
-    "simulate",
-    "tip_kinematics",
-    "write_logs",
-]
+__all__ = sorted([*_HOME, "__version__"])
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name in _HOME:
-        return getattr(import_module(f"spelgen.{_HOME[name]}"), name)
+        return vars(import_module(f"spelgen.{_HOME[name]}"))[name]
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -1,27 +1,29 @@
-"""Design: how each quantity of a model is made, as a preset names it; checked when it is made."""
+"""Design: the form of each quantity of a model, as in the file of a preset; validated when it is created."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args, get_type_hints
+from typing import Literal, get_args, get_type_hints
 
 from spelgen.errors import SettingsError, collect, suggestion
-from spelgen.settings.yaml_document import Document, read_document
+from spelgen.settings.yaml_document import YamlDocument, read_document
 
 Preset = Literal["hybrid", "closed-form", "minimal", "spel", "spel-kan", "phnode"]
-"""Those that come with spelgen."""
+"""The presets of spelgen."""
 
 PRESET_NAMES: tuple[str, ...] = get_args(Preset)
 
-BRISTLE_REACH = {
+BREAKAWAY = {
     "revolute": (1e-4, 4e-4, 1.6e-3, 6.4e-3, 2.5e-2, 1e-1),
     "prismatic": (1e-5, 4e-5, 1.6e-4, 6.4e-4, 2.5e-3, 1e-2),
 }
-"""How far friction's memory reaches, by kind of joint [rad, m]: what gears do before they slide spans such decades."""
+"""Break-away displacements of the bristles per joint type [rad, m]: presliding of gears covers such decades."""
 SERVO_STRIBECK_ROUNDING = 0.2
-"""Of the Stribeck velocity, for joints that servos hold at rest: their friction falls from rest on, or they creep."""
+"""Rounding of the Stribeck curve at rest, as a fraction of the Stribeck velocity, for joints that servos hold at rest.
+Their friction decreases from rest on; otherwise they creep.
+"""
 
 
 PRESETS = Path(__file__).parent / "presets"
@@ -29,13 +31,12 @@ PRESETS = Path(__file__).parent / "presets"
 
 @dataclass(frozen=True)
 class Design:
-    """A point in the space of models: how each quantity of the equations of motion is made.
+    """The form of each quantity of the equations of motion.
 
-    derived: by the arm's structure. dense: as if nothing were known of the arm (Wang et al., Sci Rep
-    15:33179, 2025, and Duong et al., IEEE T-RO 40:3695, 2024), over all three axes of each joint where it
-    says 3n. closed-form: that of rigid bodies with trained inertial parameters, and networks for
-    residual terms, if any. constants: friction's laws with
-    trained constants. Raises SettingsError for a combination that stands for no model.
+    derived: with the structure of the arm. dense: without knowledge of the arm (Wang et al., Sci Rep 15:33179, 2025,
+    and Duong et al., IEEE T-RO 40:3695, 2024); 3n: over all three axes of each joint. closed-form: rigid bodies with
+    trained inertial parameters, and networks for residual terms, if any. constants: friction model with trained
+    constants. Raises SettingsError for an inconsistent combination.
     """
 
     mass: Literal["derived", "dense-3n", "closed-form"]
@@ -43,12 +44,12 @@ class Design:
     dissipation: Literal["per-joint", "dense-n", "dense-3n", "constants"]
     input: Literal["derived", "dense-3n"]
     memory: Literal["bristles", "none"]
-    """Whether friction remembers the way a joint came."""
+    """Friction state: bristles, or none for friction that depends on the rate only."""
     net: Literal["mlp", "kan", "none"]
     """Networks of M and V: tanh or Kolmogorov-Arnold; residual networks in addition to rigid bodies: tanh."""
     encoding: Literal["joint", "lie-group", "none"]
-    """What a network reads: cos q and sin q or scaled q of the joints it depends on, or the nine or three
-    numbers of every joint's R or r.
+    """Inputs of a network: cos q and sin q, or scaled q, of the joints that it depends on; or the nine or three numbers
+    of R or r of every joint.
     """
 
     def __post_init__(self) -> None:
@@ -60,10 +61,7 @@ CHOICES: dict[str, tuple[str, ...]] = {name: get_args(kind) for name, kind in ge
 
 
 def load_design(preset: str | Path | Design) -> Design:
-    """Return the design of a preset, by the name of one of spelgen or the YAML file of your own.
-
-    Raises SettingsError.
-    """
+    """Return the design of a preset of spelgen, or of a YAML file. Raises SettingsError."""
     if isinstance(preset, Design):
         return preset
     if str(preset) in PRESET_NAMES:
@@ -75,7 +73,7 @@ def load_design(preset: str | Path | Design) -> Design:
 
 
 def _read(path: Path) -> Design:
-    """The design in a YAML file, which holds every key of ``Design``, and ``about``, which is for people."""
+    """Return the design in a YAML file, which has every key of ``Design``, and ``about``, a description."""
     document = read_document(path)
     content = document.value()
     if not isinstance(content, dict):
@@ -85,10 +83,10 @@ def _read(path: Path) -> Design:
     return Design(**values)
 
 
-def validate(values: Mapping[str, Any], document: Document | None = None) -> None:
+def validate(values: Mapping[str, object], document: YamlDocument | None = None) -> None:
     """Raise SettingsError, or SpelgenErrors of several, unless ``values`` are a design.
 
-    ``document`` is the file that they come from: it is then named, with the lines.
+    ``document``: the file of the values, which errors name with lines.
     """
     file = None if document is None else document.path
 
@@ -112,8 +110,8 @@ def validate(values: Mapping[str, Any], document: Document | None = None) -> Non
     collect(errors)
 
 
-def _conflicts(values: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
-    """The pairs of keys whose values contradict each other, and what to do about them."""
+def _conflicts(values: Mapping[str, object]) -> Iterator[tuple[str, str, str]]:
+    """Yield pairs of keys with contradicting values, and advice."""
     rigid = values["mass"] == "closed-form"
     if rigid != (values["potential"] == "closed-form"):
         yield "mass", "potential", "rigid bodies give both: name closed-form for both or for neither"

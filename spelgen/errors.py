@@ -1,4 +1,4 @@
-"""Errors as a user reads them: one exception per subject; diagnostics stop nothing."""
+"""Errors for users, with one exception per subject, and diagnostics, which do not stop a command."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Literal
 
 Severity = Literal["info", "warning"]
-LONGEST_LIST = 50  # errors of one pass that are printed
-LONGEST_TEXT = 2000  # characters of a part of a message that are printed
+MAX_ERRORS = 50  # number of printed errors
+MAX_TEXT = 2000  # number of printed characters of a part of a message
 
 
 class SpelgenError(Exception):
     """An error printed as ``FILE:LINE: element: got X, expected Y; do Z``, without the absent parts.
 
-    ``got`` alone may be a full statement; it is then printed as it is, without the word "got".
+    Without ``expected``, ``got`` is a full statement, printed without the word "got".
     """
 
     def __init__(
@@ -41,27 +41,27 @@ class SpelgenError(Exception):
         statement = _in_short(self.got)
         if self.expected is not None:
             statement = f"got {statement}, expected {_in_short(self.expected)}"
-        place = ":".join(str(x) for x in (self.file, self.line) if x is not None)
-        message = ": ".join(x for x in (_in_short(place), _in_short(self.element or ""), statement) if x)
+        location = ":".join(str(x) for x in (self.file, self.line) if x is not None)
+        message = ": ".join(x for x in (_in_short(location), _in_short(self.element or ""), statement) if x)
         if self.do is not None:
             message += f"; {_in_short(self.do)}"
         return message
 
 
 class UrdfError(SpelgenError):
-    """The robot description is malformed or says something impossible."""
+    """The robot description is malformed or inconsistent."""
 
 
 class ArmError(SpelgenError):
-    """The robot description is sound, but the arm asked for cannot be taken from it."""
+    """The robot description is valid, but does not contain the requested arm."""
 
 
 class SettingsError(SpelgenError):
-    """A sidecar file or an option holds something unknown or impossible."""
+    """A settings file or an option has an unknown or invalid value."""
 
 
 class OptionError(SettingsError):
-    """An option that does not apply to what is asked for; the text names what it belongs to."""
+    """An option that does not apply; the text names the command or setting that it belongs to."""
 
     def __init__(self, option: str, belongs: str) -> None:
         super().__init__(belongs, element=option)
@@ -69,11 +69,11 @@ class OptionError(SettingsError):
 
 
 class LogError(SpelgenError):
-    """Measured data is missing, malformed or not what it claims to be."""
+    """Measured data is missing, malformed or inconsistent with its description."""
 
 
 class ModuleError(SpelgenError):
-    """An emitted module is missing, foreign or stale."""
+    """An emitted module is missing, stale or no module of spelgen."""
 
 
 class RunError(SpelgenError):
@@ -81,7 +81,7 @@ class RunError(SpelgenError):
 
 
 class SpelgenErrors(SpelgenError):
-    """Several errors found in one pass, told one per line; what is the same in several files is told once."""
+    """Several errors, printed one per line; an error that occurs in several files is printed once."""
 
     def __init__(self, errors: Sequence[SpelgenError]) -> None:
         super().__init__(f"{len(errors)} errors")
@@ -92,36 +92,36 @@ class SpelgenErrors(SpelgenError):
         for error in self.errors:
             key = (error.line, error.element, error.got, error.expected, error.do)
             groups.setdefault(key, []).append(error)
-        lines = [_once(group) for group in list(groups.values())[:LONGEST_LIST]]
-        if len(groups) > LONGEST_LIST:
-            lines.append(f"and {len(groups) - LONGEST_LIST} more like these")
+        lines = [_once(group) for group in list(groups.values())[:MAX_ERRORS]]
+        if len(groups) > MAX_ERRORS:
+            lines.append(f"and {len(groups) - MAX_ERRORS} more like these")
         return "\n".join(lines)
 
 
-def _once(alike: Sequence[SpelgenError]) -> str:
-    """Return the first of errors that differ in their files alone, and the files of the others."""
-    first = alike[0]
-    files = dict.fromkeys(error.file for error in alike if error.file and error.file != first.file)
+def _once(errors: Sequence[SpelgenError]) -> str:
+    """Return the first of errors that differ only in their files, and the files of the others."""
+    first = errors[0]
+    files = dict.fromkeys(error.file for error in errors if error.file and error.file != first.file)
     if not files:
         return str(first)
     return f"{first}\n  the same: {shortened(list(files), 5)}"
 
 
 def _in_short(text: str) -> str:
-    """Return a text, or the ends of one that no one reads: a file may hold a name of a million characters."""
-    if len(text) <= LONGEST_TEXT:
+    """Return a text, or start and end of a long one: a name in a file may have a million characters."""
+    if len(text) <= MAX_TEXT:
         return text
-    half = LONGEST_TEXT // 3
+    half = MAX_TEXT // 3
     return f"{text[:half]}... ({len(text)} characters) ...{text[-half:]}"
 
 
 def in_one_line(error: BaseException) -> str:
-    """Return the kind of an exception and what it says."""
+    """Return the type of an exception and its message."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def collect(errors: Sequence[SpelgenError]) -> None:
-    """Raise what was gathered: nothing, the one error, or a ``SpelgenErrors`` of several."""
+    """Raise the errors, if any: a single error, or ``SpelgenErrors``."""
     if len(errors) == 1:
         raise errors[0]
     if errors:
@@ -129,7 +129,7 @@ def collect(errors: Sequence[SpelgenError]) -> None:
 
 
 def suggestion(name: str, names: Iterable[str]) -> str:
-    """Return a hint for someone who wrote ``name``: the nearest of the known ``names``, or the first ten."""
+    """Return a hint for an unknown ``name``: the closest of the known ``names``, or the first ten."""
     names = list(names)
     nearest = get_close_matches(name, names, n=1)
     if nearest:
@@ -141,16 +141,16 @@ def suggestion(name: str, names: Iterable[str]) -> str:
 
 
 def shortened(names: Sequence[str], limit: int) -> str:
-    """Return the names, or the first ``limit`` of them and how many more there are."""
-    rest = len(names) - limit
-    if rest <= 1:
+    """Return the names, or the first ``limit`` of them and the number of the others."""
+    omitted = len(names) - limit
+    if omitted <= 1:
         return ", ".join(names)
-    return ", ".join([*names[:limit], f"and {rest} more"])
+    return ", ".join([*names[:limit], f"and {omitted} more"])
 
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """Something a user should know that stops nothing; ``code`` is kebab-case and stable."""
+    """A remark or warning for users; ``code`` is kebab-case and stable."""
 
     severity: Severity
     code: str

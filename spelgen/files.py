@@ -1,7 +1,7 @@
-"""Read regular files alone, write files so that each is either complete or not there, and copy what lies at addresses.
+"""Reading of regular files, atomic writing of files, and local copies of files at addresses.
 
-Addresses are those that fsspec knows, such as `s3://bucket/logs`. All else in spelgen works on local paths: a copy lies
-in a temporary folder for as long as the process lives, and what is written to it is sent to the address.
+Addresses are URLs of fsspec, such as `s3://bucket/logs`. All other code works on local paths: a copy is in a temporary
+folder until the process ends, and files written to it are sent to the address.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from typing import Any
 
 from spelgen.errors import SpelgenError
 
-LARGEST_TEXT = 2**25  # bytes: parsed JSON or Python takes some thirty times as much memory
+# Largest JSON or Python file [bytes]: the parsed content takes about thirty times the memory.
+MAX_BYTES = 2**25
 
 
 def require_regular_file(path: Path, error: type[SpelgenError], expected: str | None = None) -> None:
-    """Raise ``error`` unless a path is a regular file: whoever opens a pipe or a device may wait for ever."""
+    """Raise ``error`` unless a path is a regular file: reading a pipe or a device may not end."""
     if not path.is_file():
         raise error("no regular file", file=path, expected=expected)
 
@@ -32,28 +33,34 @@ def read_bytes(
     path: Path,
     error: type[SpelgenError],
     kind: str | None = None,
-    largest: int = LARGEST_TEXT,
+    largest: int = MAX_BYTES,
     do: str | None = None,
 ) -> bytes:
-    """Return what a regular file of at most so many bytes holds.
+    """Return the bytes of a regular file.
 
-    Raises ``error``. kind: what is expected there. do: what to do where the file is too large.
+    Args:
+        path: the file.
+        error: exception for an absent, unreadable or too large file.
+        kind: description of the expected file.
+        largest: largest size [bytes].
+        do: advice for a file that is too large.
     """
     try:
-        size = path.stat().st_size  # FileNotFoundError before all else
+        size = path.stat().st_size
         require_regular_file(path, error, kind)
         if size <= largest:
             return path.read_bytes()
     except FileNotFoundError:
         raise error("no such file", file=path) from None
     except (OSError, ValueError) as problem:  # ValueError: a null character in the name
-        reason = getattr(problem, "strerror", None) or str(problem)
+        reason = problem.strerror if isinstance(problem, OSError) else None
+        reason = reason or str(problem)
         raise error(f"cannot be read ({reason})", file=path) from None
     raise error(f"a file of {size} bytes", file=path, expected=f"at most {largest}", do=do)
 
 
 def read_json(path: Path, error: type[SpelgenError]) -> dict[str, Any]:
-    """Return the object in a JSON file. Raises ``error`` where it is absent, broken or another value."""
+    """Return the object in a JSON file. Raises ``error`` if the file is absent, broken or contains another value."""
     try:
         content = json.loads(read_bytes(path, error))
     except (ValueError, RecursionError) as problem:
@@ -65,9 +72,9 @@ def read_json(path: Path, error: type[SpelgenError]) -> dict[str, Any]:
 
 @contextmanager
 def limited_memory(size: int) -> Iterator[None]:
-    """Let the process take at most so many bytes more: what unpacks to no end then raises MemoryError.
+    """Limit additional memory of the process to ``size`` bytes; more raises MemoryError.
 
-    For readers of others that believe what a file says of its size; without effect where the system is not Linux.
+    For readers of other packages, which allocate sizes stated in a file without a check. No effect except on Linux.
     """
     try:
         import resource
@@ -76,7 +83,7 @@ def limited_memory(size: int) -> Iterator[None]:
     except (ImportError, OSError):
         yield
         return
-    before, largest = resource.getrlimit(resource.RLIMIT_AS)
+    previous, largest = resource.getrlimit(resource.RLIMIT_AS)
     allowed = pages * resource.getpagesize() + size
     if largest != resource.RLIM_INFINITY:
         allowed = min(allowed, largest)
@@ -84,15 +91,15 @@ def limited_memory(size: int) -> Iterator[None]:
     try:
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_AS, (before, largest))
+        resource.setrlimit(resource.RLIMIT_AS, (previous, largest))
 
 
 @contextmanager
 def replacing(path: Path | str) -> Iterator[Path]:
-    """Yield a hidden neighbour to write to, which in the end takes the place of `path`, also through a power cut.
+    """Yield a hidden file in the same folder, which finally replaces `path` atomically, even if power fails.
 
-    Makes the folder, and sends the file to its address if it has one. An interrupted or failed write leaves what was
-    there before. Raises OSError naming the path when it cannot be written: a full disk, say.
+    Creates the folder, and sends the file to its address if it has one. An interrupted or failed write does not change
+    `path`. Raises OSError with the path if it cannot be written, for instance on a full disk.
     """
     path = Path(path)
     with naming(path):
@@ -100,7 +107,7 @@ def replacing(path: Path | str) -> Iterator[Path]:
         unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         try:
             yield unfinished
-            # without it the new name may stand before the new content does, when power is cut
+            # without it, a power failure could occur after the renaming and before the content is on disk
             with unfinished.open("rb+") as file:
                 os.fsync(file.fileno())
             os.replace(unfinished, path)
@@ -110,14 +117,14 @@ def replacing(path: Path | str) -> Iterator[Path]:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, at its address too; nothing where there is none."""
+    """Remove a file, if it exists, also at its address."""
     path.unlink(missing_ok=True)
     sent(path)
 
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Name this file in an OSError that names none, as that of a full disk."""
+    """Add the name of this file to an OSError without a file name, such as the error of a full disk."""
     try:
         yield
     except OSError as error:
@@ -143,22 +150,22 @@ def write_json(path: Path | str, content: Mapping[str, object]) -> Path:
     return write_text(path, json.dumps(content, indent=2) + "\n")
 
 
-# `Path` makes one slash of two; a Windows drive is one letter
+# `Path` reduces two slashes to one; a Windows drive is one letter
 ADDRESS = re.compile(r"^([a-z][a-z0-9+.-]+):/+(?=[^/])")
 
 _copies: dict[str, Path] = {}  # address -> its local copy
 
 
 def local(path: Path | str) -> Path:
-    """Return a local path as it is, and of an address the copy of the file or folder there.
+    """Return a local path unchanged, and for an address the local copy of its file or folder.
 
-    What is written to the copy, and into it, is sent to the address (see `sent`). Raises SpelgenError where the
-    address cannot be reached, or names files outside itself.
+    Files written to the copy are sent to the address (see `sent`). Raises SpelgenError if the address cannot be
+    reached, or has keys outside itself.
     """
     match = ADDRESS.match(str(path))
     if match is None or Path(path).exists():
         return Path(path)
-    if match[1] == "file":  # whose slashes `Path` has taken, too
+    if match[1] == "file":  # `Path` has reduced its slashes
         return Path("/" + str(path)[match.end() :])
     address = f"{match[1]}://{str(path)[match.end() :]}".rstrip("/")
     if address not in _copies:
@@ -167,7 +174,7 @@ def local(path: Path | str) -> Path:
 
 
 def sent(path: Path) -> None:
-    """Send a file that was written to its address, or remove it there if it was removed here."""
+    """Send a written file to its address, or remove it there if it was removed here."""
     target = address_of(path)
     if target is None:
         return
@@ -180,7 +187,7 @@ def sent(path: Path) -> None:
 
 
 def address_of(path: Path) -> str | None:
-    """Return the address that a path is copied from; None of a local path."""
+    """Return the address of which a path is a copy; None for a local path."""
     for address, copy in _copies.items():
         if path == copy:
             return address
@@ -198,9 +205,9 @@ def with_addresses(text: str) -> str:
 
 @contextmanager
 def reached(address: str) -> Iterator[tuple[Any, str]]:
-    """Yield the file system of an address, fsspec's, and the path there.
+    """Yield the fsspec file system of an address, and the path on it.
 
-    Within it every exception becomes a SpelgenError that names the address: each file system raises kinds of its own.
+    Every exception in the block becomes a SpelgenError with the address: file systems raise their own types.
     """
     try:
         import fsspec
@@ -214,7 +221,7 @@ def reached(address: str) -> Iterator[tuple[Any, str]]:
 
 
 def _fetch(address: str) -> Path:
-    """Copy the file or folder at an address into a new temporary folder; return where it then lies."""
+    """Copy the file or folder at an address into a new temporary folder; return the path of the copy."""
     folder = Path(tempfile.mkdtemp(prefix="spelgen-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     copy = _inside(folder, address.rpartition("/")[2], address)
@@ -231,9 +238,9 @@ def _fetch(address: str) -> Path:
 
 
 def _inside(folder: Path, name: str, address: str) -> Path:
-    """Return where a name lies in a folder. Raises SpelgenError where it leads out of it.
+    """Return the path of a name in a folder. Raises SpelgenError if it is outside the folder.
 
-    Archives and object stores take any text for a key, `../../.bashrc` too.
+    Archives and object stores accept any text as a key, such as `../../.bashrc`.
     """
     path = folder / name
     if folder.resolve() not in path.resolve().parents:

@@ -1,16 +1,16 @@
-"""Name joints and entries in pictures and sentences about a structure."""
+"""Names of joints, units and entries of M in charts, tables and sentences."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
-LONGEST_NAME = 36
+MAX_NAME = 36
 
 
 @dataclass(frozen=True)
 class Units:
-    """Name the units of a joint's quantities; torque: or force. inertia: of its entry on the diagonal of M."""
+    """Units of the quantities of a joint; torque: or force; inertia: of the diagonal entry of M."""
 
     position: str
     velocity: str
@@ -19,28 +19,28 @@ class Units:
 
 
 UNITS = {"revolute": Units("rad", "rad/s", "Nm", "kg m²"), "prismatic": Units("m", "m/s", "N", "kg")}
-"""By a joint's kind."""
+"""Units per joint type."""
 
 
 @dataclass(frozen=True)
 class NamedJoint:
-    """Hold a joint's name and its units."""
+    """The name of a joint and its units."""
 
     name: str
     units: Units
 
-    def axis(self, quantity: str) -> str:
-        """Return ``position [rad]``, or likewise of ``velocity`` or ``torque``."""
-        return f"{quantity} [{getattr(self.units, quantity)}]"
+    def axis(self, quantity: str, label: str = "") -> str:
+        """Return ``label [rad]`` with the unit of ``position``, ``velocity`` or ``torque``."""
+        return f"{label or quantity} [{asdict(self.units)[quantity]}]"
 
 
-def named_joints(names: Sequence[str], kinds: Sequence[str]) -> list[NamedJoint]:
-    """Return joints of these kinds."""
-    return [NamedJoint(name, UNITS[kind]) for name, kind in zip(names, kinds, strict=True)]
+def named_joints(names: Sequence[str], joint_types: Sequence[str]) -> list[NamedJoint]:
+    """Return the joints with the units of their types."""
+    return [NamedJoint(name, UNITS[x]) for name, x in zip(names, joint_types, strict=True)]
 
 
 def joint_ranges(joints: tuple[int, ...]) -> str:
-    """Return the joints' numbers, from 1, with runs of three and more shortened: ``2-6`` or ``2,4``."""
+    """Return the numbers of joints, from 1, with ranges of three or more: ``2-6`` or ``2,4``."""
     runs: list[list[int]] = []
     for joint in joints:
         if runs and joint == runs[-1][-1] + 1:
@@ -62,22 +62,22 @@ def joints_in_ranges(joints: tuple[int, ...]) -> str:
 
 
 def entry_name(row: int, column: int) -> str:
-    """Return how an entry of M is called, from its 0-based place: M21, or M12,1 from ten joints on."""
+    """Return the name of an entry of M with indices from 0: M21, or M12,1 from the tenth joint."""
     if max(row, column) >= 9:
         return f"M{row + 1},{column + 1}"
     return f"M{row + 1}{column + 1}"
 
 
-def joints_told(joints: Sequence[int]) -> str:
+def joints_in_words(joints: Sequence[int]) -> str:
     """Return ``joint 2``, or ``joints 2, 3 and 5``."""
     return f"{_plural('joint', joints)} {listed([str(joint + 1) for joint in sorted(joints)])}"
 
 
-def axes_told(joints: Sequence[int]) -> str:
+def axes_in_words(joints: Sequence[int]) -> str:
     """Return ``the axis of joint 2``, or ``the axes of joints 2 and 3``."""
     if len(joints) == 1:
-        return f"the axis of {joints_told(joints)}"
-    return f"the axes of {joints_told(joints)}"
+        return f"the axis of {joints_in_words(joints)}"
+    return f"the axes of {joints_in_words(joints)}"
 
 
 def listed(names: Sequence[str]) -> str:
@@ -97,18 +97,18 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}s"
 
 
-def share(fraction: float, whole: str = "") -> str:
-    """Return ``5 % of the motion``, and ``13.6 times the motion`` of what exceeds the whole."""
+def share(fraction: float, reference: str = "") -> str:
+    """Return ``5 % of the motion``, or ``13.6 times the motion`` for a fraction above 1."""
     if fraction > 1:
-        return f"{fraction:.3g} times {whole}".rstrip()
-    # four digits of what is nearly all
+        return f"{fraction:.3g} times {reference}".rstrip()
+    # four digits close to 100 %
     digits = 4 if 0.99 <= fraction < 1 else 3
     percent = f"{100 * fraction:.{digits}g} %"
-    return f"{percent} of {whole}" if whole else percent
+    return f"{percent} of {reference}" if reference else percent
 
 
 def printable(text: str, allowed: str = "") -> str:
-    """Return text from a file, with what could steer a terminal made visible, but for the characters ``allowed``."""
+    """Return text from a file with escaped control characters, except the characters ``allowed``."""
     characters = []
     for character in text:
         if not character.isprintable() and character not in allowed:
@@ -118,15 +118,15 @@ def printable(text: str, allowed: str = "") -> str:
 
 
 def short_name(name: str) -> str:
-    """Return a name from a file as one line of a table shows it: control characters would move the cursor."""
+    """Return a name from a file for a line of a table: shortened, without control characters."""
     line = " ".join(printable(name).split())
-    if len(line) > LONGEST_NAME:
-        return f"{line[: LONGEST_NAME - 3]}..."
+    if len(line) > MAX_NAME:
+        return f"{line[: MAX_NAME - 3]}..."
     return line or '""'
 
 
 def thousandths(joint_types: Sequence[str]) -> str:
-    """Return the unit of small distances of these joints: ``mrad``, ``mm`` or, of both kinds, ``mrad, mm``."""
+    """Return the unit of small distances of these joints: ``mrad``, ``mm`` or, for both types, ``mrad, mm``."""
     kinds = {kind == "prismatic" for kind in joint_types}
     if kinds == {True}:
         return "mm"

@@ -1,4 +1,4 @@
-"""Lay out tables as text and as HTML: the same rows for a terminal, a file, a page and a notebook."""
+"""Tables as text and as HTML: for a terminal, a file, a page and a notebook."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from itertools import zip_longest
 from typing import Literal
 
 WIDTH = 80
-SHORTEST = 8
-"""Characters of a name in one line; a longer name goes on in the next where a table would be too wide."""
-HEAD = 14
-"""The same of a column's name."""
-SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s\))")  # after it a name may go on in the next line
+MIN_NAME = 8
+"""Characters of the name of a row in one line, if a table is too wide; longer names are wrapped."""
+MIN_HEAD = 14
+"""The same number for the name of a column."""
+SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s\))")  # a name may be wrapped after it
 
 
 @dataclass(frozen=True)
 class Listing:
-    """Hold a table with a name in the first column; the columns in `left` are aligned to the left, others to the right.
+    """A table with a name in the first column; the columns in `left` are aligned to the left, others to the right.
 
-    text(): a title, the head and the rows, indented by two, then the note, wrapped. Where a table does not fit 80
-    columns its names are folded, numbers never are; and it is cut, where words would be. html(): the same for
-    notebooks; all text is escaped.
+    text(): the title, the head and the rows, indented by two, then the note. In a table wider than 80 characters names
+    are wrapped, not numbers; if that is not sufficient, the table is split into several. html(): for notebooks, with
+    escaped text.
     """
 
     title: str
@@ -66,11 +66,10 @@ class Listing:
         return "right"
 
     def _layout(self, columns: Sequence[Sequence[str]], group: Sequence[int]) -> str:
-        """Return the table of the names of rows, and these columns."""
+        """Return the table of the names of rows and the columns of a group."""
         names, *chosen = _fitted([columns[column] for column in (0, *group)])
-        # names may be folded, numbers never are
         room = WIDTH - 2 * (1 + len(group)) - sum(map(_width, chosen))
-        chosen.insert(0, [_folded(name, max(SHORTEST, room)) for name in names])
+        chosen.insert(0, [_folded(name, max(MIN_NAME, room)) for name in names])
         lines = []
         for row in zip(*chosen, strict=True):
             for cells in zip_longest(*(cell.split("\n") for cell in row), fillvalue=""):
@@ -83,19 +82,19 @@ class Listing:
 
 
 def _fitted(columns: Sequence[Sequence[str]]) -> list[Sequence[str]]:
-    """Return the columns, the heads above numbers folded where the table would be too wide."""
+    """Return the columns, with wrapped heads if the table is too wide."""
     if sum(2 + _width(column) for column in columns) <= WIDTH:
         return list(columns)
     fitted = [columns[0]]
     for head, *cells in columns[1:]:
-        fitted.append([_folded(head, max(HEAD, _width(cells))), *cells])
+        fitted.append([_folded(head, max(MIN_HEAD, _width(cells))), *cells])
     return fitted
 
 
 def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
-    """Return the columns in as many groups as leave room for the words in the names of rows."""
+    """Return the columns in groups, each of which fits into the width together with the names of rows."""
     words = [word for name in columns[0][1:] for word in SEPARATOR.split(name)]
-    room = WIDTH - 2 - max(SHORTEST, _width(words))
+    room = WIDTH - 2 - max(MIN_NAME, _width(words))
     groups: list[list[int]] = [[]]
     used = 0
     for column in range(1, len(columns)):
@@ -109,14 +108,14 @@ def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
 
 
 def _width(texts: Iterable[str]) -> int:
-    """Return the characters of a terminal that the widest line takes."""
-    from rich.cells import cell_len  # here: `--help` and `import spelgen` stay fast
+    """Return the width of the widest line in characters of a terminal."""
+    from rich.cells import cell_len  # a slow import
 
     return max((cell_len(line) for text in texts for line in text.split("\n")), default=0)
 
 
 def _folded(name: str, width: int) -> str:
-    """Return the name with line breaks after its separators where it is longer than the width."""
+    """Return the name with line breaks after separators if it is longer than the width."""
     lines = [""]
     for word in SEPARATOR.split(name):
         if lines[-1] and len(lines[-1]) + len(word) > width:
@@ -126,9 +125,9 @@ def _folded(name: str, width: int) -> str:
 
 
 def number(value: float | None) -> str:
-    """Return three significant digits, whole numbers from 1000 on, and all digits of a count.
+    """Return a number with three significant digits, from 1000 an integer, and all digits of a count.
 
-    A dash stands for None and for what is not finite.
+    None and numbers that are not finite are shown as a dash.
     """
     if value is None or not math.isfinite(value):
         return "-"

@@ -15,10 +15,9 @@ from typing import Literal
 
 from spelgen.design import Design
 from spelgen.errors import ModuleError, SettingsError
-from spelgen.urdf.robot import Assume
+from spelgen.urdf.robot import Assume, JointType
 
 Kind = Literal["zero", "constant", "varying"]
-JointType = Literal["revolute", "prismatic"]
 Triple = tuple[float, float, float]
 Entries = tuple[tuple[int, int, float], ...]
 """A sparse symmetric matrix by its lower triangle: (row, column, value), from 0."""
@@ -164,7 +163,7 @@ class ModelSpec:
     margin: float
     """Smallest eigenvalue of M relative to the nominal mean of M, below which M is corrected."""
     started_from_urdf: bool
-    """Whether initial inertial parameters are those of the URDF."""
+    """Whether the initial inertial parameters are from the URDF."""
     links: tuple[LinkSpec, ...] = ()
     """Of a model of rigid bodies."""
     inputs: tuple[InputSpec, ...] = ()

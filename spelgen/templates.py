@@ -1,10 +1,9 @@
-"""Templates -> text. Templates lay out; what they lay out is decided in Python."""
+"""Templates -> text. Templates contain layout only; their content is computed in Python."""
 
 from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
@@ -29,14 +28,14 @@ def _environment(autoescape: bool) -> Environment:
     )
 
 
-def render(template: str, **context: Any) -> str:
+def render(template: str, **context: object) -> str:
     """Return the text of ``template`` with ``context``.
 
-    An undefined name is an error, and HTML templates escape what they show.
+    An undefined name is an error, and HTML templates escape text.
     """
     return _environment(".html" in template).get_template(template).render(**context)
 
 
 def read(name: str) -> str:
-    """A file beside the templates that goes into pages as it is."""
+    """Return the text of a file in the folder of templates, which pages contain unchanged."""
     return (_folder() / name).read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-// The arm: plays measured beside predicted motion, turns with the pointer or the arrow keys, lights joints.
+// The arm: plays measured and predicted motion, is rotated by the pointer or the arrow keys, highlights joints.
 "use strict";
 const arm = (() => {
   const canvas = document.querySelector("canvas.arm");
@@ -22,7 +22,7 @@ const arm = (() => {
   const rgb = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16));
   const mix = (a, b, part) => a.map((x, k) => x + (b[k] - x) * part);
 
-  // 3 x 3 matrices by rows
+  // 3 x 3 matrices in row-major order
   const times = (A, B) => {
     const C = new Array(9);
     for (let i = 0; i < 3; i++) for (let j = 0; j < 3; j++) {
@@ -57,11 +57,11 @@ const arm = (() => {
     return [-c, s, 0, -s * sp, -c * sp, cp, s * cp, c * cp, sp];
   };
 
-  // where a motion is shown: its middle and the ground below all links [mm], pixels per metre
+  // view of a motion: centre and ground level below all links [mm], pixels per metre
   const view = (motion) => {
     const eye = camera(), low = [0, 0, 0], high = [0, 0, 0];
     let ground = 0;
-    // a dozen poses hold the extent of a motion well enough
+    // a dozen poses approximate the extent of a motion
     const stride = Math.max(1, Math.floor(motion.q.length / 12));
     for (let row = 0; row < motion.q.length; row += stride) frames(motion.q[row]).forEach(({ R, p }, index) => {
       ground = Math.min(ground, p[2]);
@@ -74,13 +74,13 @@ const arm = (() => {
       }
     });
     const scale = 860 * Math.min(640 / (high[0] - low[0] || 1), 420 / (high[1] - low[1] || 1));
-    // the middle of the picture, not of the arm's box: an oblique arm fills the frame too
+    // the centre of the projected picture, not of the arm's box, so that an oblique arm fills the frame
     const [x, y, z] = low.map((least, k) => (least + high[k]) / 2);
     return { middle: [0, 1, 2].map((k) => eye[k] * x + eye[3 + k] * y + eye[6 + k] * z), scale, ground };
   };
   for (const motion of scene.motions) Object.assign(motion, view(motion));
 
-  // the row of a motion at the present time, between its samples
+  // linear interpolation of the rows of a motion at the current time
   const at = (motion, rows) => {
     const t = motion.t;
     let k = 0;
@@ -103,7 +103,7 @@ const arm = (() => {
         const u = [b[0] - a[0], b[1] - a[1], b[2] - a[2]], w = [c[0] - b[0], c[1] - b[1], c[2] - b[2]];
         const n = [u[1] * w[2] - u[2] * w[1], u[2] * w[0] - u[0] * w[2], u[0] * w[1] - u[1] * w[0]];
         const norm = Math.hypot(...n);
-        // back faces close shells that are open or inside out; through the pale, predicted arm they would show
+        // back faces are drawn for open or inverted meshes, but would be visible through the translucent predicted arm
         if (norm === 0 || (moving && n[2] <= 0)) continue;
         const front = n[2] < 0 ? -1 : 1;
         const shade = Math.max(0, front * (n[0] * LIGHT[0] + n[1] * LIGHT[1] + n[2] * LIGHT[2]) / norm);
@@ -115,7 +115,7 @@ const arm = (() => {
     return found;
   };
   const css = (colour, alpha) => `rgba(${colour.map(Math.round).join(",")},${alpha})`;
-  const carried = (link) => { // the joint that a link hangs on, over links that are fixed to one another
+  const carried = (link) => { // index of the joint above a link, beyond fixed links
     while (link.joint < 0 && link.parent >= 0) link = scene.links[link.parent];
     return link.joint;
   };
@@ -160,7 +160,7 @@ const arm = (() => {
     report(motion);
   };
   const ground = (eye, size, wide, high) => {
-    const { middle, ground: z } = scene.motions[state.motion], step = 1000 * scene.reach / 4;
+    const { middle, ground: z } = scene.motions[state.motion], step = 1000 * scene.extent / 4;
     context.strokeStyle = css(ink.ground, 1);
     context.lineWidth = 1;
     context.beginPath();
@@ -235,7 +235,7 @@ const arm = (() => {
   });
   for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, () => { from = null; });
   readColours();
-  state.time = 0.6 * scene.motions[0].t.at(-1); // where measured and predicted have come apart
+  state.time = 0.6 * scene.motions[0].t.at(-1); // a time at which measured and predicted motion differ visibly
   window.addEventListener("resize", draw);
   for (const media of ["(prefers-color-scheme: dark)", "print"]) {
     matchMedia(media).addEventListener("change", () => { readColours(); draw(); });

@@ -1,4 +1,4 @@
-// Reads values off charts, and explains the entries of M.
+// Shows the values at the pointer in charts, and the reason for the structure of an entry of M.
 "use strict";
 document.documentElement.classList.add("script");
 for (const chart of document.querySelectorAll("svg.chart[data-x]")) {

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from spelgen.arm.arm import Arm, Body, Coordinate, make_arm
+from spelgen.arm.arm import Body, Chain, Coordinate, make_arm
 from spelgen.structure.structure import Structure, derive
 from spelgen.urdf.read import read_urdf
 
@@ -22,7 +22,7 @@ STRAIGHT = tuple(tuple(Fraction(int(i == j)) for j in range(3)) for i in range(3
 
 def chain(
     links: Sequence[tuple[str, Rows, Sequence[float]]], gravity: Sequence[float] = (0, 0, -9.81)
-) -> Arm:
+) -> Chain:
     """A serial arm from the (type, rotation, translation) of each joint, without inertials."""
     bodies = tuple(
         Body(
@@ -40,18 +40,20 @@ def chain(
         for i, (kind, rotation, offset) in enumerate(links)
     )
     coordinates = tuple(
-        Coordinate(body.name, body.kind, body.kind == "revolute", None, None, None, None, 0.0, 0.0, False)
+        Coordinate(
+            body.name, body.joint_type, body.joint_type == "revolute", None, None, None, None, 0.0, 0.0, False
+        )
         for body in bodies
     )
-    return Arm("arm", coordinates, bodies, tuple(Fraction(str(g)) for g in gravity), (), ())
+    return Chain("arm", coordinates, bodies, tuple(Fraction(str(g)) for g in gravity), (), ())
 
 
-def planar(joints: int) -> Arm:
+def planar(joints: int) -> Chain:
     """Parallel vertical axes, half a metre apart."""
     return chain([("revolute", STRAIGHT, (0.5 * (i > 0), 0, 0)) for i in range(joints)])
 
 
-def random_arm(joints: int, seed: int) -> Arm:
+def random_arm(joints: int, seed: int) -> Chain:
     """Revolute joints with random rational poses."""
     rng = np.random.default_rng(seed)
     return chain(
@@ -74,7 +76,7 @@ def random_rotation(rng: np.random.Generator) -> Rows:
     return tuple(tuple(a / n for a in row) for row in rows)
 
 
-def reference_arms(shared: Path, assume: str) -> Iterator[tuple[str, dict[str, Any], Arm, Structure]]:
+def reference_arms(shared: Path, assume: str) -> Iterator[tuple[str, dict[str, Any], Chain, Structure]]:
     """The arms of the reference data with their known structure, derived once for all tests."""
     for name, known in json.loads((shared / "arms" / "expected.json").read_text()).items():
         if known[assume] is not None:
@@ -83,11 +85,11 @@ def reference_arms(shared: Path, assume: str) -> Iterator[tuple[str, dict[str, A
 
 
 @cache
-def _reference(path: Path, joints: tuple[str, ...] | None, assume: str) -> tuple[Arm, Structure]:
+def _reference(path: Path, joints: tuple[str, ...] | None, assume: str) -> tuple[Chain, Structure]:
     arm = _arm(path, joints)
     return arm, derive(arm, assume)
 
 
 @cache
-def _arm(path: Path, joints: tuple[str, ...] | None) -> Arm:
+def _arm(path: Path, joints: tuple[str, ...] | None) -> Chain:
     return make_arm(read_urdf(path), joints=joints)

@@ -104,9 +104,9 @@ def shared() -> Path:
 @pytest.fixture
 def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Epochs of few windows take four steps: for tests of what stands around a fit."""
-    from spelgen.fitting.tuning import WindowTuning
+    from spelgen.fitting.tuning import FittingTuning
 
-    monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", WindowTuning(epoch_steps=4))
+    monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", FittingTuning(epoch_steps=4))
 
 
 @pytest.fixture

@@ -17,9 +17,9 @@ from flint import fmpq_mpoly
 from polynomials import polynomials
 from torch import nn
 
-from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.design import Design
-from spelgen.emission.specify import derive_spec
+from spelgen.emission.plan import derive_spec
 from spelgen.emission.text import module_text
 from spelgen.spec import Options
 from spelgen.structure.structure import Structure, derive
@@ -63,11 +63,11 @@ def built(
     """Return the source of a module, and the structure, of one of the robots that come with spelgen."""
     arm = _loaded(robot)
     spec = derive_spec(arm, Options(preset=preset, design=design, assume=assume))
-    return module_text(spec, standalone=standalone), derive(arm.arm, assume)
+    return module_text(spec, standalone=standalone), derive(arm.chain, assume)
 
 
 @cache
-def _loaded(robot: str) -> ConfiguredArm:
+def _loaded(robot: str) -> Arm:
     return load_arm(ROBOTS / f"{robot}.urdf")
 
 
@@ -182,15 +182,15 @@ def exact_model(robot: str, folder: Path) -> nn.Module:
     model = frictionless(module.Model())
     mass = model.mass
     mass.nominal_armature.zero_()
-    true = polynomials(_loaded(robot).arm, inertials=True)
+    true = polynomials(_loaded(robot).chain, inertials=True)
     if structure.outputs:
-        functions = [true.combination(output.reads) for output in structure.outputs]
+        functions = [true.combination(output.functional) for output in structure.outputs]
         encoding = model.encoding
         mass.network = ExactFunctions(functions, mass.function_mean, mass.function_scale, encoding)
     if structure.potential:
         scale = model.scale[0]
         model.potential = ExactFunctions([true.potential], torch.zeros_like(scale), scale, model.encoding)
-    constants = [true.combination(constant.reads) for constant in structure.constants]
+    constants = [true.combination(constant.functional) for constant in structure.constants]
     assert all(sum(c.degrees()) == 0 for c in constants), "a constant depends on q"
     values = torch.tensor([_float(c.leading_coefficient()) for c in constants], dtype=torch.float64)
     mass.raw_constants.data = values / mass.constant_scale

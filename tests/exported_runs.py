@@ -9,8 +9,7 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.emission.build import build
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.logs.preprocessing import Preprocessing
-from spelgen.settings.fits import TorqueFit
+from spelgen.fitting.run_record import Checkpoint, Record
 
 COUPLED = """<robot name="2 fast; } int main( /* */"><link name="base"/>
 <link name="a"><inertial><origin xyz="0.1 0 0.2"/><mass value="2"/>
@@ -58,7 +57,9 @@ def saved_run(model, urdf, folder: Path) -> RunFolder:
     record |= {"training": [], "validation": []}
     checkpoint = dict.fromkeys(("epoch", "step", "best_epoch", "best_loss", "rollbacks", "seconds"), 0)
     checkpoint |= {"learning_rate_factor": 1.0, "substeps": 1, "momentum_done": True, "best_weights": {}}
-    fit = Fit(model, TorqueFit(), Preprocessing(), (), (), None, record, checkpoint, urdf)
+    fit = Fit(
+        model, (), (), None, Record.model_validate(record), Checkpoint.model_validate(checkpoint), {}, urdf
+    )
     return RunFolder(fit.save(folder / "run"))
 
 

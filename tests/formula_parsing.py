@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pinocchio as pin
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.settings.settings import Settings
 from spelgen.structure.base_parameters import base_parameters
@@ -15,7 +15,7 @@ from spelgen.structure.base_parameters import base_parameters
 CLOSE = 1e-10
 
 
-def assert_equal_to_pinocchio(arm: Arm, rows: dict[str, str], tolerance: float = CLOSE) -> None:
+def assert_equal_to_pinocchio(arm: Chain, rows: dict[str, str], tolerance: float = CLOSE) -> None:
     """Every expression at random positions, with the base parameters of ``arm``."""
     engine = arm_dynamics(arm, Settings())
     n = len(arm.coordinates)

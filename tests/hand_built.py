@@ -3,7 +3,7 @@
 from fractions import Fraction
 from pathlib import Path
 
-from spelgen.arm.arm import Arm, Body, Coordinate
+from spelgen.arm.arm import Body, Chain, Coordinate
 
 UPRIGHT = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 SIDEWAYS = ((0, 0, 1), (1, 0, 0), (0, 1, 0))  # the joint's z along the parent's x
@@ -12,14 +12,15 @@ SIDEWAYS = ((0, 0, 1), (1, 0, 0), (0, 1, 0))  # the joint's z along the parent's
 def coordinate(name="a", kind="revolute", **changes):
     """A joint with limits of +-1 and no friction."""
     known = {"lower": -1.0, "upper": 1.0, "effort": 10.0, "velocity": 10.0, "damping": 0.0, "friction": 0.0}
-    return Coordinate(name=name, kind=kind, **({"continuous": False, "passive": False} | known | changes))
+    return Coordinate(
+        name=name, joint_type=kind, **({"continuous": False, "passive": False} | known | changes)
+    )
 
 
 def body(name="a", kind="revolute", **changes):
     """A point of mass 1 in the origin of its joint, on the root."""
     known = {
         "parent": -1,
-        "link": name,
         "coordinate": 0,
         "multiplier": Fraction(1),
         "offset": 0.0,
@@ -27,7 +28,7 @@ def body(name="a", kind="revolute", **changes):
         "translation": (0, 0, 0),
         "inertia": point(1),
     }
-    return Body(name=name, link=f"link of {name}", kind=kind, **(known | changes))
+    return Body(name=name, link=f"link of {name}", joint_type=kind, **(known | changes))
 
 
 def point(mass, x=0.0):
@@ -36,7 +37,7 @@ def point(mass, x=0.0):
 
 
 def arm(coordinates, bodies, gravity=(0, 0, 0)):
-    return Arm("hand_built", tuple(coordinates), tuple(bodies), gravity, diagnostics=(), locked=())
+    return Chain("hand_built", tuple(coordinates), tuple(bodies), gravity, diagnostics=(), locked=())
 
 
 def slider(mass=2.0, **changes):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.settings.settings import Settings
 
@@ -18,7 +18,7 @@ NOTHING = 1e-9  # of a size of 1
 class Seen:
     """An arm as Pinocchio sees it at a few random configurations; joints count from 1, as in the sentences."""
 
-    arm: Arm
+    arm: Chain
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng(1)
@@ -36,10 +36,10 @@ class Seen:
         return [place.copy() for place in self.engine.data.oMi[1:]]
 
     def slides(self, *joints: int) -> bool:
-        return all(self.arm.coordinates[joint - 1].kind == "prismatic" for joint in joints)
+        return all(self.arm.coordinates[joint - 1].joint_type == "prismatic" for joint in joints)
 
     def turns(self, *joints: int) -> bool:
-        return all(self.arm.coordinates[joint - 1].kind == "revolute" for joint in joints)
+        return all(self.arm.coordinates[joint - 1].joint_type == "revolute" for joint in joints)
 
     def parallel(self, *joints: int) -> bool:
         first, rest = self.axes[:, [joints[0] - 1]], self.axes[:, [joint - 1 for joint in joints]]

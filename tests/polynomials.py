@@ -13,7 +13,7 @@ from fractions import Fraction
 
 from flint import Ordering, fmpq, fmpq_mpoly, fmpq_mpoly_ctx
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.structure.basis import Weights
 from spelgen.structure.recursion import PARAMETERS, Position, energies
 
@@ -39,7 +39,7 @@ class Polynomials:
         return total
 
 
-def polynomials(arm: Arm, *, inertials: bool = False) -> Polynomials:
+def polynomials(arm: Chain, *, inertials: bool = False) -> Polynomials:
     """The exact polynomials of ``arm``, with its inertial parameters as variables or, under ``inertials``,
     the URDF's values.
     """

@@ -12,13 +12,13 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.inspection import inspect
 from spelgen.cli.main import app
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
-from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
+from spelgen.dynamics.pinocchio_dynamics import urdf_dynamics
 from spelgen.emission.specify import generate
 from spelgen.errors import SettingsError, SpelgenError
 from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
 from spelgen.logs.windows import Windows
 from spelgen.simulation.protocol import make_friction
-from spelgen.simulation.random_inputs import random_inputs
+from spelgen.simulation.simulate import random_inputs
 
 pytest.importorskip("pinocchio")
 
@@ -209,8 +209,11 @@ def test_the_simulation_moves_joints_by_motors(coupled):
     )
     assert np.array_equal(loaded.actuation.matrix(), G.numpy())
     drives = loaded.actuation.drives()
-    log = random_inputs(loaded.arm, settings, drives).train[0]
-    engine, friction = arm_dynamics(loaded.arm, settings), make_friction(loaded.arm, settings, drives.speeds)
+    log = random_inputs(loaded.chain, settings, drives).train[0]
+    engine, friction = (
+        arm_dynamics(loaded.chain, settings),
+        make_friction(loaded.chain, settings, drives.speeds),
+    )
     q, qd = log.q[0], log.qd[0]
     for _ in range(5000):  # explicit Euler over the first interval, 10 us a step
         qdd = engine.forward_dynamics(q, qd, G.numpy() @ log.tau[0] - friction(qd))
@@ -225,7 +228,7 @@ def test_the_urdfs_dynamics_have_the_same_motors(coupled):
     qdd = baseline.forward_dynamics(q, qd, tau)
     assert torch.allclose(baseline.inverse_dynamics(q, qd, qdd), tau, rtol=0, atol=1e-9)
     loaded = load_arm(coupled[0])
-    engine = arm_dynamics(loaded.arm, loaded.settings)  # the URDF gives no friction
+    engine = arm_dynamics(loaded.chain, loaded.settings)  # the URDF gives no friction
     wanted = [
         engine.forward_dynamics(q[i].numpy(), qd[i].numpy(), G.numpy() @ tau[i].numpy())
         for i in range(len(q))

@@ -182,7 +182,12 @@ class TestCoordinates:
         dynamics = '<dynamics damping="0.5" friction="0.25"/>'
         arm = make_arm(robot(joint("a", "0", "1", "continuous", inside=dynamics), joint("b", "1", "2")))
         first, second = arm.coordinates
-        assert (first.kind, first.continuous, first.lower, first.effort) == ("revolute", True, None, 3.0)
+        assert (first.joint_type, first.continuous, first.lower, first.effort) == (
+            "revolute",
+            True,
+            None,
+            3.0,
+        )
         assert (first.damping, first.friction, first.passive) == (0.5, 0.25, False)
         assert (second.continuous, second.lower, second.upper, second.velocity) == (False, -1.0, 2.0, 4.0)
 
@@ -355,12 +360,12 @@ class TestLumping:
         lumped = next(each for each in arm.diagnostics if each.code == "lumped")
         assert lumped.message == "also carries '2', '3' (4 kg) by fixed or locked joints"
 
-    def test_has_inertials_requires_mass_in_every_body(self, robot):
+    def test_inertials_are_complete_if_every_body_has_mass(self, robot):
         joints = joint("a", "0", "1"), joint("b", "1", "2")
-        assert make_arm(robot(*joints)).has_inertials
+        assert make_arm(robot(*joints)).inertials_complete
         bare = make_arm(robot(*joints, bare=("2",)))
         assert bare.bodies[1].inertia is None
-        assert not bare.has_inertials
+        assert not bare.inertials_complete
 
     def test_a_parallel_branch_without_mimic_is_warned_of_once(self, robot):
         branch = joint("c", "1", "3", xyz="0.1 0 0"), joint("d", "3", "4")
@@ -406,7 +411,7 @@ class Ours:
     def __init__(self, arm):
         self.model = pin.Model()
         for body in arm.bodies:
-            kind = pin.JointModelRZ() if body.kind == "revolute" else pin.JointModelPZ()
+            kind = pin.JointModelRZ() if body.joint_type == "revolute" else pin.JointModelPZ()
             pose = pin.SE3(np.array(body.rotation, dtype=float), np.array(body.translation, dtype=float))
             index = self.model.addJoint(body.parent + 1, kind, pose, body.name)
             if body.inertia is not None:
@@ -520,7 +525,7 @@ class TestReferenceArms:
             assert names(arm) == expected["joints"]
             driven = sorted(body.name for body in arm.bodies if body.name not in expected["joints"])
             assert driven == sorted(expected["mimic_driven"])
-            assert arm.has_inertials == (expected["inertials"] is not None)
+            assert arm.inertials_complete == (expected["inertials"] is not None)
 
     def test_the_default_chain_is_the_expected_one(self, shared):
         """All but three of 189: two robots with two equal arms, and one jaw that no name tells from a "

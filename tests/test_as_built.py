@@ -20,9 +20,8 @@ from spelgen.evaluation.truth import mass_error, true_mass
 from spelgen.excitation.trajectory import Motion
 from spelgen.settings.joint import JointSettings
 from spelgen.settings.settings import Settings
-from spelgen.simulation.motion_file import read_motion
-from spelgen.simulation.perturbed_urdf import perturbed_urdf
-from spelgen.simulation.prescribed import friction_along, prescribed
+from spelgen.simulation.as_built import perturbed_urdf
+from spelgen.simulation.prescribed import friction_along, prescribed, read_motion
 from spelgen.simulation.protocol import make_friction
 from spelgen.urdf.read import read_urdf
 from tests.hand_built import arm, body, coordinate, point, slider
@@ -36,13 +35,13 @@ def test_every_robot_here_has_an_arm_as_built(name, robots, tmp_path):
     """Its bodies are physically consistent and about 30 % off; drives have what the URDF has not; logs follow."""
     given = spelgen.load_arm(robots / f"{name}.urdf")
     true = spelgen.as_built(given, 3, tmp_path / "as_built.urdf")
-    assert true.arm.joint_names == given.arm.joint_names
+    assert true.chain.joint_names == given.chain.joint_names
     ratios = []
-    for before, after in zip(given.arm.bodies, true.arm.bodies, strict=True):
+    for before, after in zip(given.chain.bodies, true.chain.bodies, strict=True):
         ratios.append(np.log(float(after.inertia[0] / before.inertia[0])))
         assert is_consistent(np.array(after.inertia, dtype=float))
     assert 0.05 < np.sqrt(np.mean(np.square(ratios))) < 0.8
-    for joint in given.arm.joint_names:
+    for joint in given.chain.joint_names:
         drive = true.settings.joint(joint)
         assert drive.viscous > 0 and drive.armature > 0 and drive.coulomb[0] > 0 > drive.coulomb[1]
     logs = spelgen.simulate(true, duration=2.0)
@@ -85,7 +84,7 @@ def test_logs_are_the_inverse_dynamics_of_the_truth(robots, tmp_path):
     sidecar.write_text(yaml.safe_dump(settings))
     log = spelgen.simulate(spelgen.load_arm(tmp_path / "as_built.urdf")).train[0]
     model = pin.buildModelFromUrdf(str(tmp_path / "as_built.urdf"))
-    model.armature = np.array([true.settings.joint(name).armature for name in true.arm.joint_names])
+    model.armature = np.array([true.settings.joint(name).armature for name in true.chain.joint_names])
     data, qdd = model.createData(), np.gradient(log.qd, log.t, axis=0)
     # away from the ends, where the low-pass and differences are coarse
     rows = range(50, len(log) - 50)
@@ -192,10 +191,10 @@ class TestPrescribed:
         logs = spelgen.simulate(loaded, motions=[self.motion(2)] * 4)
         assert [len(logs.train), len(logs.test)] == [2, 2]
         np.testing.assert_allclose(logs.train[0].q[20:-20], self.motion(2).q[20:-20], atol=1e-3)
-        tau = arm_dynamics(loaded.arm, loaded.settings).inverse_dynamics(
+        tau = arm_dynamics(loaded.chain, loaded.settings).inverse_dynamics(
             self.motion(2).q, self.motion(2).qd, self.motion(2).qdd
         )
-        friction = make_friction(loaded.arm, loaded.settings)(self.motion(2).qd)
+        friction = make_friction(loaded.chain, loaded.settings)(self.motion(2).qd)
         np.testing.assert_allclose(logs.train[0].tau, tau + friction, atol=1e-12)
 
     def test_noise_is_relative_to_the_torque(self, robots):
@@ -203,7 +202,7 @@ class TestPrescribed:
         simulation = loaded.settings.simulation.model_copy(update={"torque_noise": 0.1})
         noisy = loaded.settings.model_copy(update={"simulation": simulation})
         clean, seen = (
-            prescribed(loaded.arm, settings, motions=[self.motion(2)])[0].tau
+            prescribed(loaded.chain, settings, motions=[self.motion(2)])[0].tau
             for settings in (loaded.settings, noisy)
         )
         np.testing.assert_allclose((seen - clean).std(axis=0) / clean.std(axis=0), 0.1, rtol=0.2)
@@ -224,7 +223,7 @@ class TestMotionFile:
     def test_what_excite_writes_is_read_back(self, robots, tmp_path):
         found = spelgen.excite(spelgen.load_arm(robots / "two_link.urdf"), duration=2.0, trials=2)
         (tmp_path / "m.csv").write_text(found.csv())
-        motion = read_motion(tmp_path / "m.csv", found.arm.joint_names)
+        motion = read_motion(tmp_path / "m.csv", found.chain.joint_names)
         for name in ("t", "q", "qd", "qdd"):
             np.testing.assert_allclose(getattr(motion, name), getattr(found.motion, name), atol=1e-9)
 
@@ -280,7 +279,7 @@ class TestDemo:
         assert found["model"] < found["least squares"] / 2 < found["URDF"]
         truth = spelgen.load_arm(folder / "logs" / "as_built.urdf")
         model = pin.buildModelFromUrdf(str(truth.robot.path))
-        model.armature = np.array([truth.settings.joint(name).armature for name in truth.arm.joint_names])
+        model.armature = np.array([truth.settings.joint(name).armature for name in truth.chain.joint_names])
         q = spelgen.read_logs(folder / "logs" / "test.parquet", truth)[0].q
         data = model.createData()
         mass = np.array([pin.crba(model, data, x) for x in q])

@@ -13,13 +13,11 @@ import spelgen
 from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.baseline import EvaluatedArm
 from spelgen.baselines.names import URDF, URDF_WITH_DRIVES
-from spelgen.baselines.predictor import accurate_solver
-from spelgen.baselines.rosenbrock import roll_out_stiff
-from spelgen.baselines.urdf import UrdfValues
+from spelgen.baselines.predictor import accurate_solver, roll_out_stiff
+from spelgen.baselines.registry import UrdfValues
 from spelgen.cli.main import app
 from spelgen.dynamics.bristles import moved_bristles
-from spelgen.dynamics.regressor import regressor, urdf_parameters
-from spelgen.dynamics.regressor_dynamics import RegressorDynamics
+from spelgen.dynamics.regressor_dynamics import RegressorDynamics, regressor, urdf_parameters
 from spelgen.emission.specify import generate
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.fitted import load_run
@@ -118,7 +116,7 @@ def test_method_and_steps_are_those_that_the_dynamics_need(damping, tolerance):
 
 @pytest.mark.parametrize("robot", ["rpr", "panda"])
 def test_torques_by_recursion_are_the_regressors(robots, robot):
-    arm = load_arm(robots / f"{robot}.urdf").arm
+    arm = load_arm(robots / f"{robot}.urdf").chain
     generator = np.random.default_rng(0)
     q, qd, qdd = generator.normal(size=(3, 20, len(arm.coordinates)))
     parameters = generator.normal(size=10 * len(arm.bodies))
@@ -131,7 +129,7 @@ def test_torques_by_recursion_are_the_regressors(robots, robot):
 def test_the_urdf_stands_once_as_it_is_and_once_with_its_drives(robots):
     pytest.importorskip("pinocchio")
     arm = load_arm(robots / "rpr.urdf")
-    names = [coordinate.name for coordinate in arm.arm.coordinates]
+    names = [coordinate.name for coordinate in arm.chain.coordinates]
     q = torch.zeros(1, 4, 3, dtype=torch.float64)
     probe = Windows(torch.full((1, 3), 0.05, dtype=torch.float64), q, q, q[:, :3])
     plain, driven = UrdfValues().predictors(EvaluatedArm(names, arm.robot.path, {}, None, probe, []))
@@ -154,7 +152,7 @@ def test_the_urdf_stands_once_as_it_is_and_once_with_its_drives(robots):
 def test_a_resumed_run_fits_baselines_only_if_they_are_missing(robots, tmp_path, monkeypatch):
     """The baselines of a resumed run are those that it has, for its logs are the same."""
     arm = load_arm(robots / "two_link.urdf")
-    bodies = RegressorDynamics(arm.arm, urdf_parameters(arm.arm), np.zeros(2), lambda qd, _: 0.5 * qd)
+    bodies = RegressorDynamics(arm.chain, urdf_parameters(arm.chain), np.zeros(2), lambda qd, _: 0.5 * qd)
     t = np.arange(300) / 100
     q, qd, qdd = (np.stack([f(t), g(2 * t)], axis=1) for f, g in MOTION)
     tau = bodies.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd))).numpy()
@@ -193,8 +191,8 @@ def digests(folder):
 def test_least_squares_is_kept_with_a_run_and_stands_in_its_evaluation(robots, tmp_path):
     """End to end on the command line: torques of the URDF's own bodies are explained by both, the model and it."""
     arm = load_arm(robots / "rpr.urdf")
-    bodies = RegressorDynamics(arm.arm, urdf_parameters(arm.arm), np.full(3, 0.1), lambda qd, _: 0.5 * qd)
-    names = [coordinate.name for coordinate in arm.arm.coordinates]
+    bodies = RegressorDynamics(arm.chain, urdf_parameters(arm.chain), np.full(3, 0.1), lambda qd, _: 0.5 * qd)
+    names = [coordinate.name for coordinate in arm.chain.coordinates]
     t = np.arange(300) / 100
     for role, seed in (("train", 0), ("test", 1)):
         phases = np.random.default_rng(seed).uniform(0, 6, (3, 3, 1))

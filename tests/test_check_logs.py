@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from spelgen.arm.actuation import Drives
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
-from spelgen.dynamics.regressor import body_chain, regressor, urdf_parameters
+from spelgen.dynamics.regressor_dynamics import body_chain, regressor, urdf_parameters
 from spelgen.errors import LogError, SpelgenError, SpelgenErrors
 from spelgen.identification import drive_samples
 from spelgen.identification.drive_hints import drive_problem, find_coupling
@@ -39,7 +39,7 @@ def loaded(robots):
 
 @pytest.fixture(scope="module")
 def arm(loaded):
-    return loaded.arm
+    return loaded.chain
 
 
 @pytest.fixture(scope="module")
@@ -357,7 +357,7 @@ def test_negated_torques_of_an_arm_without_gravity_are_refused(robots, rate):
     t = np.arange(0.0, 20.0, 1.0 / rate)
     q = np.stack([np.sin(1.3 * t), np.cos(2 * t) + 0.3 * np.sin(0.7 * t)], axis=1)
     qd = np.gradient(q, t, axis=0)
-    torque = regressor(flat.arm, q, qd, np.gradient(qd, t, axis=0)) @ urdf_parameters(flat.arm)
+    torque = regressor(flat.chain, q, qd, np.gradient(qd, t, axis=0)) @ urdf_parameters(flat.chain)
     right = Trajectory(t, q, qd, torque + 0.3 * qd, "motion")
     assert check_logs([right], flat).errors == ()
     # a drive that compensates more than its friction is no drive of the opposite sign
@@ -402,7 +402,7 @@ def test_a_joint_that_never_moves_back_is_told(loaded, log):
     q = np.column_stack([cumulative_trapezoid(forward, log.t, initial=0.0), log.q[:, 1:]])
     moved = replace(log, q=q, qd=np.column_stack([forward, log.qd[:, 1:]]))
     one_way = [x.where for x in check_logs([moved], loaded).findings if x.code == "one-way"]
-    assert one_way == [f"joint {loaded.arm.joint_names[0]!r}"]
+    assert one_way == [f"joint {loaded.chain.joint_names[0]!r}"]
     # another log in which it does is enough
     back = replace(log, name="back")
     assert "one-way" not in {x.code for x in check_logs([moved, back], loaded).findings}
@@ -425,7 +425,7 @@ def test_no_coupling_is_found_by_luck(loaded, log):
         noise = np.random.default_rng(seed).standard_normal(log.tau.shape).cumsum(axis=0)
         alone = Drives(np.eye(3), np.eye(3))
         samples = drive_log(3, replace(log, tau=noise)).samples()
-        assert find_coupling(drive_problem(body_chain(loaded.arm), alone, samples)) is None
+        assert find_coupling(drive_problem(body_chain(loaded.chain), alone, samples)) is None
 
 
 def test_of_many_trajectories_an_even_part_is_filtered(monkeypatch):

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from spelgen import __version__
 from spelgen.cli.main import app
-from spelgen.fitting.progress import TrainingProgress
+from spelgen.fitting.process import TrainingProgress
 
 ROOT = Path(__file__).parents[1]
 COMMANDS = ["inspect", "build", "simulate", "excite", "logs", "train", "evaluate", "report", "check"]

@@ -41,7 +41,7 @@ def emitted(robots, tmp_path_factory):
     for name in (*ROBOTS, "followed"):
         urdf = (folder if name == "followed" else robots) / f"{name}.urdf"
         source = generate(urdf, preset="closed-form")
-        made[name] = import_source(source, folder / f"{name}_closed_form.py"), load_arm(urdf).arm
+        made[name] = import_source(source, folder / f"{name}_closed_form.py"), load_arm(urdf).chain
     return made
 
 
@@ -175,7 +175,7 @@ def test_friction_at_a_standstill_has_its_slope(emitted):
     near(slope, model.dissipation(q, still).diagonal(dim1=-2, dim2=-1))
     away = torch.full_like(q, 1e-3)
     torque = constants.torque(away, model.gravity(q))
-    dry = constants.coulomb + constants.load_dependence * torch.hypot(model.gravity(q), constants.least_load)
+    dry = constants.coulomb + constants.load_dependence * torch.hypot(model.gravity(q), constants.min_load)
     relative = away / constants.stribeck_velocity
     rounding = constants.stribeck_rounding
     dry = dry + constants.stribeck / (1 + (1 + rounding) * relative**2 / (relative + rounding) / 8) ** 8

@@ -19,8 +19,8 @@ from html_page import Page
 from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
-from spelgen.baselines.constant_velocity import hold_velocity
 from spelgen.baselines.predictor import Predictor
+from spelgen.baselines.registry import hold_velocity
 from spelgen.cli.main import app
 from spelgen.comparison import jobs
 from spelgen.comparison.arms import ComparedArm, Comparison, ablation_designs, load_comparison
@@ -31,7 +31,7 @@ from spelgen.comparison.tables import arm_sections, arm_sentence, arm_tables, co
 from spelgen.design import load_design
 from spelgen.emission.build import build
 from spelgen.errors import RunError, SettingsError, SpelgenError
-from spelgen.evaluation import invariants
+from spelgen.evaluation import rollout
 from spelgen.evaluation.truth import mass_error, true_mass
 from spelgen.evaluation.tuning import EvaluationTuning
 from spelgen.fitting.fitted import load_run
@@ -55,7 +55,7 @@ def silent(text):
 @pytest.fixture(scope="module")
 def quick():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(invariants, "TUNING", EvaluationTuning(sampled_positions=100, free_steps=50))
+        patch.setattr(rollout, "TUNING", EvaluationTuning(sampled_positions=100, free_steps=50))
         yield
 
 
@@ -317,13 +317,13 @@ def test_invariants_show_a_model_that_gains_energy_or_has_an_indefinite_mass_mat
     still = spread_windows(logs, 21, 1)
     windows = replace(still, qd=0.5 + still.qd)
     low, high = (torch.full((2,), bound, dtype=torch.float64) for bound in (-math.pi, math.pi))
-    kept = invariants.invariants(model, windows, low, high)
+    kept = rollout.invariants(model, windows, low, high)
     assert kept.energy_rise <= 1e-12 < kept.least_eigenvalue
     # drives instead of braking
     model.friction_torque = lambda pose, qd, *state: -5.0 * qd
-    assert invariants.invariants(model, windows, low, high).energy_rise > 1e-3
+    assert rollout.invariants(model, windows, low, high).energy_rise > 1e-3
     model.mass_matrix = lambda q: torch.diag_embed(torch.cat([q.cos()[..., :1], 1 + 0 * q[..., :1]], dim=-1))
-    assert invariants.invariants(model, windows, low, high).least_eigenvalue < -1
+    assert rollout.invariants(model, windows, low, high).least_eigenvalue < -1
 
 
 @pytest.fixture(scope="module")

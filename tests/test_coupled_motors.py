@@ -15,7 +15,7 @@ from spelgen.arm.actuation import motor_speeds
 from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.inspection import inspect
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
-from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.emission.build import build
 from spelgen.emission.specify import generate
 from spelgen.fitting.fit import fit
@@ -44,7 +44,7 @@ def wrist(tmp_path_factory):
     names = [f"j{k}" for k in range(1, 7)]
     shutil.copy(ROBOTS / "six_dof.urdf", folder / "arm.urdf")
     arm = load_arm(folder / "arm.urdf")
-    names = [x.name for x in arm.arm.coordinates]
+    names = [x.name for x in arm.chain.coordinates]
     gears = "".join(f"  {name}: {{gear: 100}}\n" for name in names[:4])
     coupling = f"couplings:\n- {{joints: [{names[4]}, {names[5]}], matrix: {WRIST.tolist()}}}\n"
     (folder / "arm.yaml").write_text(f"torque: motor\njoints:\n{gears}{coupling}", encoding="utf-8")
@@ -66,7 +66,7 @@ def on_motors(q, qd, qdd, arm, strength, armature):
     speeds[4:, 4:] = SPEEDS
     at_motors = strength * np.tanh(qd @ speeds.T / 0.01) + 0.3 * strength * (qd @ speeds.T)
     at_motors = at_motors + armature * (qdd @ speeds.T)
-    joint = regressor(arm.arm, q, qd, qdd) @ urdf_parameters(arm.arm) + at_motors @ speeds
+    joint = regressor(arm.chain, q, qd, qdd) @ urdf_parameters(arm.chain) + at_motors @ speeds
     return joint, np.linalg.solve(arm.actuation.matrix(), joint.T).T
 
 
@@ -86,7 +86,7 @@ def test_least_squares_finds_friction_and_rotors_of_coupled_motors(wrist):
     for drives in (arm.actuation.drives(), None):
         motion = moved(module, 20.0)
         tau, _ = on_motors(*motion, arm, strength, armature)
-        found = least_squares(arm.arm, [DynamicsSamples("x", *motion, tau)], LeastSquares("range"), drives)
+        found = least_squares(arm.chain, [DynamicsSamples("x", *motion, tau)], LeastSquares("range"), drives)
         fresh = moved(module, 10.0, seed=1)
         tau, measured = on_motors(*fresh, arm, strength, armature)
         errors.append(np.square(found.torque(*fresh) - tau).mean(axis=0) / tau.var(axis=0))
@@ -160,7 +160,7 @@ def test_energy_and_memory_are_those_of_the_motors(wrist):
 def test_motors_may_be_coupled_where_joint_torques_are_logged(wrist, tmp_path):
     """Friction and rotors belong to the motors in least squares, in the emitted module and in reports."""
     _, driven = wrist
-    names = [x.name for x in driven.arm.coordinates]
+    names = [x.name for x in driven.chain.coordinates]
     shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")
     coupling = f"couplings:\n- {{joints: [{names[4]}, {names[5]}], matrix: {WRIST.tolist()}}}\n"
     (tmp_path / "arm.yaml").write_text(coupling, encoding="utf-8")
@@ -172,7 +172,7 @@ def test_motors_may_be_coupled_where_joint_torques_are_logged(wrist, tmp_path):
     motion, fresh = moved(module, 6.0), moved(module, 10.0, seed=1)
     (tau, _), (expected, _) = (on_motors(*x, driven, strength, armature) for x in (motion, fresh))
     samples = [DynamicsSamples("x", *motion, tau)]
-    found = least_squares(arm.arm, samples, LeastSquares("range"), arm.actuation.drives())
+    found = least_squares(arm.chain, samples, LeastSquares("range"), arm.actuation.drives())
     assert (np.square(found.torque(*fresh) - expected).mean(axis=0) / expected.var(axis=0)).max() < 1e-10
     model = module.Model()
     fit_torque(model, samples)
@@ -191,7 +191,7 @@ def recorded(arm, logged_at, ratio, late=0.0):
     speeds[5, 4] = ratio
     friction = np.array([5.0, 5.0, 4.0, 3.0, 2.0, 1.0])
     at_motors = friction * (np.tanh(qd @ speeds.T / 0.01) + 0.3 * qd @ speeds.T) + 0.2 * qdd @ speeds.T
-    tau = regressor(arm.arm, q, qd, qdd) @ urdf_parameters(arm.arm) + at_motors @ speeds
+    tau = regressor(arm.chain, q, qd, qdd) @ urdf_parameters(arm.chain) + at_motors @ speeds
     if logged_at == "motors":
         tau = np.linalg.solve(speeds.T, tau.T).T
     tau = tau + 0.02 * tau.std(axis=0) * rng.normal(size=tau.shape)
@@ -214,7 +214,7 @@ def test_the_suggested_coupling_removes_the_finding(uncoupled, tmp_path, logged_
     (message,) = told(check_logs([log], uncoupled), "coupled-motors")
     assert f"{ratio:g} times as fast" in message and f"those of the {logged_at}" in message
     shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")
-    names = [x.name for x in uncoupled.arm.coordinates]
+    names = [x.name for x in uncoupled.chain.coordinates]
     sidecar = f"couplings: [{{joints: [{names[4]}, {names[5]}], matrix: [[1.0, {ratio}], [0.0, 1.0]]}}]\n"
     assert sidecar.split(", matrix")[1].strip() in message
     if logged_at == "motors":
@@ -233,7 +233,7 @@ def test_logs_show_torques_that_are_late_or_early(uncoupled, tmp_path, late):
     assert f"ms {'later' if late > 0 else 'earlier'} than positions" in message
     delay = float(message.split("torque_delay=")[1].split("'")[0])
     assert delay == pytest.approx(late, abs=0.0005)
-    names = [x.name for x in uncoupled.arm.coordinates]
+    names = [x.name for x in uncoupled.chain.coordinates]
     table = {"t": log.t} | {
         f"{key}_{name}": getattr(log, key)[:, k] for key in ("q", "qd", "tau") for k, name in enumerate(names)
     }
@@ -299,7 +299,7 @@ def test_gains_of_currents_are_found(uncoupled, tmp_path):
     gains = np.array([1.5, 0.7, 1.3, 0.8, 1.2, 0.9])
     logs = [recorded(uncoupled, "joints", 0.0)]
     shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")
-    names = [x.name for x in uncoupled.arm.coordinates]
+    names = [x.name for x in uncoupled.chain.coordinates]
     sidecar = (
         "torque: motor\njoints: {" + ", ".join(f"{x}: {{gear: 1, gain: trained}}" for x in names) + "}\n"
     )

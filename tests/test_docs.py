@@ -15,6 +15,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import settings_page
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
@@ -24,6 +25,11 @@ PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").g
 FILE = re.compile(r"`((?:[a-z][a-z_]*/)+(?:[a-z][a-z_]*(?:\.[a-z]+)+)?)(?:::\w+)?`")
 BLOCK = re.compile(r"^```(console|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 CELL = re.compile(r"^```python\n(.*?)^```\n(?:\n```output\n(.*?)^```\n)?", re.MULTILINE | re.DOTALL)
+HISTORY = re.compile(
+    r"\b(?:formerly|the former (?:fit|version|code|release|graph)|previously|no longer|used to|until release"
+    r"|earlier release|not taken|was tried)\b",
+    re.IGNORECASE,
+)
 SLOW = {"tutorial_servo.md"}  # a fit of half a minute: only `pytest --update` runs it
 RUN = [page for page in PAGES if page.name not in SLOW or "--update" in sys.argv]
 TUTORIALS = sorted((ROOT / "docs").glob("tutorial_*.md"))
@@ -83,6 +89,15 @@ def test_tutorials_are_notebooks(page, request):
     assert path.read_text(encoding="utf-8") == notebook(page)
 
 
+def test_the_tables_of_settings_are_up_to_date(request):
+    """docs/settings.md has every key of the settings with its values, default, unit and meaning."""
+    path = settings_page.PAGE
+    if request.config.getoption("--update"):
+        path.write_text(settings_page.page(path.read_text(encoding="utf-8")), encoding="utf-8")
+    text = path.read_text(encoding="utf-8")
+    assert text == settings_page.page(text)
+
+
 def run_commands(block: str, folder: Path) -> str:
     """The correct block: each command with its output."""
     told = []
@@ -98,6 +113,21 @@ def run_commands(block: str, folder: Path) -> str:
 def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
         assert target.startswith("http") or (page.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_page_is_short_and_has_no_history(page):
+    """A page has at most 2,500 words; former versions and trials are described in docs/decisions.md only."""
+    text = page.read_text(encoding="utf-8")
+    if page.name != "settings.md":  # a generated table of all keys
+        assert len(text.split()) <= 2500
+    if page.name != "decisions.md":
+        assert HISTORY.findall(text) == []
+
+
+def test_the_changelog_of_a_version_is_short():
+    for section in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split("\n## ")[1:]:
+        assert len(section.splitlines()) <= 40, section.splitlines()[0]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -13,11 +13,11 @@ from planar_model import JOINTS, write_module
 from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
-from spelgen.baselines.constant_velocity import hold_velocity
 from spelgen.baselines.names import observed
+from spelgen.baselines.registry import hold_velocity
 from spelgen.cli import evaluate_command
 from spelgen.dynamics.bristles import bristle_reach
-from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
+from spelgen.dynamics.pinocchio_dynamics import urdf_dynamics
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.emission.build import build
 from spelgen.emission.loading import load_module

@@ -9,8 +9,7 @@ from typer.testing import CliRunner
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.errors import SettingsError, SpelgenErrors
-from spelgen.excitation.criterion import Criterion
-from spelgen.excitation.design import excite
+from spelgen.excitation.design import Criterion, excite
 from spelgen.excitation.trajectory import ExcitationTrajectory, motion_bounds
 from tests.hand_built import coupled_urdf
 
@@ -24,7 +23,7 @@ def loaded(robots):
 
 @pytest.fixture(scope="module")
 def arm(loaded):
-    return loaded.arm
+    return loaded.chain
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +92,7 @@ def test_the_condition_number_is_that_of_the_regressor(arm, found):
 @pytest.mark.parametrize("robot", ["rpr", "scara"])
 def test_the_gradient_is_that_of_the_criterion(robots, robot):
     """rpr's start overruns efforts, scara has prismatic and gravity-free joints; central differences tell."""
-    arm = load_arm(robots / f"{robot}.urdf").arm
+    arm = load_arm(robots / f"{robot}.urdf").chain
     trajectory = ExcitationTrajectory(10.0, 3, motion_bounds(arm, 0.9, 0.7))
     criterion = Criterion(arm, trajectory)
     parameters = np.random.default_rng(4).standard_normal(trajectory.size)

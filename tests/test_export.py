@@ -15,6 +15,7 @@ from spelgen.emission.build import build
 from spelgen.errors import RunError
 from spelgen.exporting.export import export
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
+from spelgen.structure.base_parameters import base_parameters
 
 pytest.importorskip("pinocchio")
 
@@ -43,7 +44,7 @@ def heavier(model):
 
 def differences(model, loaded):
     """Largest difference of M and of the gravity torque to Pinocchio's from the exported files."""
-    engine = arm_dynamics(loaded.arm, loaded.settings)
+    engine = arm_dynamics(loaded.chain, loaded.settings)
     q = torch.randn(20, model.n, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
         mass, load_torque = model.mass_matrix(q).numpy(), model.gravity(q).numpy()
@@ -68,8 +69,8 @@ def test_friction_goes_back_as_the_urdf_can_say_it(tmp_path):
     run, model = run_of("rpr", tmp_path, "closed-form", heavier)
     loaded, _ = exported(run, tmp_path / "learned.urdf")
     for index, name in enumerate(model.joint_names):
-        joint = loaded.settings.joint(loaded.arm.coordinates[index].name)
-        urdf = loaded.arm.coordinates[index]
+        joint = loaded.settings.joint(loaded.chain.coordinates[index].name)
+        urdf = loaded.chain.coordinates[index]
         assert joint.viscous >= 0
         assert joint.coulomb[0] > 0 > joint.coulomb[1], name
         assert urdf.friction == pytest.approx((joint.coulomb[0] - joint.coulomb[1]) / 2)
@@ -144,11 +145,10 @@ def test_exported_bodies_have_the_models_base_parameters(robot, tmp_path):
     export(run.path, "urdf", tmp_path / "learned.urdf")
     arm = load_arm(ROBOTS / f"{robot}.urdf")
     ten = model.inertial_parameters.detach().flatten().tolist()
-    learned = {
-        each.name: sum(float(weight) * ten[k] for k, weight in each.weights) for each in arm.base_parameters
-    }
-    exact = {each.name: float(each.value) for each in load_arm(tmp_path / "learned.urdf").base_parameters}
-    before = {each.name: float(each.value) for each in arm.base_parameters}
+    parameters, exported = (base_parameters(x.chain) for x in (arm, load_arm(tmp_path / "learned.urdf")))
+    learned = {each.name: sum(float(weight) * ten[k] for k, weight in each.weights) for each in parameters}
+    exact = {each.name: float(each.value) for each in exported}
+    before = {each.name: float(each.value) for each in parameters}
     assert list(exact) == list(learned)
     np.testing.assert_allclose(list(exact.values()), list(learned.values()), rtol=1e-8, atol=1e-9)
     assert max(abs(exact[name] - before[name]) for name in exact) > 0.01

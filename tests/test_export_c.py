@@ -16,7 +16,7 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.emission.build import build
 from spelgen.errors import RunError
-from spelgen.exporting import friction_expressions, parity
+from spelgen.exporting import model_expressions, parity
 from spelgen.exporting.c_export import c_files, called_by_c, compile_library
 from spelgen.exporting.c_source import c_functions, write_c
 from spelgen.exporting.casadi_export import called_by_state, export_casadi
@@ -231,7 +231,7 @@ FRACTIONS = np.array([[0.3, 0.7], [0.4, 0.6]])
 def test_bristles_follow_their_law_along_a_displacement():
     """z' = qd up to the reach, integrated in small steps, there and back."""
     z, dq = ca.SX.sym("z", 4), ca.SX.sym("dq", 2)
-    step = ca.Function("step", [z, dq], [friction_expressions.bristle_step(REACH, z, dq)])
+    step = ca.Function("step", [z, dq], [model_expressions.bristle_step(REACH, z, dq)])
     found, small, steps, reach = np.zeros(4), np.zeros(4), 4000, REACH.ravel()
     for moved in (np.array([0.05, -0.02]), np.array([-0.01, 0.03]), np.zeros(2)):
         found = step(found, moved).full()[:, 0]
@@ -246,7 +246,7 @@ def test_bristles_follow_their_law_along_a_displacement():
 def test_c_carries_frictions_memory(tmp_path):
     """Two elements a joint: z turns dry friction, and long sliding bends it fully. NZ says how many numbers."""
     model = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
-    model = replace(model, reach=REACH, friction=model.friction._replace(bristle_fractions=FRACTIONS))
+    model = replace(model, breakaway=REACH, friction=model.friction._replace(bristle_fractions=FRACTIONS))
     functions = c_functions(model, ENTRIES)
     source = write_c(model, functions, tmp_path)
     assert "#define TWO_LINK_NZ 4" in source.with_suffix(".h").read_text()
@@ -256,7 +256,7 @@ def test_c_carries_frictions_memory(tmp_path):
     relative = np.abs(qd) / law.stribeck_velocity
     rounding = law.stribeck_rounding
     dry = law.coulomb + law.stribeck / (1 + (1 + rounding) * relative**2 / (relative + rounding) / 8) ** 8
-    dry += law.load_dependence * np.hypot(called("gravity", given)["gravity"], law.least_load)
+    dry += law.load_dependence * np.hypot(called("gravity", given)["gravity"], law.min_load)
     straight = called("friction", given | {"z": np.zeros((5, 4))})["friction"]
     bent = (FRACTIONS / REACH * given["z"].reshape(5, 2, 2)).sum(axis=-1)
     np.testing.assert_allclose(called("friction", given)["friction"], straight + dry * bent)
@@ -273,7 +273,7 @@ def test_in_single_precision_a_joint_that_creeps_moves_its_bristles(tmp_path):
     library = compile_library(write_c(model, functions, tmp_path), "gcc", f"-D{model.name.upper()}_FLOAT")
     called = called_by_c(library, functions, np.float32)
     assert model.memory
-    z = start = 0.6 * model.reach.reshape(1, -1)
+    z = start = 0.6 * model.breakaway.reshape(1, -1)
     given = {"q": np.zeros((1, 2)), "dq": np.full((1, 2), 1e-9)}
     for _ in range(200):
         z = called("friction_step", given | {"z": z})["z_next"]

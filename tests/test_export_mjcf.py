@@ -37,7 +37,7 @@ def test_closed_form_bodies_go_to_mujoco_exactly(robot):
     tip = tip_kinematics(arm)
     np.testing.assert_allclose(data.site(tip.link).xpos, tip.position(q).numpy(), atol=1e-6)
     np.testing.assert_allclose(simulated.dof_armature, model.armature.numpy())
-    lower = [each.lower for each in arm.arm.coordinates if not each.continuous]
+    lower = [each.lower for each in arm.chain.coordinates if not each.continuous]
     np.testing.assert_allclose(simulated.jnt_range[simulated.jnt_limited == 1][:, 0], lower)
     assert simulated.nu == model.n
     assert (simulated.dof_damping > 0).all()
@@ -97,7 +97,7 @@ def test_coupled_motors_turn_by_several_joints(torque, tmp_path):
     """Their rotors couple M: armature of tendons in MuJoCo, couplings in the settings of a URDF."""
     urdf = tmp_path / "wrist.urdf"
     shutil.copy(ROBOTS / "six_dof.urdf", urdf)
-    names = [each.name for each in load_arm(urdf).arm.coordinates]
+    names = [each.name for each in load_arm(urdf).chain.coordinates]
     gears = ", ".join(f"{name}: {{gear: 100}}" for name in names[:4]) if torque == "motor" else ""
     coupling = f"couplings: [{{joints: {names[4:]}, matrix: [[80, 60], [0, 50]]}}]"
     urdf.with_suffix(".yaml").write_text(f"torque: {torque}\njoints: {{{gears}}}\n{coupling}\n")

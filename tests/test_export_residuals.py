@@ -9,7 +9,7 @@ from exported_runs import arm_of, moved_model
 
 from spelgen.emission.build import build
 from spelgen.exporting.c_export import called_by_c, compile_library
-from spelgen.exporting.c_source import c_functions, c_source, write_c
+from spelgen.exporting.c_source import c_functions, c_texts, write_c
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
 from spelgen.exporting.describe import Trained, describe
 from spelgen.exporting.entry_points import ENTRY_POINTS
@@ -60,7 +60,7 @@ def test_zero_terms_are_omitted():
     ours = describe(model, arm_of("rpr"))
     other = describe(closed_form(model, "rpr"), arm_of("rpr"))
     assert not ours.residuals
-    text, plain = (c_source(each, c_functions(each, ENTRIES)) for each in (ours, other))
+    text, plain = (c_texts(each, c_functions(each, ENTRIES))[".c"] for each in (ours, other))
     assert text == plain
 
 

@@ -16,8 +16,7 @@ from typer.testing import CliRunner
 
 from spelgen.arm.arm import make_arm
 from spelgen.arm.configured_arm import load_arm
-from spelgen.certificate.formula_files import sympy_source
-from spelgen.certificate.formula_text import text, to_dict
+from spelgen.certificate.formula_files import sympy_source, text, to_dict
 from spelgen.certificate.formulas import formulas
 from spelgen.certificate.inspection import inspect
 from spelgen.cli.main import app
@@ -95,13 +94,13 @@ def test_large_entries_are_counted_and_shown_on_request(robots, spelgen):
     alone = spelgen("inspect", robots / "ur10e.urdf", "--entry", "1,1").stdout
     assert alone.count("\nM") == 1 and "\nM11 = " in alone
     assert max(map(len, alone.splitlines())) <= 80
-    assert_equal_to_pinocchio(load_arm(robots / "ur10e.urdf").arm, read_back(alone))
+    assert_equal_to_pinocchio(load_arm(robots / "ur10e.urdf").chain, read_back(alone))
 
 
 def test_either_triangle_and_only_the_parameters_in_the_entry(robots, spelgen):
     one, other = (spelgen("inspect", robots / "panda.urdf", "--entry", e).stdout for e in ("2,7", "7,2"))
     assert one == other
-    assert_equal_to_pinocchio(load_arm(robots / "panda.urdf").arm, read_back(one))
+    assert_equal_to_pinocchio(load_arm(robots / "panda.urdf").chain, read_back(one))
     assert re.findall(r"^  (\w+) \[", one, re.MULTILINE) == ["Izz7", "Ixz7", "Iyz7", "hx7", "hy7"]
 
 

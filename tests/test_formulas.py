@@ -18,8 +18,7 @@ from random_arms import arms
 
 from spelgen.arm.arm import make_arm
 from spelgen.arm.configured_arm import load_arm
-from spelgen.certificate.formula_files import latex, sympy_source
-from spelgen.certificate.formula_text import text
+from spelgen.certificate.formula_files import latex, sympy_source, text
 from spelgen.certificate.formulas import WRITABLE, formulas
 from spelgen.certificate.inspection import inspect
 from spelgen.certificate.numeric_samples import with_random_inertias
@@ -49,7 +48,7 @@ print(json.dumps(found))
 @cache
 def written(robot, assume="kinematics"):
     """A robot with its structure and closed forms, all entries written out."""
-    arm = load_arm(ROOT / "robots" / f"{robot}.urdf").arm
+    arm = load_arm(ROOT / "robots" / f"{robot}.urdf").chain
     structure = derive(arm, assume)
     return arm, structure, formulas(arm, structure, longest=WRITABLE)
 
@@ -101,9 +100,9 @@ def test_sympy_proves_each_expression(robot):
     generators = [function for q in found.q for function in (sympy.sin(q), sympy.cos(q), q)]
     circles = [sympy.cos(q) ** 2 + sympy.sin(q) ** 2 - 1 for q in found.q]
     for row in found.rows:
-        element = expansion.written.potential
+        element = expansion.energies.potential
         if row.entry != "V":
-            element = expansion.written.mass[row.entry[0] - 1, row.entry[1] - 1]
+            element = expansion.energies.mass[row.entry[0] - 1, row.entry[1] - 1]
         expanded = sympy.Integer(0)
         for each in found.base:
             polynomial = expansion.polynomial(element, each.index, Budget(10**6))

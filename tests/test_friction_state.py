@@ -15,7 +15,7 @@ from spelgen.dynamics.bristles import (
     moved_bristles,
     reach_of,
 )
-from spelgen.dynamics.linear_friction import FrictionModel
+from spelgen.dynamics.friction import FrictionModel
 from spelgen.emission.build import build
 from spelgen.emission.loading import load_module
 from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
@@ -149,7 +149,7 @@ def trajectory(t: np.ndarray, q: np.ndarray, qd: np.ndarray) -> Trajectory:
 
 
 def test_least_squares_finds_the_strengths_of_bristles():
-    arm = load_arm(ROBOTS / "two_link.urdf").arm
+    arm = load_arm(ROBOTS / "two_link.urdf").chain
     rng = np.random.default_rng(0)
     q = 0.3 * swings(3000) / 0.05
     qd, qdd = np.gradient(q, 0.002, axis=0), np.gradient(np.gradient(q, 0.002, axis=0), 0.002, axis=0)

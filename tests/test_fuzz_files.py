@@ -171,7 +171,7 @@ def test_settings(tmp_path, robots):
         loaded = load_arm(urdf)
         for name in OF_A_STEP:
             getattr(loaded.settings, name).model_dump()
-        make_friction(loaded.arm, loaded.settings)(np.ones(2))
+        make_friction(loaded.chain, loaded.settings)(np.ones(2))
         loaded.actuation.matrix()
 
     fuzz(st.tuples(st.integers(0, 10**9), changes(plain)), 250, use)

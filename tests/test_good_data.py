@@ -304,11 +304,11 @@ def test_all_forms_of_no_limit_mean_unlimited_and_are_stated_once(robots, tmp_pa
     text = re.sub(r"<limit [^>]*/>", f"<limit {NO_LIMITS[form]}/>", (robots / f"{name}.urdf").read_text())
     (tmp_path / "x.urdf").write_text(text)
     arm = load_arm(tmp_path / "x.urdf")
-    for joint in arm.arm.coordinates:
+    for joint in arm.chain.coordinates:
         assert (joint.limits, joint.effort, joint.velocity) == (None, None, None)
     (note,) = [x for x in arm.robot.diagnostics if x.code == "unlimited"]
     assert "velocity of all joints; effort of all joints" in note.message
-    ranges = {joint.name: [-0.4, 0.5] for joint in arm.arm.coordinates}
+    ranges = {joint.name: [-0.4, 0.5] for joint in arm.chain.coordinates}
     with pytest.raises(
         SpelgenError, match="got no position limits, expected a range to move in; write 'simulation"
     ):

@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.inspection import inspect
 from spelgen.cli.main import app
-from spelgen.dynamics.linear_friction import FrictionModel
-from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.dynamics.friction import FrictionModel
+from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.errors import LogError
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.identification import LeastSquares
@@ -39,7 +39,7 @@ def pinocchio(path, arm):
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_regressor_spans_what_pinocchios_does_and_gives_its_torque(robots, robot):
     path = robots / f"{robot}.urdf"
-    arm = load_arm(path).arm
+    arm = load_arm(path).chain
     model = pinocchio(path, arm)
     data = model.createData()
     states = np.random.default_rng(0).uniform(-2, 2, (3, 60, len(arm.coordinates)))
@@ -61,7 +61,7 @@ def test_base_parameters_are_those_of_inspect(robots, robot):
     """Names, order, grouping and values of the bodies' are the exact ones; friction's come behind."""
     path = robots / f"{robot}.urdf"
     loaded = load_arm(path)
-    arm, exact = loaded.arm, loaded.base_parameters
+    arm, exact = loaded.chain, loaded.base_parameters
     base = base_parameters(arm, FrictionModel())
     inertial = 10 * len(arm.bodies)
     assert base.bodies == len(exact) == inspect(path).to_dict()["base_parameters"]
@@ -84,7 +84,7 @@ def columns(arm, friction, q, qd, qdd):
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_base_parameters_make_the_torque(robots, robot):
     """The regressor's columns that they stand for, times their combinations, are the whole regressor."""
-    arm, friction = load_arm(robots / f"{robot}.urdf").arm, FrictionModel(stribeck=True)
+    arm, friction = load_arm(robots / f"{robot}.urdf").chain, FrictionModel(stribeck=True)
     base = base_parameters(arm, friction)
     states = np.random.default_rng(5).uniform(-2, 2, (3, 60, len(arm.coordinates)))
     rows = columns(arm, friction, *states)
@@ -115,7 +115,7 @@ def excited(arm, seconds=20.0, seed=0, noise=0.0, friction=None):
 
 
 def test_a_known_arm_is_found_exactly(robots):
-    arm = load_arm(robots / "six_dof.urdf").arm
+    arm = load_arm(robots / "six_dof.urdf").chain
     friction = FrictionModel(stribeck=True)
     samples, x = excited(arm, friction=friction)
     found = least_squares(arm, [samples], LeastSquares("range", friction=friction))
@@ -127,7 +127,7 @@ def test_a_known_arm_is_found_exactly(robots):
 
 
 def test_standard_deviations_are_those_of_repeated_experiments(robots):
-    arm = load_arm(robots / "rpr.urdf").arm
+    arm = load_arm(robots / "rpr.urdf").chain
     drawn, claimed = [], []
     for seed in range(40):
         samples, x = excited(arm, 4.0, seed=7, noise=0.0)
@@ -144,7 +144,7 @@ def test_standard_deviations_are_those_of_repeated_experiments(robots):
 
 
 def test_weights_by_noise_beat_equal_ones_where_joints_are_measured_unequally(robots):
-    arm = load_arm(robots / "six_dof.urdf").arm
+    arm = load_arm(robots / "six_dof.urdf").chain
     errors = {}
     for weights in ("equal", "noise"):
         away = []
@@ -170,7 +170,7 @@ def test_correlated_errors_count_for_less():
 
 
 def test_unobservable_parameters_are_reported(robots):
-    arm = load_arm(robots / "six_dof.urdf").arm
+    arm = load_arm(robots / "six_dof.urdf").chain
     samples, _ = excited(arm)
     samples.qd[:, 3:], samples.qdd[:, 3:], samples.q[:, 3:] = 0.0, 0.0, 0.4
     found = least_squares(arm, [samples], LeastSquares("range"))
@@ -181,7 +181,7 @@ def test_unobservable_parameters_are_reported(robots):
 
 
 def test_errors_name_the_missing_data(robots):
-    arm = load_arm(robots / "two_link.urdf").arm
+    arm = load_arm(robots / "two_link.urdf").chain
     with pytest.raises(LogError, match="24 Hz"):
         least_squares(arm, [], LeastSquares())
 
@@ -194,7 +194,7 @@ def trajectory(arm, **options):
 
 def test_command(robots, tmp_path):
     robot = robots / "six_dof.urdf"
-    arm = load_arm(robot).arm
+    arm = load_arm(robot).chain
     write_logs(tmp_path / "logs.parquet", [trajectory(arm, noise=0.02)], [c.name for c in arm.coordinates])
     base = ["identify", str(robot), "--data", str(tmp_path / "logs.parquet")]
     shown = CliRunner().invoke(app, base)
@@ -251,7 +251,7 @@ def read(folder, names, arm):
 
 def test_ur10e_gives_the_published_figures(shared):
     folder = shared / "logs" / "ur10e"
-    arm = load_arm(folder / "ur10e.urdf").arm
+    arm = load_arm(folder / "ur10e.urdf").chain
     training = dynamics_samples(read(folder, TRAINING, arm))
     found = least_squares(arm, training, LeastSquares("range"))
     tests = dynamics_samples(read(folder, BASELINE, arm), pauses=True)
@@ -287,7 +287,7 @@ def test_a_filter_beyond_the_samples_is_refused(rate, least):
 
 
 def test_panda_gives_the_published_figure(shared):
-    arm = load_arm(shared / "arms" / "panda_erd.urdf").arm
+    arm = load_arm(shared / "arms" / "panda_erd.urdf").chain
     (whole,) = read(shared / "logs" / "panda", ["exciting_traj1"], arm)
     cut = int(np.searchsorted(whole.t, whole.t[0] + 12.0))
     training, test = dynamics_samples([whole[:cut]]), dynamics_samples([whole[cut:]])

@@ -8,8 +8,9 @@ from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.inspection import inspect
+from spelgen.certificate.verify import verify
 from spelgen.cli.main import app
-from spelgen.render.inspection_page import page
+from spelgen.render.arm_pages import inspection_page
 
 HOSTILE = "<script>alert(1)</script>{{ 7 * 7 }}&quot;'&amp;"
 
@@ -17,11 +18,11 @@ HOSTILE = "<script>alert(1)</script>{{ 7 * 7 }}&quot;'&amp;"
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "panda"])
 def test_the_page_states_the_same_as_the_text(robots, robot):
     found = inspect(robots / f"{robot}.urdf")
-    shown = Page(page(found))
+    shown = Page(inspection_page(found))
     told = " ".join(" ".join(shown.text).split())
     for sentence in (*found.needs().values(), *map(str, found.facts)):
         assert sentence in told
-    cells = re.findall(r'<td class="(\w+)" data-row="(\d)" data-column="(\d)"', page(found))
+    cells = re.findall(r'<td class="(\w+)" data-row="(\d)" data-column="(\d)"', inspection_page(found))
     kinds = {(e.row + 1, e.column + 1): e.kind for e in found.structure.entries}
     assert len(cells) == len(found.structure.joints) ** 2
     assert all(kinds[max(int(i), int(j)) + 1, min(int(i), int(j)) + 1] == kind for kind, i, j in cells)
@@ -36,8 +37,9 @@ def test_formulas_and_proof_only_where_asked(robots, tmp_path, monkeypatch):
     assert run.exit_code == 0, run.stderr
     text = " ".join(Page((tmp_path / "rpr.html").read_text()).text)
     assert "\nM22 = m2R\n" in text
-    assert load_arm(robots / "rpr.urdf").verify().checks[0].found in text
-    plain = page(inspect(robots / "rpr.urdf"))
+    found, arm = inspect(robots / "rpr.urdf"), load_arm(robots / "rpr.urdf")
+    assert verify(arm.robot, arm.chain, found.structure).checks[0].found in text
+    plain = inspection_page(found)
     assert "Closed forms" not in plain and "Proof" not in plain
 
 
@@ -47,5 +49,5 @@ def test_names_are_escaped(robots, tmp_path):
     )
     (tmp_path / "evil.urdf").write_text(text.replace(HOSTILE, HOSTILE.replace("<", "&lt;")))
     found = inspect(tmp_path / "evil.urdf")
-    shown = Page(page(found, found.closed_forms(), urdf=tmp_path / "evil.urdf"))
+    shown = Page(inspection_page(found, found.closed_forms(), urdf=tmp_path / "evil.urdf"))
     assert "".join(shown.text).count("<script>alert(1)</script>{{ 7 * 7 }}\"'&") >= 3

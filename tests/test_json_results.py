@@ -7,7 +7,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from spelgen.cli.evaluate_command import MISSED
+from spelgen.cli.evaluate_command import LIMIT_EXCEEDED
 from spelgen.cli.main import app
 
 
@@ -56,7 +56,7 @@ def test_every_step_answers_in_json(folder):
         "torque.nmse=1e-9",
         "--limit",
         "joint.nmse=9",
-        code=MISSED,
+        code=LIMIT_EXCEEDED,
     )
     figure = json.loads(evaluated.out)["torque"]["model"]["mean_nmse"]
     assert evaluated.err.splitlines()[-1] == (

@@ -31,7 +31,7 @@ def motion(arm, seed: int, rate: float = 100.0, seconds: float = 20.0) -> dict[s
     random = np.random.default_rng(seed)
     t = np.arange(round(seconds * rate)) / rate
     columns = {"t": t}
-    for joint in arm.arm.joint_names:
+    for joint in arm.chain.joint_names:
         w, phase = random.uniform(0.5, 1.5), random.uniform(0, 6)
         size, middle = random.uniform(0.3, 0.8), random.uniform(-0.2, 0.2)
         columns[f"q_{joint}"] = middle + size * np.sin(w * t + phase) + 1e-5 * random.standard_normal(len(t))
@@ -53,7 +53,7 @@ def written(columns, path):
 
 def errors(logs, arm) -> str:
     try:
-        check(logs, arm.arm.joint_names, arm.arm.joint_types)
+        check(logs, arm.chain.joint_names, arm.chain.joint_types)
     except SpelgenError as error:
         return str(error)
     return ""
@@ -74,7 +74,9 @@ def test_wraps_of_angles_without_limits_are_removed_before_anything_else(robots,
         arm = load_arm(tmp_path / f"{name}.urdf")
         columns = motion(arm, number)
         turning = [
-            x for x, kind in zip(arm.arm.joint_names, arm.arm.joint_types, strict=True) if kind == "revolute"
+            x
+            for x, kind in zip(arm.chain.joint_names, arm.chain.joint_types, strict=True)
+            if kind == "revolute"
         ]
         joint = turning[number % len(turning)]
         columns[f"q_{joint}"] = 0.2 + 0.9 * columns["t"] + 0.5 * np.sin(columns["t"])
@@ -97,9 +99,9 @@ def test_wraps_of_angles_without_limits_are_removed_before_anything_else(robots,
 @pytest.mark.parametrize("form", ["sign bit", "overflow", "unsigned", "turn", "degrees"])
 def test_words_of_a_register_are_named_and_the_line_to_write_decodes_them(arm, tmp_path, form, seed):
     random = np.random.default_rng(seed)
-    columns, joints = motion(arm, seed), arm.arm.joint_names
+    columns, joints = motion(arm, seed), arm.chain.joint_names
     joint = joints[random.integers(len(joints))]
-    turning = arm.arm.joint_types[joints.index(joint)] == "revolute"
+    turning = arm.chain.joint_types[joints.index(joint)] == "revolute"
     counts, per_turn = 2 ** int(random.integers(12, 17)), int(random.choice([4096, 16384]))
     if form == "turn" and not turning:
         pytest.skip("a joint that slides has no turns")
@@ -147,7 +149,7 @@ def test_words_of_a_register_are_named_and_the_line_to_write_decodes_them(arm, t
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("form", ["sign bit", "unsigned"])
 def test_words_of_a_load_register_are_named_too(arm, tmp_path, form, seed):
-    columns, joints = motion(arm, seed), arm.arm.joint_names
+    columns, joints = motion(arm, seed), arm.chain.joint_names
     joint = joints[seed % len(joints)]
     load, size = np.round(columns[f"tau_{joint}"] * 100 / 3), {"sign bit": 1024, "unsigned": 65536}[form]
     words = np.where(load < 0, size - load, load) if form == "sign bit" else load % size
@@ -166,7 +168,7 @@ def test_words_of_a_load_register_are_named_too(arm, tmp_path, form, seed):
 @pytest.mark.parametrize("quantity", ["q", "qd", "tau"])
 def test_outliers_of_any_size_are_named_and_dropped_on_request(arm, tmp_path, form, quantity):
     random = np.random.default_rng(len(form) + len(quantity))
-    joints = arm.arm.joint_names
+    joints = arm.chain.joint_names
     for size in (0.3, 2 * np.pi, 1e5) if quantity == "q" else (1e2, 1e5):
         columns = motion(arm, int(random.integers(1000)))
         joint = joints[random.integers(len(joints))]
@@ -188,7 +190,7 @@ def test_outliers_of_any_size_are_named_and_dropped_on_request(arm, tmp_path, fo
 
 @pytest.mark.parametrize("often", [2, 5, 25])
 def test_rows_that_are_written_several_times_are_read_once_with_their_own_rate(arm, tmp_path, often):
-    columns, joints = motion(arm, often, rate=250.0), arm.arm.joint_names
+    columns, joints = motion(arm, often, rate=250.0), arm.chain.joint_names
     held = np.arange(len(columns["t"])) // often * often
     all_held = {name: x if name == "t" else x[held] for name, x in columns.items()}
     (log,) = read_logs(written(all_held, tmp_path / "all.csv"), joints)
@@ -202,14 +204,14 @@ def test_rows_that_are_written_several_times_are_read_once_with_their_own_rate(a
     if 250 / often < 24:
         assert told in errors([log], arm)
     else:
-        notes = check([log], joints, arm.arm.joint_types)
+        notes = check([log], joints, arm.chain.joint_types)
         assert [x.message for x in notes] == [told] * len(joints)
 
 
 @pytest.mark.parametrize("rate", [100.0, 60.0, 27.0])
 def test_the_newest_state_written_at_a_rate_that_is_no_multiple_of_its_own(arm, tmp_path, rate):
     """Each state is written two or three times, three or four times, ...: it is read once."""
-    columns, joints = motion(arm, 5, rate=250.0), arm.arm.joint_names
+    columns, joints = motion(arm, 5, rate=250.0), arm.chain.joint_names
     newest = np.floor(np.arange(len(columns["t"])) * rate / 250 + 1e-9)
     first = np.searchsorted(newest, newest)
     log = {name: x if name == "t" else x[first] for name, x in columns.items()}
@@ -220,7 +222,7 @@ def test_the_newest_state_written_at_a_rate_that_is_no_multiple_of_its_own(arm, 
 
 
 def test_frames_that_are_written_twice_now_and_then_are_counted_and_dropped_on_request(arm, tmp_path):
-    columns, joints = motion(arm, 5, rate=30.0, seconds=60), arm.arm.joint_names
+    columns, joints = motion(arm, 5, rate=30.0, seconds=60), arm.chain.joint_names
     random = np.random.default_rng(0)
     rows = np.arange(len(columns["t"]))
     repeats = np.sort(random.choice(np.arange(10, len(rows) - 10, 3), 150, replace=False))
@@ -239,7 +241,7 @@ def test_frames_that_are_written_twice_now_and_then_are_counted_and_dropped_on_r
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_velocities_that_are_magnitudes_are_an_error_and_differentiating_remedies_it(arm, tmp_path, sign):
-    columns, joints = motion(arm, 7), arm.arm.joint_names
+    columns, joints = motion(arm, 7), arm.chain.joint_names
     joint = joints[-1]
     random = np.random.default_rng(1)
     columns[f"qd_{joint}"] = sign * np.abs(columns[f"qd_{joint}"] + 0.005 * random.standard_normal(2000))
@@ -290,18 +292,18 @@ def test_wrapped_commands_of_servos_are_unwrapped_with_their_positions(robots, t
         arm = load_arm(tmp_path / f"{name}.urdf")
         t = 0.02 * np.arange(1500)
         columns = {"t": t}
-        for k, joint in enumerate(arm.arm.joint_names):
+        for k, joint in enumerate(arm.chain.joint_names):
             u = 3.0 + 0.8 * (k + number) * t + 0.4 * np.sin(t + k)
             columns |= {f"u_{joint}": u, f"q_{joint}": u - 0.1 * np.cos(t)}
         wrapped = dict(columns)
-        for joint, kind in zip(arm.arm.joint_names, arm.arm.joint_types, strict=True):
+        for joint, kind in zip(arm.chain.joint_names, arm.chain.joint_types, strict=True):
             if kind == "revolute":
                 for quantity in ("q", "u"):
                     angle = columns[f"{quantity}_{joint}"]
                     wrapped[f"{quantity}_{joint}"] = (angle + np.pi) % (2 * np.pi) - np.pi
         (log,) = read_logs(written(wrapped, tmp_path / f"log{number}.{form}"), arm)
-        followed = columns_of(columns, "u", arm.arm.joint_names) - columns_of(
-            columns, "q", arm.arm.joint_names
+        followed = columns_of(columns, "u", arm.chain.joint_names) - columns_of(
+            columns, "q", arm.chain.joint_names
         )
         assert log.u is not None
         assert log.u - log.q == pytest.approx(followed, abs=1e-9)

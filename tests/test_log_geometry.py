@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from spelgen.arm.configured_arm import load_arm
-from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.errors import SpelgenError
 from spelgen.log_checks.check_logs import check_logs, require_sound_logs
 from spelgen.logs.read import read_logs, write_logs
@@ -33,7 +33,7 @@ def arm(request, robots, tmp_path_factory):
 
 def excitation(arm, rng):
     t = np.arange(0.0, SECONDS, 1 / RATE)
-    n = len(arm.arm.coordinates)
+    n = len(arm.chain.coordinates)
     q = rng.uniform(-0.5, 0.5, n) * np.ones((len(t), 1))
     for omega in 2 * np.pi * rng.uniform(0.05, 0.5, (4, n)):
         q = q + rng.uniform(0.1, 0.4, n) * np.sin(omega * t[:, None] + rng.uniform(0, 6, n))
@@ -43,7 +43,7 @@ def excitation(arm, rng):
 def pick_and_place(arm, rng):
     t = np.arange(0.0, SECONDS, 1 / RATE)
     s = np.clip((t % 2.0) / 1.6, 0.0, 1.0)[:, None]  # 1.6 s of motion, 0.4 s of rest
-    stops = rng.uniform(-1.0, 1.0, (round(SECONDS / 2) + 1, len(arm.arm.coordinates)))
+    stops = rng.uniform(-1.0, 1.0, (round(SECONDS / 2) + 1, len(arm.chain.coordinates)))
     number = (t // 2.0).astype(int)
     return t, stops[number] + (10 * s**3 - 15 * s**4 + 6 * s**5) * (stops[number + 1] - stops[number])
 
@@ -54,11 +54,11 @@ def recorded(arm, seed, motion=excitation, noise=0.02, gravity=1.0) -> Trajector
     t, q = motion(arm, rng)
     qd = np.gradient(q, t, axis=0)
     qdd = np.gradient(qd, t, axis=0)
-    factors = np.exp(0.3 * rng.standard_normal((len(arm.arm.bodies), 2)))
-    parameters = urdf_parameters(arm.arm).reshape(-1, 10) * np.repeat(factors, (4, 6), axis=1)
+    factors = np.exp(0.3 * rng.standard_normal((len(arm.chain.bodies), 2)))
+    parameters = urdf_parameters(arm.chain).reshape(-1, 10) * np.repeat(factors, (4, 6), axis=1)
     still = np.zeros_like(q)
-    load = regressor(arm.arm, q, still, still) @ parameters.ravel()
-    rigid = regressor(arm.arm, q, qd, qdd) @ parameters.ravel() + (gravity - 1.0) * load
+    load = regressor(arm.chain, q, still, still) @ parameters.ravel()
+    rigid = regressor(arm.chain, q, qd, qdd) @ parameters.ravel() + (gravity - 1.0) * load
     size = rigid.std(axis=0)
     tau = rigid + 0.1 * size * (np.sign(qd) + qd / np.abs(qd).max(axis=0))
     return Trajectory(t, q, qd, tau + noise * size * rng.standard_normal(q.shape), "motion")
@@ -126,12 +126,12 @@ def test_a_log_that_means_what_it_says_is_not_doubted(arm, motion, noise):
 @pytest.mark.parametrize("fault", FAULTS)
 def test_the_line_that_is_named_mends_the_log(arm, fault, tmp_path):
     code, spoil = FAULTS[fault]
-    seed = sum(map(ord, fault + arm.arm.name))
+    seed = sum(map(ord, fault + arm.chain.name))
     log = recorded(arm, seed, (excitation, pick_and_place)[seed % 2])
     wrong = spoil(log, np.random.default_rng(seed))
     error = told(arm, wrong)
     assert f"--accept {code}" in error
-    write_logs(tmp_path / "log.csv", [wrong], arm.arm.joint_names)
+    write_logs(tmp_path / "log.csv", [wrong], arm.chain.joint_names)
     again, (read,) = mended(arm, error, tmp_path / "log.csv")
     for name in ("q", "qd", "tau"):
         np.testing.assert_allclose(getattr(read, name), getattr(log, name), atol=1e-9)
@@ -141,16 +141,16 @@ def test_the_line_that_is_named_mends_the_log(arm, fault, tmp_path):
 @pytest.mark.parametrize("angle", [90, 180, -90, 37])
 def test_a_zero_offset_is_named_to_a_tenth_of_a_radian(arm, angle, tmp_path):
     rng = np.random.default_rng(angle % 360)
-    turning = [k for k, x in enumerate(arm.arm.coordinates) if x.kind == "revolute"]
+    turning = [k for k, x in enumerate(arm.chain.coordinates) if x.joint_type == "revolute"]
     k = turning[1] if len(turning) > 2 else 2
     log = recorded(arm, int(rng.integers(1000)))
-    if arm.arm.name == "rpr":  # its last link is rigidly turned: other masses could make up for it
+    if arm.chain.name == "rpr":  # its last link is rigidly turned: other masses could make up for it
         assert check_logs([turned(log, k, np.deg2rad(angle))], arm).errors == ()
         return
     wrong = turned(log, k, np.deg2rad(angle))
     error = told(arm, wrong)
     assert "--accept joint-zero" in error
-    write_logs(tmp_path / "log.csv", [wrong], arm.arm.joint_names)
+    write_logs(tmp_path / "log.csv", [wrong], arm.chain.joint_names)
     _, (read,) = mended(arm, error, tmp_path / "log.csv")
     # half a turn to either side is the same zero
     assert np.abs(np.angle(np.exp(1j * (read.q - log.q)))).max() < 0.1
@@ -168,9 +168,9 @@ def test_the_direction_of_gravity_is_found(arm, seed, tmp_path):
     rng = np.random.default_rng(seed)
     direction = [np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), rng.standard_normal(3)][seed]
     gravity = 9.81 * direction / np.linalg.norm(direction)
-    mounted = replace(arm, arm=replace(arm.arm, gravity=tuple(gravity.tolist())))
+    mounted = replace(arm, chain=replace(arm.chain, gravity=tuple(gravity.tolist())))
     log = recorded(mounted, seed)
-    write_logs(tmp_path / "log.csv", [log], arm.arm.joint_names)
+    write_logs(tmp_path / "log.csv", [log], arm.chain.joint_names)
     error = told(arm, log)
     lines = re.findall(r"'gravity: \[(.*?)\]'", error)
     assert lines, error  # rpr on a ceiling is as well an arm with a joint that turns the other way
@@ -195,14 +195,14 @@ def test_another_unit_is_offered_as_gain(arm):
 
 def test_a_link_with_a_mistyped_mass_is_named(arm):
     """One mass of the URDF is six times too large, and its tensor about the centre of mass is right."""
-    moments = [np.linalg.norm(np.array(body.inertia[1:4], dtype=float)) for body in arm.arm.bodies]
+    moments = [np.linalg.norm(np.array(body.inertia[1:4], dtype=float)) for body in arm.chain.bodies]
     # the first joint of these arms is vertical: its body's first moment is invisible
     k = 1 + int(np.argmax(moments[1:]))
-    body = arm.arm.bodies[k]
+    body = arm.chain.bodies[k]
     heavy = replace(body, inertia=(*(6 * float(x) for x in body.inertia[:4]), *body.inertia[4:]))
-    mistyped = replace(arm.arm, bodies=(*arm.arm.bodies[:k], heavy, *arm.arm.bodies[k + 1 :]))
+    mistyped = replace(arm.chain, bodies=(*arm.chain.bodies[:k], heavy, *arm.chain.bodies[k + 1 :]))
     log = recorded(arm, 10)
-    report = check_logs([log], replace(arm, arm=mistyped))
+    report = check_logs([log], replace(arm, chain=mistyped))
     assert report.errors == ()
     (note,) = (x for x in report.findings if x.code == "urdf-inertials")
     assert note.where == f"link {body.link!r}"
@@ -218,7 +218,7 @@ def test_training_refuses_it_unless_it_is_accepted(arm):
 
 def test_a_line_keeps_what_the_mapping_states(arm):
     """A gain and a sense that are there already are multiplied."""
-    joint = arm.arm.joint_names[1]
+    joint = arm.chain.joint_names[1]
     mapping = LogMapping.model_validate({"joints": {joint: {"gain": 14.2, "sign": -1}}})
     error = told(arm, flipped(recorded(arm, 8), 1, True, False), mapping)
     assert f"'joints: {{{joint}: {{sign: 1, gain: -14.2}}}}' under 'logs'" in error
@@ -229,7 +229,7 @@ def test_a_slow_arm_with_right_torques_is_not_refused(arm):
     log = recorded(arm, 9)
     slow = replace(log, t=8.0 * log.t, qd=log.qd / 8.0)
     still = np.zeros_like(log.q)
-    load = regressor(arm.arm, log.q, still, still) @ urdf_parameters(arm.arm)
+    load = regressor(arm.chain, log.q, still, still) @ urdf_parameters(arm.chain)
     rng = np.random.default_rng(0)
     noisy = log.q + 1e-4 * rng.standard_normal(log.q.shape)
     tau = load + 0.1 * load.std(axis=0) * np.sign(log.qd) + 0.05 * rng.standard_normal(log.q.shape)

@@ -8,9 +8,9 @@ from planar_model import Model
 from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.baselines.predictor import Solver
 from spelgen.dynamics.protocol import VelocityState
-from spelgen.evaluation import momentum_observer
+from spelgen.evaluation import horizons
 from spelgen.evaluation.evaluate import evaluate
-from spelgen.evaluation.momentum_observer import observe, past_steps, without_past
+from spelgen.evaluation.horizons import observe, past_steps, without_past
 from spelgen.evaluation.rollout import rollout
 from spelgen.evaluation.tuning import EvaluationTuning
 from spelgen.logs.preprocessing import Preprocessing
@@ -48,7 +48,7 @@ def test_a_constant_torque_is_found():
 def test_a_step_is_followed_with_the_time_constant(monkeypatch, time_constant):
     """Some time after a torque begins the observer, long at work, has found 1 - exp(-time / time constant) of it."""
     tuning = EvaluationTuning(observer_time_constant=time_constant)
-    monkeypatch.setattr(momentum_observer, "TUNING", tuning)
+    monkeypatch.setattr(horizons, "TUNING", tuning)
     model, log = Model(), motions(count=1, after=2.0)[0]
     for since in (0.02, 0.05, 0.1):
         past = round((2.0 + since) * RATE)

@@ -85,7 +85,7 @@ def test_objects_are_short_to_read(robots):
     assert repr(inspection.structure) == f"<Structure of 3 joints (kinematics used): {told}>"
     told = "3 outputs and 2 constants, 11 base inertial parameters"
     assert repr(inspection) == f"<Inspection of 'rpr': {told}>"
-    proof = verify(arm.robot, arm.arm, inspection.structure)
+    proof = verify(arm.robot, arm.chain, inspection.structure)
     for each in (inspection, proof, inspection.closed_forms((2, 2))):
         assert len(repr(each)) < 100
         assert each._repr_html_().count("<tr>") >= 2

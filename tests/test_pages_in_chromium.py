@@ -7,7 +7,8 @@ from chromium import Chromium, executable
 from test_report import run  # noqa: F401  (a fixture)
 
 from spelgen.arm.configured_arm import load_arm
-from spelgen.render.inspection_page import page
+from spelgen.certificate.inspection import inspect
+from spelgen.render.arm_pages import inspection_page
 from spelgen.render.report_page import write_report
 
 pytestmark = pytest.mark.skipif(executable() is None, reason="no Chromium is installed")
@@ -41,7 +42,9 @@ def pages(run, robots, tmp_path):  # noqa: F811
     """The report of a run whose folder has its URDF, and the page of `inspect` of a longer arm."""
     (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
     panda = load_arm(robots / "panda.urdf")
-    (tmp_path / "panda.html").write_text(page(panda.inspect(), urdf=panda.robot.path), encoding="utf-8")
+    (tmp_path / "panda.html").write_text(
+        inspection_page(inspect(panda), urdf=panda.robot.path), encoding="utf-8"
+    )
     return [write_report(run), tmp_path / "panda.html"]
 
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, assume, event, given, settings
 from random_arms import DrawnArm, arms
 
-from spelgen.arm.arm import Arm, make_arm
+from spelgen.arm.arm import Chain, make_arm
 from spelgen.arm.rational import exact_rotation, rotation_from_rpy
 from spelgen.structure.sampling import float_energies
 from spelgen.structure.structure import Structure, derive
@@ -159,7 +159,7 @@ RANDOM = settings(
 )
 
 
-def read(drawn: DrawnArm, folder: Path) -> Arm:
+def read(drawn: DrawnArm, folder: Path) -> Chain:
     path = folder / "drawn.urdf"
     path.write_text(drawn.text, encoding="utf-8")
     return make_arm(read_urdf(path), joints=drawn.joints)

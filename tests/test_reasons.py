@@ -11,7 +11,7 @@ import pytest
 from arms import STRAIGHT, chain, reference_arms
 from pinocchio_geometry import NOTHING, Seen
 
-from spelgen.arm.arm import Arm, make_arm
+from spelgen.arm.arm import Chain, make_arm
 from spelgen.certificate.axes import is_plain
 from spelgen.certificate.facts import Fact, facts
 from spelgen.certificate.inspection import inspect
@@ -115,7 +115,7 @@ def test_reference_arms(shared, assume):
     for name, _, arm, structure in reference_arms(shared, assume):
         told = facts(arm, structure)
         assert_statements_hold(arm, structure, told, name)
-        seen = Seen(arm) if arm.has_inertials else None
+        seen = Seen(arm) if arm.inertials_complete else None
         for fact in told:
             if fact.reason is not None:
                 reasons.add(re.sub(r"\d+", "#", fact.reason))
@@ -123,7 +123,7 @@ def test_reference_arms(shared, assume):
     assert len(reasons) > 12
 
 
-def assert_statements_hold(arm: Arm, structure: Structure, told: tuple[Fact, ...], name: str) -> None:
+def assert_statements_hold(arm: Chain, structure: Structure, told: tuple[Fact, ...], name: str) -> None:
     """Every reason is true in Pinocchio at random configurations, with random inertials or the URDF's."""
     keys = triangle(len(structure.joints))
     free = structure.assume == "kinematics"

@@ -252,6 +252,13 @@ def test_a_run_of_any_preset_has_its_page(run, robots, preset):
         assert f"Torque of {joint}" in text and f"torque [{unit}]" in text
 
 
+def test_a_constant_entry_of_the_mass_matrix_has_the_value_in_the_table(run, robots):
+    model = build(robots / "rpr.urdf", "spel", width=8)
+    write_model(run, model)
+    entry = model.mass_matrix(torch.tensor([0.3, 0.2, 0.1]).double())[1, 1] - model.mass.armature()[1]
+    assert f'<th scope="row">M22</th><td>{entry.item():.4g}</td><td>kg</td>' in render_report(run)
+
+
 def test_the_report_is_available_as_json(run, robots):
     (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
     found = json.loads(write_report(run, run / "report.json").read_text(encoding="utf-8"))

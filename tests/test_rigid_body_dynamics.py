@@ -10,10 +10,9 @@ import torch
 from spelgen.arm.arm import make_arm
 from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics, pinocchio_model
-from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
+from spelgen.dynamics.pinocchio_dynamics import urdf_dynamics
 from spelgen.dynamics.protocol import integrable
-from spelgen.dynamics.regressor import urdf_parameters
-from spelgen.dynamics.regressor_dynamics import RegressorDynamics
+from spelgen.dynamics.regressor_dynamics import RegressorDynamics, urdf_parameters
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import ArmError, SpelgenErrors
 from spelgen.settings.joint import JointSettings
@@ -214,7 +213,7 @@ def test_pose_and_jacobian_of_the_tip_are_pinocchios(robot, link, robots, tmp_pa
     if robot == "lift":
         path.write_text(LIFT)
     loaded = load_arm(path, ["low", "swing"] if robot == "lift" else None)
-    joints = [c.name for c in loaded.arm.coordinates]
+    joints = [c.name for c in loaded.chain.coordinates]
     tip, dynamics = tip_kinematics(loaded, link), urdf_dynamics(path, joints)
     q = states(len(joints))[0]
     pose, jacobian = tip.pose(q), tip.jacobian(q)

@@ -84,7 +84,7 @@ def test_reading_it_needs_no_remark(robot):
     arm = make_arm(read, gravity=load_settings(path).gravity)
     assert read.diagnostics + arm.diagnostics == ()
     assert read.name == robot
-    assert arm.has_inertials
+    assert arm.inertials_complete
     assert not arm.locked
 
 

@@ -31,7 +31,7 @@ from spelgen.fitting.fitted import load_run
 from spelgen.fitting.process import locked
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.train import train
-from spelgen.fitting.tuning import WindowTuning
+from spelgen.fitting.tuning import FittingTuning
 from spelgen.fitting.window import momentum
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
@@ -57,7 +57,7 @@ def motions(count: int = 4, samples: int = 25) -> list[Trajectory]:
 def short_epochs():
     """Two steps an epoch: what is written, and when, is the same after twenty."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(momentum, "TUNING", WindowTuning(epoch_steps=2))
+        patch.setattr(momentum, "TUNING", FittingTuning(epoch_steps=2))
         yield
 
 

@@ -18,7 +18,7 @@ from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import CSV_HEAD, csv_text
 from spelgen.identification.identify import identify
 from spelgen.logs.trajectory import Trajectory
-from spelgen.render.identification_page import page
+from spelgen.render.arm_pages import identification_page
 from spelgen.render.runs_page import render_runs
 
 
@@ -85,7 +85,7 @@ def test_the_page_of_an_identification_states_the_same_as_the_text(robots):
         lambda k: np.sin(k * t) / 4, lambda k: k * np.cos(k * t) / 4, lambda k: np.sin(k * t + k)
     ))  # fmt: skip
     found = identify(arm, Trajectory(t=t, q=q, qd=qd, tau=tau))
-    shown = Page(page(found, arm))
+    shown = Page(identification_page(found, arm))
     text = " ".join(" ".join(shown.text).split())
     for each in found.to_dict()["base_parameters"]:
         assert each["name"] in text and f"{each['value']:.4g}" in text

@@ -13,6 +13,7 @@ from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import json_data
 from spelgen.render.scene import scene
 from spelgen.render.shapes import joined, tube
+from spelgen.structure.structure import derive
 
 
 def frames(links, q):
@@ -36,7 +37,7 @@ def test_link_poses_equal_those_of_pytorch_kinematics(robots, robot):
     import torch
 
     arm = load_arm(robots / f"{robot}.urdf")
-    names = [coordinate.name for coordinate in arm.arm.coordinates]
+    names = [coordinate.name for coordinate in arm.chain.coordinates]
     drawn, tip = scene(arm.robot.path, names), tip_kinematics(arm)
     at = [link.name for link in drawn.links].index(tip.link)
     q = np.random.default_rng(1).uniform(-1, 1, (5, len(names)))
@@ -73,7 +74,7 @@ def test_tubes_are_closed_and_look_outward():
 
 def test_every_cell_states_its_kind_and_the_reason(robots):
     arm = load_arm(robots / "rpr.urdf")
-    cells = matrix(arm.arm, arm.structure)
+    cells = matrix(arm.chain, derive(arm.chain))
     assert (
         cells[1][1].explanation.startswith("M22 is constant.")
         and "the mass that it carries" in cells[1][1].explanation
@@ -87,7 +88,7 @@ def test_data_cannot_end_its_element_and_is_the_same_every_time(robots):
     assert "<" not in json_data({"x": "</script><script>alert(1)</script>"})
     assert json.loads(json_data({"x": "</script>&"})) == {"x": "</script>&"}
     arm = load_arm(robots / "panda.urdf")
-    first, again = (arm_section(arm.arm, arm.robot.path) for _ in range(2))
+    first, again = (arm_section(arm.chain, arm.robot.path) for _ in range(2))
     assert first == again and len(first.data) < 200_000
 
 

@@ -11,19 +11,19 @@ from scipy.optimize import minimize
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.emission.build import build
-from spelgen.evaluation import invariants
+from spelgen.evaluation import rollout
 from spelgen.evaluation.horizons import end_errors
-from spelgen.exporting.mjcf_file import mjcf_text
+from spelgen.exporting.mjcf_export import mjcf_text
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo import laws
 from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.torque import jacobian as torque_jacobian
-from spelgen.fitting.torque import joint_functions, network_selection, selection, stages
+from spelgen.fitting.torque import joint_functions, networks, selection, stages
 from spelgen.fitting.torque import objective as torque_objective
 from spelgen.fitting.torque import problem as torque_problem
-from spelgen.fitting.torque.bayesian_ridge import append_target, bayesian_ridge
 from spelgen.fitting.torque.jacobian import ResidualSamples
+from spelgen.fitting.torque.linearization import append_target, bayesian_ridge
 from spelgen.fitting.torque.objective import fit_torques
 from spelgen.fitting.torque.selection import select_functions
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer
@@ -142,12 +142,12 @@ def test_a_network_is_fitted_to_what_functions_of_joints_leave(robots, monkeypat
     left = []
 
     def fitted(model, network, samples, *_):
-        left.append(network_selection._remaining_residual(model, samples))
+        left.append(networks._remaining_residual(model, samples))
         return 0.5
 
-    monkeypatch.setattr(network_selection, "_fit_network", fitted)
+    monkeypatch.setattr(networks, "_fit_network", fitted)
     q = torch.linspace(-1, 1, 2000).double().unsqueeze(-1).expand(-1, 2)
-    assert len(list(network_selection.select_networks(model, samples(q.sin(), q), 1.0))) == 2
+    assert len(list(networks.select_networks(model, samples(q.sin(), q), 1.0))) == 2
     for missing in left:
         torch.testing.assert_close(missing, q.sin())
 
@@ -246,13 +246,9 @@ def test_the_first_noise_is_that_of_least_squares(correlation):
 def test_a_dead_zone_of_a_servo_is_worth_more_than_luck(monkeypatch):
     """A dead zone that lowers the cost by 1, which a chance does once in six times, is not selected; one of 10 is."""
     without = ServoParameters(torch.ones(1, 1), torch.zeros(0), 0.0, torch.zeros(1, 1, dtype=torch.bool))
-    problem = SimpleNamespace(
-        rows=SimpleNamespace(row=lambda name: 0),
-        residual=lambda x: None,
-        weigh=lambda errors: None,
-    )
+    problem = SimpleNamespace(parameters=SimpleNamespace(row=lambda name: 0), reweighted=lambda x: problem)
     with_zone = replace(without, joints=2 * torch.ones(1, 1))
-    monkeypatch.setattr(laws, "divided", lambda problem, x, fraction: with_zone)
+    monkeypatch.setattr(laws, "with_dead_zones", lambda problem, x, fraction: with_zone)
     for gain, selected in ((1.0, False), (10.0, True)):
         costs = {without: torch.tensor([100.0]), with_zone: torch.tensor([100.0 - gain])}
         monkeypatch.setattr(laws, "_joint_minima", lambda problem, x, costs=costs: (x, costs[x]))
@@ -392,11 +388,11 @@ def test_freedom_that_samples_narrow_speaks_against_memory():
 def test_energy_that_only_changes_its_kind_is_no_rise(robots, monkeypatch):
     """Links that swing upwards gain height and lose speed; with friction the sum falls."""
     # of the ten seconds one shows it: speed and height alone rise by a thousandth in a step
-    monkeypatch.setattr(invariants, "TUNING", replace(invariants.TUNING, free_steps=1000))
+    monkeypatch.setattr(rollout, "TUNING", replace(rollout.TUNING, free_steps=1000))
     model = build(robots / "two_link.urdf", "closed-form")
     q, qd = torch.full((4, 2, 2), 0.3).double(), torch.full((4, 2, 2), 2.0).double()
     windows = Windows(
         torch.full((4, 1), 0.01).double(), q, torch.cat([qd, -qd])[::2], torch.zeros(4, 1, 2).double()
     )
     with torch.no_grad():
-        assert invariants._energy_rise(model, windows) < 1e-5
+        assert rollout._energy_rise(model, windows) < 1e-5

@@ -23,8 +23,8 @@ from spelgen.files import write_json
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.servo import objective
-from spelgen.fitting.servo.problem import ServoProblem
 from spelgen.fitting.servo.report import covariance, servo_summary
+from spelgen.fitting.servo.rollouts import ServoRollouts
 from spelgen.fitting.servo.windows import servo_windows
 from spelgen.listing import number
 from spelgen.logs.commands import delayed_commands
@@ -67,14 +67,18 @@ def results(fitted, logs):
 def test_ratios_to_kp_are_found(fitted):
     model, kp = fitted.model, np.array(TRUTH.kp)
     with torch.no_grad():
-        found = {name: getattr(model, name).numpy() / model.kp.numpy() for name in ("kd", "coulomb")}
+        fitted_kp = model.servo.kp()
+        found = {
+            name: (x / fitted_kp).numpy()
+            for name, x in (("kd", model.servo.kd()), ("coulomb", model.coulomb))
+        }
         pointing = torch.tensor([[0.0, np.pi / 2]]).double()
-        weight = (model.gravity(pointing) / model.kp).numpy()[0, 1]
-        inertia = (model.mass_matrix(pointing)[0].diagonal() / model.kp).numpy()
+        weight = (model.gravity(pointing) / fitted_kp).numpy()[0, 1]
+        inertia = (model.mass_matrix(pointing)[0].diagonal() / fitted_kp).numpy()
     assert found["kd"] == pytest.approx(np.array(TRUTH.kd) / kp, rel=0.05)
     assert abs(weight) == pytest.approx(GRAVITY * MASS[1] * COM[1] / kp[1], rel=0.03)
     assert inertia[1] == pytest.approx((6e-4 + MASS[1] * COM[1] ** 2 + TRUTH.armature[1]) / kp[1], rel=0.08)
-    assert float(model.delay) == pytest.approx(TRUTH.delay, abs=0.004)
+    assert float(model.servo.delay) == pytest.approx(TRUTH.delay, abs=0.004)
 
 
 def test_replay_of_another_motion_beats_the_baselines(fitted, logs, results):
@@ -88,8 +92,8 @@ def test_replay_of_another_motion_beats_the_baselines(fitted, logs, results):
 
 
 def test_a_module_of_servos_stands_alone_and_says_so(arm, tmp_path):
-    source = spelgen.generate(arm, "closed-form")
-    assert "stores 1/2 kp (q - u)^2" in source
+    source = spelgen.generate(arm, "closed-form", standalone=True)
+    assert "stores 1/2 kp d(q - u)^2" in source
     model = import_source(source, tmp_path / "servo.py").Model()
     q, u = torch.tensor([[0.1, -0.2]]).double(), torch.tensor([[0.3, -0.2]]).double()
     with torch.no_grad():
@@ -97,7 +101,7 @@ def test_a_module_of_servos_stands_alone_and_says_so(arm, tmp_path):
         assert float(model.servo.stored_energy(u, q)) == pytest.approx(0.5 * 12.0 * 0.04)
         far = model.servo(u + 9, q, torch.zeros_like(q))
     assert far.tolist() == [[6.0, 6.0]]  # the URDF's effort
-    assert "in ratio to kp only" in " ".join(arm.inspect().text().split())
+    assert "in ratio to kp only" in " ".join(spelgen.inspect(arm).text().split())
 
 
 def test_within_its_dead_zone_a_servo_gives_nothing(arm):
@@ -123,7 +127,7 @@ def test_joints_get_the_laws_that_they_have(fitted):
         dry = laws.dry(speeds[:, None].expand(-1, 2), torch.zeros(4, 2).double())
     falling = TRUTH.coulomb[1] + TRUTH.stribeck[1] * torch.exp(-((speeds / STRIBECK_VELOCITY) ** 2))
     torch.testing.assert_close(
-        dry[:, 1] / fitted.model.kp[1].detach(), falling / TRUTH.kp[1], rtol=0.06, atol=0
+        dry[:, 1] / fitted.model.servo.kp()[1].detach(), falling / TRUTH.kp[1], rtol=0.06, atol=0
     )
 
 
@@ -148,9 +152,9 @@ def test_intervals_leave_out_whole_motions(logs):
     numbers = {}
     for count in (1, 3, 4, 5):
         windows = servo_windows(logs[:count], Preprocessing())
-        stretches = windows.stretches(4, 6).tolist()
+        stretches = windows.blocks(4, 6).tolist()
         numbers[count] = len(set(stretches))
-        by_log = {(log.name, stretch) for (log, _), stretch in zip(windows.parts, stretches, strict=True)}
+        by_log = {(log.name, stretch) for (log, _), stretch in zip(windows.rows, stretches, strict=True)}
         assert len(by_log) == numbers[count]  # none is of two logs
     # three logs are too few to tell how their motions differ: each is cut in two
     assert numbers == {1: 5, 3: 6, 4: 4, 5: 5}
@@ -158,7 +162,7 @@ def test_intervals_leave_out_whole_motions(logs):
 
 def test_a_known_kp_stays(tmp_path, logs, monkeypatch):
     monkeypatch.setattr(objective, "TUNING", replace(objective.TUNING, steps=1))
-    monkeypatch.setattr(objective, "ROUNDS", 1)
+    monkeypatch.setattr(objective, "OUTER_ITERATIONS", 1)
     settings = "input: position\njoints: {shoulder: {kp: 14.0}}\n"
     model = spelgen.build(write_servo_arm(tmp_path, settings), "closed-form")
     fit = spelgen.fit(model, [x[:100] for x in logs[:2]])
@@ -229,7 +233,7 @@ def test_what_servo_logs_can_tell_at_all(robots, tmp_path, robot, groups, left):
     path = tmp_path / "sliders.urdf" if robot == "sliders" else robots / f"{robot}.urdf"
     if robot == "sliders":  # at right angles, of which each moves by itself
         path.write_text(SLIDERS)
-    found = servo_rank(spelgen.load_arm(path).arm)
+    found = servo_rank(spelgen.load_arm(path).chain)
     assert found.groups == groups and {*found.open} == left
 
 
@@ -249,7 +253,7 @@ def test_exports_hold_the_servos(fitted, arm, tmp_path, monkeypatch):
     found = re.findall(r'<position name="\w+" joint="\w+" kp="([^"]+)" kv="([^"]+)" forcerange="-6 6"', xml)
     assert np.array(found, dtype=float) == pytest.approx(np.stack([kp, kd], axis=1))
     held = yaml.safe_load(spelgen.export(fitted, to="urdf").files[".urdf.friction.yaml"])
-    assert held["delay"] == pytest.approx(float(fitted.model.delay))
+    assert held["delay"] == pytest.approx(float(fitted.model.servo.delay))
     assert held["joints"]["elbow"]["servo"]["kp"] == pytest.approx(kp[1])
     monkeypatch.setattr(fitted.model.servo, "dead_zone", torch.tensor([0.01, 0.0]).double())
     assert "dead zones are left out" in spelgen.export(fitted, to="mjcf").files[".xml.README.md"].decode()
@@ -332,10 +336,11 @@ def test_presets_are_not_compared_under_servos(tmp_path):
 def test_joints_by_themselves_move_as_the_arm_does(arm):
     model = spelgen.build(arm, "closed-form")
     windows = replace(servo_windows(moved(model, 3.0), Preprocessing()), steps=24)
-    problem = ServoProblem(model, windows, torch.full((2,), 1e-5).double())
-    # all laws, as the logs have
-    start = replace(problem.start, active=torch.ones_like(problem.start.active))
+    rollouts = ServoRollouts.of(model, windows)
+    x = rollouts.parameters.prior_mean
+    # all friction effects, as the logs have
+    x = replace(x, active=torch.ones_like(x.active))
     for _ in range(2):
-        problem.linearise(start, problem.predicted_path(start))
-    errors = problem.residual(start).square().mean(dim=(0, 1)).sqrt()
+        rollouts = rollouts.linearized(x, rollouts.predicted_motion(x))
+    errors = rollouts.residual(x).square().mean(dim=(0, 1)).sqrt()
     assert errors.max() < 6e-4

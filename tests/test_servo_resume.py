@@ -17,7 +17,7 @@ from spelgen.cli.main import app
 from spelgen.errors import RunError
 from spelgen.fitting.dataset import digest
 from spelgen.fitting.fit import RunOptions
-from spelgen.fitting.progress import TrainingProgress
+from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.train import train
 

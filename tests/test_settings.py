@@ -265,11 +265,11 @@ def test_a_starter_file_states_the_defaults(robots, tmp_path, name):
     assert not said.settings.diagnostics
     assert (
         said.settings.joints.keys()
-        == {x.name for x in said.arm.coordinates}
+        == {x.name for x in said.chain.coordinates}
         == said.settings.logs.joints.keys()
     )
-    kinds = [x.kind for x in said.arm.coordinates]
-    assert not said.settings.logs.misfits([x.name for x in said.arm.coordinates], kinds)
-    ours, theirs = (make_friction(x.arm, x.settings) for x in (plain, said))
+    kinds = [x.joint_type for x in said.chain.coordinates]
+    assert not said.settings.logs.misfits([x.name for x in said.chain.coordinates], kinds)
+    ours, theirs = (make_friction(x.chain, x.settings) for x in (plain, said))
     assert np.array_equal(ours(np.ones(len(kinds))), theirs(np.ones(len(kinds))))
     assert "this output exists already" in CliRunner().invoke(app, ["init", str(urdf)]).stderr

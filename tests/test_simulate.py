@@ -15,8 +15,7 @@ from spelgen.settings.settings import Settings, load_settings
 from spelgen.simulation import integration
 from spelgen.simulation.integration import rollout
 from spelgen.simulation.protocol import make_friction
-from spelgen.simulation.random_inputs import random_inputs
-from spelgen.simulation.simulate import simulate
+from spelgen.simulation.simulate import random_inputs, simulate
 from spelgen.urdf.read import read_urdf
 from tests.hand_built import arm, body, coordinate, coupled_urdf, pendulum, point, slider
 

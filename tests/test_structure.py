@@ -34,7 +34,7 @@ TOLERANCE_CASES = {
 
 @pytest.mark.parametrize("robot", COUNTS)
 def test_counts_of_the_own_robots(robots, robot):
-    structure = derive(load_arm(robots / f"{robot}.urdf").arm)
+    structure = derive(load_arm(robots / f"{robot}.urdf").chain)
     zeros = sum(entry.kind == "zero" for entry in structure.entries)
     assert (len(structure.outputs), len(structure.constants), zeros) == COUNTS[robot]
     assert not structure.passive
@@ -42,7 +42,7 @@ def test_counts_of_the_own_robots(robots, robot):
 
 
 def test_rpr_has_the_structure_of_the_paper(robots):
-    structure = derive(load_arm(robots / "rpr.urdf").arm)
+    structure = derive(load_arm(robots / "rpr.urdf").chain)
     assert sorted(output.joints for output in structure.outputs) == [(1, 2), (1, 2), (2,)]
     assert {(e.row, e.column): e.kind for e in structure.entries if e.kind != "varying"} == {
         (1, 1): "constant",
@@ -63,12 +63,12 @@ def test_a_planar_chain_separates_shared_functions():
 def test_smallest_form_is_exact(robots, robot):
     """sum c A + sum f B equals M, with c and f taken from the entries of M that the structure names."""
     loaded = load_arm(robots / f"{robot}.urdf")
-    structure = derive(loaded.arm)
+    structure = derive(loaded.chain)
     keys = triangle(len(structure.joints))
-    mass = float_samples(loaded.arm, "kinematics", 50, seed=9)[0]
+    mass = float_samples(loaded.chain, "kinematics", 50, seed=9)[0]
     rebuilt = np.zeros_like(mass)
     for term in (*structure.outputs, *structure.constants):
-        value = sum(float(weight) * mass[:, keys.index((i, j))] for i, j, weight in term.reads)
+        value = sum(float(weight) * mass[:, keys.index((i, j))] for i, j, weight in term.functional)
         for i, j, factor in term.basis:
             rebuilt[:, keys.index((i, j))] += float(factor) * value
     assert np.abs(rebuilt - mass).max() < 1e-10 * np.abs(mass).max()
@@ -76,7 +76,7 @@ def test_smallest_form_is_exact(robots, robot):
 
 def test_factors_are_exact_fractions(robots):
     """two_link is eq. 20 of the paper: M_11 contains twice the functions of M_21."""
-    structure = derive(load_arm(robots / "two_link.urdf").arm)
+    structure = derive(load_arm(robots / "two_link.urdf").chain)
     assert structure.outputs[0].basis == ((0, 0, Fraction(2)), (1, 0, Fraction(1)))
 
 

@@ -26,7 +26,7 @@ def scara(robots):
 
 def suggested(path, arm):
     """The trajectory as the mapping reads it, and the mapping's text."""
-    found = suggest_mapping(path, [x.name for x in arm.arm.coordinates])
+    found = suggest_mapping(path, [x.name for x in arm.chain.coordinates])
     assert not found.missing
     path.with_suffix(".yaml").write_text(found.text)
     (read,) = read_logs(path, arm, path.with_suffix(".yaml"))
@@ -66,7 +66,7 @@ def test_numbered_columns_with_set_points_and_without_velocities(scara, tmp_path
 
 
 def test_names_of_joints_count_before_numbers(scara, tmp_path):
-    names = [x.name for x in scara.arm.coordinates]
+    names = [x.name for x in scara.chain.coordinates]
     order = [3, 1, 0, 2]
     head = ["t", *(f"/{what}/{names[k]}/x0" for what in ("position", "velocity", "torque") for k in order)]
     rows = [[t, *q[order], *qd[order], *tau[order]] for t, q, qd, tau in zip(T, Q, QD, TAU, strict=True)]

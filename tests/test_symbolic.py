@@ -16,7 +16,7 @@ ROBOTS = ["two_link", "rpr", "scara", "six_dof", "ur10e", "panda"]
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_spans_of_coefficients_agree_with_the_structure(robots, robot):
     """Every number of the structure once more, from the polynomials' coefficients over the rationals."""
-    arm = load_arm(robots / f"{robot}.urdf").arm
+    arm = load_arm(robots / f"{robot}.urdf").chain
     _assert_agrees(derive(arm), polynomials(arm), len(arm.coordinates))
 
 
@@ -38,9 +38,9 @@ def _assert_agrees(structure, poly: Polynomials, n: int) -> None:
         assert tuple(sorted(joints)) == entry.joints
         assert (entry.kind == "zero") == (len(poly.mass[entry.row, entry.column]) == 0)
     for output in structure.outputs:
-        assert _joints_of(poly.combination(output.reads), n) == set(output.joints)
+        assert _joints_of(poly.combination(output.functional), n) == set(output.joints)
     for constant in structure.constants:
-        assert not _joints_of(poly.combination(constant.reads), n)
+        assert not _joints_of(poly.combination(constant.functional), n)
     assert _joints_of(poly.potential, n) == set(structure.potential)
 
 
@@ -71,7 +71,7 @@ def test_two_link_is_the_papers_equation_20(robots):
     """M = [[J1 + 5 J2 + 4 m(q), J2 + 2 m(q)], [J2 + 2 m(q), J2]] for links of one metre, half a metre to the
     mass.
     """
-    true = polynomials(load_arm(robots / "two_link.urdf").arm, inertials=True)
+    true = polynomials(load_arm(robots / "two_link.urdf").chain, inertials=True)
     assert {key: str(value) for key, value in true.mass.items()} == {
         (0, 0): "c2 + 7/2",
         (1, 0): "1/2*c2 + 5/4",
@@ -81,7 +81,7 @@ def test_two_link_is_the_papers_equation_20(robots):
 
 def test_every_sine_is_reduced_under_mimic_joints(shared):
     """Two bodies that turn with one angle still give polynomials with s to the first power."""
-    arm = load_arm(shared / "arms" / "abb_irb5400.urdf").arm
+    arm = load_arm(shared / "arms" / "abb_irb5400.urdf").chain
     poly = polynomials(arm)
     sines = [3 * k + 1 for k in range(len(arm.coordinates))]
     degrees = np.array([value.degrees() for value in (*poly.mass.values(), poly.potential)])

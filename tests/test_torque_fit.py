@@ -30,12 +30,15 @@ from spelgen.fitting.torque.joint_functions import FRICTION
 from spelgen.fitting.torque.linearization import RigidProjection
 from spelgen.fitting.torque.networks import adapt_networks
 from spelgen.fitting.torque.parameters import (
+    ESTIMATED_GROUPS,
     NEGLIGIBLE,
     RIGID_GROUPS,
+    ParameterPrior,
     ParameterVector,
+    prior_covariance,
     step_in_inertial_parameters,
+    update_widths,
 )
-from spelgen.fitting.torque.prior import ESTIMATED_GROUPS, ParameterPrior, prior_covariance, update_widths
 from spelgen.fitting.torque.problem import NoiseEstimator, TorqueProblem
 from spelgen.fitting.torque.report import terms_in_use, torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples
@@ -61,7 +64,7 @@ def emitted(robots, tmp_path_factory):
     for name in (*ROBOTS, "followed"):
         urdf = (folder if name == "followed" else robots) / f"{name}.urdf"
         source = generate(urdf, preset="closed-form")
-        made[name] = import_source(source, folder / f"{name}_closed_form.py"), load_arm(urdf).arm
+        made[name] = import_source(source, folder / f"{name}_closed_form.py"), load_arm(urdf).chain
     return made
 
 
@@ -541,7 +544,7 @@ def test_two_seconds_of_a_real_arm_beat_least_squares(shared, tmp_path):
     folder = shared / "logs" / "ur10e"
     source = generate(folder / "ur10e.urdf", preset="closed-form")
     model = import_source(source, tmp_path / "ur10e_closed_form.py").Model()
-    names = [coordinate.name for coordinate in load_arm(folder / "ur10e.urdf").arm.coordinates]
+    names = [coordinate.name for coordinate in load_arm(folder / "ur10e.urdf").chain.coordinates]
     (long,) = read_logs([folder / "20_02_10_30sec_12harm.parquet"], names)
     fit_torque(model, dynamics_samples([long[: int(np.searchsorted(long.t, long.t[0] + 2.0))]]))
     tests = ("19_12_23_free", "20_02_06_20sec_5harm")

@@ -13,8 +13,7 @@ from spelgen.errors import SettingsError, SpelgenErrors
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
 from spelgen.simulation import tracking
-from spelgen.simulation.paths import paths, sines
-from spelgen.simulation.protocol import initial_range, make_friction
+from spelgen.simulation.protocol import initial_range, make_friction, paths, sines
 from spelgen.simulation.simulate import simulate
 from spelgen.simulation.tracking import measured, record, track, tuned_gains
 from tests.hand_built import arm, body, coordinate, point, slider
@@ -44,7 +43,7 @@ def recordings(loaded):
         patch.setattr(
             tracking, "record", lambda *given: kept.append((given[3], inner(*given))) or kept[-1][1]
         )
-        logs = track(loaded.arm, settings)
+        logs = track(loaded.chain, settings)
     return settings, kept, logs
 
 
@@ -73,7 +72,7 @@ def test_trajectories_follow_one_path_or_each_its_own(loaded, choice):
     """On one path, trajectories overlap, so that the whole path is trained on."""
     settings = changed(loaded.settings, {"paths": choice})
     period = 1 / settings.tracking.frequency
-    begun = paths(loaded.arm, settings, np.array([0.0, 2 / 6 * period]))
+    begun = paths(loaded.chain, settings, np.array([0.0, 2 / 6 * period]))
     assert (np.abs(begun[2].q[0] - begun[0].q[1]).max() < 1e-12) == (choice == "same")
     assert len({tuple(path.q[0]) for path in begun}) == 6
 
@@ -83,10 +82,10 @@ def test_paths_of_excitation_go_from_rest_to_rest_within_range_and_speed(loaded)
         {"simulation": {"trajectories": 3}, "tracking": {"paths": "excitation"}}
     )
     t = np.linspace(0, 8, 1001)
-    for path in paths(loaded.arm, settings, t):
+    for path in paths(loaded.chain, settings, t):
         assert np.abs(path.qd[[0, -1]]).max() < 1e-12
         np.testing.assert_allclose(np.gradient(path.q, t, axis=0)[1:-1], path.qd[1:-1], atol=1e-3)
-        low, high = initial_range(loaded.arm, settings)
+        low, high = initial_range(loaded.chain, settings)
         assert (np.abs(path.q - (low + high) / 2) <= 0.35 * (high - low) + 1e-12).all()
         assert 0.3 < np.abs(path.qd).max() <= 1
 
@@ -144,7 +143,7 @@ def test_torques_are_held_between_ticks_and_explain_the_motion(recordings, loade
     _, recording = kept[1]
     np.testing.assert_array_equal(np.concatenate([logs.train[1].tau, logs.test[1].tau]), recording.tau)
     assert (recording.tau.reshape(-1, 4, N) == recording.tau[::4, None]).all()
-    engine, friction = arm_dynamics(loaded.arm, settings), make_friction(loaded.arm, settings)
+    engine, friction = arm_dynamics(loaded.chain, settings), make_friction(loaded.chain, settings)
     start = 4 * 300
 
     def derivative(_, state):
@@ -167,7 +166,7 @@ def test_the_first_seventy_percent_train_and_the_rest_tests(recordings):
 
 def test_the_seed_decides_everything(loaded):
     def logs(**protocol):
-        return track(loaded.arm, changed(loaded.settings, trajectories=1, duration=0.2, **protocol))
+        return track(loaded.chain, changed(loaded.settings, trajectories=1, duration=0.2, **protocol))
 
     first, again, other = logs(), logs(), logs(seed=1)
     for quantity in ("q", "qd", "tau"):
@@ -192,8 +191,8 @@ def test_motors_behind_gears_get_their_share_and_a_passive_joint_none():
 
 def test_the_arm_is_held_against_its_weight_from_the_start(loaded):
     """Without gains and without a sine, the initial torque of the controller keeps the arm at rest."""
-    friction = make_friction(loaded.arm, loaded.settings)
-    engine = arm_dynamics(loaded.arm, loaded.settings, friction)
+    friction = make_friction(loaded.chain, loaded.settings)
+    engine = arm_dynamics(loaded.chain, loaded.settings, friction)
     still = sines(np.full(N, 0.4), 0.0, 0.125, np.zeros(N), np.arange(50) / 125)
     settings = changed(loaded.settings, duration=0.4)
     held = record(engine, friction, np.eye(N), still, tuned_gains(np.zeros(N), 3.0), settings)
@@ -234,7 +233,7 @@ def test_by_default_an_arm_is_controlled(shared):
     for name in ("kinova_gen3_7dof_2f85", "kuka_iiwa14_lbrstack"):
         loaded = load_arm(shared / "arms" / f"{name}.urdf")
         logs = simulate(loaded, trajectories=1, duration=1.0)
-        low, high = initial_range(loaded.arm, loaded.settings)
+        low, high = initial_range(loaded.chain, loaded.settings)
         middle, reach = (low + high) / 2, 0.35 * (high - low)
         for log in logs:
             assert (np.abs(log.q - middle) < 1.02 * reach + 0.005).all()

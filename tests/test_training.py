@@ -27,7 +27,7 @@ from spelgen.fitting.dataset import TrainingData, prepare_data
 from spelgen.fitting.fit import RunOptions, fit
 from spelgen.fitting.objective import FitRequest
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW
-from spelgen.fitting.progress import TrainingProgress
+from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.rollout import (
     choose_substeps,
     integration_error,
@@ -40,7 +40,7 @@ from spelgen.fitting.rollout import (
 )
 from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.train import train
-from spelgen.fitting.tuning import WindowTuning
+from spelgen.fitting.tuning import FittingTuning
 from spelgen.fitting.window.rollout import RolloutObjective
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs
@@ -239,7 +239,7 @@ class Interrupted(TrainingProgress):
 
 @pytest.mark.parametrize(("optimizer", "steps"), [("adamw", 20), ("lbfgs", 3)])
 def test_resuming_repeats_what_would_have_been(module, logs, tmp_path, monkeypatch, optimizer, steps):
-    monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", WindowTuning(epoch_steps=steps))
+    monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", FittingTuning(epoch_steps=steps))
     config = quick(optimizer=optimizer, momentum_steps=20 if optimizer == "adamw" else 0)
     straight, broken = tmp_path / "straight", tmp_path / "broken"
     train(module, [logs], straight, config)
@@ -535,7 +535,7 @@ def test_progress_without_a_terminal_is_a_line_for_each_stage(show, capsys):
 def test_progress_on_a_terminal_is_one_line_of_80_columns(monkeypatch):
     screen = io.StringIO()
     console = Console(file=screen, width=80, force_terminal=True, legacy_windows=False)
-    monkeypatch.setattr("spelgen.fitting.progress.Console", lambda **options: console)
+    monkeypatch.setattr("spelgen.fitting.process.Console", lambda **options: console)
     with TrainingProgress(show=True) as progress:
         progress.momentum(1900, 2000, 1.234e-5)
         losses = {"loss": 1.234e-5, "validation": 1.234e-5, "best": 1.234e-5}

@@ -11,7 +11,7 @@ from time_bounds import in_time
 from spelgen.arm.arm import make_arm
 from spelgen.errors import ArmError, SpelgenError
 from spelgen.urdf.read import read_urdf
-from spelgen.urdf.robot import Inertial, Joint, Mimic, Transmission
+from spelgen.urdf.robot import Inertial, Mimic, Transmission, UrdfJoint
 
 LINKS = '<link name="base"/>\n<link name="arm"/>\n'
 JOINT = (
@@ -53,7 +53,7 @@ class TestValues:
         )
         text = LINKS + '<link name="tip"/>' + joint(inside) + joint(name="lead", parent="arm", child="tip")
         robot = read_urdf(write(text))
-        assert robot.joints[0] == Joint(
+        assert robot.joints[0] == UrdfJoint(
             name="j",
             type="revolute",
             parent="base",

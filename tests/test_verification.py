@@ -7,7 +7,7 @@ import pytest
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.verify import verify
-from spelgen.structure.structure import Entry, derive
+from spelgen.structure.structure import MassEntry, derive
 
 ROBOTS = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")
 
@@ -19,23 +19,23 @@ def rpr(robots):
 
 @pytest.fixture(scope="module")
 def true(rpr):
-    return derive(rpr.arm)
+    return derive(rpr.chain)
 
 
 @pytest.mark.parametrize("assume", ["kinematics", "inertials"])
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_derived_structure_is_confirmed(robots, name, assume):
     loaded = load_arm(robots / f"{name}.urdf")
-    proof = verify(loaded.robot, loaded.arm, derive(loaded.arm, assume))
+    proof = verify(loaded.robot, loaded.chain, derive(loaded.chain, assume))
     assert proof.agrees, proof.text()
     assert {check.verdict for check in proof.checks} == {"agrees"}
-    assert proof.samples > len(loaded.arm.coordinates)
+    assert proof.samples > len(loaded.chain.coordinates)
 
 
 def entry(structure, row, column, kind, joints=()):
     """The structure with one entry changed."""
     entries = tuple(
-        Entry(row, column, kind, joints) if (x.row, x.column) == (row, column) else x
+        MassEntry(row, column, kind, joints) if (x.row, x.column) == (row, column) else x
         for x in structure.entries
     )
     return replace(structure, entries=entries)
@@ -81,18 +81,18 @@ LIES = {
 @pytest.mark.parametrize("lie", LIES)
 def test_false_statements_are_reported(rpr, true, lie):
     told, words = LIES[lie]
-    proof = verify(rpr.robot, rpr.arm, told(true))
+    proof = verify(rpr.robot, rpr.chain, told(true))
     assert not proof.agrees
     assert any(word in str(check) for check in proof.differences for word in words.split("|")), proof.text()
 
 
 def test_an_arm_that_is_not_the_file_s_is_reported(rpr, true):
-    first, *rest = rpr.arm.bodies
+    first, *rest = rpr.chain.bodies
     moved = replace(first, translation=(first.translation[0] + Fraction(1, 100), *first.translation[1:]))
-    arm = replace(rpr.arm, bodies=(moved, *rest))
+    arm = replace(rpr.chain, bodies=(moved, *rest))
     assert not verify(rpr.robot, arm, derive(arm)).agrees
 
 
 def test_same_seed_same_proof(rpr, true):
-    assert verify(rpr.robot, rpr.arm, true) == verify(rpr.robot, rpr.arm, true)
-    assert verify(rpr.robot, rpr.arm, true, seed=1) != verify(rpr.robot, rpr.arm, true)
+    assert verify(rpr.robot, rpr.chain, true) == verify(rpr.robot, rpr.chain, true)
+    assert verify(rpr.robot, rpr.chain, true, seed=1) != verify(rpr.robot, rpr.chain, true)

@@ -18,8 +18,10 @@ UNUSED = re.compile(
 )
 FRAGMENT = re.compile(r"^(What|Of|By|Whoever|Whether) ")
 # terms of mechanics, and the name of an option
-ALLOWED = re.compile(r"\b(at|from|to) rest\b|--trust|trust=True|`trust`|hold(s|ing)? the arm|zero-order hold")
-CODE = re.compile(r"^```.*?^```$|^(?: {4}|\t).*$|`[^`\n]*`|\]\([^)]*\)", re.MULTILINE | re.DOTALL)
+ALLOWED = re.compile(
+    r"\b(at|from|to) rest\b|--trust|trust=True|`trust`|hold(s|ing)? the arm|leaves? out|held samples|zero-order hold"
+)
+CODE = re.compile(r"^```.*?^```$|^(?: {4}|\t)[^\n]*$|`[^`\n]*`|\]\([^)]*\)", re.MULTILINE | re.DOTALL)
 # texts for developers: what each number of a table means
 INTERNAL = ("runtime",)
 

@@ -11,7 +11,8 @@ import pytest
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.module_check import check
-from spelgen.emission.specify import arm_of_spec, derive_spec, generate
+from spelgen.emission.plan import derive_spec
+from spelgen.emission.specify import arm_of_spec, generate
 from spelgen.errors import SpelgenError
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.train import train
@@ -130,7 +131,7 @@ class TestExpansion:
             '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="top">'
             '<xacro:include filename="$(find my_arm)/urdf/part.xacro"/></robot>'
         )
-        assert load_arm(top).arm.joint_names == load_arm(arm).arm.joint_names
+        assert load_arm(top).chain.joint_names == load_arm(arm).chain.joint_names
 
     def test_the_current_folder_does_not_replace_the_package(self, arm, monkeypatch):
         (arm.parent / "xacro.py").write_text("raise SystemExit('a foreign module')")

@@ -1,1 +1,1 @@
-"""A Robot to an Arm: the serial chain in exact rational numbers."""
+"""Robot -> Arm: the serial chain in exact rational numbers."""

@@ -1,6 +1,7 @@
-"""Derive what the logs' torques do to the joints: the input matrix G of M qdd + ... = G tau, as the files say.
+"""Input matrix G of M qdd + ... = G tau, from the transmissions of the URDF and the settings.
 
-A log holds joint torques unless the sidecar says ``torque: motor``; then gears and coupled wrists stand between.
+Logs contain joint torques, or motor torques if the settings specify ``torque: motor``; G then contains gear ratios and
+the couplings of wrists.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ _SIMPLE, _DIFFERENTIAL = "SimpleTransmission", "DifferentialTransmission"
 
 @dataclass(frozen=True)
 class InputEntry:
-    """Hold an entry of G that is not zero, 0-based.
+    """A nonzero entry of G, with indices from 0.
 
-    It is known (``fixed``, or ``coupled`` where one motor moves several joints), or a ``gain`` that is trained and
-    starts at ``value``.
+    ``fixed``: a known gear; ``coupled``: known, of a motor that moves several joints; ``gain``: trained, with the
+    initial value ``value``.
     """
 
     row: int
@@ -34,10 +35,10 @@ class InputEntry:
 
 
 class Drives(NamedTuple):
-    """Hold matrices (n, n) of the motors of n joints.
+    """Matrices (n, n) of the motors of n joints.
 
-    inputs: G, the joints' torques are G times what is logged. speeds: C, the motors' speeds are C qd, in units of the
-    joints: friction and rotors belong to them (see `motor_speeds`).
+    inputs: G, the joint torques are G times the logged torques. speeds: C, the motors rotate at C qd in units of the
+    joints; friction and rotor inertia act at these speeds (see `motor_speeds`).
     """
 
     inputs: np.ndarray
@@ -46,9 +47,9 @@ class Drives(NamedTuple):
 
 @dataclass(frozen=True)
 class Actuation:
-    """Hold G of n joints by its entries, and what there is to tell about it.
+    """The entries of G for n joints, and diagnostics.
 
-    couplings: joint torques by motor torques where what is logged is at the joints already, but motors move several.
+    couplings: torque of a joint per motor torque, for coupled motors of a robot whose logs contain joint torques.
     """
 
     joints: int
@@ -58,22 +59,23 @@ class Actuation:
 
     @property
     def direct(self) -> bool:
-        """Whether every torque acts on its own joint as it is."""
+        """Whether G is the identity for all joints with a drive."""
         return all(entry == InputEntry(entry.row, entry.row, "fixed", 1.0) for entry in self.entries)
 
     def matrix(self) -> np.ndarray:
-        """Return G (n, n), gains at their start."""
+        """Return G (n, n), with trained gains at their initial values."""
         return self._matrix(self.entries)
 
     def drives(self) -> Drives:
-        """Return G, and how the motors turn."""
+        """Return G (n, n) and C (n, n)."""
         torques = self.matrix()
         for coupling in self.couplings:
-            torques[coupling.row] = 0.0  # the logs' torque is at the joint, its motors' are not
+            torques[coupling.row] = 0.0  # the logged torque acts at the joint, not at its motors
         torques += self._matrix(self.couplings)
         return Drives(self.matrix(), motor_speeds(torques))
 
     def _matrix(self, entries: Sequence[InputEntry]) -> np.ndarray:
+        """Return the matrix (n, n) of these entries."""
         result = np.zeros((self.joints, self.joints))
         for entry in entries:
             result[entry.row, entry.column] = entry.value
@@ -81,12 +83,16 @@ class Actuation:
 
 
 def motor_speeds(inputs: np.ndarray) -> np.ndarray:
-    """Return C, (n, n): the motors' speeds are C qd, where the joints' torques are ``inputs`` times the motors'.
+    """Return C, with which the motors rotate at C qd.
 
-    By the same power, each motor's in the units of the joint that it moves most: C is the identity where each moves
-    its own joint alone. A joint without a motor stands for its own.
+    Args:
+        inputs: joint torques per motor torque, (n, n).
+
+    Returns:
+        C (n, n). The speed of a motor is in units of the joint with its largest torque: C is the identity if each motor
+        moves only its own joint. A joint without motor has the row of the identity.
     """
-    # power is the same on both sides: tau_m . speed_m = tau . qd makes C the transpose of G, up to units
+    # Equal power, tau_m . speed_m = tau . qd with tau = G tau_m, gives C = G^T, up to the scales of the motors.
     largest = np.take_along_axis(inputs, np.abs(inputs).argmax(axis=0)[None], axis=0)
     passive = largest == 0
     speeds: np.ndarray = (inputs / np.where(passive, 1.0, largest)).T + np.diag(passive[0].astype(float))
@@ -96,10 +102,9 @@ def motor_speeds(inputs: np.ndarray) -> np.ndarray:
 def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) -> Actuation:
     """Return G of the arm with these ``joints``.
 
-    Raises SettingsError for couplings with locked joints, UrdfError for a transmission that is needed and
-    has unusable numbers.
+    Raises SettingsError for couplings with locked joints, UrdfError for a required transmission with unusable numbers.
     """
-    # the row of a passive joint stays zero: no torque of a log acts on it
+    # the row of a passive joint is zero
     driven = [name for name in joints if settings.joint(name).actuated]
     remarks = tuple(_undriven(robot, settings, driven))
     couplings = _couplings(robot, settings, joints)
@@ -119,11 +124,11 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
 
 
 def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterator[Diagnostic]:
-    """Yield remarks on joints without a transmission where others have one: perhaps passive, perhaps forgotten."""
+    """Yield a remark for each joint without transmission if other joints have one: it may be a passive joint."""
     transmitted: set[str] = set()
     for transmission in robot.transmissions:
         transmitted.update(transmission.joint_names)
-    # most URDFs have no transmissions at all: their absence says nothing
+    # most URDFs have no transmissions
     if transmitted.isdisjoint(driven):
         return
     for name in driven:
@@ -133,12 +138,12 @@ def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterat
 
 
 def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEntry:
-    """Return the gear between a motor and its joint: the sidecar's, else the URDF's, else a gain to be trained."""
+    """Return the entry of a motor and its joint: the gear of the settings, else of the URDF, else a trained gain."""
     joint = settings.joint(name)
     gear: float | None = joint.gear
     if "gear" not in joint.model_fields_set:
         gear = _reduction(robot, name)
-    # a gain that nobody knows is learned from the logs rather than assumed to be 1
+    # an unknown gain is trained, not assumed to be 1
     if gear is None:
         return InputEntry(index, index, "gain", 1.0)
     if joint.gain == "trained":
@@ -147,25 +152,25 @@ def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEnt
 
 
 def _reduction(robot: Robot, name: str) -> float | None:
-    """Return the reduction of a joint's simple transmission, where the URDF gives one that is not zero."""
+    """Return the reduction of the simple transmission of a joint; None if the URDF has none, or 0."""
     for transmission in robot.transmissions:
         if _SIMPLE in transmission.type and transmission.joint_names == [name]:
             collect(transmission.errors)
             reductions = [reduction for _, reduction in transmission.actuators if reduction]
-            # two actuators on one joint share the load in a way that no file says
+            # URDF does not specify the distribution of the load on two actuators of a joint
             if len(reductions) == 1:
                 return reductions[0]
     return None
 
 
 def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[InputEntry]:
-    """Return the sidecar's couplings, then the URDF's differential transmissions of joints not coupled there."""
+    """Return the couplings of the settings, then the differential transmissions of the URDF for all other joints."""
     entries: list[InputEntry] = []
     coupled: set[str] = set()
     errors = []
     for coupling in settings.couplings:
         locked = [name for name in coupling.joints if name not in joints]
-        # a coupling of locked joints alone concerns another part of the robot
+        # a coupling of only locked joints belongs to another part of the robot
         if len(locked) < len(coupling.joints):
             for name in locked:
                 errors.append(_locked(name, joints))
@@ -176,7 +181,7 @@ def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[
     for transmission in robot.transmissions:
         if _is_differential(transmission, set(joints) - coupled):
             if transmission.errors and settings.torque == "joint":
-                continue  # what is not needed must not refuse the arm
+                continue  # not needed
             collect(transmission.errors)
             entries += _block(joints, transmission.joint_names, _differential(transmission))
             coupled.update(transmission.joint_names)
@@ -195,9 +200,9 @@ def _is_differential(transmission: Transmission, free: Collection[str]) -> bool:
 
 
 def _differential(transmission: Transmission) -> tuple[tuple[float, float], ...]:
-    """Return joint torques by motor torques: both motors move both joints.
+    """Return the torques of two joints per torque of two motors, each of which moves both joints.
 
-    ROS transmission_interface, DifferentialTransmission; a reduction of 0 or none counts as 1.
+    Source: ROS transmission_interface, DifferentialTransmission. An absent reduction, or 0, counts as 1.
     """
     first, second = (reduction or 1.0 for _, reduction, _ in transmission.joints)
     a, b = (reduction or 1.0 for _, reduction in transmission.actuators)
@@ -207,7 +212,7 @@ def _differential(transmission: Transmission) -> tuple[tuple[float, float], ...]
 def _block(
     joints: Sequence[str], names: Sequence[str], matrix: Sequence[Sequence[float]]
 ) -> Iterator[InputEntry]:
-    """Yield the entries of G, not zero, of the joints called ``names``."""
+    """Yield the nonzero entries of G of the joints ``names``, whose block of G is ``matrix``."""
     for row, values in zip(names, matrix, strict=True):
         for column, value in zip(names, values, strict=True):
             if value:

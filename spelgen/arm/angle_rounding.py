@@ -1,4 +1,4 @@
-"""Round a file's origins and axes where they mean a special value, and say so."""
+"""Rounding of the origins and axes of a URDF to the special values that they represent, with diagnostics."""
 
 from __future__ import annotations
 
@@ -12,33 +12,32 @@ import numpy as np
 from spelgen.arm.rational import bounded, exact, rotation_from_rpy, rounded_angle
 from spelgen.arm.tuning import TUNING
 from spelgen.errors import Diagnostic
-from spelgen.urdf.robot import Inertial, Joint, Link
+from spelgen.urdf.robot import Inertial, UrdfJoint, UrdfLink
 
 
 @dataclass(frozen=True)
 class AngleRounding:
-    """Read special values out of rounded ones: angles within ``tolerance`` [rad], offsets, axes, tensors.
+    """Rounding of angles within ``tolerance`` [rad], and of offsets, axes and tensors; a tolerance of 0 disables it.
 
-    A tolerance of 0 switches all of it off. What changed is gathered in ``diagnostics``, once per origin or
-    axis.
+    ``diagnostics`` has one entry per changed origin or axis.
     """
 
     tolerance: float
     diagnostics: list[Diagnostic] = field(default_factory=list)
 
-    def joint_origin(self, joint: Joint) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return position [m] and rotation (3, 3) of a joint in its parent link's frame; None for no rotation."""
+    def joint_origin(self, joint: UrdfJoint) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return position (3,) [m] and rotation (3, 3) of a joint in the frame of its parent; None: no rotation."""
         where = f"joint {joint.name!r} origin"
         return self._offset(joint.xyz, where, joint.line), self._rotation(joint.rpy, where, joint.line)
 
-    def inertial_origin(self, link: Link, inertial: Inertial) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return position [m] and rotation (3, 3) of an inertial in its link's frame; None for no rotation."""
+    def inertial_origin(self, link: UrdfLink, inertial: Inertial) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return position (3,) [m] and rotation (3, 3) of an inertial in the frame of its link; None: no rotation."""
         where = f"link {link.name!r} inertial origin"
         offset = self._offset(inertial.com, where, inertial.line)
         return offset, self._rotation(inertial.rpy, where, inertial.line)
 
-    def tensor(self, link: Link, inertial: Inertial) -> np.ndarray:
-        """Return the exact tensor (3, 3) [kg m2], without products of inertia that are a computation's rounding."""
+    def tensor(self, link: UrdfLink, inertial: Inertial) -> np.ndarray:
+        """Return the exact inertia tensor (3, 3) [kg m2]; products of inertia of the order of rounding errors are 0."""
         xx, xy, xz, yy, yz, zz = inertial.tensor
         if self.tolerance:
             noise = TUNING.zero_noise * max(abs(xx), abs(yy), abs(zz))
@@ -52,9 +51,9 @@ class AngleRounding:
         tensor: np.ndarray = np.vectorize(exact, otypes=[object])(rows)
         return tensor
 
-    def axis(self, joint: Joint) -> np.ndarray:
-        """Return the joint's axis as a unit vector in the joint's frame, (3,)."""
-        # axes in files are often longer than one, 0 0 -1.0001 for example
+    def axis(self, joint: UrdfJoint) -> np.ndarray:
+        """Return the axis of a joint as a unit vector in the frame of the joint, (3,)."""
+        # axes in URDFs often have other lengths, such as 0 0 -1.0001
         unit: np.ndarray = np.array(joint.axis) / np.linalg.norm(joint.axis)
         if self.tolerance == 0.0:
             return unit
@@ -66,11 +65,11 @@ class AngleRounding:
         return rounded
 
     def angle(self, angle: float) -> float:
-        """Return an angle [rad] whose rounding is not worth a diagnostic: a constant offset of a mimic joint."""
+        """Return a rounded angle [rad] without a diagnostic, such as the constant offset of a mimic joint."""
         return rounded_angle(angle, self.tolerance)
 
     def position(self, vector: np.ndarray) -> np.ndarray:
-        """Return a composed position [m] without the noise that rounded rotations leave in it."""
+        """Return a composed position (3,) [m] without the noise of rounded rotations."""
         noise = 0.0
         if self.tolerance:
             noise = TUNING.offset_noise
@@ -78,6 +77,7 @@ class AngleRounding:
         return np.array(rounded)
 
     def _offset(self, offset: Sequence[float], where: str, line: int) -> np.ndarray:
+        """Return an offset (3,) [m], rounded."""
         written = np.array(list(map(exact, offset)))
         rounded = self.position(written)
         if (rounded != written).any():
@@ -86,6 +86,7 @@ class AngleRounding:
         return rounded
 
     def _rotation(self, rpy: Sequence[float], where: str, line: int) -> np.ndarray | None:
+        """Return the rotation (3, 3) of rounded roll, pitch and yaw [rad]; None for the identity."""
         if not any(rpy):
             return None
         rounded = list(map(self.angle, rpy))
@@ -95,7 +96,7 @@ class AngleRounding:
                 changes.append(f"{angle:.10g} is taken as {_in_pi(special)}")
         if changes:
             self._note("snapped-angle", where, line, "; ".join(changes))
-        # most origins do not turn: None saves a product of exact matrices
+        # most origins have no rotation: None avoids a product of exact matrices
         if not any(rounded):
             return None
         return rotation_from_rpy(rounded)
@@ -105,19 +106,20 @@ class AngleRounding:
 
 
 def _in_pi(angle: float) -> str:
-    """Return an angle as a multiple of pi, which a rounded one is: "-3 pi/4"."""
-    turns = Fraction(angle / pi).limit_denominator(120)  # a multiple of all divisors that are rounded to
-    if turns == 0:
+    """Return a rounded angle as a multiple of pi: "-3 pi/4"."""
+    multiple = Fraction(angle / pi).limit_denominator(120)  # a common multiple of the divisors
+    if multiple == 0:
         return "0"
     text = "pi"
-    if abs(turns.numerator) > 1:
-        text = f"{abs(turns.numerator)} pi"
-    if turns < 0:
+    if abs(multiple.numerator) > 1:
+        text = f"{abs(multiple.numerator)} pi"
+    if multiple < 0:
         text = f"-{text}"
-    if turns.denominator > 1:
-        text = f"{text}/{turns.denominator}"
+    if multiple.denominator > 1:
+        text = f"{text}/{multiple.denominator}"
     return text
 
 
 def _vector_text(values: Sequence[float] | np.ndarray) -> str:
+    """Return a vector (3,) as text with six digits."""
     return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"

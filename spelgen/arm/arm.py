@@ -1,4 +1,4 @@
-"""Robot -> Arm: the serial chain, fixed and locked links lumped, mimic joints folded in, geometry exact."""
+"""Robot -> Chain: the serial chain with exact geometry; links on fixed and locked joints are lumped."""
 
 from __future__ import annotations
 
@@ -6,30 +6,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import pi
-from typing import Literal
 
-from spelgen.arm.chain import Chain, choose_chain, follows
-from spelgen.arm.lump_links import Moved, lump_links
+from spelgen.arm.chain import ChainChoice, choose_chain, leaders
+from spelgen.arm.lump_links import MovingJoint, lump_links
 from spelgen.arm.placement import TenVector
 from spelgen.arm.rational import Matrix, Vector, as_matrix, as_vector, exact
 from spelgen.errors import ArmError, Diagnostic
-from spelgen.urdf.robot import Joint, Robot
+from spelgen.urdf.robot import JointType, Robot, UrdfJoint
 
-Kind = Literal["revolute", "prismatic"]
-
-MOST_JOINTS = 16
-"""Longest arm that is taken: what comes after grows with about the fifth power of it."""
-
-MOST_FOLLOWERS = 48
-"""Most joints that follow others by <mimic>: each is a body of its own in all that comes after."""
+# Largest number of joints: the cost of the derivation increases with about the fifth power.
+MAX_JOINTS = 16
+# Largest number of mimic joints, each of which is a separate body in the derivation.
+MAX_FOLLOWERS = 48
 
 
 @dataclass(frozen=True)
 class Coordinate:
-    """Hold one degree of freedom; limits as in the file (rad or m, N m or N, per second), None where absent."""
+    """A degree of freedom; limits as in the file (rad or m, N m or N, per second), None if absent."""
 
     name: str
-    kind: Kind
+    joint_type: JointType
     continuous: bool
     lower: float | None
     upper: float | None
@@ -41,7 +37,7 @@ class Coordinate:
 
     @property
     def limits(self) -> tuple[float, float] | None:
-        """Return lower and upper limit of a joint that has both and cannot turn on and on."""
+        """Lower and upper limit [rad, m]; None for a continuous joint, and if one is absent."""
         if self.continuous or self.lower is None or self.upper is None:
             return None
         return self.lower, self.upper
@@ -60,7 +56,7 @@ class Body:
 
     name: str
     link: str
-    kind: Kind
+    joint_type: JointType
     parent: int
     coordinate: int
     multiplier: Fraction
@@ -71,11 +67,11 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Arm:
-    """Hold a serial arm with n coordinates, root first; ``bodies`` hold the chain in its order, parents first.
+class Chain:
+    """A serial arm with n coordinates from the root to the tip; parents precede their children in ``bodies``.
 
-    ``gravity`` [m/s2] is in the root link's frame; ``locked`` names the joints held still; ``diagnostics``
-    holds what this step did, the robot's own stay with the robot.
+    ``gravity`` [m/s2] is in the frame of the root link; ``locked`` are the names of locked joints; ``diagnostics`` are
+    the diagnostics of this step, without the diagnostics of the robot.
     """
 
     name: str
@@ -91,12 +87,12 @@ class Arm:
         return tuple(coordinate.name for coordinate in self.coordinates)
 
     @property
-    def joint_types(self) -> tuple[Kind, ...]:
-        """Whether each coordinate turns or slides."""
-        return tuple(coordinate.kind for coordinate in self.coordinates)
+    def joint_types(self) -> tuple[JointType, ...]:
+        """Types of the coordinates."""
+        return tuple(coordinate.joint_type for coordinate in self.coordinates)
 
     @property
-    def has_inertials(self) -> bool:
+    def inertials_complete(self) -> bool:
         """Whether every body has an inertial with mass."""
         return all(body.inertia is not None and body.inertia[0] > 0 for body in self.bodies)
 
@@ -108,29 +104,31 @@ def make_arm(
     tip: str | None = None,
     angle_tolerance: float = 2e-3,
     gravity: Sequence[float] = (0.0, 0.0, -9.81),
-) -> Arm:
-    """Return the arm of the named ``joints``, up to the link ``tip``, or of the longest serial chain.
+) -> Chain:
+    """Return an arm of a robot; all joints that are not part of the arm are locked at 0.
 
-    All other joints are locked at 0.
+    Args:
+        robot: the robot.
+        joints: names of the moving joints.
+        tip: the last link, in place of ``joints``; without both, the arm is the longest serial chain.
+        angle_tolerance: angles within it [rad] of a multiple of pi/2 are rounded to it; 0: none are.
+        gravity: acceleration of gravity in the frame of the root link [m/s2].
 
-    ``angle_tolerance`` [rad] is how far an angle may be from a multiple of pi/2 to be taken as one; 0 takes
-    the file as it stands. Raises ``ArmError``.
+    Raises ArmError.
     """
     if not 0 <= angle_tolerance < pi / 4:
         got = f"an angle tolerance of {angle_tolerance:g} rad"
         raise ArmError(got, expected="at least 0 and less than pi/4 (0.785)")
-    # the choice may raise: nothing is placed or made exact before
     chain = choose_chain(robot, joints, tip)
     _require_small(robot, chain)
     lumped = lump_links(robot, chain, angle_tolerance)
-    locked = {joint.name for joint in lumped.held if joint.type != "fixed"}
+    locked = {joint.name for joint in lumped.locked if joint.type != "fixed"}
     bodies = []
-    # all bodies of one coordinate move with it, so bodies are found by their leader
     for moved in lumped.moved:
         bodies.append(_body(moved, chain.names.index(moved.followed.leader.name)))
-    # exact, so that a horizontal joint has no gravity torque at all and not one of 1e-17
+    # exact, so that the gravity torque of a vertical axis is 0 and not 1e-17
     x, y, z = map(exact, map(float, gravity))
-    return Arm(
+    return Chain(
         name=robot.name,
         coordinates=tuple(map(_coordinate, chain.joints)),
         bodies=tuple(bodies),
@@ -140,26 +138,25 @@ def make_arm(
     )
 
 
-def _require_small(robot: Robot, chain: Chain) -> None:
-    """Refuse what would take more than seconds, before any of it is done."""
-    # M of 16 joints has 136 entries, each over ten parameters of 16 bodies
+def _require_small(robot: Robot, chain: ChainChoice) -> None:
+    """Raise ArmError for an arm whose derivation would take more than some seconds."""
     moving = len(chain.joints)
-    if moving > MOST_JOINTS:
+    if moving > MAX_JOINTS:
         do = "choose fewer with --joints or --tip"
-        raise ArmError(f"{moving} joints", file=robot.told_as, expected=f"at most {MOST_JOINTS}", do=do)
-    following = -moving  # each joint of the chain follows itself
-    for follow in follows(robot).values():
+        raise ArmError(f"{moving} joints", file=robot.source, expected=f"at most {MAX_JOINTS}", do=do)
+    following = -moving  # each joint of the chain is its own leader
+    for follow in leaders(robot).values():
         following += follow.leader.name in chain.names
-    if following > MOST_FOLLOWERS:
+    if following > MAX_FOLLOWERS:
         got = f"{following} joints that follow others by <mimic>"
-        raise ArmError(got, file=robot.told_as, expected=f"at most {MOST_FOLLOWERS}", do="fix some of them")
+        raise ArmError(got, file=robot.source, expected=f"at most {MAX_FOLLOWERS}", do="fix some of them")
 
 
-def _body(moved: Moved, coordinate: int) -> Body:
+def _body(moved: MovingJoint, coordinate: int) -> Body:
     return Body(
         name=moved.joint.name,
         link=moved.joint.child,
-        kind=_kind(moved.joint),
+        joint_type=_joint_type(moved.joint),
         parent=moved.pose.parent,
         coordinate=coordinate,
         multiplier=moved.followed.multiplier,
@@ -170,10 +167,10 @@ def _body(moved: Moved, coordinate: int) -> Body:
     )
 
 
-def _coordinate(joint: Joint) -> Coordinate:
+def _coordinate(joint: UrdfJoint) -> Coordinate:
     return Coordinate(
         name=joint.name,
-        kind=_kind(joint),
+        joint_type=_joint_type(joint),
         continuous=joint.type == "continuous",
         lower=joint.lower,
         upper=joint.upper,
@@ -185,7 +182,7 @@ def _coordinate(joint: Joint) -> Coordinate:
     )
 
 
-def _kind(joint: Joint) -> Kind:
+def _joint_type(joint: UrdfJoint) -> JointType:
     if joint.type == "prismatic":
         return "prismatic"
     return "revolute"

@@ -1,4 +1,4 @@
-"""Robot -> the joints that are the arm's coordinates, and what the mimic joints follow."""
+"""Robot -> the joints that are the coordinates of the arm, and the leaders of mimic joints."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from fractions import Fraction
 
 from spelgen.arm.rational import bounded, exact
 from spelgen.errors import ArmError, Diagnostic, Severity, suggestion
-from spelgen.urdf.robot import Joint, Robot
+from spelgen.urdf.robot import Robot, UrdfJoint
 
-# names of vendors' grippers: what is behind such a joint is no part of the arm
+# names of joints of grippers, at which the arm ends
 _GRIPPER = re.compile(r"gripper|finger|thumb|knuckle|(?:^|[^a-z])jaws?(?:[^a-z]|$)", re.IGNORECASE)
 _CHOOSE = "choose one with --tip LINK or --joints A,B,..., or write tip or moving_joints into the settings"
 
 
 @dataclass(frozen=True)
-class Chain:
-    """Hold the chosen joints, root first, and what to tell about the choice."""
+class ChainChoice:
+    """The selected joints, root first, and diagnostics of the selection."""
 
-    joints: tuple[Joint, ...]
+    joints: tuple[UrdfJoint, ...]
     diagnostics: tuple[Diagnostic, ...] = ()
 
     @property
@@ -30,71 +30,70 @@ class Chain:
 
 
 @dataclass(frozen=True)
-class Follow:
-    """Say that q = multiplier * q_leader + offset, with a leader that follows nothing."""
+class Leader:
+    """The leader of a joint, which is no mimic joint: q = multiplier * q_leader + offset."""
 
-    leader: Joint
+    leader: UrdfJoint
     multiplier: Fraction
     offset: Fraction
 
 
-def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) -> Chain:
-    """Return the joints named, those on the way to the link ``tip``, or the longest serial chain.
+def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) -> ChainChoice:
+    """Return the named joints, the joints from the root to the link ``tip``, or the longest serial chain.
 
-    In the last case joints named after a gripper or finger at the end of the chain are left out. Raises
-    ``ArmError``.
+    The longest chain excludes joints at its end with the name of a gripper or finger. Raises ArmError.
     """
     if joints is not None and tip is not None:
-        raise ArmError("both joints and a tip", file=robot.told_as, expected="one of the two")
+        raise ArmError("both joints and a tip", file=robot.source, expected="one of the two")
     if joints is not None:
-        chain = Chain(_named(robot, joints))
+        chain = ChainChoice(_named(robot, joints))
     elif tip is not None:
-        chain = Chain(_up_to(robot, tip))
+        chain = ChainChoice(_up_to(robot, tip))
     else:
         chain = _longest(robot)
     if not chain.joints:
         expected = "a serial chain of joints"
-        raise ArmError("no joint that moves by itself", file=robot.told_as, expected=expected)
+        raise ArmError("no joint that moves by itself", file=robot.source, expected=expected)
     _refuse_free_joints(robot, chain.joints)
     return chain
 
 
-def follows(robot: Robot) -> dict[str, Follow]:
-    """Return what each joint follows, through any number of mimic joints; itself where it follows none."""
-    result: dict[str, Follow] = {}
+def leaders(robot: Robot) -> dict[str, Leader]:
+    """Return the leader of each joint, through any number of mimic joints; a joint without <mimic> leads itself."""
+    result: dict[str, Leader] = {}
     for joint in robot.joints:
         followers = []
         leader = joint
-        # a loop and no recursion: mimic joints may follow one another hundreds deep
+        # A loop replaces recursion: the nesting of mimic joints is not bounded.
         while leader.name not in result and leader.mimic is not None:
             followers.append((leader.name, leader.mimic))
             leader = robot.joint[leader.mimic.joint]
-        follow = result.setdefault(leader.name, Follow(leader, Fraction(1), Fraction(0)))
-        # nearest to the leader first: each follows the one before it
+        follow = result.setdefault(leader.name, Leader(leader, Fraction(1), Fraction(0)))
+        # from the leader outwards
         for name, mimic in reversed(followers):
             multiplier = exact(mimic.multiplier)
             offset = multiplier * follow.offset + exact(mimic.offset)
-            follow = Follow(follow.leader, bounded(multiplier * follow.multiplier), bounded(offset))
+            follow = Leader(follow.leader, bounded(multiplier * follow.multiplier), bounded(offset))
             result[name] = follow
     return result
 
 
-def _moves_by_itself(joint: Joint) -> bool:
+def _moves_by_itself(joint: UrdfJoint) -> bool:
     return joint.moves and joint.mimic is None
 
 
-def _independent(joints: Iterable[Joint]) -> tuple[Joint, ...]:
+def _independent(joints: Iterable[UrdfJoint]) -> tuple[UrdfJoint, ...]:
     return tuple(filter(_moves_by_itself, joints))
 
 
-def _refuse_free_joints(robot: Robot, chain: Sequence[Joint]) -> None:
+def _refuse_free_joints(robot: Robot, chain: Sequence[UrdfJoint]) -> None:
     """Raise ArmError for a floating or planar joint between the chain's joints; one below the arm is held fixed."""
     below = robot.path_to(chain[0].parent)
     for joint in robot.path_to(chain[-1].parent):
         if joint.type in ("floating", "planar") and joint not in below:
             raise ArmError(
                 f"a {joint.type} joint on the way to the joint {chain[-1].name!r}",
-                file=robot.told_as,
+                file=robot.source,
                 line=joint.line,
                 element=f"joint {joint.name!r}",
                 expected="revolute, continuous, prismatic and fixed joints there",
@@ -102,43 +101,42 @@ def _refuse_free_joints(robot: Robot, chain: Sequence[Joint]) -> None:
             )
 
 
-def _named(robot: Robot, names: Sequence[str]) -> tuple[Joint, ...]:
-    """Return the joints of these names, which must be in their order on one path."""
+def _named(robot: Robot, names: Sequence[str]) -> tuple[UrdfJoint, ...]:
+    """Return the joints of these names. Raises ArmError unless they are in their order on one path."""
     chosen = [_usable(robot, name) for name in names]
     for name in names:
         if list(names).count(name) > 1:
-            raise ArmError(f"the joint {name!r} twice", file=robot.told_as, expected="each joint once")
+            raise ArmError(f"the joint {name!r} twice", file=robot.source, expected="each joint once")
     if not chosen:
         return ()
-    # a path through the deepest joint passes all others, or they lie on another branch
+    # the path to the deepest joint contains all others, unless they are on another branch
     deepest = max(chosen, key=lambda joint: len(robot.path_to(joint.child)))
     ordered = tuple(joint for joint in robot.path_to(deepest.child) if joint in chosen)
     for joint in chosen:
         if joint not in ordered:
             raise ArmError(
                 f"the joints {joint.name!r} and {deepest.name!r}, which lie on different branches",
-                file=robot.told_as,
+                file=robot.source,
                 line=joint.line,
                 expected="joints on one path from the root",
             )
-    # columns of logs follow the order that is given: silently sorting would permute them
+    # columns of logs have the given order, which sorting would permute
     if list(ordered) != chosen:
         raise ArmError(
             f"the joints in the order {','.join(names)}",
-            file=robot.told_as,
+            file=robot.source,
             expected="the order from the root to the tip",
             do=f"use {','.join(joint.name for joint in ordered)}",
         )
     return ordered
 
 
-def _usable(robot: Robot, name: str) -> Joint:
-    """Return the joint of this name, which must move by itself."""
-    # each mistake has an answer of its own: misspelt, a follower, or fixed
+def _usable(robot: Robot, name: str) -> UrdfJoint:
+    """Return the joint of this name. Raises ArmError for an unknown, mimic, fixed, floating or planar joint."""
     joint = robot.joint.get(name)
     if joint is None:
         names = [joint.name for joint in _independent(robot.joints)]
-        raise ArmError(f"no joint is named {name!r}", file=robot.told_as, do=suggestion(name, names))
+        raise ArmError(f"no joint is named {name!r}", file=robot.source, do=suggestion(name, names))
     if _moves_by_itself(joint):
         return joint
     got = f"a {joint.type} joint"
@@ -147,64 +145,64 @@ def _usable(robot: Robot, name: str) -> Joint:
     if joint.moves:
         got = "a mimic joint"
         expected = "its leader"
-        do = f"name {follows(robot)[name].leader.name!r} instead: what follows it moves with it"
+        do = f"name {leaders(robot)[name].leader.name!r} instead: what follows it moves with it"
     element = f"joint {name!r}"
-    raise ArmError(got, file=robot.told_as, line=joint.line, element=element, expected=expected, do=do)
+    raise ArmError(got, file=robot.source, line=joint.line, element=element, expected=expected, do=do)
 
 
-def _up_to(robot: Robot, tip: str) -> tuple[Joint, ...]:
+def _up_to(robot: Robot, tip: str) -> tuple[UrdfJoint, ...]:
     if tip not in robot.link:
-        raise ArmError(f"no link is named {tip!r}", file=robot.told_as, do=suggestion(tip, robot.link))
+        raise ArmError(f"no link is named {tip!r}", file=robot.source, do=suggestion(tip, robot.link))
     return _independent(robot.path_to(tip))
 
 
-def _longest(robot: Robot) -> Chain:
-    """Return the longest chain; of several of one length, the one that something certain speaks for."""
+def _longest(robot: Robot) -> ChainChoice:
+    """Return the longest chain. Raises ArmError for several of equal length without an unambiguous criterion."""
     chains = _chains(robot)
     length = max(map(len, chains), default=0)
     longest = [chain for chain in chains if len(chain) == length]
     if not longest:
-        return Chain(())
+        return ChainChoice(())
     if len(longest) == 1:
-        return Chain(longest[0])
-    # two jaws make two chains of one length, and neither is the arm
+        return ChainChoice(longest[0])
+    # two jaws form two chains of equal length
     if _is_parallel_gripper(longest):
         jaws = ", ".join(repr(chain[-1].name) for chain in longest)
         message = f"{jaws} slide side by side at the end of the chain: taken as a gripper's and locked"
-        return Chain(longest[0][:-1], (_remark(longest[0][-1], "info", message),))
+        return ChainChoice(longest[0][:-1], (_remark(longest[0][-1], "info", message),))
     # nothing drives a joint without an effort limit, which is 0 in the file
     driven = [chain for chain in longest if all(joint.effort is not None for joint in chain)]
     if len(driven) == 1:
         message = f"{len(longest)} chains of {length} joints: the only one with effort limits of all joints is taken"
-        return Chain(driven[0], (_remark(driven[0][-1], "warning", message),))
+        return ChainChoice(driven[0], (_remark(driven[0][-1], "warning", message),))
     raise _ambiguous(robot, longest)
 
 
-def _remark(joint: Joint, severity: Severity, message: str) -> Diagnostic:
+def _remark(joint: UrdfJoint, severity: Severity, message: str) -> Diagnostic:
     return Diagnostic(severity, "ambiguous-chain", f"joint {joint.name!r}", joint.line, message)
 
 
-def _chains(robot: Robot) -> list[tuple[Joint, ...]]:
-    """Return the distinct chains from the root to a tip, without what belongs to a gripper by its name."""
-    chains: dict[tuple[str, ...], tuple[Joint, ...]] = {}
+def _chains(robot: Robot) -> list[tuple[UrdfJoint, ...]]:
+    """Return the distinct chains from the root to a tip, without joints of grippers."""
+    chains: dict[tuple[str, ...], tuple[UrdfJoint, ...]] = {}
     for link in robot.links:
         if not robot.joints_below[link.name]:
             chain = _without_gripper(_independent(robot.path_to(link.name)))
-            # fingers fixed side by side end the same chain
+            # several fixed fingers are at the end of the same chain
             chains.setdefault(tuple(joint.name for joint in chain), chain)
     return list(chains.values())
 
 
-def _without_gripper(chain: tuple[Joint, ...]) -> tuple[Joint, ...]:
+def _without_gripper(chain: tuple[UrdfJoint, ...]) -> tuple[UrdfJoint, ...]:
     end = len(chain)
     while end and _GRIPPER.search(chain[end - 1].name):
         end -= 1
-    # a chain of nothing but fingers is a finger robot, and the finger is the arm
+    # if all joints are joints of fingers, the finger is the arm
     return chain[:end] or chain
 
 
-def _is_parallel_gripper(chains: Sequence[tuple[Joint, ...]]) -> bool:
-    """Whether chains differ in a last sliding joint only, all from one link."""
+def _is_parallel_gripper(chains: Sequence[tuple[UrdfJoint, ...]]) -> bool:
+    """Whether chains differ only in a last prismatic joint with the same parent link."""
     *arm, jaw = chains[0]
     for chain in chains:
         last = chain[-1]
@@ -213,11 +211,11 @@ def _is_parallel_gripper(chains: Sequence[tuple[Joint, ...]]) -> bool:
     return bool(arm)
 
 
-def _ambiguous(robot: Robot, chains: Sequence[tuple[Joint, ...]]) -> ArmError:
+def _ambiguous(robot: Robot, chains: Sequence[tuple[UrdfJoint, ...]]) -> ArmError:
     listed = []
     for chain in chains[:4]:
         listed.append(f"one to the link {chain[-1].child!r} ({chain[0].name} ... {chain[-1].name})")
     if len(chains) > 4:
         listed.append(f"{len(chains) - 4} more")
     got = f"{len(chains)} chains of {len(chains[0])} joints: {' and '.join(listed)}"
-    return ArmError(got, file=robot.told_as, expected="one longest chain", do=_CHOOSE)
+    return ArmError(got, file=robot.source, expected="one longest chain", do=_CHOOSE)

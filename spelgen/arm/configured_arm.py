@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from spelgen.arm.actuation import Actuation, derive_actuation
-from spelgen.arm.arm import Arm, make_arm
+from spelgen.arm.arm import Chain, make_arm
 from spelgen.errors import Diagnostic
 from spelgen.labels import counted
 from spelgen.settings.settings import Settings, load_settings
@@ -16,7 +16,7 @@ from spelgen.urdf.robot import Robot
 
 
 @dataclass(frozen=True, repr=False)
-class ConfiguredArm:
+class Arm:
     """An arm: the robot of a URDF, its settings, the serial chain, and how motors drive the joints.
 
     ``joints``, ``tip`` and ``angle_tolerance`` are the arguments of ``load_arm``.
@@ -24,7 +24,7 @@ class ConfiguredArm:
 
     robot: Robot
     settings: Settings
-    arm: Arm
+    chain: Chain
     actuation: Actuation
     joints: tuple[str, ...] | None
     tip: str | None
@@ -33,18 +33,18 @@ class ConfiguredArm:
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
         """Return the diagnostics of the URDF, the settings, the chain and its inputs."""
-        sources = (self.robot, self.arm, self.actuation, self.settings)
+        sources = (self.robot, self.chain, self.actuation, self.settings)
         return tuple(item for source in sources for item in source.diagnostics)
 
     @property
     def turning_joints(self) -> tuple[str, ...]:
         """Names of the revolute joints without position limits."""
-        joints = self.arm.coordinates
-        return tuple(x.name for x in joints if x.kind == "revolute" and x.limits is None)
+        joints = self.chain.coordinates
+        return tuple(x.name for x in joints if x.joint_type == "revolute" and x.limits is None)
 
     def __repr__(self) -> str:
-        joints = counted(len(self.arm.coordinates), "joint")
-        return f"<Arm {self.arm.name!r}: {joints} of {self.robot.path.name}>"
+        joints = counted(len(self.chain.coordinates), "joint")
+        return f"<Arm {self.chain.name!r}: {joints} of {self.robot.path.name}>"
 
 
 def load_arm(
@@ -52,12 +52,12 @@ def load_arm(
     joints: Sequence[str] | None = None,
     tip: str | None = None,
     angle_tolerance: float = 2e-3,
-) -> ConfiguredArm:
+) -> Arm:
     """Return the arm in the URDF at ``path``, with the settings in the YAML file of the same name.
 
     Args:
         path: URDF or xacro file.
-        joints: names of the moving joints; None: those of the settings, or of the longest actuated chain.
+        joints: names of the moving joints; None: the joints in the settings, or of the longest actuated chain.
         tip: name of the last link, in place of ``joints``.
         angle_tolerance: angles within it [rad] of a multiple of pi/2 are rounded to it; 0: none are.
 
@@ -73,10 +73,10 @@ def load_arm(
         replace(coordinate, passive=not settings.joint(coordinate.name).actuated)
         for coordinate in arm.coordinates
     )
-    return ConfiguredArm(
+    return Arm(
         robot=robot,
         settings=settings,
-        arm=replace(arm, coordinates=coordinates),
+        chain=replace(arm, coordinates=coordinates),
         actuation=derive_actuation(robot, settings, arm.joint_names),
         joints=None if joints is None else tuple(joints),
         tip=tip,

@@ -1,4 +1,4 @@
-"""Every joint sorted into what moves and what is held, the links lumped, and what to tell about it."""
+"""Classification of all joints as moving or locked, lumping of links into bodies, and diagnostics."""
 
 from __future__ import annotations
 
@@ -8,80 +8,71 @@ from dataclasses import dataclass
 import numpy as np
 
 from spelgen.arm.angle_rounding import AngleRounding
-from spelgen.arm.chain import Chain, Follow, follows
+from spelgen.arm.chain import ChainChoice, Leader, leaders
 from spelgen.arm.placement import Frame, Placement, Pose, TenVector
 from spelgen.arm.rational import bounded, rotation_from_rpy
 from spelgen.arm.tuning import TUNING
 from spelgen.errors import Diagnostic
-from spelgen.urdf.robot import Joint, Link, Robot
+from spelgen.urdf.robot import Robot, UrdfJoint, UrdfLink
 
 
 @dataclass(frozen=True)
-class Moved:
-    """Hold a joint that moves, what it follows, where it is, and the ``links`` it carries with their inertia."""
+class MovingJoint:
+    """A moving joint with its leader and pose, and the ``links`` of its body with their total inertia."""
 
-    joint: Joint
-    followed: Follow
+    joint: UrdfJoint
+    followed: Leader
     pose: Pose
-    links: tuple[Link, ...]
+    links: tuple[UrdfLink, ...]
     inertia: TenVector | None
 
 
 @dataclass(frozen=True)
 class LumpedLinks:
-    """Hold all joints: those that move, the chain's first, and those held still, fixed ones included.
+    """Moving joints (the chain first), locked joints (fixed ones included), and the frames of all links by name."""
 
-    frames: of all links, by name.
-    """
-
-    moved: tuple[Moved, ...]
-    held: tuple[Joint, ...]
+    moved: tuple[MovingJoint, ...]
+    locked: tuple[UrdfJoint, ...]
     frames: Mapping[str, Frame]
     diagnostics: tuple[Diagnostic, ...]
 
 
-def lump_links(robot: Robot, chain: Chain, angle_tolerance: float) -> LumpedLinks:
-    """Return the robot with the chain's joints and their followers moving, and all others held."""
+def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> LumpedLinks:
+    """Return the robot with moving joints of the chain and their followers, and all other joints locked."""
     rounding = AngleRounding(angle_tolerance)
-    # parents first: a link is placed in the frame of the body that carries it
     placement = Placement(robot.root, rounding)
-    following = follows(robot)
-    poses: list[tuple[Joint, Pose]] = []
-    held: list[Joint] = []
-    for joint in _chain_first(robot, chain):
+    following = leaders(robot)
+    poses: list[tuple[UrdfJoint, Pose]] = []
+    locked: list[UrdfJoint] = []
+    # bodies have this order: parents first, and the chain before followers on branches
+    path = robot.path_to(chain.joints[-1].child)
+    for joint in dict.fromkeys([*path, *robot.joints_from_root]):
         followed = following[joint.name]
         if joint.moves and followed.leader.name in chain.names and followed.multiplier:
             poses.append((joint, placement.move(joint)))
         else:
-            # a follower whose leader is held stands at its offset, all other joints at 0
-            held.append(joint)
-            placement.hold(joint, float(followed.offset) if joint.moves else 0.0)
+            # the position of a follower of a locked joint is its offset
+            locked.append(joint)
+            placement.lock(joint, float(followed.offset) if joint.moves else 0.0)
     moved = []
     for (joint, pose), links in zip(poses, _lumps(robot, placement, len(poses)), strict=True):
-        moved.append(Moved(joint, following[joint.name], pose, tuple(links), _total(placement, links)))
+        total = _total(placement, links)
+        moved.append(MovingJoint(joint, following[joint.name], pose, tuple(links), total))
     diagnostics = [
         *chain.diagnostics,
         *rounding.diagnostics,
         *_folded_remarks(moved),
         *_lumped_remarks(moved),
-        *_locked_remarks(following, held),
-        *_dependent_remarks(placement, moved, held),
+        *_locked_remarks(following, locked),
+        *_dependent_remarks(placement, moved, locked),
     ]
     diagnostics.sort(key=lambda diagnostic: diagnostic.line or 0)
-    return LumpedLinks(tuple(moved), tuple(held), placement.frames, tuple(diagnostics))
+    return LumpedLinks(tuple(moved), tuple(locked), placement.frames, tuple(diagnostics))
 
 
-def _chain_first(robot: Robot, chain: Chain) -> list[Joint]:
-    """Return all joints, parents first, those on the way to the chain's tip before all others."""
-    path = robot.path_to(chain.joints[-1].child)
-    # bodies are numbered in this order, so the chain's come first and followers after them
-    return list(dict.fromkeys([*path, *robot.joints_from_root]))
-
-
-def _lumps(robot: Robot, placement: Placement, count: int) -> list[list[Link]]:
-    """Return the links with an inertial that each body carries; what the root carries never moves."""
-    lumps: list[list[Link]] = [[] for _ in range(count)]
-    # what the root carries never moves, and a link without inertial adds nothing
+def _lumps(robot: Robot, placement: Placement, count: int) -> list[list[UrdfLink]]:
+    """Return the links with an inertial for each body; links that are fixed to the root do not move."""
+    lumps: list[list[UrdfLink]] = [[] for _ in range(count)]
     for link in robot.links:
         body = placement.frames[link.name].body
         if body >= 0 and link.inertial is not None:
@@ -89,8 +80,8 @@ def _lumps(robot: Robot, placement: Placement, count: int) -> list[list[Link]]:
     return lumps
 
 
-def _total(placement: Placement, links: Sequence[Link]) -> TenVector | None:
-    """Return the sum of the links' inertias about their body's origin."""
+def _total(placement: Placement, links: Sequence[UrdfLink]) -> TenVector | None:
+    """Return the sum of the inertias of links about the origin of their body."""
     total: TenVector | None = None
     for link in links:
         if link.inertial is not None:
@@ -99,11 +90,11 @@ def _total(placement: Placement, links: Sequence[Link]) -> TenVector | None:
     return total
 
 
-def _info(code: str, joint: Joint, message: str) -> Diagnostic:
+def _info(code: str, joint: UrdfJoint, message: str) -> Diagnostic:
     return Diagnostic("info", code, f"joint {joint.name!r}", joint.line, message)
 
 
-def _folded_remarks(moved: Sequence[Moved]) -> Iterator[Diagnostic]:
+def _folded_remarks(moved: Sequence[MovingJoint]) -> Iterator[Diagnostic]:
     for body in moved:
         if body.joint.mimic is not None:
             followed = body.followed
@@ -113,7 +104,7 @@ def _folded_remarks(moved: Sequence[Moved]) -> Iterator[Diagnostic]:
             yield _info("mimic-folded", body.joint, message)
 
 
-def _lumped_remarks(moved: Sequence[Moved]) -> Iterator[Diagnostic]:
+def _lumped_remarks(moved: Sequence[MovingJoint]) -> Iterator[Diagnostic]:
     for body in moved:
         names = []
         mass = 0.0
@@ -126,14 +117,14 @@ def _lumped_remarks(moved: Sequence[Moved]) -> Iterator[Diagnostic]:
             yield _info("lumped", body.joint, message)
 
 
-def _locked_remarks(following: Mapping[str, Follow], held: Sequence[Joint]) -> Iterator[Diagnostic]:
-    # a humanoid has thirty of them: one remark for all
-    outside = [joint for joint in held if joint.moves and joint.mimic is None]
+def _locked_remarks(following: Mapping[str, Leader], locked: Sequence[UrdfJoint]) -> Iterator[Diagnostic]:
+    # one remark for all: a humanoid has thirty locked joints
+    outside = [joint for joint in locked if joint.moves and joint.mimic is None]
     if outside:
         names = ", ".join(repr(joint.name) for joint in outside)
         message = f"locked at 0, not part of the chain: {names}"
         yield Diagnostic("info", "locked-joint", "joints", outside[0].line, message)
-    for joint in held:
+    for joint in locked:
         if joint.type == "fixed" or joint in outside:
             continue
         followed = following[joint.name]
@@ -145,18 +136,18 @@ def _locked_remarks(following: Mapping[str, Follow], held: Sequence[Joint]) -> I
 
 
 def _dependent_remarks(
-    placement: Placement, moved: Sequence[Moved], held: Sequence[Joint]
+    placement: Placement, moved: Sequence[MovingJoint], locked: Sequence[UrdfJoint]
 ) -> Iterator[Diagnostic]:
-    """Say which locked joints are parallel to one of the chain beside them.
+    """Yield a warning for each locked joint that is parallel to a joint of the chain with the same parent body.
 
-    A locked joint beside a joint of the chain and parallel to it is the mark of an opened parallelogram.
+    Such a pair indicates a parallelogram linkage whose loop was opened in the URDF.
     """
     behind: set[str] = set()
-    for joint in held:
+    for joint in locked:
         if joint.moves or joint.parent in behind:
             behind.add(joint.child)
         turns = joint.type in ("revolute", "continuous") and joint.mimic is None
-        # behind a locked joint the arm's own geometry says nothing any more
+        # joints behind a locked joint are not part of a linkage of the arm
         if joint.parent in behind or not turns:
             continue
         beside = _parallel_beside(placement, moved, joint)
@@ -168,14 +159,16 @@ def _dependent_remarks(
             yield Diagnostic("warning", "dependent-joints", f"joint {joint.name!r}", joint.line, message)
 
 
-def _parallel_beside(placement: Placement, moved: Sequence[Moved], joint: Joint) -> Joint | None:
-    """Return the revolute joint that starts from the same moving body as ``joint``, with a parallel axis."""
+def _parallel_beside(
+    placement: Placement, moved: Sequence[MovingJoint], joint: UrdfJoint
+) -> UrdfJoint | None:
+    """Return the revolute joint with the same parent body as ``joint`` and a parallel axis; None if there is none."""
     frame = placement.frames[joint.parent]
     rotation = np.array(frame.rotation, dtype=float) @ rotation_from_rpy(joint.rpy)
     axis = rotation @ np.array(joint.axis) / np.linalg.norm(joint.axis)
     for body in moved:
         if body.pose.parent == frame.body >= 0 and body.joint.type != "prismatic":
-            # a body turns about the +z of its own frame
+            # a body rotates about the z axis of its frame
             beside = np.array(body.pose.rotation, dtype=float)[:, 2]
             if np.linalg.norm(np.cross(axis, beside)) < TUNING.parallel:
                 return body.joint

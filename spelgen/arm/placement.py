@@ -1,8 +1,8 @@
-"""Exact poses of joints and links at zero position, and inertias in the frame of the body they move with.
+"""Exact poses of joints and links at zero position, and inertias in the frame of their body.
 
-A rotation composed of decimal angles is no rational matrix, so it is composed in float64 over the longest
-stretch that no revolute joint interrupts, and made rational once: 45 degrees, a prismatic joint and another
-45 degrees are exactly 90, and every rotation is exactly orthogonal.
+A rotation composed of decimal angles is not rational. Rotations are therefore composed in float64 between revolute
+joints (a segment), and approximated by a rational matrix once: 45 degrees, a prismatic joint and another 45 degrees are
+exactly 90, and every rotation is exactly orthogonal.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import numpy as np
 
 from spelgen.arm.angle_rounding import AngleRounding
 from spelgen.arm.rational import IDENTITY, ZERO, alignment, exact, exact_rotation, lost_zeros, rotation_about
-from spelgen.urdf.robot import Inertial, Joint, Link
+from spelgen.urdf.robot import Inertial, UrdfJoint, UrdfLink
 
 TenVector = tuple[Fraction, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Hold a link's frame at zero position, in the frame of the body it moves with (-1: the root link).
+    """The frame of a link at zero position in the frame of its body (-1: the root link).
 
-    ``composed`` (3, 3) is its float64 rotation in the frame of the last revolute body on the way,
-    ``rotation`` the exact one in the body's own frame; they differ where prismatic bodies lie between.
+    composed: float64 rotation (3, 3) in the frame of the last revolute body before the link. rotation: exact rotation
+    (3, 3) in the frame of the body, which differs if there are prismatic bodies between the two.
     """
 
     body: int
@@ -34,19 +34,19 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class _StretchFrame:
-    """Hold a frame's rotation in the frame of the last revolute body before it, (3, 3) float64 and rational."""
+class _SegmentFrame:
+    """The rotation of a frame in the frame of the last revolute body before it, (3, 3), in float64 and rational."""
 
     composed: np.ndarray
     exact: np.ndarray
 
 
-_STRAIGHT = _StretchFrame(np.eye(3), IDENTITY)
+_UNROTATED = _SegmentFrame(np.eye(3), IDENTITY)
 
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Hold a joint's own frame, with +z along its axis, in the frame of the body ``parent``."""
+    """The frame of a joint, with +z along its axis, in the frame of the body ``parent``."""
 
     parent: int
     rotation: np.ndarray
@@ -54,47 +54,50 @@ class Pose:
 
 
 class Placement:
-    """Place links from the root outwards: every joint is either held, or starts a body of its own."""
+    """Poses of links from the root outwards: a joint is locked, or starts a new body."""
 
     def __init__(self, root: str, rounding: AngleRounding) -> None:
         self.frames = {root: Frame(-1, np.eye(3), IDENTITY, ZERO)}
         self._rounding = rounding
-        # by body, the frames from the last revolute body above it, or itself, to its own
-        self._stretches: list[tuple[_StretchFrame, ...]] = [(_STRAIGHT,)]
+        # per body, the frames from the last revolute body (the body itself if it is revolute) to the body
+        self._segments: list[tuple[_SegmentFrame, ...]] = [(_UNROTATED,)]
 
-    def hold(self, joint: Joint, value: float) -> None:
-        """Place the child of a joint that stays at ``value`` [rad or m]."""
+    def lock(self, joint: UrdfJoint, value: float) -> None:
+        """Add the child of a joint that is locked at ``value`` [rad, m]."""
         frame = self._joint_origin(joint)
         if value and joint.type == "prismatic":
-            frame = self._slid(frame, self._rounding.axis(joint), value)
+            axis = np.array(list(map(exact, self._rounding.axis(joint).tolist())))
+            frame = self._turned(frame, self._offset(frame, exact(value) * axis), None)
         elif value:
             turn = rotation_about(self._rounding.axis(joint), self._rounding.angle(value))
             frame = self._turned(frame, frame.position, turn)
         self.frames[joint.child] = frame
 
-    def move(self, joint: Joint) -> Pose:
-        """Place a moving joint and its child, which start a body; bodies are numbered by order of calls."""
+    def move(self, joint: UrdfJoint) -> Pose:
+        """Add a moving joint and its child, which start a body; bodies are numbered in the order of the calls."""
         frame = self._joint_origin(joint)
-        # the recursion knows joints about z alone: other axes are turned into it here
+        # in the recursion all axes are z axes
         aligning = alignment(self._rounding.axis(joint))
         aligned = frame.composed @ aligning
         rotation = self._in_body(frame.body, aligned)
-        body = len(self._stretches) - 1
+        body = len(self._segments) - 1
         if joint.type == "prismatic":
-            # a slide turns nothing, so angles before and after it still add up
-            stretch = self._stretches[frame.body + 1]
-            self._stretches.append((*stretch, _StretchFrame(aligned, stretch[-1].exact @ rotation)))
+            # a prismatic joint does not rotate: rotations before and behind it compose to a constant rotation
+            segment = self._segments[frame.body + 1]
+            self._segments.append((*segment, _SegmentFrame(aligned, segment[-1].exact @ rotation)))
             composed = frame.composed
         else:
-            # a revolute joint turns by any angle: what comes behind it no longer adds up with what was before
-            self._stretches.append((_STRAIGHT,))
+            # a revolute joint has any angle: a new segment begins
+            self._segments.append((_UNROTATED,))
             composed = aligning.T
         self.frames[joint.child] = Frame(body, composed, self._in_body(body, composed), ZERO)
         return Pose(frame.body, rotation, self._seen_from_both(rotation, frame.position))
 
-    def inertia(self, link: Link, inertial: Inertial) -> TenVector:
-        """Return the link's (m, m c, I) about its body's origin, in the body's frame (parallel-axis theorem)."""
-        # about the body origin, in which M and V are linear in all ten parameters
+    def inertia(self, link: UrdfLink, inertial: Inertial) -> TenVector:
+        """Return (m, m c, I) of a link about the origin of its body, in the frame of the body (parallel-axis theorem).
+
+        M and V are linear in these parameters.
+        """
         offset, turn = self._rounding.inertial_origin(link, inertial)
         frame = self._turned(self.frames[link.name], self._offset(self.frames[link.name], offset), turn)
         mass = exact(inertial.mass)
@@ -103,29 +106,26 @@ class Placement:
         tensor = tensor + mass * (center @ center * IDENTITY - np.outer(center, center))
         return (mass, *mass * center, *tensor[np.triu_indices(3)])
 
-    def _joint_origin(self, joint: Joint) -> Frame:
+    def _joint_origin(self, joint: UrdfJoint) -> Frame:
         frame = self.frames[joint.parent]
         offset, turn = self._rounding.joint_origin(joint)
         return self._turned(frame, self._offset(frame, offset), turn)
 
     def _offset(self, frame: Frame, offset: np.ndarray) -> np.ndarray:
+        """Return the position (3,) [m] at ``offset`` (3,) in ``frame``, in the frame of the body."""
         return self._rounding.position(frame.position + frame.rotation @ offset)
 
-    def _slid(self, frame: Frame, axis: np.ndarray, value: float) -> Frame:
-        position = self._offset(frame, exact(value) * np.array(list(map(exact, axis.tolist()))))
-        return Frame(frame.body, frame.composed, frame.rotation, position)
-
     def _turned(self, frame: Frame, position: np.ndarray, turn: np.ndarray | None) -> Frame:
-        """Return ``frame`` turned by ``turn`` (3, 3), None for not at all, and at ``position``."""
+        """Return ``frame`` rotated by ``turn`` (3, 3), if not None, with its origin at ``position`` (3,)."""
         if turn is None:
             return Frame(frame.body, frame.composed, frame.rotation, position)
         composed = frame.composed @ turn
         return Frame(frame.body, composed, self._in_body(frame.body, composed), position)
 
     def _seen_from_both(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Return the position of a joint without noise in its parent's frame nor, where both can be, in its own.
+        """Return the position (3,) of a joint without noise in the frame of its parent and, if possible, in its own.
 
-        An offset of (0.1, 0.1, 0) goes exactly along an axis of 45 degrees, but not along a rational one.
+        An offset of (0.1, 0.1, 0) is parallel to an axis at 45 degrees, but not to its rational approximation.
         """
         in_own_frame = self._rounding.position(rotation.T @ position)
         moved = self._rounding.position(rotation @ in_own_frame)
@@ -134,28 +134,20 @@ class Placement:
         return position
 
     def _in_body(self, body: int, composed: np.ndarray) -> np.ndarray:
-        """Return the exact rotation in the body's frame of what is turned by ``composed`` in its stretch's.
+        """Return the exact rotation (3, 3) in the frame of a body for a rotation ``composed`` (3, 3) in its segment.
 
-        It is made rational in that frame of the stretch in which it then keeps most zeros seen from all of them: an
-        axis of 45 degrees, no rational one, may be square to several.
+        The rational approximation is made in the frame of the segment for which most zeros are preserved in all frames
+        of the segment: an axis at 45 degrees, which is not rational, may be normal to several other axes.
         """
-        stretch = self._stretches[body + 1]
+        segment = self._segments[body + 1]
         best = IDENTITY
-        fewest: int | None = None
-        for frame in stretch:
+        min_lost: int | None = None
+        for frame in segment:
             candidate = frame.exact @ exact_rotation(frame.composed.T @ composed)
-            lost = _zeros_lost(stretch, composed, candidate)
-            if fewest is None or lost < fewest:
-                best, fewest = candidate, lost
+            lost = sum(lost_zeros(x.exact.T @ candidate, x.composed.T @ composed) for x in segment)
+            if min_lost is None or lost < min_lost:
+                best, min_lost = candidate, lost
             if not lost:
                 break
-        rotation: np.ndarray = stretch[-1].exact.T @ best
+        rotation: np.ndarray = segment[-1].exact.T @ best
         return rotation
-
-
-def _zeros_lost(stretch: tuple[_StretchFrame, ...], composed: np.ndarray, candidate: np.ndarray) -> int:
-    """Count the zeros, seen from the frames of a stretch, that a rational rotation has lost."""
-    lost = 0
-    for frame in stretch:
-        lost += lost_zeros(frame.exact.T @ candidate, frame.composed.T @ composed)
-    return lost

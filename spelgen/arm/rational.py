@@ -1,4 +1,4 @@
-"""Exact rotations and vectors, arrays of fractions, and how a measured angle becomes one of them."""
+"""Exact rotations and vectors as arrays of fractions, and rational approximation of angles and rotations."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ ZERO = np.array([Fraction(0)] * 3)
 
 
 def exact(value: float) -> Fraction:
-    """Return the decimal a float was written as: 0.1 is 1/10."""
+    """Return the shortest decimal of a float as a fraction: 0.1 is 1/10."""
     return Fraction(repr(value))
 
 
 def bounded(value: Fraction) -> Fraction:
-    """Return the number itself, or the nearest float to one of thousands of digits.
+    """Return a number, or the nearest float if it has thousands of digits.
 
-    Such a number is no exact value but the trace of dozens of rounded rotations in a row; kept, it would make
-    a hostile file take hours.
+    Such a number results from dozens of consecutive approximated rotations, and is not exact. Arithmetic with it could
+    take hours for a file from an untrusted source.
     """
-    if value.denominator.bit_length() <= TUNING.most_bits:
+    if value.denominator.bit_length() <= TUNING.max_bits:
         return value
     return Fraction(float(value))
 
@@ -37,7 +37,7 @@ def bounded(value: Fraction) -> Fraction:
 def rounded_angle(angle: float, tolerance: float) -> float:
     """Return the multiple of pi/2 within ``tolerance`` [rad], else of a finer step within 2e-5, else the angle.
 
-    A tolerance of 0 takes every angle as it is written.
+    A tolerance of 0 disables rounding.
     """
     if tolerance == 0.0:
         return angle
@@ -53,8 +53,8 @@ def rounded_angle(angle: float, tolerance: float) -> float:
 
 
 def rotation_from_rpy(rpy: Sequence[float]) -> np.ndarray:
-    """Return Rz(yaw) Ry(pitch) Rx(roll) of URDF's fixed-axis angles [rad], (3, 3) float64."""
-    # written out: SciPy's Rotation takes as long for one origin as all else for a joint
+    """Return Rz(yaw) Ry(pitch) Rx(roll) for the fixed-axis angles of URDF [rad], (3, 3) float64."""
+    # Explicit, because a call of SciPy's Rotation takes longer than all other operations of a joint together.
     (cr, cp, cy), (sr, sp, sy) = map(cos, rpy), map(sin, rpy)
     return np.array(
         [
@@ -66,51 +66,52 @@ def rotation_from_rpy(rpy: Sequence[float]) -> np.ndarray:
 
 
 def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Return the rotation by ``angle`` [rad] about the unit vector ``axis``, (3, 3) float64 (Rodrigues)."""
+    """Return the rotation (3, 3) by ``angle`` [rad] about the unit vector ``axis`` (3,), in float64 (Rodrigues)."""
     cross = np.cross(np.eye(3), axis)
     rotation: np.ndarray = np.eye(3) + sin(angle) * cross + (1.0 - cos(angle)) * (cross @ cross)
     return rotation
 
 
 def alignment(axis: np.ndarray) -> np.ndarray:
-    """Return a rotation (3, 3) that takes +z to the unit vector ``axis``; a signed permutation for +-x, +-y, +-z.
+    """Return a rotation R (3, 3) with R z = ``axis``, a unit vector (3,).
 
-    Other axes are reached from the nearest coordinate axis by the smallest rotation, which keeps what zeros
-    it can.
+    For axes along x, y or z it is a signed permutation. For other axes it is followed by the smallest rotation from the
+    closest coordinate axis, which preserves zeros.
     """
     index = int(np.argmax(np.abs(axis)))
     sign = 1.0 if axis[index] > 0 else -1.0
-    start = np.zeros(3)
-    start[index] = sign
-    cross = np.cross(start, axis)
+    closest = np.zeros(3)
+    closest[index] = sign
+    cross = np.cross(closest, axis)
     skew = np.cross(np.eye(3), cross)
-    smallest = np.eye(3) + skew + skew @ skew / (1.0 + float(start @ axis))
+    smallest = np.eye(3) + skew + skew @ skew / (1.0 + float(closest @ axis))
     turned: np.ndarray = smallest @ _coordinate_alignment(index, sign)
     return turned
 
 
 def _coordinate_alignment(index: int, sign: float) -> np.ndarray:
-    """Return a signed permutation (3, 3) that takes +z to the coordinate axis ``index``, or against it."""
+    """Return a signed permutation (3, 3) that maps +z to the coordinate axis ``index``, or to its opposite."""
     following, last = np.eye(3)[(index + 1) % 3], np.eye(3)[(index + 2) % 3]
     axis = sign * np.eye(3)[index]
     if sign > 0:
         return np.stack([following, last, axis], axis=1)
     if index == 2:
-        # half a turn about x: modules written before count on the x that -z axes keep
+        # Rotation by pi about x. Parameters of existing modules depend on this convention for -z axes.
         return np.stack([following, -last, axis], axis=1)
     return np.stack([last, following, axis], axis=1)
 
 
 def exact_rotation(rotation: np.ndarray) -> np.ndarray:
-    """Return a rational rotation within 1e-11 of a float64 one, exactly orthogonal, with zeros where it has zeros.
+    """Return a rational approximation (3, 3) of a float64 rotation (3, 3): orthogonal, error 1e-11, same zeros.
 
-    The unit quaternion is divided by its largest component and each ratio replaced by a nearby fraction; the
-    rotation of an unnormalised rational quaternion is rational (Euler-Rodrigues). That may miss a zero which
-    the ratios only make together; one turn before and one behind a signed permutation then keep it.
+    The unit quaternion is divided by its largest component and each ratio is replaced by a close fraction; the rotation
+    matrix of an unnormalised rational quaternion is rational (Euler-Rodrigues). A zero that depends on several ratios
+    may be lost. The rotation is then approximated by a signed permutation between two rotations about coordinate axes,
+    which preserves the zero.
     """
     ratios = _quaternion_ratios(rotation)
     candidate = IDENTITY
-    # the shortest fractions that are near enough keep exact arithmetic fast
+    # Short fractions make exact arithmetic fast.
     for bound in TUNING.denominators:
         candidate = _rotation_of([Fraction(ratio).limit_denominator(bound) for ratio in ratios])
         if np.abs(candidate.astype(float) - rotation).max() < TUNING.rotation_error:
@@ -122,9 +123,9 @@ def exact_rotation(rotation: np.ndarray) -> np.ndarray:
 
 
 def _quaternion_ratios(rotation: np.ndarray) -> list[float]:
-    """Return the quaternion (w, x, y, z) over its largest component, noise removed (Shepperd's method).
+    """Return the quaternion (w, x, y, z) of a rotation (3, 3), divided by its largest component (Shepperd's method).
 
-    SciPy's Rotation finds the same, at 0.2 ms a call for its checks: as long as all else here.
+    SciPy's Rotation is not used, because its checks of the input take 0.2 ms per call.
     """
     trace = float(np.trace(rotation))
     squares = np.empty((4, 4))  # 4 q q^T
@@ -140,15 +141,14 @@ def _quaternion_ratios(rotation: np.ndarray) -> list[float]:
 
 
 def lost_zeros(candidate: np.ndarray, rotation: np.ndarray) -> int:
-    """Return how many zeros of a float64 rotation are none in the rational ``candidate``."""
+    """Return the number of zeros of a float64 rotation (3, 3) that are nonzero in the rational candidate (3, 3)."""
     return int(np.count_nonzero(candidate[np.abs(rotation) < TUNING.zero_noise]))
 
 
 def _rotation_with_zero(rotation: np.ndarray, row: int, column: int) -> np.ndarray:
-    """Return the rational rotation near a float64 one of which this element is zero.
+    """Return a rational approximation of a float64 rotation (3, 3) in which this element is zero.
 
-    It is a turn about axis ``row``, a signed permutation, and a turn about axis ``column``, so that the other zeros are
-    those of the turns.
+    It is the product of a rotation about axis ``row``, a signed permutation, and a rotation about axis ``column``.
     """
     first = _turn(row, rotation[(row + 1) % 3, column], rotation[(row + 2) % 3, column])
     last = _turn(column, rotation[row, (column + 1) % 3], -rotation[row, (column + 2) % 3])
@@ -158,15 +158,16 @@ def _rotation_with_zero(rotation: np.ndarray, row: int, column: int) -> np.ndarr
 
 
 def _turn(axis: int, cosine: float, sine: float) -> np.ndarray:
-    """Return the rational rotation about a coordinate axis by the angle of this cosine and sine."""
-    # reduced to one eighth, so that 45 and 135 degrees are a right angle apart; no usual angle is on an edge
+    """Return the rational rotation (3, 3) about a coordinate axis by the angle with this cosine and sine."""
+    # Reduction to a quarter turn, so that the approximations of 45 and 135 degrees differ by exactly a right angle.
+    # Common angles are inside the interval of the reduced angles, not at its ends.
     quarter, angle = divmod(atan2(sine, cosine) + TUNING.eighth, pi / 2)
     tangent = tan((angle - TUNING.eighth) / 2)
     t = Fraction(0)
     if abs(tangent) >= TUNING.zero_noise:
         for bound in TUNING.denominators:
             t = Fraction(tangent).limit_denominator(bound)
-            # an angle is off by twice what its half-angle tangent is, and two turns share the error
+            # The error of the angle is twice the error of t, and two rotations share the bound.
             if abs(float(t) - tangent) < TUNING.rotation_error / 4:
                 break
     norm = 1 + t * t
@@ -177,7 +178,7 @@ def _turn(axis: int, cosine: float, sine: float) -> np.ndarray:
 
 
 def turn_about(axis: int, cosine: Fraction, sine: Fraction) -> np.ndarray:
-    """Return the rotation about the coordinate axis 0, 1 or 2 by the angle of this cosine and sine."""
+    """Return the rotation (3, 3) about the coordinate axis 0, 1 or 2 by the angle with this cosine and sine."""
     rotation = IDENTITY.copy()
     first, second = (axis + 1) % 3, (axis + 2) % 3
     rotation[first, first] = rotation[second, second] = cosine
@@ -187,8 +188,8 @@ def turn_about(axis: int, cosine: Fraction, sine: Fraction) -> np.ndarray:
 
 
 def _rotation_of(quaternion: Sequence[Fraction]) -> np.ndarray:
-    """Return the rotation of a quaternion (w, x, y, z) of any length (Euler-Rodrigues)."""
-    # over one denominator, whole numbers do: fractions are costly
+    """Return the rotation matrix (3, 3) of a quaternion (w, x, y, z) of any norm (Euler-Rodrigues)."""
+    # A common denominator: integers are faster than fractions.
     common = lcm(*(component.denominator for component in quaternion))
     w, x, y, z = (int(component * common) for component in quaternion)
     v = np.array([x, y, z], dtype=object)
@@ -199,12 +200,12 @@ def _rotation_of(quaternion: Sequence[Fraction]) -> np.ndarray:
 
 
 def as_vector(values: np.ndarray) -> Vector:
-    """Return three fractions as a tuple, which can be a part of a key."""
+    """Return three fractions (3,) as a hashable tuple."""
     x, y, z = values
     return x, y, z
 
 
 def as_matrix(rows: np.ndarray) -> Matrix:
-    """Return nine fractions as tuples."""
+    """Return nine fractions (3, 3) as hashable tuples."""
     x, y, z = map(as_vector, rows)
     return x, y, z

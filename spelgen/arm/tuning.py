@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class GeometryTuning:
-    """Which exact number a rounded number of a URDF represents."""
+    """Tolerances for the exact values that rounded numbers of a URDF represent."""
 
     # [rad] Distance to a multiple of pi/12, pi/8 or pi/5 within which an angle is rounded to it. It is small because
     # 0.26, 0.39 and 0.63 also occur as exact values.
@@ -31,7 +31,7 @@ class GeometryTuning:
     # at an edge.
     eighth: float = 0.7
     # [1] Largest number of bits of a denominator: exact arithmetic on longer ones takes hours (untrusted input).
-    most_bits: int = 4096
+    max_bits: int = 4096
     # [rad] Largest angle between two axes that are meant to be parallel, rounding included.
     parallel: float = 1e-2
 

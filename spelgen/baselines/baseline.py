@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.baselines.predictor import CommandFollower, Predictor
 from spelgen.emission.assemble import spec_of
 from spelgen.errors import Diagnostic
@@ -32,7 +32,7 @@ class EvaluatedArm:
     joints: Sequence[str]
     urdf: Path | None
     fitted: FittedBaselines
-    fitted_arm: ConfiguredArm | None
+    fitted_arm: Arm | None
     probe: Windows
     notes: list[Diagnostic]
 
@@ -43,9 +43,7 @@ class Baseline:
     Each baseline is listed in `registry.py`. It overrides `predictors` or `followers`, and `fit` if it has parameters.
     """
 
-    def fit(
-        self, arm: ConfiguredArm, logs: Sequence[Trajectory], preprocessing: Preprocessing
-    ) -> dict[str, object]:
+    def fit(self, arm: Arm, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> dict[str, object]:
         """Return the parameters fitted to the training logs, as JSON; {} if there is nothing to fit."""
         return {}
 
@@ -63,7 +61,7 @@ class Baseline:
         return {}
 
 
-def arm_of_model(model: object, urdf: Path) -> ConfiguredArm:
+def arm_of_model(model: object, urdf: Path) -> Arm:
     """Return the arm that a model was built from, read from its URDF. Raises UrdfError, ArmError or SettingsError."""
     spec = spec_of(model)
     options = Options() if spec is None else spec.options

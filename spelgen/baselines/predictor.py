@@ -1,4 +1,4 @@
-"""Predictors of the motion of an arm, under torques or under position commands: a model, or a baseline."""
+"""Predictors of the motion of an arm, under torques or under position commands, and the integration of dynamics."""
 
 from __future__ import annotations
 
@@ -10,11 +10,142 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spelgen.baselines.rosenbrock import roll_out_stiff
-from spelgen.baselines.tuning import TUNING
-from spelgen.dynamics.protocol import RigidDynamics
+from spelgen.dynamics.equations import MotionEquations, equations_of
+from spelgen.dynamics.protocol import RigidDynamics, is_stateful, memory_after, sliding_memory
 from spelgen.logs.commands import LogRows
 from spelgen.logs.windows import Windows, thinned
+from spelgen.runtime.port_hamiltonian import PortHamiltonian
+
+GAMMA = 1 - 0.5**0.5  # makes the method L-stable
+
+
+State = tuple[Tensor, Tensor, Tensor]
+"""q and qd, (W, n), and the friction state z, (W, n, K)."""
+
+
+def roll_out_stiff(
+    dynamics: object, windows: Windows, substeps: int, disturbance: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return positions and velocities (W, K-1, n) at samples 1..K-1 of each window, from its sample 0.
+
+    Method: ROS2, a Rosenbrock method of order two for any matrix in place of the Jacobian; with the exact one it is
+    L-stable (Verwer, Spee, Blom and Hundsdorfer, SIAM J. Sci. Comput. 20:1456, 1999). Here the matrix is the Jacobian
+    of friction only, so that damping and bristles of any stiffness (light links with dry friction) need no smaller
+    steps, and the error of an explicit method is not confused with an error of the dynamics.
+
+    disturbance: (W, n) of `observe`. After a divergence the states of a window are NaN.
+    """
+    q, qd = windows.q[:, 0], windows.qd[:, 0]
+    z = sliding_memory(dynamics, qd) if windows.z is None else windows.z
+    largest = windows.qd.abs().amax(dim=(0, 1))
+    largest = torch.maximum(largest, 1e-3 * largest.max()).clamp(min=1e-2)
+    if disturbance is None:
+        disturbance = torch.zeros_like(q)
+    advance = _stepper(dynamics, TUNING.velocity_step * largest, disturbance)
+    positions = torch.full_like(windows.q[:, 1:], torch.nan)
+    velocities = positions.clone()
+    for k in range(windows.dt.shape[1]):
+        step = windows.dt[:, k].unsqueeze(-1) / substeps  # (W, 1)
+        for _ in range(substeps):
+            q, qd, z = advance((q, qd, z), windows.tau[:, k], step)
+        inside = ((qd.abs() <= TUNING.bounds * largest) & q.isfinite()).all(dim=-1, keepdim=True)
+        if not inside.any():
+            break
+        # NaN propagates to all later samples
+        q, qd = torch.where(inside, q, torch.nan), torch.where(inside, qd, torch.nan)
+        positions[:, k], velocities[:, k] = q, qd
+    return positions, velocities
+
+
+def _stepper(
+    dynamics: object, width: Tensor, disturbance: Tensor
+) -> Callable[[State, Tensor, Tensor], State]:
+    """Return the function that takes a step of M qdd = force from a state, under tau.
+
+    width: (n,) finite-difference steps of velocity. disturbance: a force if the state has momenta, else acceleration.
+    """
+    pose_at = equations_of(dynamics)
+    is_force = isinstance(dynamics, PortHamiltonian)
+
+    def forces(pose: MotionEquations, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
+        """Return M qdd, (W, n)."""
+        added = disturbance if is_force else (pose.mass @ disturbance.unsqueeze(-1)).squeeze(-1)
+        return pose.force(qd, tau, z) + added
+
+    def step(state: State, tau: Tensor, step: Tensor) -> State:
+        """Take one step of (q, qd), with A = [[0, 1], [-M^-1 K, -M^-1 D]].
+
+        D = d friction / d qd and, if friction has a state z, K = d friction / d q through z.
+        """
+        q, qd, z = state
+        pose = pose_at(q)
+        damping, stiffness = _friction_slopes(dynamics, pose, qd, z, width)
+        h = GAMMA * step
+        factors, pivots, _ = torch.linalg.lu_factor_ex(
+            pose.mass + torch.diag_embed(h * damping + h * h * stiffness)
+        )
+
+        def solve(velocity: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
+            """Return (1 - h A)^-1 of (velocity, force), with the mass in the second row."""
+            right = (force - h * stiffness * velocity).unsqueeze(-1)
+            solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
+            return velocity + h * solution, solution
+
+        v1, a1 = solve(qd, forces(pose, qd, tau, z))
+        q2, qd2 = q + step * v1, qd + step * a1
+        second = pose_at(q2)
+        force = forces(second, qd2, tau, memory_after(dynamics, z, q2 - q))
+        # solve_ex: a singular matrix of one window must not stop the others
+        a2 = torch.linalg.solve_ex(second.mass, force)[0] - 2 * a1
+        v2, a2 = solve(qd2 - 2 * v1, (pose.mass @ a2.unsqueeze(-1)).squeeze(-1))
+        end = q + step * (1.5 * v1 + 0.5 * v2)
+        speed = qd + step * (1.5 * a1 + 0.5 * a2)
+        return end, speed, memory_after(dynamics, z, end - q)
+
+    return step
+
+
+def _friction_slopes(
+    dynamics: object, pose: MotionEquations, qd: Tensor, z: Tensor, width: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return D and K, (W, n): the friction of a joint depends on its own motion only."""
+    # central differences: dry friction jumps at standstill
+    slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
+    # friction that falls with velocity (negative damping) is integrated by the explicit part
+    damping = slope.clamp(min=0)
+    if not is_stateful(dynamics):
+        return damping, torch.zeros_like(damping)
+    # bristles deflect in the direction of motion
+    displacement = TUNING.displacement_step * torch.where(qd < 0, -1.0, 1.0).to(qd)
+    bent = pose.friction(qd, memory_after(dynamics, z, displacement))
+    return damping, ((bent - pose.friction(qd, z)) / displacement).clamp(min=0)
+
+
+@dataclass(frozen=True)
+class PredictorTuning:
+    """Integration of predictions by the Rosenbrock method."""
+
+    # [1] Largest number of steps between samples; a power of two.
+    most_substeps: int = 16
+    # [s] Shortest step: only dynamics that diverge would need shorter ones.
+    shortest_step: float = 1e-3
+    # [1] Change by twice as many steps that is allowed, relative to the error of the dynamics: reported figures
+    # change by a thousandth.
+    tolerance: float = 5e-2
+    # [1] Smallest expected error of dynamics, relative to the motion.
+    least_error: float = 2e-5
+    # [1] Windows on which the number of steps is chosen.
+    probed_windows: int = 16
+    # [1] Multiple of the largest measured velocity beyond which a prediction has diverged.
+    bounds: float = 100.0
+    # [1] Finite-difference step of friction with respect to velocity, as a fraction of a joint's largest velocity.
+    velocity_step: float = 1e-5
+    # [rad, m] Finite-difference step of friction with respect to the displacement of bristles.
+    displacement_step: float = 1e-7
+
+
+TUNING = PredictorTuning()
+
 
 States = tuple[Tensor, Tensor]
 

@@ -1,1 +1,1 @@
-"""An arm's structure as people and programs read it: facts with reasons, closed forms, and a numerical proof."""
+"""The structure of an arm for users and programs: facts with reasons, closed forms, and a numerical verification."""

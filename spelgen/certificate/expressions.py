@@ -1,8 +1,8 @@
-"""Write polynomials in cosines, sines and distances as SymPy expressions, in one canonical way.
+"""Polynomials in cosines, sines and distances as SymPy expressions in a canonical form.
 
-Products of cosines and sines along a run of joints with parallel axes become cosines and sines of sums of these
-angles. Other ways (powers of single angles, common factors of several terms) made long formulas a fifth shorter, and
-those that a person reads no shorter.
+Products of cosines and sines of consecutive joints with parallel axes become cosines and sines of sums of their angles.
+Alternatives (powers of single angles, common factors of several terms) reduce the length of long formulas by 20 %, but
+not the length of formulas that are short enough to be read.
 """
 
 from __future__ import annotations
@@ -14,29 +14,29 @@ from flint import fmpq, fmpq_mpoly, fmpq_mpoly_ctx
 from sympy import Add, Expr, Integer, Rational, Symbol, cos, sin
 from sympy.core.parameters import distribute
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.certificate.axes import Axes, is_plain
 from spelgen.structure.recursion import base_denominators
 
 Terms = dict[Expr, fmpq]
-"""A sum of products of distances, cosines and sines, each times a number that is not 0."""
+"""A linear combination of products of distances, cosines and sines, with nonzero coefficients."""
 
 
 @cache
 def coordinate(joint: int) -> Symbol:
-    """Return the position of a joint, counted from 0."""
+    """Return the symbol of the position of a joint; joints are counted from 0."""
     return Symbol(f"q{joint + 1}", real=True)
 
 
 def parameter(name: str) -> Symbol:
-    """Return a base parameter, or an inertial parameter of a body."""
+    """Return the symbol of a base parameter, or of an inertial parameter of a body."""
     return Symbol(name, real=True)
 
 
 def weighted_sum(terms: Mapping[Expr, fmpq]) -> Expr:
-    """Return the sum of the expressions, each times its number."""
+    """Return the linear combination of the expressions with these coefficients."""
     products = []
-    # SymPy would else make 2*(a + b) into 2*a + 2*b
+    # Otherwise SymPy expands 2*(a + b) to 2*a + 2*b.
     with distribute(False):
         for expression, number in terms.items():
             products.append(Rational(int(number.p), int(number.q)) * expression)
@@ -44,27 +44,27 @@ def weighted_sum(terms: Mapping[Expr, fmpq]) -> Expr:
 
 
 class PolynomialWriter:
-    """Write the polynomials of one arm, over s1, c1, q1, s2, ..."""
+    """Conversion of the polynomials of an arm, over s1, c1, q1, s2, ..., to terms."""
 
-    def __init__(self, arm: Arm, context: fmpq_mpoly_ctx):
+    def __init__(self, arm: Chain, context: fmpq_mpoly_ctx):
         generators = context.gens()
         self._circles = []
         for sine, cosine in zip(generators[::3], generators[1::3], strict=True):
             self._circles.append(sine**2 + cosine**2 - 1)
         self._angles: list[Expr] = []
         for joint, denominator in enumerate(base_denominators(arm)):
-            # mimic joints may turn by fractions of a coordinate
+            # Angles of mimic joints are multiples of a fraction of the coordinate.
             self._angles.append(coordinate(joint) / denominator)
         self._runs = parallel_runs(arm)
 
     def reduced(self, polynomial: fmpq_mpoly) -> fmpq_mpoly:
-        """Return the same function with every sine to the first power at most."""
+        """Return the polynomial of the same function in which the power of every sine is at most 1."""
         for circle in self._circles:
             polynomial %= circle
         return polynomial
 
     def terms(self, polynomial: fmpq_mpoly) -> Terms:
-        """Return a polynomial with its products of cosines and sines as multiple angles."""
+        """Return the terms of a polynomial, with cosines and sines of sums of angles in place of products."""
         result: Terms = {}
         for exponents, coefficient in polynomial.terms():
             distances = Integer(1)
@@ -82,12 +82,12 @@ class PolynomialWriter:
         return {factor: value for factor, value in result.items() if value != 0}
 
 
-def parallel_runs(arm: Arm) -> list[list[int]]:
-    """Return the turning coordinates by runs of axes that are parallel however the arm moves.
+def parallel_runs(arm: Chain) -> list[list[int]]:
+    """Return the revolute coordinates in groups of consecutive axes that are parallel at every configuration.
 
-    Where bodies share coordinates, each is a run of its own.
+    If bodies share coordinates (mimic joints), each coordinate is its own group.
     """
-    turning = sorted({body.coordinate for body in arm.bodies if body.kind == "revolute"})
+    turning = sorted({body.coordinate for body in arm.bodies if body.joint_type == "revolute"})
     if not is_plain(arm):
         return [[joint] for joint in turning]
     axes = Axes(arm)
@@ -104,9 +104,9 @@ def parallel_runs(arm: Arm) -> list[list[int]]:
 def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
     """Return a product of powers, given as (angle, power of sin, power of cos), as a sum.
 
-    Each term is a multiple of one or of a cosine or sine of a sum of the angles.
+    Each term is a constant, or a multiple of a cosine or sine of a sum of the angles.
     """
-    # a wave is cos(sum of angles - quarters pi/2), in which sin(x) is cos(x - pi/2)
+    # A wave (angle, k) is cos(angle - k pi/2); sin(x) = cos(x - pi/2).
     waves: dict[tuple[Expr, int], fmpq] = {(Integer(0), 0): fmpq(1)}
     for angle, sines, cosines in powers:
         for quarter in [1] * sines + [0] * cosines:
@@ -122,7 +122,7 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
         function = cos(total)
         if quarters % 2:
             function = sin(total)
-        # SymPy writes cos(-a) as cos(a) and sin(-a) as -sin(a)
+        # SymPy simplifies cos(-a) to cos(a) and sin(-a) to -sin(a).
         sign, function = function.as_coeff_Mul()
         if quarters > 1:
             sign = -sign
@@ -131,7 +131,7 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
 
 
 def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
-    """Return the sum of parameters times functions; parameters with one function, up to a factor, together."""
+    """Return the sum of parameters times functions; parameters with proportional functions form one product."""
     groups: dict[tuple[tuple[Expr, fmpq], ...], dict[Expr, fmpq]] = {}
     for symbol, terms in functions:
         leading = next(iter(terms.values()))
@@ -140,7 +140,7 @@ def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
     total = []
     for unit, parameters in groups.items():
         factor = fmpq(1)
-        # the numbers of a function that stands alone are those of the arm
+        # The function of a single parameter retains its coefficients, which are dimensions of the arm.
         if len(parameters) == 1:
             factor = abs(next(iter(parameters.values())))
         symbols = weighted_sum({symbol: value / factor for symbol, value in parameters.items()})

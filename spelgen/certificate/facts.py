@@ -1,6 +1,6 @@
-"""Say a structure in plain words: which entries are zero, constant or equal, which joints do not matter, and why.
+"""A structure in words: zero, constant and equal entries of M, joints without effect on M or V, and the reasons.
 
-A reason is given only where the arm's exact geometry proves it (``reasons``).
+A reason is given only if the exact geometry of the arm proves it (``reasons``).
 """
 
 from __future__ import annotations
@@ -9,22 +9,22 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.certificate import reasons
 from spelgen.certificate.axes import Axes, is_plain
-from spelgen.labels import axes_told, entry_name, joints_told, listed
-from spelgen.structure.structure import Entry, Structure
+from spelgen.labels import axes_in_words, entry_name, joints_in_words, listed
+from spelgen.structure.structure import MassEntry, Structure
 
 Reason = str | None
-EntryReason = Callable[[Axes, Structure, Entry], Reason]
+EntryReason = Callable[[Axes, Structure, MassEntry], Reason]
 
 
 @dataclass(frozen=True)
 class Fact:
-    """Hold something that always holds, what it means for the model, and why it holds.
+    """A property of M or V at all configurations, its consequence for the model (``means``), and its reason.
 
-    ``reason`` is None where geometry gives no simple one, and where bodies share a coordinate: there the
-    exact ranks tell the fact and nothing more.
+    ``reason`` is None if the geometry gives no simple reason, or if bodies share a coordinate: the fact then follows
+    from exact ranks only.
     """
 
     statement: str
@@ -37,13 +37,13 @@ class Fact:
         return f"{self.statement}. {self.means}."
 
 
-def facts(arm: Arm, structure: Structure) -> tuple[Fact, ...]:
-    """Return what holds of M and V at all configurations, with the reason where geometry gives a simple one."""
-    # mimic joints move several bodies at once, of which the sentences about two axes do not hold
+def facts(arm: Chain, structure: Structure) -> tuple[Fact, ...]:
+    """Return the properties of M and V at all configurations, with simple geometric reasons if there are any."""
+    # A mimic joint moves several bodies, for which the reasons about pairs of axes are not valid.
     axes = None
     if is_plain(arm):
         axes = Axes(arm)
-    words = _Words(structure, axes)
+    words = _Sentences(structure, axes)
     zero = ("always zero", "Nothing is learned for it", "Nothing is learned for them")
     constant = ("constant", "It needs a number, no network", "They need numbers, no network")
     return (
@@ -56,8 +56,8 @@ def facts(arm: Arm, structure: Structure) -> tuple[Fact, ...]:
 
 
 @dataclass(frozen=True)
-class _Words:
-    """Say what holds of a structure; ``axes`` is None where bodies share coordinates, and no reason is sought."""
+class _Sentences:
+    """The facts of a structure. axes: None if bodies share coordinates, and no reasons are given."""
 
     structure: Structure
     axes: Axes | None
@@ -70,18 +70,18 @@ class _Words:
     def entries(
         self, kind: str, why: EntryReason, statement: str, means_one: str, means_several: str
     ) -> Iterator[Fact]:
-        """Yield what holds of the entries of this kind; those with one reason make one sentence."""
-        groups: dict[Reason, list[Entry]] = {}
+        """Yield the facts about entries of this kind; entries with the same reason share a sentence."""
+        groups: dict[Reason, list[MassEntry]] = {}
         for entry in self.structure.entries:
             if entry.kind == kind:
                 groups.setdefault(self._reason(why, entry), []).append(entry)
-        # those without a reason come last
+        # entries without a reason come last
         for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
             if reason is not None and self.axes is not None:
-                # the joint that a reason is about comes second only where it slides, and is nearer to the root
+                # The subject of a reason is the joint closer to the tip, unless the joint closer to the root slides.
                 slides = self.axes.slides
-                others = sorted({entry.row if slides[entry.column] else entry.column for entry in group})
-                reason = reason.format(axes=axes_told(others), joints=joints_told(others))
+                joints = sorted({entry.row if slides[entry.column] else entry.column for entry in group})
+                reason = reason.format(axes=axes_in_words(joints), joints=joints_in_words(joints))
             names = listed([entry_name(entry.row, entry.column) for entry in group])
             if len(group) == 1:
                 yield Fact(f"{names} is {statement}", means_one, reason)
@@ -89,14 +89,14 @@ class _Words:
                 yield Fact(f"{names} are {statement}", means_several, reason)
 
     def equalities(self) -> Iterator[Fact]:
-        """Yield entries that are equal, or opposite, at every configuration: the smallest form writes them alike."""
+        """Yield entries that are equal or opposite at every configuration: they have the same terms."""
         terms: dict[tuple[int, int], dict[int, Fraction]] = {}
         for number, term in enumerate((*self.structure.outputs, *self.structure.constants)):
             for row, column, factor in term.basis:
                 terms.setdefault((row, column), {})[number] = factor
         groups: dict[tuple[tuple[int, Fraction], ...], dict[tuple[int, int], bool]] = {}
         for entry, factors in sorted(terms.items()):
-            # entries are opposite where all factors are: so the first one's sign is taken out
+            # Entries are opposite if all factors are opposite: normalise the sign of the first factor.
             positive = next(iter(factors.values())) > 0
             if not positive:
                 factors = {number: -factor for number, factor in factors.items()}
@@ -110,13 +110,12 @@ class _Words:
 
     def idle_joints(self) -> Iterator[Fact]:
         """Yield joints that no entry of M depends on."""
-        # what no network reads is the most useful fact: an input less
-        read: set[int] = set()
+        inputs: set[int] = set()
         for entry in self.structure.entries:
-            read.update(entry.joints)
-        if not read:
-            return  # every entry is zero or constant, which has been said
-        for joint in sorted(set(range(len(self.structure.joints))) - read):
+            inputs.update(entry.joints)
+        if not inputs:
+            return  # M is constant, which other facts state
+        for joint in sorted(set(range(len(self.structure.joints))) - inputs):
             reason = self._reason(reasons.idle_reason, joint)
             yield Fact(f"M does not depend on joint {joint + 1}", "No network of M reads it", reason)
 
@@ -124,7 +123,7 @@ class _Words:
         if not self.structure.potential:
             yield Fact("V is zero", "It needs no network", self._reason(reasons.potential_reason))
             return
-        # joints with one reason make one sentence
+        # joints with the same reason share a sentence
         groups: dict[Reason, list[int]] = {}
         for joint in range(len(self.structure.joints)):
             if joint not in self.structure.potential:
@@ -132,4 +131,4 @@ class _Words:
         for reason, group in groups.items():
             pronoun = "it" if len(group) == 1 else "them"
             means = f"The network of V does not read {pronoun}"
-            yield Fact(f"V does not depend on {joints_told(group)}", means, reason)
+            yield Fact(f"V does not depend on {joints_in_words(group)}", means, reason)

@@ -1,25 +1,27 @@
-"""Write closed forms as files: LaTeX for a document that loads amsmath, and Python that needs SymPy alone.
+"""Closed forms as text for a terminal, a JSON object, LaTeX for documents with amsmath, and Python for SymPy.
 
-Every name in a formula is made from numbers; the URDF's names stand in comments only, as JSON strings, which
-have neither line ends nor control characters.
+Names in formulas consist of letters and numbers of joints. In files, names from the URDF occur only in comments, as
+JSON strings, which contain neither line ends nor control characters.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import textwrap
 from collections.abc import Mapping
 
 from sympy import Expr, Symbol
 
 from spelgen.certificate import printing
-from spelgen.certificate.formulas import Formulas
-from spelgen.certificate.printing import lines, python
+from spelgen.certificate.formulas import WRITABLE, Formula, Formulas
+from spelgen.certificate.printing import python
+from spelgen.labels import printable, short_name
 
 _LATEX_WIDTH = 140
 _PYTHON_WIDTH = 100
 
-# A docstring first: in a comment of the first two lines a name could pass for the file's encoding (PEP 263).
+# The docstring comes first: a name in a comment of the first two lines could declare an encoding (PEP 263).
 _HEAD = '''"""Closed forms of a serial arm's mass matrix M(q) and potential energy V(q), by spelgen.
 
 q: the joints' positions [rad, m]. entries: {(row, column): entry of M}, counted from 1, lower triangle.
@@ -29,6 +31,79 @@ base_parameters: what each stands for, m being a mass [kg], h = m c a first mome
 values: what the URDF gives them, where it has inertials.
 """
 '''
+
+
+def text(formulas: Formulas, width: int = 80) -> str:
+    """Return the formulas, the definitions of their parameters, and the values of the parameters from the URDF."""
+    title = f"{printable(formulas.arm.name)}: closed forms for {formulas.trusted}"
+    lines = [*textwrap.wrap(title, width), ""]
+    for row in formulas.rows:
+        if row.expression is None:
+            lines.append(f"{row.name}: {row.omission}")
+        else:
+            lines += printing.lines(printing.text(row.expression), f"{row.name} = ", width)
+    for note in _notes(formulas):
+        lines += ["", *textwrap.wrap(note, width)]
+    if formulas.base:
+        lines += ["", *_parameters(formulas, width), "", *textwrap.wrap(_legend(formulas), width)]
+    return "\n".join(lines)
+
+
+def to_dict(formulas: Formulas) -> dict[str, object]:
+    """Return a JSON object; rows and columns are counted from 1, and an expression is null if it is too long."""
+    base, values = [], formulas.values
+    for symbol, definition in formulas.base_parameters.items():
+        # JSON has no fractions
+        value = float(values[symbol]) if symbol in values else None
+        base.append({"name": symbol.name, "definition": printing.text(definition), "value": value})
+    return {"entries": list(map(_entry, formulas.rows)), "base_parameters": base}
+
+
+def _entry(formula: Formula) -> dict[str, object]:
+    row = column = text = None
+    if formula.entry != "V":
+        row, column = formula.entry
+    if formula.expression is not None:
+        text = printing.text(formula.expression)
+    return {"name": formula.name, "row": row, "col": column, "terms": formula.terms, "expression": text}
+
+
+def _notes(formulas: Formulas) -> list[str]:
+    notes = []
+    if formulas.rows[-1].entry == "V":
+        notes.append("V is determined up to a constant.")
+    writable = [row for row in formulas.unwritten if row.terms is not None and row.terms <= WRITABLE]
+    for row in writable[:1]:
+        option = ",".join(map(str, row.entry))
+        notes.append(
+            f"Omitted here: --entry {option} shows {row.name} alone, and -o FILE.py writes all entries for SymPy."
+        )
+    return notes
+
+
+def _parameters(formulas: Formulas, width: int) -> list[str]:
+    values = formulas.values
+    lines = ["Base parameters"]
+    if values:
+        lines = ["Base parameters, and the URDF's values"]
+    for symbol, definition in formulas.base_parameters.items():
+        value = f" [{float(values[symbol]):.6g}]" if symbol in values else ""
+        # a base parameter that equals an inertial parameter needs no equation
+        name = "" if definition.is_Symbol else f"{symbol.name} = "
+        lines += printing.lines(printing.text(definition), f"  {name}", width, value)
+    return lines
+
+
+def _legend(formulas: Formulas) -> str:
+    bodies: set[int] = set()
+    for base in formulas.base:
+        bodies.update(index // 10 for index, _ in base.weights)  # ten inertial parameters a body
+    names = [f"{body + 1} {short_name(formulas.arm.bodies[body].name)}" for body in sorted(bodies)]
+    return (
+        "m is the mass [kg], h = m c the first moment [kg m] and I the inertia tensor [kg m2] about the "
+        "origin of the joint's frame, turned so that z is the joint's axis, of all that moves rigidly with "
+        f"the joint: {', '.join(names)}. q is the joint's position [rad, m]."
+    )
 
 
 def latex(formulas: Formulas) -> str:
@@ -45,9 +120,9 @@ def latex(formulas: Formulas) -> str:
         aligned = []
         for name, expression in equations.items():
             start = f"{printing.latex(name)} &= "
-            aligned += lines(printing.latex(expression), start, _LATEX_WIDTH)
+            aligned += printing.lines(printing.latex(expression), start, _LATEX_WIDTH)
         if aligned:
-            # what goes on in another line is indented
+            # continuation lines are indented
             body = " \\\\\n".join(re.sub("^ +", r"    &\\quad ", line) for line in aligned)
             result += [r"\begin{align*}", body, r"\end{align*}"]
     return "\n".join(result) + "\n"
@@ -57,12 +132,12 @@ def sympy_source(formulas: Formulas) -> str:
     """Return the text of the file for SymPy."""
     n = len(formulas.q)
     body = _table("entries", formulas.entries)
-    # a matrix with holes would be wrong without a word
+    # an incomplete matrix is omitted
     if formulas.mass_matrix is not None:
         body.append(f"M = Matrix({n}, {n}, lambda i, j: entries[max(i, j) + 1, min(i, j) + 1])")
     body.append("")
     if formulas.potential is not None:
-        body += lines(python(formulas.potential), "V = (", _PYTHON_WIDTH, end=")")
+        body += printing.lines(python(formulas.potential), "V = (", _PYTHON_WIDTH, end=")")
     body += _table("base_parameters", formulas.base_parameters)
     body += _table("values", formulas.values)
     return "\n".join([_HEAD, *_beginning(formulas, "\n".join(body)), *body]) + "\n"
@@ -71,13 +146,13 @@ def sympy_source(formulas: Formulas) -> str:
 def _table(name: str, rows: Mapping[tuple[int, int], Expr] | Mapping[Symbol, Expr]) -> list[str]:
     result = [f"{name} = {{"]
     for key, expression in rows.items():
-        result += lines(python(expression), f"    {key}: ", _PYTHON_WIDTH, end=",")
+        result += printing.lines(python(expression), f"    {key}: ", _PYTHON_WIDTH, end=",")
     return [*result, "}"]
 
 
 def _beginning(formulas: Formulas, body: str) -> list[str]:
-    """Return comments, imports of what ``body`` uses, and the symbols."""
-    # an import that is not used would fail the linters of whoever takes the file
+    """Return the comments, the imports that ``body`` needs, and the symbols."""
+    # Linters reject unused imports.
     imported = sorted({"Symbol", *re.findall(r"\b(Add|Matrix|S|cos|sin)\(", body)})
     inertial: set[str] = set()
     for definition in formulas.base_parameters.values():
@@ -87,12 +162,12 @@ def _beginning(formulas: Formulas, body: str) -> list[str]:
     lines = [*_comments(formulas, "#"), "", f"from sympy import {', '.join(imported)}", ""]
     for name in dict.fromkeys([*positions, *sorted(inertial), *bases]):
         lines.append(f'{name} = Symbol("{name}", real=True)')
-    # the last comma makes a tuple of one position too
+    # a tuple of one element needs a trailing comma
     return [*lines, f"q = ({', '.join(positions)}{',' * (len(positions) == 1)})", ""]
 
 
 def _comments(formulas: Formulas, mark: str) -> list[str]:
-    """Return which robot, joints and bodies the numbers in the names stand for."""
+    """Return the names of the robot, the joints and the bodies as comments."""
     arm = formulas.arm
     lines = [f"{mark} Robot {json.dumps(arm.name)}, for {formulas.trusted}."]
     for number, coordinate in enumerate(arm.coordinates, start=1):

@@ -1,7 +1,7 @@
-"""Derive closed forms of M(q) and V(q), linear in the base inertial parameters, as SymPy expressions.
+"""Closed forms of M(q) and V(q), linear in the base inertial parameters, as SymPy expressions.
 
-Each entry is expanded exactly (``expansion``), its terms are collected by base parameter (``base_parameters``) and
-written with multiple angles (``expressions``). What is too long is counted, not written.
+Each entry is expanded exactly (``expansion``), its terms are collected per base parameter (``base_parameters``) and
+expressed with sums of angles (``expressions``). For an entry that is too long, only the number of terms is given.
 """
 
 from __future__ import annotations
@@ -14,14 +14,8 @@ from typing import Literal
 from flint import fmpq_mpoly
 from sympy import Expr, Integer, Matrix, Rational, Symbol
 
-from spelgen.arm.arm import Arm
-from spelgen.certificate.expressions import (
-    PolynomialWriter,
-    coordinate,
-    grouped,
-    parameter,
-    weighted_sum,
-)
+from spelgen.arm.arm import Chain
+from spelgen.certificate.expressions import PolynomialWriter, coordinate, grouped, parameter, weighted_sum
 from spelgen.certificate.printing import latex
 from spelgen.certificate.tuning import TUNING
 from spelgen.errors import SpelgenError
@@ -36,16 +30,15 @@ READABLE = TUNING.readable_terms
 WRITABLE = TUNING.writable_terms
 
 Entry = tuple[int, int] | Literal["V"]
-"""An entry of M as users name it, (row, column) from 1, or V."""
+"""An entry of M, (row, column) from 1, or V."""
 
 
 @dataclass(frozen=True)
 class Formula:
-    """Hold one entry of M's lower triangle, or V: its number of terms, and how it is written.
+    """An entry of the lower triangle of M, or V: its number of terms and its expression.
 
-    ``terms`` counts products of a base parameter and a monomial in cosines, sines and distances, before
-    they become multiple angles; None where they were too many to be expanded. ``expression`` is None where it is too
-    long.
+    terms: products of a base parameter and a monomial in cosines, sines and distances; None if the expansion exceeds
+    its budget. expression: with sums of angles; None if it is too long.
     """
 
     entry: Entry
@@ -61,7 +54,7 @@ class Formula:
 
     @property
     def omission(self) -> str:
-        """Why it is not written out."""
+        """The reason for an entry without expression."""
         if self.terms is None:
             return "too many terms to be expanded"
         return f"{self.terms} terms, not written out"
@@ -69,29 +62,29 @@ class Formula:
 
 @dataclass(frozen=True, repr=False)
 class Formulas:
-    """Hold closed forms of ``arm`` in the base parameters ``base``; V up to a constant.
+    """Closed forms of ``arm`` in the base parameters ``base``; V up to a constant.
 
-    Under ``inertials`` terms that vanish for the URDF's values are left out.
+    With ``inertials``, terms that vanish for the values of the URDF are omitted.
     """
 
-    arm: Arm
+    arm: Chain
     assume: str
     base: tuple[BaseParameter, ...]
     rows: tuple[Formula, ...]
 
     @property
     def q(self) -> tuple[Symbol, ...]:
-        """The joints' positions [rad, m]."""
+        """The positions of the joints [rad, m]."""
         return tuple(map(coordinate, range(len(self.arm.coordinates))))
 
     @cached_property
     def entries(self) -> dict[tuple[int, int], Expr]:
-        """(row, column) -> entry of M that is not too long; the lower triangle, counted from 1."""
+        """Expressions of the entries of M that are not too long: {(row, column): entry}, lower triangle, from 1."""
         return {row.entry: row.expression for row in self.written if row.entry != "V"}
 
     @property
     def mass_matrix(self) -> Matrix | None:
-        """M(q), None where entries are missing."""
+        """M(q); None if an entry has no expression."""
         n = len(self.arm.coordinates)
         if len(self.entries) < n * (n + 1) // 2:
             return None
@@ -99,15 +92,15 @@ class Formulas:
 
     @property
     def potential(self) -> Expr | None:
-        """V(q) [J], None where it is missing."""
+        """V(q) [J]; None if it has no expression."""
         return next((row.expression for row in self.written if row.entry == "V"), None)
 
     @property
     def base_parameters(self) -> dict[Symbol, Expr]:
-        """Return the sum that each parameter in the expressions stands for, by body.
+        """Return the definition of each base parameter as a sum of inertial parameters of the bodies.
 
-        m is a mass [kg], h = m c a first moment [kg m] and I a tensor [kg m2] about the joint's origin, in a frame
-        whose z is the joint's axis.
+        m is a mass [kg], h = m c a first moment [kg m] and I an inertia tensor [kg m2] about the origin of the joint's
+        frame, whose z axis is the axis of the joint.
         """
         definitions = {}
         for base in self.base:
@@ -119,24 +112,24 @@ class Formulas:
 
     @property
     def values(self) -> dict[Symbol, Rational]:
-        """The base parameters' exact values by the URDF, where it has inertials."""
+        """Exact values of the base parameters from the URDF, if it has inertials."""
         return {parameter(base.name): Rational(base.value) for base in self.base if base.value is not None}
 
     @property
     def trusted(self) -> str:
-        """For which inertial values the formulas hold."""
+        """The inertial values for which the formulas are valid."""
         if self.assume == "inertials":
             return "the URDF's inertial zeros and symmetries"
         return "any inertial values"
 
     @property
     def written(self) -> tuple[Formula, ...]:
-        """The entries that are not too long."""
+        """The entries with an expression."""
         return tuple(row for row in self.rows if row.expression is not None)
 
     @property
     def unwritten(self) -> tuple[Formula, ...]:
-        """The entries that were too long."""
+        """The entries without an expression."""
         return tuple(row for row in self.rows if row.expression is None)
 
     def __repr__(self) -> str:
@@ -155,12 +148,12 @@ class Formulas:
 
 
 def formulas(
-    arm: Arm, structure: Structure, *, entry: Entry | None = None, longest: int | None = None
+    arm: Chain, structure: Structure, *, entry: Entry | None = None, longest: int | None = None
 ) -> Formulas:
-    """Closed forms of all entries of M and of V, or of one ``entry``.
+    """Return closed forms of all entries of M and of V, or of one ``entry``.
 
-    Entries of more than ``longest`` terms (``READABLE``, of one entry ``WRITABLE``) are counted and not
-    written. Raises SpelgenError for an entry that M does not have.
+    Entries of more than ``longest`` terms (by default ``READABLE``, for one entry ``WRITABLE``) have no expression.
+    Raises SpelgenError for an entry that M does not have.
     """
     n = len(arm.coordinates)
     entries: list[Entry] = []
@@ -177,12 +170,11 @@ def formulas(
         entries = [lower]
     if longest is None:
         longest = READABLE if entry is None else WRITABLE
-    # recursion and base parameters serve all entries: they are worked out once
     writer = _Writer(arm, structure)
     budget = Budget(TUNING.budget)
-    # from the tip on, so that what is cheap is not left out for what is dear
+    # Entries close to the tip are short: they come first, before the budget is exhausted.
     rows = [writer.formula(x, longest, budget) for x in reversed(entries)]
-    # of one entry, parameters that it does not contain would only puzzle a reader
+    # For a single entry, list only its own parameters.
     base = writer.base
     if entry is not None:
         symbols = (rows[0].expression or Integer(0)).free_symbols
@@ -191,9 +183,9 @@ def formulas(
 
 
 class _Writer:
-    """Write the entries of one arm."""
+    """The formulas of the entries of one arm; recursion and base parameters are computed once."""
 
-    def __init__(self, arm: Arm, structure: Structure):
+    def __init__(self, arm: Chain, structure: Structure):
         self._at_urdf_values = structure.assume == "inertials"
         self.base = base_parameters(arm)
         if self._at_urdf_values:
@@ -202,7 +194,7 @@ class _Writer:
         self._writer = PolynomialWriter(arm, self._expansion.context)
 
     def formula(self, entry: Entry, longest: int, budget: Budget) -> Formula:
-        """Return one entry, counted only where it has more than ``longest`` terms or needs more than ``budget``."""
+        """Return an entry; it has no expression if it has more than ``longest`` terms or exceeds ``budget``."""
         try:
             polynomials = self._polynomials(entry, budget)
         except TooLarge:
@@ -217,14 +209,14 @@ class _Writer:
         return Formula(entry, terms, grouped(functions))
 
     def _polynomials(self, entry: Entry, budget: Budget) -> dict[str, fmpq_mpoly]:
-        """Return by what each base parameter is multiplied, without the constant part of V. Raises TooLarge."""
-        element = self._expansion.written.potential
+        """Return the polynomial coefficient of each base parameter, without the constant of V. Raises TooLarge."""
+        element = self._expansion.energies.potential
         if entry != "V":
-            element = self._expansion.written.mass[entry[0] - 1, entry[1] - 1]
+            element = self._expansion.energies.mass[entry[0] - 1, entry[1] - 1]
         polynomials = {}
         total = self._expansion.context.from_dict({})
         for base in self.base:
-            # the parameters regrouped into this one have their part in its first one's polynomial
+            # The coefficient of a base parameter is the coefficient of its first inertial parameter.
             polynomial = self._writer.reduced(self._expansion.polynomial(element, base.index, budget))
             if entry == "V":
                 polynomial -= polynomial[(0,) * self._expansion.context.nvars()]
@@ -232,7 +224,7 @@ class _Writer:
             total += rational(base.value or Fraction(0)) * polynomial
         if not self._at_urdf_values:
             return polynomials
-        # with the URDF's values a monomial may cancel between parameters
+        # For the values of the URDF, a monomial may cancel between parameters.
         remaining = set(total.monoms())
         for name, polynomial in polynomials.items():
             terms = {monomial: value for monomial, value in polynomial.terms() if monomial in remaining}

@@ -1,4 +1,4 @@
-"""Present a derived structure as people and programs read it: text of a given width, and JSON (schema 1)."""
+"""The result of `spelgen inspect`: the structure of an arm as text, and as JSON (schema 1)."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from spelgen.arm.actuation import Actuation, InputEntry
-from spelgen.arm.arm import Arm, Coordinate
-from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.arm.arm import Chain, Coordinate
+from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.certificate.facts import Fact, facts
 from spelgen.errors import Diagnostic
 from spelgen.labels import counted, joint_ranges, joints_in_ranges, printable, short_name
 from spelgen.listing import WIDTH, Listing
 from spelgen.structure.servo_rank import servo_rank
-from spelgen.structure.structure import Entry, Structure, derive
+from spelgen.structure.structure import MassEntry, Structure, derive
 from spelgen.urdf.robot import Assume
 
-if TYPE_CHECKING:  # SymPy is read in only for formulas
+if TYPE_CHECKING:  # SymPy is imported for formulas only
     from spelgen.certificate.formulas import Entry as PlaceOfEntry
     from spelgen.certificate.formulas import Formulas
 
 SCHEMA = 1
 LETTERS = {"zero": "0", "constant": "C"}
-"""Of entries of M that no joint moves."""
+"""Symbols of entries of M that do not depend on q."""
 POSITION = "the springs of position servos: tau = clip(kp (u - q) - kd qd), which store 1/2 kp (q - u)^2"
 
 
@@ -35,7 +35,7 @@ POSITION = "the springs of position servos: tau = clip(kp (u - q) - kd qd), whic
 class Inspection:
     """The facts that ``spelgen inspect`` shows of an arm."""
 
-    arm: Arm
+    arm: Chain
     structure: Structure
     actuation: Actuation
     diagnostics: tuple[Diagnostic, ...]
@@ -70,10 +70,7 @@ class Inspection:
                 "constants": len(structure.constants),
                 "output_joints": [self._names(output.joints) for output in structure.outputs],
             },
-            "potential_energy": {
-                "kind": potential,
-                "joints": self._names(structure.potential),
-            },
+            "potential_energy": {"kind": potential, "joints": self._names(structure.potential)},
             "input_matrix": self._input_matrix(),
             "base_parameters": structure.base_parameter_count,
             "facts": list(map(asdict, self.facts)),
@@ -98,7 +95,7 @@ class Inspection:
         cells, n = self._cells(), len(self.structure.joints)
         rows = []
         for row, name in enumerate(self.structure.joints):
-            # M is symmetric: above the diagonal stand the entries below it
+            # M is symmetric
             line = [cells[max(row, column), min(row, column)] for column in range(n)]
             rows.append((f"{row + 1} {name}", *line))
         title = f"{self.arm.name}: mass matrix; joints each entry depends on, C constant, 0 always zero"
@@ -109,7 +106,7 @@ class Inspection:
     def _names(self, joints: Iterable[int]) -> list[str]:
         return [self.structure.joints[joint] for joint in joints]
 
-    def _entry(self, entry: Entry) -> dict[str, object]:
+    def _entry(self, entry: MassEntry) -> dict[str, object]:
         return {
             "row": entry.row + 1,
             "col": entry.column + 1,
@@ -119,7 +116,7 @@ class Inspection:
 
     def _input_matrix(self) -> dict[str, object]:
         n = len(self.structure.joints)
-        # programs read every entry of G, also those that are zero
+        # JSON contains the zero entries of G as well
         values = {(entry.row, entry.column): (entry.kind, entry.value) for entry in self.actuation.entries}
         entries: list[dict[str, object]] = []
         for row, column in product(range(n), repeat=2):
@@ -134,11 +131,11 @@ class Inspection:
         return {**content, "entries": entries}
 
     def _servo_needs(self) -> str:
-        """Return what logs of positions determine, by the rank of their equations."""
-        # positions alone do not fix the scale of torques: kp, mass and friction may all be doubled
+        """Return the parameters that logs of positions determine, in words."""
+        # Logs of positions do not determine the scale of torques: kp, mass and friction may be multiplied by a factor.
         rank = servo_rank(self.arm)
         text = f"{POSITION}; logs of positions determine inertia, weight and friction in ratio to kp only"
-        # one number in SI units then sets the scale of the whole arm
+        # One known torque parameter determines the scale of a group of joints.
         if len(rank.groups) == 1:
             text += ": one known kp, mass or load determines all"
         else:
@@ -152,11 +149,11 @@ class Inspection:
         return text
 
     def _input_needs(self) -> str:
-        """Return what a model needs of G."""
+        """Return the requirements on G in words."""
         needs = ["fixed"]
         if self.input == "position":
             needs = [self._servo_needs()]
-        # logs hold motor torques then, which a model must convert to those of the joints
+        # logs contain motor torques, which a model converts to joint torques
         if not self.actuation.direct:
             needs = ["motor torques"]
             for kind, meaning in (("fixed", "gear known"), ("gain", "gain trained"), ("coupled", "coupled")):
@@ -165,7 +162,7 @@ class Inspection:
                     needs.append(f"{meaning} at {_rows(entries)}")
         if self.actuation.couplings:
             needs.append(f"motors coupled at {_rows(self.actuation.couplings)}")
-        # a joint without a drive has no input, so friction alone explains its torque
+        # a joint without a drive has no input
         if self.structure.passive:
             needs.append(f"{joints_in_ranges(self.structure.passive)} without a drive")
         return ", ".join(needs)
@@ -180,8 +177,8 @@ class Inspection:
         lines = ["Joints"]
         names = [short_name(coordinate.name) for coordinate in self.arm.coordinates]
         width = max(map(len, names))
-        for index, coordinate in enumerate(self.arm.coordinates):
-            line = f"  {index + 1:>2}  {names[index]:<{width}}  {coordinate.kind:<9}  {reach(coordinate)}"
+        for index, joint in enumerate(self.arm.coordinates):
+            line = f"  {index + 1:>2}  {names[index]:<{width}}  {joint.joint_type:<9}  {range_text(joint)}"
             if index in self.structure.passive:
                 line += ", passive"
             lines.append(line)
@@ -194,7 +191,7 @@ class Inspection:
         return cells
 
     def _matrix(self) -> str:
-        """Return the lower triangle of M with each entry's joints, its columns aligned."""
+        """Return the lower triangle of M as aligned text: the joints that each entry depends on."""
         cells, n = self._cells(), len(self.structure.joints)
         lines = ["Mass matrix: joints each entry depends on; C constant, 0 always zero"]
         widths = [0] * n
@@ -208,9 +205,9 @@ class Inspection:
         return "\n".join(lines)
 
     def needs(self) -> dict[str, str]:
-        """Return what a model of M(q), V(q) and G needs, in words, and the number of base parameters."""
+        """Return the requirements of a model of M(q), V(q) and G in words, and the number of base parameters."""
         structure = self.structure
-        # outputs that read the same joints are one network: said together
+        # outputs that depend on the same joints are one network
         counts = Counter(output.joints for output in structure.outputs)
         outputs = counted(len(structure.outputs), "output")
         mass = f"{outputs} and {counted(len(structure.constants), 'constant')}"
@@ -236,7 +233,7 @@ class Inspection:
 
 
 def _rows(entries: Iterable[InputEntry]) -> str:
-    """Return the joints on which the torques of these entries of G act."""
+    """Return the joints (rows) of these entries of G, in words."""
     return joints_in_ranges(tuple(sorted({entry.row for entry in entries})))
 
 
@@ -254,20 +251,20 @@ def _remark(diagnostic: Diagnostic) -> str:
     return printable(f"{diagnostic.severity}: {line}{diagnostic.where}: {diagnostic.message}")
 
 
-def reach(coordinate: Coordinate) -> str:
-    """Return how far a joint can move, with its unit."""
+def range_text(coordinate: Coordinate) -> str:
+    """Return the range of a joint with its unit."""
     if coordinate.continuous:
         return "continuous"
     if coordinate.lower is None or coordinate.upper is None:
         return "no limits"
     unit = "m"
-    if coordinate.kind == "revolute":
+    if coordinate.joint_type == "revolute":
         unit = "rad"
     return f"{coordinate.lower:g} .. {coordinate.upper:g} {unit}"
 
 
 def inspect(
-    arm: ConfiguredArm | str | Path,
+    arm: Arm | str | Path,
     joints: Sequence[str] | None = None,
     tip: str | None = None,
     assume: Assume = "kinematics",
@@ -278,11 +275,11 @@ def inspect(
 
     Args:
         arm: the result of ``load_arm``, or the path of a URDF; the other arguments of ``load_arm`` go with a path.
-        assume: ``kinematics``: the structure for any inertial parameters; ``inertials``: for the inertials of the URDF.
+        assume: ``kinematics``: structure for any inertial parameters; ``inertials``: for the parameters of the URDF.
 
-    Raises the errors of ``load_arm``, and ArmError if the URDF has no inertials to assume.
+    Raises the errors of ``load_arm``, and ArmError for ``inertials`` if the URDF has none.
     """
-    if not isinstance(arm, ConfiguredArm):
+    if not isinstance(arm, Arm):
         arm = load_arm(arm, joints, tip, angle_tolerance)
-    structure = derive(arm.arm, assume)
-    return Inspection(arm.arm, structure, arm.actuation, arm.diagnostics, arm.settings.input)
+    structure = derive(arm.chain, assume)
+    return Inspection(arm.chain, structure, arm.actuation, arm.diagnostics, arm.settings.input)

@@ -8,7 +8,8 @@ from pathlib import Path
 from spelgen.certificate.verification import Verification
 from spelgen.certificate.verify import verify
 from spelgen.emission.module_file import parse_spec, read_source
-from spelgen.emission.specify import arm_of_spec, derive_spec, find_urdf
+from spelgen.emission.plan import derive_spec
+from spelgen.emission.specify import arm_of_spec, find_urdf
 from spelgen.emission.text import module_text
 from spelgen.structure.structure import derive
 
@@ -42,6 +43,6 @@ def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
         reasons.append("the derived model differs from the one in the module")
     if text not in (module_text(spec, standalone=is_standalone) for is_standalone in (False, True)):
         reasons.append("the text of the module differs from that of `spelgen build`")
-    proof = verify(arm.robot, arm.arm, derive(arm.arm, stated.options.assume))
+    proof = verify(arm.robot, arm.chain, derive(arm.chain, stated.options.assume))
     reasons += [str(difference) for difference in proof.differences]
     return CheckResult(path, not reasons, tuple(reasons), proof)

@@ -1,7 +1,7 @@
-"""Draw mass matrices, torques of gravity and torque regressors of an arm by Pinocchio, at random configurations.
+"""Mass matrices, gravity torques and torque regressors of an arm at random configurations, computed by Pinocchio.
 
-With random inertials every sample has its own, each that of a possible rigid body: the pseudo-inertia is
-positive definite (Wensing, Kim and Slotine, RA-L 3(1), 2018).
+Random inertial parameters are physically consistent: their pseudo-inertia is positive definite (Wensing, Kim and
+Slotine, RA-L 3(1), 2018).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from fractions import Fraction
 import numpy as np
 import pinocchio as pin
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.settings.settings import Settings
 from spelgen.structure.pseudo_inertia import parameters_of
@@ -22,10 +22,11 @@ ENGINE = f"Pinocchio {pin.__version__}"
 
 @dataclass(frozen=True)
 class NumericSamples:
-    """Hold samples: of M in blocks, every one but the first with one coordinate moved.
+    """Samples of M and of the gravity torque.
 
-    ``mass`` (1 + n, samples, n(n+1)/2), each entry in units of ``scale`` (n(n+1)/2,), the geometric mean of
-    its row's and column's diagonal entries; ``gravity`` dV/dq (samples, n), in units of its largest value.
+    mass: lower triangles of M divided by ``scale``, (1 + n, S, n(n+1)/2); in block k only coordinate k differs from
+    block 0. scale: geometric mean of the diagonal entries of row and column, (n(n+1)/2,). gravity: dV/dq divided by its
+    largest value, (S, n).
     """
 
     mass: np.ndarray
@@ -34,13 +35,13 @@ class NumericSamples:
 
     @property
     def changes(self) -> np.ndarray:
-        """How M changes when one coordinate moves, (n, samples, n(n+1)/2)."""
+        """Changes of M with each coordinate, (n, S, n(n+1)/2)."""
         result: np.ndarray = self.mass[1:] - self.mass[0]
         return result
 
 
-def draw(arm: Arm, count: int, rng: np.random.Generator, *, random_inertials: bool) -> NumericSamples:
-    """Return ``count`` samples of ``arm``, with random inertials or those it has."""
+def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: bool) -> NumericSamples:
+    """Return samples at ``count`` configurations, with random inertial parameters or those from the URDF."""
     n = len(arm.coordinates)
     rows, columns = np.tril_indices(n)
     mass = np.zeros((1 + n, count, n, n))
@@ -54,7 +55,7 @@ def draw(arm: Arm, count: int, rng: np.random.Generator, *, random_inertials: bo
         q = np.where(np.eye(1 + n, n, -1) == 1, moved, base)  # (1 + n, n)
         mass[:, sample] = dynamics.mass_matrix(q)
         gravity[sample] = dynamics.gravity(base)
-    # entries mix kilograms and kilogram square metres: each is judged in its own unit
+    # Entries have different units (kg, kg m, kg m2): each is relative to its own scale.
     diagonal = np.abs(np.diagonal(mass, axis1=2, axis2=3)).mean(axis=(0, 1))
     scale = np.sqrt(np.outer(diagonal, diagonal))[rows, columns]
     scale[scale == 0] = 1.0
@@ -62,9 +63,9 @@ def draw(arm: Arm, count: int, rng: np.random.Generator, *, random_inertials: bo
     return NumericSamples(mass[:, :, rows, columns] / scale, scale, gravity / largest)
 
 
-def regressor(arm: Arm, rng: np.random.Generator) -> np.ndarray:
-    """Return rows of the inverse-dynamics regressor at random q, qd, qdd, (rows, 10 bodies)."""
-    # a regressor does not depend on inertials: any possible ones will do
+def regressor(arm: Chain, rng: np.random.Generator) -> np.ndarray:
+    """Return rows of the inverse-dynamics regressor at random q, qd, qdd, (m n, 10 B) for B bodies."""
+    # The regressor does not depend on the inertial parameters.
     dynamics = arm_dynamics(with_random_inertias(arm, rng), Settings())
     n, bodies = len(arm.coordinates), len(arm.bodies)
     rows = []
@@ -73,23 +74,23 @@ def regressor(arm: Arm, rng: np.random.Generator) -> np.ndarray:
         qd = dynamics.jacobian @ rng.normal(size=n)
         qdd = dynamics.jacobian @ rng.normal(size=n)
         by_joint = pin.computeJointTorqueRegressor(dynamics.model, dynamics.data, q, qd, qdd)
-        # of a single joint Pinocchio gives a vector
+        # Pinocchio returns a vector for a single joint.
         rows.append(dynamics.jacobian.T @ by_joint.reshape(bodies, -1))
     return np.concatenate(rows)
 
 
-def _positions(arm: Arm, rng: np.random.Generator) -> np.ndarray:
-    turns = np.array(arm.joint_types) == "revolute"
-    # beyond limits, too: the structure holds at every configuration
-    reach = np.where(turns, np.pi, 1.0)
-    return rng.uniform(-reach, reach)
+def _positions(arm: Chain, rng: np.random.Generator) -> np.ndarray:
+    """Return random positions (n,) [rad, m]."""
+    # The structure holds at every configuration, also outside the limits.
+    half_range = np.where(np.array(arm.joint_types) == "revolute", np.pi, 1.0)
+    return rng.uniform(-half_range, half_range)
 
 
-def with_random_inertias(arm: Arm, rng: np.random.Generator) -> Arm:
-    """Return the arm with the inertia of a possible rigid body, drawn anew, on every joint."""
+def with_random_inertias(arm: Chain, rng: np.random.Generator) -> Chain:
+    """Return the arm with random, physically consistent inertial parameters of all bodies."""
     translations = np.array([body.translation for body in arm.bodies], dtype=float)
     size = float(np.linalg.norm(translations, axis=1).mean()) or 1.0
-    # any positive definite pseudo-inertia is that of a possible body; lengths are of the arm's size
+    # A A^T is a positive definite pseudo-inertia; lengths have the magnitude of the arm's.
     factors = rng.normal(size=(len(arm.bodies), 4, 4)) * np.array([[size], [size], [size], [1.0]])
     bodies = []
     for body, inertia in zip(arm.bodies, parameters_of(factors @ factors.mT).tolist(), strict=True):

@@ -1,6 +1,6 @@
-"""Print expressions with SymPy's own printers: text and LaTeX with decimals, Python with exact fractions.
+"""Expressions as text, LaTeX and Python, by the printers of SymPy: with decimals, in Python with exact fractions.
 
-Blanks that must not end a line are no-break spaces until the lines are made.
+Blanks at which a line must not be broken are no-break spaces until the text is wrapped.
 """
 
 from __future__ import annotations
@@ -13,21 +13,20 @@ from sympy.core.parameters import distribute
 from sympy.printing.latex import LatexPrinter
 from sympy.printing.str import StrPrinter
 
-# textwrap breaks lines at blanks alone, so a no-break space holds a line together
-_FIXED = "\N{NO-BREAK SPACE}"
+_FIXED = "\N{NO-BREAK SPACE}"  # textwrap does not break lines at it
 _LONG_SUM = 20
 _DIGITS = 12
-_DOUBLE = 10**17  # more digits than a double holds
+_DOUBLE = 10**17  # has more digits than a float
 
 
 def text(expression: Expr) -> str:
-    """Return it as one types it: numbers as decimals of up to twelve digits."""
+    """Return an expression as plain text, with decimals of at most twelve digits."""
     result: str = StrPrinter({"full_prec": False}).doprint(_rounded(expression, 1, _DIGITS))
     return result
 
 
 def latex(expression: Expr) -> str:
-    r"""Return a formula of LaTeX's, with brackets that unlike \left( may stand on different lines."""
+    r"""Return an expression in LaTeX, with \bigl( in place of \left(, which cannot span lines."""
     names = {symbol: _latex_name(symbol.name) for symbol in expression.free_symbols}
     printer = LatexPrinter({"full_prec": False, "mul_symbol": r" \, ", "symbol_names": names})
     formula: str = printer.doprint(_rounded(expression, 1, _DIGITS))
@@ -35,15 +34,15 @@ def latex(expression: Expr) -> str:
 
 
 def python(expression: Expr) -> str:
-    """Return Python that SymPy evaluates exactly, but for fractions of more digits than a double has."""
+    """Return an expression in Python for SymPy: exact, except fractions with more digits than a float."""
     result: str = _PythonPrinter({"sympy_integers": True}).doprint(_rounded(expression, _DOUBLE, 17))
     return result
 
 
 def lines(formula: str, start: str, width: int, end: str = "") -> list[str]:
-    """Return a formula between ``start`` and ``end``, broken where lines get longer than ``width``."""
+    """Return ``start``, a formula and ``end`` as lines of at most ``width`` characters if possible."""
     indent = " " * (len(start) - len(start.lstrip()) + 4)
-    # a sign stays with what follows it; angles, and short brackets, stay in one line
+    # No line break after a sign, nor within angles and short brackets.
     formula = re.sub(r"([+-]) ", rf"\1{_FIXED}", formula)
     brackets = re.findall(r"\((?:[^()]|\([^()]*\))+\)", formula)
     angles = re.findall(r"(?:cos|sin)\b.*?\)", formula)
@@ -58,7 +57,7 @@ def lines(formula: str, start: str, width: int, end: str = "") -> list[str]:
 
 class _PythonPrinter(StrPrinter):  # type: ignore[misc]  # SymPy has no types
     def _print_Add(self, expression: Add, order: str | None = None) -> str:
-        """Print a long sum in one call, since Python cannot nest thousands of additions."""
+        """Print a long sum as one call, because Python cannot nest thousands of additions."""
         if len(expression.args) <= _LONG_SUM:
             result: str = super()._print_Add(expression, order)
             return result
@@ -66,18 +65,18 @@ class _PythonPrinter(StrPrinter):  # type: ignore[misc]  # SymPy has no types
 
 
 def _rounded(expression: Expr, largest: int, digits: int) -> Expr:
-    """Return it with decimals for fractions whose numerator or denominator exceeds ``largest``."""
+    """Return the expression with decimals for fractions whose numerator or denominator exceeds ``largest``."""
     decimals = {}
     for number in expression.atoms(Rational):
         if not number.is_Integer and max(abs(number.p), number.q) > largest:
             decimals[number] = Float(number, digits)
-    # SymPy would else multiply brackets out
+    # Otherwise SymPy expands products.
     with distribute(False):
         return expression.xreplace(decimals)
 
 
 def _latex_name(name: str) -> str:
-    """Return ``Izz1R`` as I with the index zz,1R."""
-    letter, axes, place = re.findall(r"(.)([a-z]*)(.*)", name)[0]
-    index = ",".join(filter(None, [axes, place]))
+    """Return a name such as ``Izz1R`` in LaTeX: I with the index zz,1R."""
+    letter, axes, number = re.findall(r"(.)([a-z]*)(.*)", name)[0]
+    index = ",".join(filter(None, [axes, number]))
     return f"{letter}_{{{index}}}" if index else str(letter)

@@ -1,8 +1,8 @@
-"""Give the reason why an entry is zero, constant or equal to another, and why a joint does not matter: the geometry.
+"""Geometric reasons for zero, constant and equal entries of M, and for joints without effect on M or V.
 
-M couples joints a and b by the integral of v_a . v_b over the mass that both move, v being the velocity field
-of a unit rate: that integral is what the reasons speak of. Each function gives None where it finds none.
-``{joints}`` and ``{axes}`` in a reason stand for the other joints concerned, and for their axes.
+The entry of joints a and b is the integral of v_a . v_b over the mass that both move, with v the velocity field of a
+unit rate; the reasons are properties of this integral. Each function returns None if it knows no reason. ``{joints}``
+and ``{axes}`` in a reason are placeholders for the other joints of the entries, and for their axes.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from spelgen.certificate.axes import Axes
-from spelgen.labels import axes_told, entry_name, joints_told
-from spelgen.structure.structure import Entry, Structure
+from spelgen.labels import axes_in_words, entry_name, joints_in_words
+from spelgen.structure.structure import MassEntry, Structure
 
 
-def zero_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None:
-    """Return why ``entry`` is zero."""
+def zero_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str | None:
+    """Return the reason for a zero entry."""
     later, earlier = entry.row, entry.column
     slider = later if axes.slides[later] else earlier
     if axes.slides[later] != axes.slides[earlier] and axes.parallel(later, earlier):
@@ -25,8 +25,8 @@ def zero_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None:
     return balance_reason(axes, structure, entry)
 
 
-def constant_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None:
-    """Return why ``entry`` is constant."""
+def constant_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str | None:
+    """Return the reason for a constant entry."""
     later, earlier = entry.row, entry.column
     if later == earlier:
         return _diagonal_reason(axes, structure, later)
@@ -35,83 +35,83 @@ def constant_reason(axes: Axes, structure: Structure, entry: Entry) -> str | Non
     if axes.slides[later] and not axes.slides[earlier] and axes.keep_offset(later, earlier):
         return (
             f"the mass that joint {later + 1} carries keeps its distance from the plane through "
-            f"{axes_told([earlier])} along its slide"
+            f"{axes_in_words([earlier])} along its slide"
         )
     turn = not axes.slides[later] and not axes.slides[earlier]
-    if turn and axes.move_alike(later, earlier) and _diagonal_reason(axes, structure, later):
+    if turn and axes.same_twist(later, earlier) and _diagonal_reason(axes, structure, later):
         same = entry_name(later, later)
         if axes.opposed(later, earlier):
             same = f"-{same}"
-        return f"{joints_told([earlier, later])} turn about one line, so it is {same}"
+        return f"{joints_in_words([earlier, later])} turn about one line, so it is {same}"
     return balance_reason(axes, structure, entry)
 
 
 def _diagonal_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
-    # joints before this one move all that it carries as one piece, which changes no inertia
+    # Joints before this one move its load as a rigid body: they do not change the inertia about its axis.
     behind = range(joint + 1, len(axes.slides))
     if axes.slides[joint]:
         return "for a sliding joint the entry is the mass that it carries"
     if not behind:
         return f"joint {joint + 1} is the last, so the inertia about its axis stays the same"
-    if all(axes.commute(joint, other) for other in behind):
+    if all(axes.commute(joint, later) for later in behind):
         return f"all joints after joint {joint + 1} turn about its axis or slide along it"
     if len(behind) == 1 and structure.assume == "inertials" and axes.symmetric:
         return f"what joint {joint + 2} carries is symmetric about its axis"
     return None
 
 
-def balance_reason(axes: Axes, structure: Structure, entry: Entry) -> str | None:
-    """Return why an entry of a balanced last body is what it is: it is Izz times the cosine between the axes."""
-    last, other = len(structure.joints) - 1, entry.column
+def balance_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str | None:
+    """Return the reason for an entry of a balanced last body: the entry is Izz times the cosine of the axes."""
+    last, earlier = len(structure.joints) - 1, entry.column
     if structure.assume != "inertials" or not axes.balanced or entry.row != last:
         return None
-    # its velocity field about its own axis is a pure spin: only axes along it feel that
+    # Rotation about a principal axis through the centre of mass has angular momentum along this axis only.
     balanced = f"what joint {last + 1} carries is balanced about its axis"
     if axes.without_inertia:
         return f"{balanced} and has no moment of inertia about it"
-    if axes.slides[other]:
+    if axes.slides[earlier]:
         return f"{balanced}, so turning it shifts no mass"
-    if axes.perpendicular(last, other):
+    if axes.perpendicular(last, earlier):
         return f"{balanced}, which is always at right angles to {{axes}}"
-    if axes.fixed_angle(last, other):
+    if axes.fixed_angle(last, earlier):
         return f"{balanced}, which keeps its angle to {{axes}}"
     return None
 
 
 def equality_reason(axes: Axes, structure: Structure, entries: Sequence[tuple[int, int]]) -> str | None:
-    """Return why entries of one row are equal: their columns' joints move alike what the row's joint carries."""
-    # entries of different rows belong to different masses: no simple reason makes these equal
+    """Return the reason for equal entries of a row: the joints of the columns move the load of the row equally."""
+    # Entries of different rows belong to different loads: there is no simple reason.
     rows, columns = map(sorted, zip(*entries, strict=True))
     if rows[0] != rows[-1]:
         return None
-    if all(axes.move_alike(columns[0], column) for column in columns[1:]):
+    if all(axes.same_twist(columns[0], column) for column in columns[1:]):
         if axes.slides[columns[0]]:
-            return f"{joints_told(columns)} slide along one direction"
-        return f"{joints_told(columns)} turn about one line"
+            return f"{joints_in_words(columns)} slide along one direction"
+        return f"{joints_in_words(columns)} turn about one line"
     last = len(structure.joints) - 1
     if entries[0][0] == last and structure.assume == "inertials" and axes.balanced:
         turn = not any(axes.slides[column] for column in columns)
         if turn and all(axes.parallel(columns[0], column) for column in columns[1:]):
             balanced = f"what joint {last + 1} carries is balanced about its axis"
-            return f"{balanced}, and {joints_told(columns)} are parallel"
+            return f"{balanced}, and {joints_in_words(columns)} are parallel"
     return None
 
 
 def idle_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
-    """Return why M does not depend on ``joint``."""
+    """Return the reason for M not to depend on ``joint``."""
     if joint == 0:
         return "it moves the whole arm as one piece"
-    # M is the same from whatever the base: a joint that commutes with all before it may count as the first
+    # M does not depend on the pose of the base: a joint that commutes with all joints before it acts as the first.
     nearer = list(range(joint))
-    if all(axes.commute(joint, other) for other in nearer):
-        return f"it does not move {axes_told(nearer)}, as if it moved the whole arm"
+    if all(axes.commute(joint, earlier) for earlier in nearer):
+        return f"it does not move {axes_in_words(nearer)}, as if it moved the whole arm"
     if joint == len(axes.slides) - 1 and structure.assume == "inertials" and axes.symmetric:
         return "what it carries is symmetric about its axis"
     return None
 
 
 def weightless_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
-    """Return why V does not depend on ``joint``."""
+    """Return the reason for V not to depend on ``joint``."""
     if axes.lifts_nothing(joint):
         if axes.slides[joint]:
             return "sliding level lifts nothing"
@@ -123,7 +123,7 @@ def weightless_reason(axes: Axes, structure: Structure, joint: int) -> str | Non
 
 
 def potential_reason(axes: Axes, structure: Structure) -> str | None:
-    """Return why V is zero."""
+    """Return the reason for V = 0."""
     if not any(axes.arm.gravity):
         return "so is gravity"
     if all(axes.lifts_nothing(joint) for joint in range(len(structure.joints))):

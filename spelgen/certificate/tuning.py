@@ -15,6 +15,12 @@ class CertificateTuning:
     writable_terms: int = 3000
     # [1] Multiplications of terms for all entries of an arm, about 2 s.
     budget: int = 2_000_000
+    # [1] Random configurations at which relations between axes are tested exactly.
+    configurations: int = 2
+    # [1] Bound of numerators and denominators of random rational positions.
+    grid: int = 10**6
+    # [1] Samples of a verification in addition to the largest possible rank: they would reveal a larger rank.
+    spare_samples: int = 6
     # [1] A number of a check below this fraction of its scale is rounding; measured differences are reported.
     rounding: float = 1e-12
     # [1] The same bound for the smallest form, whose long fractions are evaluated in double precision.

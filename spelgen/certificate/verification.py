@@ -1,4 +1,4 @@
-"""Hold the result of a numerical check of the derived facts, as people and programs read it."""
+"""The result of a numerical verification of the derived facts, as text and as JSON."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _MARKS = {"agrees": "ok", "differs": "DIFFERS", "undecided": "open"}
 
 
 @dataclass(frozen=True)
-class Check:
-    """Hold one fact: what was derived, what an independent computation found, and whether the two agree.
+class FactCheck:
+    """A derived fact, the result of an independent computation, and whether the two agree.
 
-    ``undecided`` stands for what double precision, or the other program, cannot tell.
+    ``undecided``: neither confirmed nor refuted in double precision, or by the other program.
     """
 
     fact: str
@@ -30,20 +30,20 @@ class Check:
 
 @dataclass(frozen=True, repr=False)
 class Verification:
-    """Hold the checks of one arm, made with ``samples`` random configurations from ``seed``."""
+    """The checks of an arm at ``samples`` random configurations from ``seed``."""
 
     means: str
     samples: int
     seed: int
-    checks: tuple[Check, ...]
+    checks: tuple[FactCheck, ...]
 
     @property
     def agrees(self) -> bool:
-        """Whether no result contradicts what was derived."""
+        """Whether no result contradicts the derivation."""
         return not self.differences
 
     @property
-    def differences(self) -> tuple[Check, ...]:
+    def differences(self) -> tuple[FactCheck, ...]:
         """The checks that contradict the derivation, or the reading of the file."""
         return tuple(check for check in self.checks if check.verdict == "differs")
 
@@ -56,7 +56,7 @@ class Verification:
         return Listing(f"Verified by {self.means}", head, tuple(rows), left=(0, 1, 2, 3)).html()
 
     def to_dict(self) -> dict[str, object]:
-        """Return a JSON object; ``checks`` in the order they were made."""
+        """Return a JSON object."""
         return {
             "agrees": self.agrees,
             "means": self.means,
@@ -66,7 +66,7 @@ class Verification:
         }
 
     def text(self) -> str:
-        """Return a paragraph for a terminal: one line or more for every check."""
+        """Return a paragraph for a terminal, with one or more lines per check."""
         lines = textwrap.wrap(f"Verified by {self.means}", WIDTH)
         for check in self.checks:
             mark = f"  {_MARKS[check.verdict]:<7} "

@@ -70,17 +70,17 @@ def compare(
     if ablation and presets is not None:
         raise UsageError("--ablation: names the presets itself, omit --presets")
     names = options.names(presets)
-    changes = {
+    values = {
         "presets": tuple(ablation_designs()) if ablation else names and tuple(names),
         "seeds": seeds, "splits": splits, "steps": steps,
     }  # fmt: skip
-    given = {name: value for name, value in changes.items() if value is not None}
-    comparison = _comparison(target, data, mapping).model_copy(update=given)
+    changes = {name: value for name, value in values.items() if value is not None}
+    comparison = _comparison(target, data, mapping).model_copy(update=changes)
     name = target.stem + ("-logs" if data else "") + ("-ablation" if ablation else "")
-    # workers have working folders of their own, so paths must be absolute
+    # the working folders of workers differ, so paths must be absolute
     folder = (output or Path("comparisons") / name).absolute()
     parallel = jobs or default_jobs()
-    # two comparisons in one folder would overwrite the runs of one another
+    # two simultaneous comparisons in one folder would overwrite each other's runs
     with locked(folder), termination_as_interrupt():
         with progress_bar("simulating") as progress:
             study = prepare_study(comparison, folder, progress)

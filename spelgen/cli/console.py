@@ -1,4 +1,4 @@
-"""How a command speaks: results to stdout, one line per error to stderr, exit codes to rely on."""
+"""Output of commands: results to stdout, one line per error to stderr, documented exit codes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FAILED = 1
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
 BROKEN_PIPE = 141  # 128 + SIGPIPE
 
-# top-level module that only an extra brings -> the extra
+# top-level module -> the extra that installs it
 EXTRAS = {
     "pinocchio": "simulate",
     "casadi": "deploy",
@@ -41,16 +41,16 @@ Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an e
 
 
 def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
-    """Wrap a command: it gains the option --debug, and its exceptions end as `fail` reports them.
+    """Return the command with the option --debug, and with its exceptions reported by `fail`.
 
-    Typer finds usage errors (exit 2) before the command runs; they pass through.
+    Typer raises usage errors (exit code 2) before the command runs; they are not changed.
     """
 
     @functools.wraps(command)
     def run(*arguments: object, debug: bool = False, **options: object) -> None:
         try:
             command(*arguments, **{name: _local(value) for name, value in options.items()})
-            sys.stdout.flush()  # a closed pipe shows here, where it is handled, and not at exit
+            sys.stdout.flush()  # a closed pipe raises its error here, and not in the interpreter at exit
         except (typer.Exit, typer.Abort, typer.BadParameter):
             raise
         except BaseException as error:
@@ -68,18 +68,18 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def _name_values(kind: object, *metadata: object) -> None:
-    """Give an annotated option the name of its values that people read: N, X, FILE, or the choices."""
-    kinds = [kind]
-    if NoneType in get_args(kind):
-        kinds = list(get_args(kind))
+def _name_values(annotation: object, *metadata: object) -> None:
+    """Set the name of an option's values in the help: N, X, FILE, or the choices."""
+    value_type = annotation
+    if NoneType in get_args(annotation):
+        value_type = get_args(annotation)[0]
     for info in metadata:
-        if isinstance(info, OptionInfo) and info.metavar is None and kind is not bool:
-            info.metavar = METAVARS.get(kinds[0]) or "|".join(map(str, get_args(kinds[0])))
+        if isinstance(info, OptionInfo) and info.metavar is None and value_type is not bool:
+            info.metavar = METAVARS.get(value_type) or "|".join(map(str, get_args(value_type)))
 
 
 def _local(value: object) -> object:
-    """Return paths that are addresses as their local copies, all else as it is."""
+    """Return the local copies of paths that are addresses; other values are unchanged."""
     if isinstance(value, list):
         return [_local(element) for element in value]
     if isinstance(value, Path):
@@ -90,13 +90,12 @@ def _local(value: object) -> object:
 def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
     """Report an exception on stderr and exit with its exit code; with `debug`, its traceback first."""
     if isinstance(error, BrokenPipeError):
-        # Nobody listens any more: let the interpreter's last flush go nowhere, and say nothing.
+        # the reader of stdout has ended: no message, and the last flush of the interpreter goes to /dev/null
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(BROKEN_PIPE)
     if debug:
         traceback.print_exception(error)
     if isinstance(error, KeyboardInterrupt):
-        # no traceback: whoever pressed Ctrl-C knows why it ended
         note("interrupted")
         raise typer.Exit(INTERRUPTED)
     note(_message(error, debug))
@@ -112,7 +111,7 @@ def _message(error: BaseException, debug: bool) -> str:
             return (
                 f"this needs the package {error.name}, which is not installed; pip install 'spelgen[{extra}]'"
             )
-    # disks that are full and folders without permission are no defects of spelgen
+    # a full disk or a missing permission is not a defect of spelgen
     if isinstance(error, OSError) and error.filename is not None:
         return f"{os.fsdecode(error.filename)}: {(error.strerror or type(error).__name__).lower()}"
     if isinstance(error, OSError) and error.strerror:
@@ -123,9 +122,9 @@ def _message(error: BaseException, debug: bool) -> str:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[..., None]]:
-    """Show a bar on stderr, where that is a terminal.
+    """Show a progress bar on stderr if it is a terminal.
 
-    Gives a function to call with (done, all), and with a title of what runs now.
+    Yields a function of (done, all) and optionally of the title of the current step.
     """
     from rich.console import Console
     from rich.progress import Progress
@@ -146,7 +145,7 @@ def note(text: object) -> None:
 
 
 def answer(form: str, record: Mapping[str, object], *lines: str) -> None:
-    """Print the result of a command: its lines for people, or its record as one line of JSON."""
+    """Print the result of a command: its lines as text, or its record as one line of JSON."""
     if form == "json":
         print(json.dumps(record, default=str))
         return
@@ -155,7 +154,7 @@ def answer(form: str, record: Mapping[str, object], *lines: str) -> None:
 
 
 def deliver(text: str, output: Path | None) -> None:
-    """Print a result without its last line end, or write it to a file and say so."""
+    """Print a result without its last line end, or write it to a file and print the path."""
     if output is None:
         say(text.removesuffix("\n"))
     else:
@@ -163,7 +162,7 @@ def deliver(text: str, output: Path | None) -> None:
 
 
 def refuse_warnings(subject: str, count: int) -> None:
-    """Exit with 1 if there are warnings and --strict allows none."""
+    """Exit with 1 if there is any warning, for --strict."""
     if count:
         note(f"{subject}{counted(count, 'warning')}, and --strict allows none")
         raise typer.Exit(FAILED)

@@ -1,4 +1,4 @@
-"""Commands about trained runs: `evaluate` measures one on test logs, `report` writes a page about it."""
+"""Commands about trained runs: `evaluate` on test logs, and `report`, a page about the results."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from spelgen.evaluation.tables import LIMITS, csv_text, figures, summary
 from spelgen.files import read_json
 
 Format = Literal["text", "json", "csv"]
-MISSED = 3  # exit code: usage errors are 2
+LIMIT_EXCEEDED = 3  # exit code; usage errors have 2
 
 
 def evaluate(
@@ -31,7 +31,7 @@ def evaluate(
         list[str] | None,
         typer.Option(
             metavar="FIGURE=MAX",
-            help=f"Exit with {MISSED} if a figure is larger: {', '.join(LIMITS)}; once for each.",
+            help=f"Exit with {LIMIT_EXCEEDED} if a figure is larger: {', '.join(LIMITS)}; once for each.",
         ),
     ] = None,
     truth: Annotated[
@@ -55,17 +55,15 @@ def evaluate(
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.logs.preprocessing import Preprocessing
 
-    preprocessing = None if filter is None else Preprocessing(cutoff=filter)
     logs = read_test_logs(run, paths, mapping)
     model = load_run(run)
-    steps, seconds = ((), ()) if quick else (STEPS, SECONDS)
     with progress_bar("evaluating") as progress:
         results = evaluate_model(
             model,
             logs,
-            preprocessing=preprocessing,
-            steps=steps,
-            seconds=seconds,
+            preprocessing=None if filter is None else Preprocessing(cutoff=filter),
+            steps=() if quick else STEPS,
+            seconds=() if quick else SECONDS,
             truth=truth,
             progress=progress,
         )
@@ -79,22 +77,22 @@ def evaluate(
     # after the result, so that a script gets the figures in any case
     values = {figure.name: figure.value for figure in figures(results)}
     exceeded = []
-    for name, largest in limits:
+    for name, limit_value in limits:
         value = values.get(name)
-        if value is None or value > largest:
-            size = "not known" if value is None else f"{value:.4g}"
-            exceeded.append(f"limit exceeded: {name} is {size}, expected at most {largest:g}")
+        if value is None or value > limit_value:
+            text = "not known" if value is None else f"{value:.4g}"
+            exceeded.append(f"limit exceeded: {name} is {text}, expected at most {limit_value:g}")
     if exceeded:
         note("\n".join(exceeded))
-        raise typer.Exit(MISSED)
+        raise typer.Exit(LIMIT_EXCEEDED)
 
 
 def _limit(text: str) -> tuple[str, float]:
-    """Return `torque.nmse=0.01` as a name and a number. A usage error for anything else."""
-    name, _, largest = text.partition("=")
+    """Return `torque.nmse=0.01` as a name and a number. Raises a usage error for any other text."""
+    name, _, value = text.partition("=")
     try:
         if name in LIMITS:
-            return name, float(largest)
+            return name, float(value)
     except ValueError:
         pass
     raise typer.BadParameter(
@@ -127,9 +125,10 @@ def report(
         from spelgen.render.report_page import write_report
 
         path, evaluation = write_report(runs[0], output, robot), RunFolder(runs[0]).evaluation
-        found = summary(Results.from_dict(read_json(evaluation, RunError))) if evaluation.exists() else None
-        if found is not None:
-            say(found.text() + "\n")
+        if evaluation.exists():
+            listing = summary(Results.from_dict(read_json(evaluation, RunError)))
+            if listing is not None:
+                say(listing.text() + "\n")
         say(f"wrote {path}: the report, for any browser")
     else:
         from spelgen.render.runs_page import write_runs

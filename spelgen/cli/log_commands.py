@@ -1,4 +1,4 @@
-"""Commands about logs: `excite`, which motion to log, `simulate`, logs of a simulation, and `logs`, what was logged."""
+"""Commands about logs: `excite` designs a motion, `simulate` simulates logs, `logs` checks logs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from spelgen.errors import SpelgenErrors
 from spelgen.files import write_text
 
 if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import ConfiguredArm
+    from spelgen.arm.configured_arm import Arm
 
 
 def excite(
@@ -47,7 +47,7 @@ def excite(
     speed: Annotated[
         float, typer.Option(min=0.05, max=1.0, help="Fraction of the velocity limits to use.")
     ] = 0.7,
-    trials: Annotated[int, typer.Option(min=1, help="Candidates of the search, beside random ones.")] = 100,
+    trials: Annotated[int, typer.Option(min=1, help="Candidates of the search, after random ones.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
     force: Force = False,
     format: TextOrJson = "text",
@@ -102,16 +102,16 @@ def simulate(
 ) -> None:
     """Simulate training and test logs with Pinocchio.
 
-    With --as-built, masses, centres of mass, friction and armature differ from the URDF, as in a real arm;
+    With --as-built, masses, centres of mass, friction and armature differ from the URDF as on a real arm;
     LOGS/as_built.urdf and .yaml are the truth, for `spelgen evaluate --truth`.
     """
     from spelgen.logs.read import write_logs
     from spelgen.simulation.as_built import as_built as make_as_built
-    from spelgen.simulation.motion_file import read_motion
+    from spelgen.simulation.prescribed import read_motion
     from spelgen.simulation.simulate import simulate as simulate_arm
 
     arm = options.load(robot, joints, tip, angle_tolerance)
-    names = arm.arm.joint_names
+    names = arm.chain.joint_names
     motions = [read_motion(file, names) for file in motion or ()]
     truth = output / "as_built.urdf"
     paths = {role: output / f"{role}.parquet" for role in ("train", "test")}
@@ -156,7 +156,7 @@ def logs(
     from spelgen.logs.read import read_bounded_logs
     from spelgen.render.logs_page import page
 
-    # the URDF says which joints a mapping must name
+    # a mapping must name the joints of the URDF
     arm = options.load(robot, joints, tip, angle_tolerance)
     if suggest is not None:
         options.require_free(suggest, force=force)
@@ -169,19 +169,19 @@ def logs(
         say(result.text())
     else:
         say(json.dumps(result.to_dict(), indent=2))
-    # also of logs with errors: a picture often shows what is wrong
+    # also for logs with errors, whose charts may show the cause
     if html is not None:
-        note(f"wrote {write_text(html, page(result, arm.arm, arm.actuation.matrix()))}")
+        note(f"wrote {write_text(html, page(result, arm.chain, arm.actuation.matrix()))}")
     if result.errors:
         note(SpelgenErrors(result.errors))
-    # what is wrong comes first: a warning is no news beside an error
+    # errors before warnings
     if strict:
         refuse_warnings("", len(result.warnings))
     if result.errors:
         raise typer.Exit(FAILED)
 
 
-def _suggested(paths: list[Path], arm: ConfiguredArm, file: Path) -> Path:
+def _suggested(paths: list[Path], arm: Arm, file: Path) -> Path:
     """Write the mapping that the first log suggests, and return its file; exit with 1 if the log lacks columns."""
     from spelgen.errors import collect
     from spelgen.logs.formats import log_files
@@ -189,7 +189,7 @@ def _suggested(paths: list[Path], arm: ConfiguredArm, file: Path) -> Path:
 
     logs, errors = log_files(paths)
     collect(errors)
-    suggestion = suggest_mapping(logs[0], arm.arm.joint_names, commands=arm.settings.input == "position")
+    suggestion = suggest_mapping(logs[0], arm.chain.joint_names, commands=arm.settings.input == "position")
     say(f"wrote {write_text(file, suggestion.text)}; check it, then pass it by --mapping")
     if suggestion.missing:
         note(f"no column was found for {', '.join(suggestion.missing)}; write their names into {file}")

@@ -1,7 +1,6 @@
-"""The command line: each command is one step of the way from a URDF to a report.
+"""The command line: each command is one step from a URDF to a report.
 
-Commands import what they need when they run, so that `spelgen --help` is instant and `spelgen inspect`
-never loads torch.
+Commands import modules when they run, so that `spelgen --help` is fast and `spelgen inspect` never imports torch.
 """
 
 from __future__ import annotations
@@ -18,10 +17,9 @@ import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
 from spelgen.cli import (
+    arm_commands,
     compare_command,
     evaluate_command,
-    identify_command,
-    inspect_command,
     log_commands,
     model_commands,
     train_command,
@@ -29,12 +27,13 @@ from spelgen.cli import (
 from spelgen.cli.console import handle_errors, say
 from spelgen.version import __version__
 
-UsageError: type[Exception] = typer.BadParameter.__mro__[1]
+BaseUsageError: type[Exception] = typer.BadParameter.__mro__[1]
+"""UsageError of click, a copy of which is a private package of typer."""
 CONTEXT = {"max_content_width": 80, "help_option_names": ["-h", "--help"]}
 
 
 class Command(TyperCommand):
-    """A command whose help names arguments and nothing of their types, which their names say."""
+    """A command whose help shows the names of arguments without their types."""
 
     def get_help(self, ctx: Any) -> str:
         """Return the help."""
@@ -44,12 +43,12 @@ class Command(TyperCommand):
         return super().get_help(ctx)
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return the names as they are, optional ones in brackets."""
+        """Return the names of the arguments without braces, optional ones in brackets."""
         return [re.sub(r"[{}]", "", piece) for piece in super().collect_usage_pieces(ctx)]
 
 
-class Group(TyperGroup):
-    """All commands: a mistake in the words of one is answered with what may have been meant."""
+class CommandGroup(TyperGroup):
+    """All commands. A usage error suggests the nearest command, option or choice."""
 
     def make_context(self, *arguments: Any, **options: Any) -> Any:
         """Read the program's own options."""
@@ -67,20 +66,20 @@ def _suggestions() -> Iterator[None]:
     """Add suggestions to usage errors."""
     try:
         yield
-    except UsageError as error:
+    except BaseUsageError as error:
         _suggest(error)
         raise
 
 
 def _suggest(error: Any) -> None:
-    """Add to the message of a usage error the option or the choice that may have been meant."""
-    # click lists all that is similar: one suggestion is enough
-    nearest = list(getattr(error, "possibilities", None) or [])[:1]
+    """Add the nearest option or choice to the message of a usage error of click."""
+    # click lists all similar names; the message has one of them
+    nearest = list(vars(error).get("possibilities") or [])[:1]
     if nearest:
         error.possibilities = []
-    # typer checks choices by pydantic, which begins its messages so
+    # the prefix of pydantic, by which typer checks choices
     error.message = error.message.replace("Value error, ", "")
-    # click has no suggestion for values of a choice, which are misspelt as often as options
+    # click suggests no value of a choice
     choice = re.fullmatch(r"'(.*)' is not one of (.*)\.", error.message, re.DOTALL)
     if choice:
         choices = re.findall(r"'([^']*)'", choice[2])
@@ -92,17 +91,17 @@ def _suggest(error: Any) -> None:
 
 app = typer.Typer(
     name="spelgen",
-    cls=Group,
+    cls=CommandGroup,
     context_settings=CONTEXT,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
 for command in (
-    inspect_command.inspect,
+    arm_commands.inspect,
     model_commands.init,
     model_commands.build,
     log_commands.simulate,
-    identify_command.identify,
+    arm_commands.identify,
     log_commands.excite,
     log_commands.logs,
     train_command.train,
@@ -135,7 +134,7 @@ def common(
 
 def main() -> None:
     """Entry point of the command `spelgen`."""
-    # read by BLAS and torch when they are loaded: matrices are tiny, and one thread makes runs repeatable
+    # before BLAS and torch are imported: the matrices are small, and one thread makes runs deterministic
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     for stream in (sys.stdout, sys.stderr):
         # names from a file may not fit the terminal's encoding

@@ -1,4 +1,4 @@
-"""Commands about the model itself: `init`, `build`, `check`, `export`."""
+"""Commands about models: `init`, `build`, `check`, `export`."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ def init(
 
     path = output or robot.with_suffix(".yaml")
     options.require_free(path, force=force)
-    # without the sidecar, which this command is about to write
+    # without the settings file, which this command writes
     arm = make_arm(read_urdf(robot), joints=options.names(joints), tip=tip)
-    drives = [StarterJoint(x.name, x.kind, x.damping, x.friction) for x in arm.coordinates]
+    drives = [StarterJoint(x.name, x.joint_type, x.damping, x.friction) for x in arm.coordinates]
     say(f"wrote {write_text(path, starter(robot.name, drives))}")
 
 
@@ -74,7 +74,7 @@ def build(
     format: TextOrJson = "text",
 ) -> None:
     """Write the PyTorch module tailored to an arm."""
-    # before the URDF is read, which takes longest
+    # before the URDF is read, which takes time
     if preset not in PRESET_NAMES and Path(preset).suffix not in (".yaml", ".yml"):
         message = f"{preset!r} is none of {', '.join(PRESET_NAMES)}, nor a YAML file"
         raise typer.BadParameter(message, param_hint="'--preset'")
@@ -85,7 +85,7 @@ def build(
     path = output or Path(f"{robot.stem}_spel.py")
     spec = make_spec(arm, preset, width=width, depth=depth, assume=assume, module=path)
     source = module_text(spec, standalone=standalone)
-    # the same text: nothing is replaced, and its date stays
+    # an unchanged file keeps its date
     is_new = not path.is_file() or path.read_bytes() != source.encode()
     line = f"{path} is up to date"
     if is_new:
@@ -143,7 +143,7 @@ def export(
     require_fitting(to, output)
     options.require_free(output, force=force)
     result = export_run(load_run(run), to, entries=entry or ())
-    # all or nothing: a failed parity check above has left no file
+    # all files or none: a failed parity check has raised its error before
     files = [str(path) for path in result.write(output, force=force)]
     lines = [f"wrote {path}" for path in files]
     answer(format, {"files": files, "summary": result.summary}, *lines, *result.summary)

@@ -1,4 +1,4 @@
-"""Arguments and options that several commands have, and what these turn into."""
+"""Arguments and options of several commands, and the conversion of their values."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from spelgen.settings.log_mapping import Accepted
 from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import ConfiguredArm
+    from spelgen.arm.configured_arm import Arm
     from spelgen.logs.arm_mapping import LoggedArm
     from spelgen.settings.log_mapping import LogMapping
 
@@ -120,7 +120,7 @@ Output = Annotated[Path | None, output_option("FILE", "Write the result to a fil
 
 
 def result_format() -> OptionInfo:
-    """Return the option `--format`; one for each command, whose formats are its own."""
+    """Return the option `--format` of a command; the formats depend on the command."""
     option: OptionInfo = typer.Option(
         help="Format of the result; default: that of the suffix of -o, else text.", show_default=False
     )
@@ -128,28 +128,27 @@ def result_format() -> OptionInfo:
 
 
 def choose_format(format: str | None, output: Path | None, formats: Container[str]) -> str:
-    """Return the format named, else the one of these that the output's suffix means, else text."""
-    # `-o page.html` means HTML: to say so twice would be tedious
-    meant = SUFFIXES.get(output.suffix.lower(), "text") if output else "text"
-    return format or (meant if meant in formats else "text")
+    """Return the format, by default the format of the output's suffix if the command has it, else text."""
+    by_suffix = SUFFIXES.get(output.suffix.lower(), "text") if output else "text"
+    return format or (by_suffix if by_suffix in formats else "text")
 
 
 def write_result(format: str | None, output: Path | None, forms: Mapping[str, Callable[[], str]]) -> None:
-    """Print or write a result by the function of the format that `choose_format` returns."""
+    """Print or write a result; forms: functions that return its text, by format."""
     deliver(forms[choose_format(format, output, forms)]() + "\n", output)
 
 
 def names(text: str | None) -> list[str] | None:
-    """Return `a, b, "c, d"` as three names; None stays None."""
+    """Return `a, b, "c, d"` as three names, and None as None."""
     if text is None:
         return None
-    # as CSV: names of joints may hold commas, in quotes
+    # CSV, as a name in quotes may contain a comma
     cells: list[str] = next(csv.reader([text], skipinitialspace=True), [])
     return [name.strip() for name in cells]
 
 
 def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
-    """Return `3,2` as (3, 2), `V` as "V"; None stays None. A usage error for anything else."""
+    """Return `3,2` as (3, 2), `V` as "V" and None as None. Raises a usage error for any other text."""
     if text is None:
         return None
     if text == "V":
@@ -161,39 +160,39 @@ def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
 
 
 def logs(data: list[Path] | None, extra_logs: list[Path] | None) -> list[Path]:
-    """Return the paths after --data, however often it stands there; a usage error without any."""
+    """Return the paths of all options --data. Raises a usage error if there are none."""
     if not data:
         raise typer.BadParameter("name at least one file or folder", param_hint="'--data'")
     return [*data, *(extra_logs or [])]
 
 
 def log_mapping(arm: LoggedArm, mapping: Path | LogMapping | None, codes: Sequence[str] | None) -> LogMapping:
-    """Return how the logs of an arm are named, by default as its settings say, with these errors accepted too.
+    """Return the mapping of logs, by default the mapping in the arm's settings, with additional accepted errors.
 
-    A usage error for an unknown code.
+    Raises a usage error for an unknown code.
     """
     from spelgen.logs.arm_mapping import log_source
 
     for code in codes or ():
-        # a misspelt code would silently accept nothing
+        # a misspelt code would have no effect
         if code not in get_args(Accepted):
             hint = suggestion(code, get_args(Accepted))
             raise typer.BadParameter(f"unknown code {code!r}; {hint}", param_hint="'--accept'")
     chosen = log_source(arm, mapping).mapping
-    # a dict keeps the order, so that the same command writes the same record
+    # a dict preserves the order, so that the record of a run is deterministic
     accepted = dict.fromkeys((*chosen.accept, *(codes or ())))
     return chosen.model_copy(update={"accept": tuple(accepted)})
 
 
-def load(robot: Path, joints: str | None, tip: str | None, angle_tolerance: float) -> ConfiguredArm:
-    """Return the arm that a command names."""
+def load(robot: Path, joints: str | None, tip: str | None, angle_tolerance: float) -> Arm:
+    """Return the arm of a URDF with the options of a command."""
     from spelgen.arm.configured_arm import load_arm
 
     return load_arm(robot, names(joints), tip, angle_tolerance)
 
 
 def require_free(path: Path, *, force: bool) -> None:
-    """Raise SpelgenError where an output exists already, unless it may be replaced."""
+    """Raise SpelgenError if an output exists already, unless `force` allows to replace it."""
     if path.exists() and not force:
         raise SpelgenError(
             "this output exists already", file=path, do="--force replaces it, -o names another"

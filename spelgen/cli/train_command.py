@@ -75,8 +75,8 @@ def train(
 ) -> None:
     """Fit a module to logs.
 
-    Defaults come from `training` in the robot's settings; --set takes the same keys, which docs/cli.md lists. A key
-    that does not apply to the objective is an error.
+    Defaults come from `training` in the robot's settings; --set takes the same keys, which docs/cli_runs.md lists.
+    A key that does not apply to the objective is an error.
     """
     start_time = time.monotonic()  # max_minutes counts from here, reading of logs included
     # before anything is read: a misspelt key costs no time
@@ -95,7 +95,7 @@ def train(
     elif module is None:
         raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
     paths = options.logs(data, extra_logs)
-    # `train RUN --resume` names the folder where a module stands otherwise
+    # with --resume, the argument may be the run folder
     folder = output or _default_folder(module, source, resume=resume)
     spec = _specification(module, source, folder if resume else None)
     urdf = None if resume else robot or (None if module is None else _unchanged_urdf(module, spec))
@@ -106,12 +106,12 @@ def train(
     # the mapping may contain all joints of a URDF, and logs are checked with the arm
     arm = None if urdf is None else arm_of_spec(spec, urdf)
     log_mapping = options.log_mapping(arm or spec.joint_names, mapping or start.mapping or recorded, accept)
-    # torch is imported where it is needed: --help and mistakes are answered at once
+    # torch is imported after the checks above, which therefore report errors without delay
     from spelgen.fitting.fit import RunOptions
     from spelgen.fitting.train import train as train_files
     from spelgen.logs.preprocessing import Preprocessing
 
-    # where a fit runs is no part of what is fitted, and not recorded with it
+    # device and threads are not recorded, as they do not belong to the result
     machine = {"progress": True} | request.values_of(("device", "threads", "progress"))
     run_options = RunOptions(**machine, resume=resume, force=force, mapping=log_mapping, began=start_time)
     try:
@@ -158,14 +158,14 @@ def _report(fit: Fit, request: Request, folder: Path, format: str) -> None:
 
 
 def _outcome(fit: Fit) -> tuple[str, str]:
-    """Return the end of a fit, with a reason in addition to its status, and its result."""
+    """Return the status of a fit with its reason, and its result, as two sentences."""
     from spelgen.fitting.servo.report import servo_summary
 
     config, result = fit.config, fit.result
     reason = ""
     if fit.status == "out of time" and isinstance(config, WindowConfig):
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
-    if not isinstance(config, Rollout):  # windows only measure the model
+    if not isinstance(config, Rollout):  # windows are only used to evaluate the model
         summary = servo_summary(fit.record.servo)
         if summary is not None:
             result = summary.text
@@ -194,9 +194,9 @@ def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -
     """Return the run folder: with --resume the argument may be the folder itself."""
     if resume and module is not None and module.is_dir():
         return module
-    return Path("runs") / (
-        module.stem if module is not None else f"{(source or Path()).resolve().name}_adapted"
-    )
+    if module is not None:
+        return Path("runs") / module.stem
+    return Path("runs") / f"{(source or Path()).resolve().name}_adapted"
 
 
 def _specification(module: Path | None, source: Path | None, resumed: Path | None) -> ModelSpec:
@@ -205,11 +205,9 @@ def _specification(module: Path | None, source: Path | None, resumed: Path | Non
     from spelgen.fitting.run_folder import RunFolder
 
     folder = resumed or source
-    return (
-        read_spec(module)
-        if folder is None and module is not None
-        else RunFolder(folder or Path()).read_spec()
-    )
+    if folder is None and module is not None:
+        return read_spec(module)
+    return RunFolder(folder or Path()).read_spec()
 
 
 def _unchanged_urdf(module: Path, spec: ModelSpec) -> Path | None:

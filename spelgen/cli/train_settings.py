@@ -1,4 +1,4 @@
-"""The settings of the command `train`: the command line, then the settings of the robot or of the resumed run."""
+"""The settings of the command `train`: the command line, then the robot's settings or the record of the resumed run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from spelgen.errors import RunError, suggestion
 from spelgen.settings.fits import OWNERS, Adaptation
 from spelgen.settings.messages import explain
-from spelgen.settings.training import TrainingSettings
+from spelgen.settings.training import PREPROCESSING, TrainingSettings
 from spelgen.settings.values import Count
 
 if TYPE_CHECKING:
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from spelgen.settings.log_mapping import LogMapping
 
 TIME_LIMIT = "max_minutes"
-OF_LOGS = {"cutoff", "decimation", "gap", "torque_delay", "validation_fraction", "seed"}
+OF_LOGS = PREPROCESSING | {"validation_fraction", "seed"}
 FIELD_SEPARATOR = "."
 
 
 class UsageError(typer.BadParameter):
-    """An option that does not apply to what is fitted; the message names the option itself."""
+    """An option that does not apply; the message names the option."""
 
     def format_message(self) -> str:
         """Return the message without the name of a parameter before it."""
@@ -34,9 +34,9 @@ class UsageError(typer.BadParameter):
 
 
 class Assignments(TrainingSettings):
-    """The keys of `--set`: a robot's settings, which parameters are adapted, and where and how a fit runs.
+    """The keys of `--set`: training settings of a robot, and options of one fit.
 
-    device, threads: of torch. progress: whether it is shown.
+    adapt: see `TorqueFit`. device, threads: of torch. progress: whether a progress bar is shown.
     """
 
     adapt: Adaptation | None = None
@@ -58,7 +58,7 @@ class Request:
         return {name: self.values[name] for name in keys if name in self.values}
 
     def settings(self, defaults: TrainingSettings) -> TrainingSettings:
-        """Return the settings, with options of the command line for preprocessing and split."""
+        """Return `defaults` with the preprocessing, split and seed of the command line."""
         return defaults.model_copy(update=self.values_of(OF_LOGS))
 
 
@@ -77,8 +77,8 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     Raises a usage error for an unknown key, with the nearest known one, and for an invalid value.
     """
     keys = Assignments.model_fields.keys() - {"objective"}  # an option of its own
-    # first gathered: fields of one group are checked together
-    texts: dict[str, Any] = {}
+    # all assignments first, since the fields of one group are checked together
+    texts: dict[str, str | dict[str, str]] = {}
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         name, _, field = key.strip().replace("-", "_").partition(FIELD_SEPARATOR)
@@ -88,14 +88,17 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
             raise UsageError(f"--set: unknown key {name!r}; {suggestion(name, sorted(keys))}")
         if not field:
             texts[name] = text
-        elif isinstance(texts.setdefault(name, {}), dict):
-            texts[name][field] = text
+            continue
+        group = texts.setdefault(name, {})
+        if isinstance(group, dict):
+            group[field] = text
     try:
         checked = Assignments.model_validate(texts)
     except ValidationError as error:
         wrong = explain(error.errors(include_url=False)[0], None, Assignments)
         raise UsageError(f"--set {wrong}") from error
-    return {name: getattr(checked, name) for name in texts}
+    values = dict(checked)
+    return {name: values[name] for name in texts}
 
 
 def new_run(urdf: Path | None, request: Request) -> Start:
@@ -110,7 +113,7 @@ def new_run(urdf: Path | None, request: Request) -> Start:
     if request.warm_start and objective == "rollout":
         defaults["torque_first"] = False  # a torque fit would discard the weights of the run
     if objective is None and TIME_LIMIT in options:
-        # the user cannot know which objective the logs will lead to
+        # the objective is chosen from the logs, so the option is not an error for any objective
         defaults[TIME_LIMIT] = options.pop(TIME_LIMIT)
     return Start(FitOptions(objective, options, defaults), request.settings(settings))
 
@@ -122,14 +125,14 @@ def resumed_run(folder: Path, request: Request) -> Start:
 
     run = RunFolder(folder)
     record = run.read_record()
-    # validation logs that were passed from Python are not in any file
+    # validation logs that were passed from Python are in no file
     if record.validation_fraction is None and record.validation:
         raise RunError(
             "a run whose validation logs were passed from Python",
             file=folder,
             do="resume it by spelgen.fit(..., folder=..., options=spelgen.RunOptions(resume=True))",
         )
-    # not validated again: Python allows more than settings files do
+    # not validated: Python accepts values that settings files do not
     recorded = {"seed": record.seed, **asdict(record.preprocessing)}
     if record.validation_fraction is not None:
         recorded["validation_fraction"] = record.validation_fraction

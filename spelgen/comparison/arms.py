@@ -14,7 +14,7 @@ from spelgen.errors import SettingsError, collect, suggestion
 from spelgen.settings.messages import dotted, validated
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Count, Group
-from spelgen.settings.yaml_document import Document, Location, read_document
+from spelgen.settings.yaml_document import Location, YamlDocument, read_document
 
 YAML = (".yaml", ".yml")
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,60}$")]
@@ -101,19 +101,19 @@ def _is_file(preset: str) -> bool:
     return Path(preset).suffix in YAML
 
 
-def _unknown_presets(comparison: Comparison, document: Document) -> Iterator[SettingsError]:
+def _unknown_presets(comparison: Comparison, document: YamlDocument) -> Iterator[SettingsError]:
     for number, preset in enumerate(comparison.presets or ()):
         if preset not in (*PRESET_NAMES, *ablation_designs()) and not _is_file(preset):
             hint = suggestion(preset, PRESET_NAMES)
             yield _error(document, ("presets", number), f"unknown preset {preset!r}", hint)
 
 
-def _missing_files(comparison: Comparison, document: Document) -> Iterator[SettingsError]:
+def _missing_files(comparison: Comparison, document: YamlDocument) -> Iterator[SettingsError]:
     for name, arm in comparison.arms.items():
         for key, file in arm.files():
             if not (document.path.parent / file).exists():
                 yield _error(document, ("arms", name, key), f"no such file: {file}", "check the path")
 
 
-def _error(document: Document, place: Location, got: str, do: str) -> SettingsError:
+def _error(document: YamlDocument, place: Location, got: str, do: str) -> SettingsError:
     return SettingsError(got, file=document.path, line=document.line(place), element=dotted(place), do=do)

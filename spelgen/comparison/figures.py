@@ -19,8 +19,8 @@ from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.comparison.tuning import ComparisonTuning
 from spelgen.dynamics.parameters import parameter_count
 from spelgen.evaluation.drawn_motions import PredictedMotion, predicted_motion
-from spelgen.evaluation.invariants import Invariants, invariants
 from spelgen.evaluation.plain import Curve, finite
+from spelgen.evaluation.rollout import Invariants, invariants
 from spelgen.evaluation.truth import mass_error, true_mass
 from spelgen.fitting.rollout import loss_scales, position_difference, roll_out, rollout_loss
 from spelgen.logs.trajectory import Trajectory
@@ -88,7 +88,7 @@ def simulated_figures(
     far = spread_windows(testing, steps + 1, decimation)
     # smallest eigenvalue of M: where the arm can be; error of M: where the arm has been
     joints = fit.record.joints
-    ranges = list(map(working_range, load_arm(truth, joints).arm.coordinates))
+    ranges = list(map(working_range, load_arm(truth, joints).chain.coordinates))
     low, high = torch.tensor(ranges, dtype=torch.float64).T
     visited = far.q[:, 0]
     example = predict_example(of_dynamics("", model, far), testing, steps, decimation)

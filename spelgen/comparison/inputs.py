@@ -25,7 +25,7 @@ from spelgen.logs.windows import split_validation
 from spelgen.settings.log_mapping import LogMapping
 
 if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import ConfiguredArm
+    from spelgen.arm.configured_arm import Arm
 
 TUNING = ComparisonTuning()
 Progress = Callable[[int, int], None]
@@ -41,7 +41,7 @@ class ArmInputs(ComparedArm):
     truth: Path | None = None
     digest: str
 
-    def load(self) -> ConfiguredArm:
+    def load(self) -> Arm:
         """Return the arm that models are built from."""
         return load_arm(self.urdf, self.joints, self.tip)
 
@@ -99,7 +99,7 @@ def arm_inputs(
     return inputs
 
 
-def _simulate(inputs: ArmInputs, loaded: ConfiguredArm, folder: Path, progress: Progress | None) -> None:
+def _simulate(inputs: ArmInputs, loaded: Arm, folder: Path, progress: Progress | None) -> None:
     """Simulate logs by the protocol of the arm's settings, unless they are in the folder.
 
     Models know only a copy of the URDF without inertials, drives and friction, so that no model starts from the truth.
@@ -123,8 +123,8 @@ def _simulate(inputs: ArmInputs, loaded: ConfiguredArm, folder: Path, progress: 
     training, first = list(logs.train), loaded.settings.comparison.first
     if first is not None:
         training = [log[: int((log.t - log.t[0] < first - 1e-9).sum())] for log in training]
-    write_logs(folder / "train.parquet", training, loaded.arm.joint_names)
-    write_logs(folder / "test.parquet", logs.test, loaded.arm.joint_names)
+    write_logs(folder / "train.parquet", training, loaded.chain.joint_names)
+    write_logs(folder / "test.parquet", logs.test, loaded.chain.joint_names)
     write_bytes(inputs.urdf, _kinematics(loaded.robot.path))
     write_text(inputs.urdf.with_suffix(".yaml"), yaml.safe_dump({"gravity": list(loaded.settings.gravity)}))
     write_json(complete, {"digest": inputs.digest})

@@ -24,13 +24,12 @@ from spelgen.files import read_json, write_json
 from spelgen.fitting.fit import RunOptions, fit
 from spelgen.fitting.objectives import FitOptions
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.window.momentum import TUNING as WINDOWS
+from spelgen.fitting.tuning import TUNING as WINDOWS
 from spelgen.labels import thousandths
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
-from spelgen.settings.comparison import ComparisonSettings
 from spelgen.settings.fits import Rollout, fit_config
-from spelgen.settings.training import TrainingSettings
+from spelgen.settings.training import ComparisonSettings, TrainingSettings
 from spelgen.settings.values import Group
 from spelgen.version import __version__
 

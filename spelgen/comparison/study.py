@@ -98,14 +98,14 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
     finished = {job.name: job.result() for job in jobs}
     results = {name: result for name, result in finished.items() if result is not None}
     estimates: dict[str, float] = {}
-    known: dict[tuple[str, str], float] = {}
+    by_preset: dict[tuple[str, str], float] = {}
     for job in jobs:
         if job.name not in results:
             # runs that differ only by seed or split take about the same time
-            alike = (job.arm, job.preset)
-            if alike not in known:
-                known[alike] = _estimate(job, results)
-            estimates[job.name] = known[alike]
+            key = (job.arm, job.preset)
+            if key not in by_preset:
+                by_preset[key] = _estimate(job, results)
+            estimates[job.name] = by_preset[key]
     return Study(folder, tuple(jobs), results, failures, estimates)
 
 
@@ -169,9 +169,9 @@ def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) ->
 
 def _estimate(job: Job, results: Mapping[str, RunResult]) -> float:
     """Return the expected time of a run [s]: of finished runs of this arm and preset, else of its training steps."""
-    known = [x.seconds for x in results.values() if (x.arm, x.preset) == (job.arm, job.preset)]
-    if known:
-        return statistics.median(known) + TUNING.measuring
+    finished = [x.seconds for x in results.values() if (x.arm, x.preset) == (job.arm, job.preset)]
+    if finished:
+        return statistics.median(finished) + TUNING.measuring
     if job.inputs.truth is None:
         return TUNING.run_on_logs
     torch.set_num_threads(1)

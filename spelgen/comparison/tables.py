@@ -14,7 +14,7 @@ from spelgen.comparison.study import Study
 from spelgen.evaluation.tables import Row, Table, table
 from spelgen.labels import counted, listed
 from spelgen.listing import number
-from spelgen.settings.comparison import PublishedFigures
+from spelgen.settings.training import PublishedFigures
 
 BASELINE = "phnode"
 Runs = Mapping[str, Sequence[RunResult]]
@@ -45,7 +45,7 @@ RATIO = {"prediction loss, 1 s": "prediction loss", "velocity, 1 s": "velocity"}
 
 
 @dataclass(frozen=True)
-class ArmSection:
+class ArmResults:
     """The results of one arm: a sentence, tables of which the first shows the result, and the results themselves."""
 
     name: str
@@ -54,13 +54,13 @@ class ArmSection:
     results: tuple[RunResult, ...]
 
 
-def arm_sections(study: Study) -> list[ArmSection]:
+def arm_sections(study: Study) -> list[ArmResults]:
     """Return a section for each arm with finished runs."""
     sections = []
     for name, results in study.arms.items():
         published = next(job.protocol.published for job in study.jobs if job.arm == name)
         tables = tuple(arm_tables(results, published))
-        sections.append(ArmSection(name, arm_sentence(results), tables, tuple(results)))
+        sections.append(ArmResults(name, arm_sentence(results), tables, tuple(results)))
     return sections
 
 
@@ -117,7 +117,7 @@ def arm_sentence(results: Sequence[RunResult]) -> str:
     return f"{sentence}."
 
 
-def comparison_sentence(sections: Sequence[ArmSection]) -> str:
+def comparison_sentence(sections: Sequence[ArmResults]) -> str:
     """Return one sentence about all arms: the number of arms on which each preset is best."""
     if not sections:
         return "No run is finished."

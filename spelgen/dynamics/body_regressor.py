@@ -1,13 +1,33 @@
-"""Regressor of a chain of bodies: joint torques are linear in the inertial parameters."""
+"""Inertial parameters of bodies: in the form that simulators take, as pseudo-inertias, and their regressor."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from spelgen.runtime.body_chain import BodyChain
 from spelgen.runtime.port_hamiltonian import applied
+
+
+def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return mass, centre of mass and the tensor about it, (3, 3), of ten parameters about the joint, in its frame."""
+    mass = inertia[0]
+    center = inertia[1:4] / mass
+    xx, xy, xz, yy, yz, zz = inertia[4:]
+    about_joint = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    # the parallel axis theorem
+    shift = center @ center * np.eye(3) - np.outer(center, center)
+    return mass, center, about_joint - mass * shift
+
+
+def quaternion(rotation: object) -> np.ndarray:
+    """Return (w, x, y, z) of a rotation, (3, 3), w not negative."""
+    matrix = np.array(rotation, dtype=float)
+    result: np.ndarray = np.roll(Rotation.from_matrix(matrix).as_quat(canonical=True), 1)
+    result[np.abs(result) < 1e-16] = 0.0  # rounding
+    return result
 
 
 def pseudo_inertia(ten: Tensor) -> Tensor:

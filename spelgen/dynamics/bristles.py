@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from spelgen.design import BRISTLE_REACH
+from spelgen.design import BREAKAWAY
 from spelgen.dynamics.protocol import motors_of
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
@@ -32,14 +32,13 @@ class BristleReach:
         return int(self.values.shape[1])
 
 
-NO_BRISTLES = BristleReach(np.zeros((0, 0)))
 # Samples that are computed at a time: several arrays of this size are in memory.
 BLOCK = 2**14
 
 
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
     """Return the typical break-away displacements of joints of these types."""
-    return BristleReach(np.array([BRISTLE_REACH[kind] for kind in kinds]), motors)
+    return BristleReach(np.array([BREAKAWAY[kind] for kind in kinds]), motors)
 
 
 def bristle_reach(model: PortHamiltonian) -> BristleReach:
@@ -70,8 +69,8 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     drives, reach = np.arange(path.shape[1]), torch.from_numpy(bristles.values)
     turned_at = np.take_along_axis(path, corners, axis=0)
     at_corners = [torch.zeros_like(reach)]
-    for way in torch.from_numpy(np.diff(turned_at, axis=0)):
-        at_corners.append(moved_bristles(at_corners[-1], way[:, None], reach))
+    for displacement in torch.from_numpy(np.diff(turned_at, axis=0)):
+        at_corners.append(moved_bristles(at_corners[-1], displacement[:, None], reach))
     turned_with, z = torch.stack(at_corners), np.empty((*q.shape, bristles.elements))
     for start in range(0, len(q), BLOCK):
         block = slice(start, start + BLOCK)
@@ -113,10 +112,8 @@ def encoded(q: np.ndarray) -> np.ndarray:
     step = encoder_step(q)
     if not step.any():
         return q
-    low, high = (
-        q - step,
-        q + step,
-    )  # the composition of two clamps is a clamp: log2(T) passes over all samples in place of T
+    # the composition of two clamps is a clamp: log2(T) passes over all samples in place of T
+    low, high = q - step, q + step
     shift = 1
     while shift < len(q):
         earlier, later = slice(None, -shift), slice(shift, None)

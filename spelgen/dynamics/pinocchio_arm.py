@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pinocchio as pin
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.constraint import Constraint
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import ArmError, collect
@@ -15,7 +15,7 @@ from spelgen.settings.settings import Settings
 
 
 def arm_dynamics(
-    arm: Arm, settings: Settings, friction: Callable[[np.ndarray], np.ndarray] | None = None
+    arm: Chain, settings: Settings, friction: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> PinocchioDynamics:
     """Return the dynamics of the arm with joint torques as inputs. Raises ArmError if a body has no inertial."""
     jacobian = np.zeros((len(arm.bodies), len(arm.coordinates)))
@@ -26,7 +26,7 @@ def arm_dynamics(
     return PinocchioDynamics(pinocchio_model(arm, settings), Constraint(names, jacobian, offset), friction)
 
 
-def pinocchio_model(arm: Arm, settings: Settings) -> pin.Model:
+def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
     """Return a model with a joint about or along z for each body, in the order of the bodies.
 
     The rotor inertia on the joint side is the armature of the model. Raises ArmError if a body has no inertial.
@@ -45,7 +45,7 @@ def pinocchio_model(arm: Arm, settings: Settings) -> pin.Model:
     model.name = arm.name
     model.gravity.linear = np.array(arm.gravity, dtype=float)
     for body in arm.bodies:
-        joint = pin.JointModelPZ() if body.kind == "prismatic" else pin.JointModelRZ()
+        joint = pin.JointModelPZ() if body.joint_type == "prismatic" else pin.JointModelRZ()
         placement = pin.SE3(np.array(body.rotation, dtype=float), np.array(body.translation, dtype=float))
         index = model.addJoint(body.parent + 1, joint, placement, body.name)
         model.appendBodyToJoint(index, _inertia(np.array(body.inertia, dtype=float)), pin.SE3.Identity())

@@ -7,14 +7,20 @@ K is constant, so it adds no velocity terms; it is a permutation unless there ar
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import wraps
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from spelgen.dynamics.constraint import Constraint
+from spelgen.arm.actuation import derive_actuation
+from spelgen.dynamics.constraint import Constraint, mimic_constraint
+from spelgen.dynamics.friction import joint_friction
+from spelgen.settings.settings import load_settings
+from spelgen.urdf.document import urdf_bytes
+from spelgen.urdf.read import read_urdf
 
 
 def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
@@ -126,3 +132,38 @@ class PinocchioDynamics:
         rows = zip(*(x.reshape(-1, x.shape[-1]) for x in states), strict=True)
         result = np.array([algorithm(self.model, self.data, *row) for row in rows])
         return result.reshape(*batch, *result.shape[1:])
+
+
+# Width of the tanh in place of the sign of the velocity, for Coulomb friction of a URDF [rad/s, m/s].
+COULOMB_SMOOTHING_VELOCITY = 0.05
+
+
+def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) -> PinocchioDynamics:
+    """Return the dynamics of these joints of a URDF and of their mimic joints; all other joints are locked at zero.
+
+    Inertials, damping and friction are those of the URDF; gravity and inputs those of the settings. drives: with rotors
+    of the settings, and their friction, if there is any, in place of that of the URDF. Raises the errors of Pinocchio
+    if it cannot read the file.
+    """
+    robot, settings = read_urdf(urdf), load_settings(urdf)
+    model = pin.buildModelFromXML(urdf_bytes(urdf).decode(errors="replace"))
+    model.gravity.linear = np.array(settings.gravity)
+    constraint = mimic_constraint(robot, joints)
+    missing = [name for name in constraint.names if not model.existJointName(name)]
+    if missing:
+        raise ValueError(f"Pinocchio sees no joint {', '.join(missing)}")
+    motors = derive_actuation(robot, settings, joints).drives()
+    # friction of the URDF acts at the joints, friction of the settings at the motors
+    by_joint, speeds = (settings.joints, motors.speeds) if drives else ({}, None)
+    for name in joints:
+        if name in by_joint:
+            model.armature[model.joints[model.getJointId(name)].idx_v] = by_joint[name].armature
+    moving = [robot.joint[name] for name in joints]
+    friction = joint_friction(moving, by_joint, COULOMB_SMOOTHING_VELOCITY, speeds)
+    return PinocchioDynamics(model, constraint, friction, motors.inputs)
+
+
+def drives_known(urdf: Path, joints: Sequence[str]) -> bool:
+    """Return whether the settings of a URDF specify rotors or friction of these joints."""
+    drives = load_settings(urdf).joints
+    return any(x.rotor_inertia or x.viscous or any(x.coulomb) for k, x in drives.items() if k in joints)

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from spelgen.dynamics.equations import runge_kutta
+from spelgen.dynamics.parameters import without_idle_residuals
 from spelgen.dynamics.protocol import known_past, sliding_memory
-from spelgen.dynamics.residuals import without_idle_residuals
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 

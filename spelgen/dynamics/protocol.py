@@ -151,4 +151,4 @@ class VelocityState:
 
 def integrable(dynamics: RigidDynamics) -> Any:
     """Return the dynamics that a rollout integrates: in momenta if they have them, else in velocities."""
-    return dynamics if isinstance(dynamics, PortHamiltonian) else VelocityState(dynamics)
+    return dynamics if isinstance(dynamics, PortHamiltonian | VelocityState) else VelocityState(dynamics)

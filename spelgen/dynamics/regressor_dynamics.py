@@ -1,22 +1,50 @@
-"""Dynamics of inertial parameters that need not be physically consistent, such as the result of least squares."""
+"""Regressor of the bodies of an arm, and dynamics of inertial parameters that need not be physically consistent."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from spelgen.arm.actuation import Drives
-from spelgen.arm.arm import Arm
-from spelgen.dynamics.body_regressor import pseudo_inertia
+from spelgen.arm.arm import Chain
+from spelgen.dynamics.body_regressor import chain_regressor, pseudo_inertia
 from spelgen.dynamics.bristles import moved_bristles
 from spelgen.dynamics.equations import MotionEquations
-from spelgen.dynamics.regressor import body_chain
-from spelgen.runtime.body_chain import ChainConfiguration
+from spelgen.runtime.body_chain import BodyChain, ChainConfiguration
+from spelgen.runtime.parts import Row
 from spelgen.runtime.port_hamiltonian import applied
+
+
+def body_chain(arm: Chain, gravity: Row | None = None) -> BodyChain:
+    """Return the kinematics of the bodies of an arm; gravity [m/s^2]: by default the arm's."""
+    rows: list[tuple[Any, ...]] = []
+    for body in arm.bodies:
+        placement = [(*_row(row), float(x)) for row, x in zip(body.rotation, body.translation, strict=True)]
+        is_revolute, ratio = body.joint_type == "revolute", float(body.multiplier)
+        rows.append((body.parent, body.coordinate, is_revolute, ratio, body.offset, placement))
+    return BodyChain(len(arm.coordinates), gravity or _row(arm.gravity), *zip(*rows, strict=True))
+
+
+def regressor(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
+    """Return Y (T, n, 10 B) of the arm's B bodies at q, qd, qdd, each (T, n): tau = Y pi [Nm, N].
+
+    Column 10 b + i belongs to parameter i of ``arm.bodies[b]``, in the order of ``Body.inertia``.
+    """
+    return chain_regressor(body_chain(arm), q, qd, qdd)
+
+
+def urdf_parameters(arm: Chain) -> np.ndarray:
+    """Return the inertial parameters of the URDF, (10 B,); zero for a body without inertial."""
+    return np.array([body.inertia or (0,) * 10 for body in arm.bodies], dtype=float).ravel()
+
+
+def _row(values: tuple[object, object, object]) -> Row:
+    return tuple(map(float, values))  # type: ignore[arg-type]
 
 
 class RegressorDynamics:
@@ -29,7 +57,7 @@ class RegressorDynamics:
 
     def __init__(
         self,
-        arm: Arm,
+        arm: Chain,
         parameters: np.ndarray,
         armature: np.ndarray,
         friction: Callable[[np.ndarray, np.ndarray | None], np.ndarray],
@@ -82,9 +110,9 @@ class RegressorDynamics:
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """Return qdd, (..., n), under the inputs tau (..., n)."""
-        at = self.equations_at(q)
-        force = at.force(qd, tau, z).unsqueeze(-1)  # one column: vectors would need the same batch
-        qdd: Tensor = torch.linalg.solve(at.mass, force)
+        equations = self.equations_at(q)
+        force = equations.force(qd, tau, z).unsqueeze(-1)  # one column: vectors would need the same batch
+        qdd: Tensor = torch.linalg.solve(equations.mass, force)
         return qdd.squeeze(-1)
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
@@ -95,8 +123,8 @@ class RegressorDynamics:
 
     def joint_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """Return the torque of all joints, passive ones included, for qdd, (..., n) [Nm, N]."""
-        at = self.equations_at(q)
-        return applied(at.mass, qdd) - at.force(qd, torch.zeros_like(qdd), z)
+        equations = self.equations_at(q)
+        return applied(equations.mass, qdd) - equations.force(qd, torch.zeros_like(qdd), z)
 
     def equations_at(self, q: Tensor) -> MotionEquations:
         """Return the equations of motion at q, (T, n); see `equations.equations_of`."""

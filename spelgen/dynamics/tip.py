@@ -68,7 +68,7 @@ def tip_kinematics(
     if isinstance(arm, str | Path):
         robot, names = read_urdf(Path(arm)), list(joints or ())
     else:
-        robot, names = arm.robot, arm.arm.joint_names
+        robot, names = arm.robot, arm.chain.joint_names
         link = link or arm.tip
     if not names:
         raise ValueError("no joints are named")

@@ -1,1 +1,1 @@
-"""A Structure to the source of a module."""
+"""Structure -> specification of a model -> model in memory, or the source of a module."""

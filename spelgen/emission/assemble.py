@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class ArmModel(PortHamiltonian):
-    """The model of an arm, assembled from its specification; it is one of the runtime's classes as well."""
+    """The model of an arm, assembled from its specification, and an instance of a class of the runtime."""
 
     spec: ModelSpec
 
@@ -54,13 +54,13 @@ def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
 
     Raises ModuleError for a specification of no model, such as a mass that is not positive.
     """
-    parts = model_parts(spec)
-    names: dict[str, Any] = {"generator": torch.Generator().manual_seed(seed)}
+    assembly = model_parts(spec)
+    names: dict[str, object] = {"generator": torch.Generator().manual_seed(seed)}
     names["mass_entries"] = MassEntries(entry_sums(spec))
     try:
-        for name, rows in parts.rows.items():
+        for name, rows in assembly.rows.items():
             names[name] = tuple(_value(row, names) for row in rows)
-        arguments = {str(name): _value(item, names) for name, item in parts.model.arguments}
+        arguments = {str(name): _value(item, names) for name, item in assembly.model.arguments}
         model = _model_class(base_class(spec))(**arguments)
     except (RuntimeError, ValueError, ArithmeticError, LookupError, TypeError) as problem:
         reason = " ".join(str(problem).split())[:200]
@@ -75,25 +75,25 @@ def spec_of(model: object) -> ModelSpec | None:
 
 
 class MassEntries:
-    """M, (..., n, n), as a function of its functions and constants: what ``mass_entries`` of a module computes."""
+    """M (..., n, n) from its functions of q and constants, equal to the function ``mass_entries`` of a module."""
 
     def __init__(self, rows: list[list[Sums]]) -> None:
         self.rows = rows
 
     def __call__(self, *terms: Tensor) -> Tensor:
-        """Return the symmetric matrix of these functions and constants, (...) each."""
+        """Return the symmetric matrix (..., n, n) of these functions and constants, each (...,)."""
         return runtime.symmetric(*([_sum(sums, terms) for sums in row] for row in self.rows))
 
 
 def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
-    """Return the linear combination, added in the order of a written module: equal to the last bit."""
+    """Return the linear combination of terms (...,) in the order of the module, with the same rounding errors."""
     total: Tensor | float = 0
     for position, (factor, index) in enumerate(sums):
-        size = terms[index] if abs(factor) == 1 else abs(factor) * terms[index]
+        term = terms[index] if abs(factor) == 1 else abs(factor) * terms[index]
         if position == 0:
-            total = -size if factor < 0 else size
+            total = -term if factor < 0 else term
         else:
-            total = total - size if factor < 0 else total + size
+            total = total - term if factor < 0 else total + term
     return total
 
 
@@ -103,12 +103,12 @@ def _model_class(base: str) -> Callable[..., ArmModel]:
     return cast("Callable[..., ArmModel]", type("Model", (ArmModel, vars(runtime)[base]), {}))
 
 
-def _value(item: object, names: dict[str, Any]) -> Any:
-    """Return the value of an argument: calls are made, and names looked up."""
+def _value(item: object, names: dict[str, object]) -> object:
+    """Return the value of an argument: the result of a call, or the object with a name."""
     if isinstance(item, Code):
         return names[item.text]
     if isinstance(item, tuple):
-        return tuple(_value(each, names) for each in item)
+        return tuple(_value(x, names) for x in item)
     if not isinstance(item, Call):
         return item
     positional = [_value(value, names) for name, value in item.arguments if name is None]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import Arm
 from spelgen.design import Design
 from spelgen.emission.assemble import ArmModel, assemble
 from spelgen.emission.specify import make_spec
@@ -12,7 +12,7 @@ from spelgen.urdf.robot import Assume
 
 
 def build(
-    arm: ConfiguredArm | str | Path,
+    arm: Arm | str | Path,
     preset: str | Path | Design = "hybrid",
     *,
     width: int = 64,
@@ -26,9 +26,9 @@ def build(
         arm: the result of ``load_arm``, or the path of a URDF.
         preset: name of a preset, path of a YAML file with a design, or a ``Design``.
         width, depth: units of the hidden layers of networks, and their number.
-        assume: ``kinematics``: the structure for any inertial parameters; ``inertials``: for those of the URDF.
+        assume: ``kinematics``: structure for any inertial parameters; ``inertials``: for the parameters of the URDF.
         seed: of the initial weights of networks.
 
-    Raises what ``load_arm`` raises, and SettingsError for a design of no model.
+    Raises the errors of ``load_arm``, and SettingsError for an inconsistent design.
     """
     return assemble(make_spec(arm, preset, width=width, depth=depth, assume=assume), seed)

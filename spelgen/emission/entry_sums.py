@@ -14,13 +14,13 @@ Sums = list[tuple[float, int]]
 
 
 def entry_sums(spec: ModelSpec) -> list[list[Sums]]:
-    """Return the terms of each entry of the lower triangle of M, row by row."""
+    """Return the terms of each entry of the lower triangle of M, row after row."""
     cells: defaultdict[tuple[int, int], Sums] = defaultdict(list)
     terms: Sequence[OutputSpec | ConstantSpec] = (*spec.outputs, *spec.constants)
     for index, term in enumerate(terms):
         for row, column, factor in term.basis:
             cells[row, column].append((factor, index))
-    ordered = {place: sorted(sums, key=lambda term: term[0] < 0) for place, sums in cells.items()}
+    ordered = {entry: sorted(sums, key=lambda term: term[0] < 0) for entry, sums in cells.items()}
     return [[ordered.get((row, column), []) for column in range(row + 1)] for row in range(len(spec.joints))]
 
 

@@ -7,22 +7,15 @@ from fractions import Fraction
 
 import numpy as np
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.arm.rational import Vector
+from spelgen.emission.tuning import TUNING
 from spelgen.spec import LinkSpec, Triple
 from spelgen.structure.pseudo_inertia import parameters_of, pseudo_inertia, reference_factor
 
-# Significant digits of inertial parameters: more than any URDF is accurate to, and few enough that the decimals of a
-# URDF come out as they are written there.
-DIGITS = 12
-# Smallest second moment of mass about the center of mass, relative to the largest: above the error of rounding.
-THIN = 1e-10
-# Mass of a link without mass, relative to the heaviest link.
-LIGHT = 0.01
 
-
-def link_specs(arm: Arm, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[LinkSpec, ...]:
-    """Return the links of ``arm`` with these inertial parameters, the nearest physically consistent ones if necessary.
+def link_specs(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[LinkSpec, ...]:
+    """Return the links of ``arm`` with these inertial parameters, made physically consistent if necessary.
 
     Args:
         arm: the arm.
@@ -38,7 +31,7 @@ def link_specs(arm: Arm, inertias: Sequence[Sequence[Fraction | float]]) -> tupl
             name=names[index],
             parent=body.parent,
             joint=body.coordinate,
-            joint_type=body.kind,
+            joint_type=body.joint_type,
             ratio=float(body.multiplier),
             offset=body.offset,
             position=_floats(body.translation),
@@ -57,25 +50,26 @@ def _unique(names: Sequence[str]) -> list[str]:
 
 
 def _consistent(
-    arm: Arm, index: int, ten: Sequence[Fraction | float], heaviest: float
+    arm: Chain, index: int, ten: Sequence[Fraction | float], heaviest: float
 ) -> Sequence[Fraction | float]:
     """Return physically consistent inertial parameters, (10,)."""
     if ten[0] <= 0:
-        ten = _light_ball(_length(arm, index), LIGHT * heaviest)
+        ten = _light_ball(_length(arm, index), TUNING.default_mass * heaviest)
     factor, is_consistent = reference_factor(np.array(ten, dtype=float))
-    if is_consistent and _smallest_moment(np.array(ten, dtype=float)) > THIN:
+    if is_consistent and _smallest_moment(np.array(ten, dtype=float)) > TUNING.min_second_moment:
         return ten
     pseudo = factor @ factor.T
     mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
     moments = pseudo[:3, :3] - mass * np.outer(center, center)
-    # below it, rounding of the digits could make the body inconsistent
+    # With smaller moments, rounding of the digits could make the body inconsistent.
     values, vectors = np.linalg.eigh(moments)
-    pseudo[:3, :3] += (vectors * (np.maximum(values, 2 * THIN * values[-1]) - values)) @ vectors.T
-    return _rounded(parameters_of(pseudo), DIGITS)
+    raised = np.maximum(values, 2 * TUNING.min_second_moment * values[-1])
+    pseudo[:3, :3] += (vectors * (raised - values)) @ vectors.T
+    return _rounded(parameters_of(pseudo))
 
 
 def _smallest_moment(ten: np.ndarray) -> float:
-    """Return the smallest second moment of mass about the center of mass, relative to the largest."""
+    """Return the smallest second moment of mass about the center of mass, relative to the largest, of ten (10,)."""
     center = ten[1:4] / ten[0]
     moments = np.linalg.eigvalsh(pseudo_inertia(ten)[:3, :3] - ten[0] * np.outer(center, center))
     return float(moments[0] / moments[-1]) if moments[-1] > 0 else 0.0
@@ -84,20 +78,22 @@ def _smallest_moment(ten: np.ndarray) -> float:
 def _about_center(
     ten: Sequence[Fraction | float],
 ) -> tuple[float, Triple, tuple[float, float, float, float, float, float]]:
-    """Return mass, center of mass, and inertia about the center of mass, rounded; exact before."""
+    """Return mass, center of mass, and inertia about the center of mass: computed exactly, then rounded."""
     m, hx, hy, hz, *tensor = [Fraction(value) for value in ten]
     x, y, z = hx / m, hy / m, hz / m
     steiner = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
-    inertia = [value - m * part for value, part in zip(tensor, steiner, strict=True)]
+    inertia = [value - m * square for value, square in zip(tensor, steiner, strict=True)]
     # rounding errors of an inertia that was made consistent
-    noise = max(map(abs, inertia)) / 10 ** (DIGITS + 3)
+    noise = max(map(abs, inertia)) / 10 ** (TUNING.inertia_digits + 3)
     inertia = [value if abs(value) > noise else Fraction(0) for value in inertia]
-    cx, cy, cz = _rounded((x, y, z), DIGITS)
-    xx, xy, xz, yy, yz, zz = _rounded(inertia, DIGITS)
-    return _rounded([m], DIGITS)[0], (cx, cy, cz), (xx, xy, xz, yy, yz, zz)
+    cx, cy, cz = _rounded((x, y, z))
+    xx, xy, xz, yy, yz, zz = _rounded(inertia)
+    return _rounded([m])[0], (cx, cy, cz), (xx, xy, xz, yy, yz, zz)
 
 
-def _rounded(values: Iterable[Fraction | float], digits: int) -> list[float]:
+def _rounded(values: Iterable[Fraction | float]) -> list[float]:
+    """Return values with the significant digits of inertial parameters."""
+    digits = TUNING.inertia_digits
     return [float(f"{float(value):.{digits}g}") + 0.0 for value in values]  # no -0.0
 
 
@@ -106,7 +102,7 @@ def _light_ball(radius: float, mass: float) -> list[float]:
     return [mass, 0, 0, 0, moment, 0, 0, moment, 0, moment]
 
 
-def _length(arm: Arm, index: int) -> float:
+def _length(arm: Chain, index: int) -> float:
     """Return the distance to the next joint, at least 0.1 [m]."""
     distances = [
         float(np.linalg.norm(_floats(body.translation))) for body in arm.bodies if body.parent == index

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from spelgen.design import BRISTLE_REACH, SERVO_STRIBECK_ROUNDING
+from spelgen.design import BREAKAWAY, SERVO_STRIBECK_ROUNDING
 from spelgen.emission.entry_sums import mean_mass
 from spelgen.emission.source import Call, Code, call
 from spelgen.emission.tuning import TUNING
@@ -21,21 +21,21 @@ _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 class ModelParts:
     """The rows of an arm by their name, and the call that makes its model from them.
 
-    Classes are those of ``spelgen.runtime``. Arguments are numbers, texts, tuples, calls and names: of the rows,
-    of ``mass_entries``, and of ``generator``, which draws the initial weights of networks in the order of the calls.
+    Calls are to classes of ``spelgen.runtime``. Arguments are numbers, texts, tuples, calls and names: of the rows, of
+    ``mass_entries``, and of ``generator``, the random generator of initial weights, used in the order of the calls.
     """
 
     rows: dict[str, tuple[Call, ...]]
     model: Call
 
     @property
-    def has_networks(self) -> bool:
-        """Whether initial weights are drawn."""
+    def uses_networks(self) -> bool:
+        """Whether the model has networks with random initial weights."""
         return _names(self.model, GENERATOR)
 
     @property
-    def has_mass_entries(self) -> bool:
-        """Whether M is made of functions and constants."""
+    def uses_mass_entries(self) -> bool:
+        """Whether M is a linear combination of functions and constants."""
         return _names(self.model, MASS_ENTRIES)
 
 
@@ -83,7 +83,7 @@ def base_class(spec: ModelSpec) -> str:
 
 
 def _names(value: object, name: Code) -> bool:
-    """Return whether a value refers to a name."""
+    """Test whether a value refers to a name."""
     if isinstance(value, Call):
         return any(_names(item, name) for _, item in value.arguments)
     if isinstance(value, tuple):
@@ -130,11 +130,11 @@ def _link(spec: ModelSpec, link: LinkSpec) -> Call:
 
 def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
     """Return the arguments of a model of rigid bodies."""
-    parts: dict[str, object] = {"links": LINKS, "gravity": spec.gravity, "friction": _friction_laws(spec)}
+    arguments: dict[str, object] = {"links": LINKS, "gravity": spec.gravity, "friction": _friction_laws(spec)}
     if spec.motor_speeds:
-        parts["motor_speeds"] = spec.motor_speeds
+        arguments["motor_speeds"] = spec.motor_speeds
     if spec.servos:
-        parts["servo"] = call(
+        arguments["servo"] = call(
             "PositionServo",
             kp=tuple(servo.kp for servo in spec.servos),
             kd=tuple(servo.kd for servo in spec.servos),
@@ -148,7 +148,7 @@ def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
         if spec.potential:
             networks["potential"] = _potential(spec)
         scale = {"potential_scale": spec.potential_scale} if spec.potential else {}
-        parts["residuals"] = call(
+        arguments["residuals"] = call(
             "ResidualTerms",
             JOINTS,
             MASS_ENTRIES,
@@ -157,37 +157,34 @@ def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
             **scale,
             **networks,
         )
-    return parts
+    return arguments
 
 
 def _friction_laws(spec: ModelSpec) -> Call:
     if spec.design.memory == "none":
         return call("SlidingFriction", JOINTS)
     # of the types of the arm's joints, in the order of the table
-    types = [name for name in BRISTLE_REACH if name in spec.joint_types]
-    breakaway = call("dict", **{name: BRISTLE_REACH[name] for name in types})
+    types = [name for name in BREAKAWAY if name in spec.joint_types]
+    breakaway = call("dict", **{name: BREAKAWAY[name] for name in types})
     rounding = {"stribeck_rounding": SERVO_STRIBECK_ROUNDING} if spec.servos else {}
     return call("FrictionLaws", JOINTS, breakaway=breakaway, **rounding)
 
 
 def _networks(spec: ModelSpec) -> dict[str, object]:
-    """Return the arguments of a model of networks, in the order in which their weights are drawn."""
-    parts: dict[str, object] = {"mass": _mass(spec)}
+    """Return the arguments of a model of networks, in the order of their random initial weights."""
+    n = len(spec.joints)
+    ones = (1.0,) * n
+    arguments: dict[str, object] = {"mass": _mass(spec)}
     if spec.potential:
-        parts |= {"potential": _potential(spec), "potential_scale": spec.potential_scale}
+        arguments |= {"potential": _potential(spec), "potential_scale": spec.potential_scale}
     else:
         # one output that depends on no joint
-        ones = (1.0,) * len(spec.joints)
-        parts |= {
-            "potential": _network(spec, ((),), (ones, ones), width=1, depth=0),
-            "potential_scale": 1.0,
-        }
-    parts["friction"] = _friction(spec)
+        constant = _network(spec, ((),), (ones, ones), width=1, depth=0)
+        arguments |= {"potential": constant, "potential_scale": 1.0}
+    arguments["friction"] = _friction(spec)
     if spec.design.input == "dense-3n":
-        n = len(spec.joints)
-        ones = (1.0,) * n
-        parts["input_network"] = _network(spec, (spec.joint_names,) * (3 * n), (ones, ones))
-    return parts
+        arguments["input_network"] = _network(spec, (spec.joint_names,) * (3 * n), (ones, ones))
+    return arguments
 
 
 def _mass(spec: ModelSpec) -> Call:
@@ -213,7 +210,7 @@ def _mass(spec: ModelSpec) -> Call:
 
 def _mass_network(spec: ModelSpec) -> Call:
     """Return the network of the functions of M."""
-    min_units = TUNING.least_kan_units if spec.design.net == "kan" else TUNING.least_units
+    min_units = TUNING.min_kan_units if spec.design.net == "kan" else TUNING.min_units
     return _network(spec, call("joints_of", FUNCTIONS), _mass_scales(spec), min_units=min_units)
 
 
@@ -224,7 +221,7 @@ def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
 
 def _potential(spec: ModelSpec) -> Call:
     scales = (tuple(joint.potential_sensitivity for joint in spec.joints),) * 2
-    width = max(TUNING.least_units, round(TUNING.potential_fraction * units(spec)))
+    width = max(TUNING.min_units, round(TUNING.potential_fraction * units(spec)))
     return _network(spec, (_joint_names(spec, spec.potential),), scales, width=width)
 
 
@@ -232,15 +229,15 @@ def _friction(spec: ModelSpec) -> Call:
     n = len(spec.joints)
     scale, ones = (TUNING.position_sensitivity,) * n, (1.0,) * n
     if spec.design.dissipation == "per-joint":
-        own = tuple((name,) for name in spec.joint_names)
+        outputs = tuple((name,) for name in spec.joint_names)
         speeds = tuple(float(f"{1 / joint.speed:.4g}") for joint in spec.joints)
         width = TUNING.friction_units * n
-        network = _network(spec, own, (scale, scale, speeds, ones), width=width, depth=1)
+        network = _network(spec, outputs, (scale, scale, speeds, ones), width=width, depth=1)
         return call("JointFriction", JOINTS, network=network)
     axes = _FRICTION_AXES[spec.design.dissipation]
     rows = axes * n
-    outputs = (spec.joint_names,) * (rows * (rows + 1) // 2)
-    return call("DenseFriction", JOINTS, axes=axes, network=_network(spec, outputs, (scale, scale, ones)))
+    network = _network(spec, (spec.joint_names,) * (rows * (rows + 1) // 2), (scale, scale, ones))
+    return call("DenseFriction", JOINTS, axes=axes, network=network)
 
 
 def _network(
@@ -268,7 +265,7 @@ def _network(
 def units(spec: ModelSpec) -> int:
     """Return the units of a hidden layer: fewer of a Kolmogorov-Arnold network, which has a grid on every edge."""
     width = spec.options.width
-    return width if spec.design.net == "mlp" else max(TUNING.least_units, round(TUNING.kan_fraction * width))
+    return width if spec.design.net == "mlp" else max(TUNING.min_units, round(TUNING.kan_fraction * width))
 
 
 def _joint_names(spec: ModelSpec, joints: Sequence[int]) -> tuple[str, ...]:

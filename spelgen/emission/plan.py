@@ -1,15 +1,16 @@
-"""Structure and nominal sizes -> ModelSpec: the decisions that the emitted module then merely spells out."""
+"""Arm, structure and nominal values -> ModelSpec: the function ``derive_spec``."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from math import isfinite
 
 import numpy as np
 
 from spelgen.arm.actuation import Actuation
-from spelgen.arm.arm import Arm, Coordinate
+from spelgen.arm.arm import Coordinate
+from spelgen.arm.configured_arm import Arm
 from spelgen.design import Design, load_design
 from spelgen.emission.entry_sums import mean_mass
 from spelgen.emission.links import link_specs
@@ -29,56 +30,39 @@ from spelgen.spec import (
 )
 from spelgen.structure.basis import Weights
 from spelgen.structure.nominal import Nominal, exact_inertias, nominal, working_range
-from spelgen.structure.structure import Structure
+from spelgen.structure.structure import Structure, derive
 
 
-def plan_model(
-    arm: Arm,
-    structure: Structure,
-    actuation: Actuation,
-    options: Options,
-    *,
-    urdf: str,
-    urdf_sha256: str,
-    drives: Mapping[str, JointSettings] | None = None,
-    servos: bool = False,
-) -> ModelSpec:
-    """The model of ``arm`` under ``options``; ``urdf`` is the file's name without its folder.
+def derive_spec(arm: Arm, options: Options) -> ModelSpec:
+    """Return the specification of the model of ``arm`` with these options.
 
-    ``drives``: what is known of the joints' motors and gears; where no rotor inertia is, one is guessed.
-    ``servos``: whether positions are commanded. Raises SettingsError where the design has no friction that remembers.
+    Raises SettingsError for position servos with a design without bristle friction.
     """
     design = load_design(options.design or options.preset)
-    if servos and design.memory == "none":
+    has_servos = arm.settings.input == "position"
+    if has_servos and design.memory == "none":
         raise SettingsError(
             f"position servos with the preset {options.preset}", element="input",
             expected="a preset with bristle friction, which position servos need", do="--preset closed-form",
         )  # fmt: skip
-    everything = tuple(range(len(arm.coordinates)))
-    sizes = nominal(arm, structure)
-    joints, servo_specs = [], []
-    for index, coordinate in enumerate(arm.coordinates):
-        drive = (drives or {}).get(coordinate.name, JointSettings())
+    structure = derive(arm.chain, options.assume)
+    sizes = nominal(arm.chain, structure)
+    joints, servos = [], []
+    for index, coordinate in enumerate(arm.chain.coordinates):
+        drive = arm.settings.joint(coordinate.name)
         joints.append(_joint(coordinate, sizes, index, drive))
-        if servos:
-            servo_specs.append(_servo(coordinate, drive))
-    inputs = []
-    if design.input == "derived" and not (actuation.direct and len(actuation.entries) == len(joints)):
-        for entry in actuation.entries:
-            inputs.append(InputSpec(entry.row, entry.column, entry.value, entry.kind == "gain"))
+        if has_servos:
+            servos.append(_servo(coordinate, drive))
     links: tuple[LinkSpec, ...] = ()
     outputs, constants = _outputs(structure, sizes, design), _constants(structure, sizes)
     if design.mass == "closed-form":
-        links = link_specs(arm, exact_inertias(arm, sizes.from_urdf))
+        links = link_specs(arm.chain, exact_inertias(arm.chain, sizes.from_urdf))
         joints = _with_armature(joints, np.diagonal(mean_mass(len(joints), outputs, constants)))
-    potential = structure.potential
-    if design.potential == "dense":
-        potential = everything
-    x, y, z = map(float, arm.gravity)
+    x, y, z = map(float, arm.chain.gravity)
     return ModelSpec(
-        robot=arm.name,
-        urdf=urdf,
-        urdf_sha256=urdf_sha256,
+        robot=arm.chain.name,
+        urdf=arm.robot.path.name,
+        urdf_sha256=arm.robot.digest,
         gravity=(x, y, z),
         options=options,
         design=design,
@@ -86,19 +70,27 @@ def plan_model(
         entries=tuple((e.row, e.column, e.kind, e.joints) for e in structure.entries),
         outputs=outputs,
         constants=constants,
-        potential=potential,
+        potential=tuple(range(len(joints))) if design.potential == "dense" else structure.potential,
         potential_scale=sizes.potential_scale,
-        margin=float(f"{max(TUNING.margin * sizes.least_eigenvalue, 1e-4):.0e}"),
+        margin=float(f"{max(TUNING.margin * sizes.min_eigenvalue, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
         links=links,
-        inputs=tuple(inputs),
-        motor_speeds=_motor_speeds(actuation),
-        servos=tuple(servo_specs),
+        inputs=_inputs(arm.actuation, design),
+        motor_speeds=_motor_speeds(arm.actuation),
+        servos=tuple(servos),
     )
 
 
+def _inputs(actuation: Actuation, design: Design) -> tuple[InputSpec, ...]:
+    """Return the entries of G; empty if each input is the torque of its own joint, or if G is learned."""
+    entries = actuation.entries
+    if design.input != "derived" or (actuation.direct and len(entries) == actuation.joints):
+        return ()
+    return tuple(InputSpec(x.row, x.column, x.value, x.kind == "gain") for x in entries)
+
+
 def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[OutputSpec, ...]:
-    """The functions of M, each with the joints that it reads, its mean and its scale."""
+    """Return the functions of M, each with the joints that it depends on, its mean and its scale."""
     outputs = []
     for output, mean, scale in zip(structure.outputs, sizes.output_means, sizes.output_scales, strict=True):
         joints = output.joints
@@ -109,17 +101,13 @@ def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[Outp
 
 
 def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]:
-    """The constants of M, each with its start and its unit."""
-    constants = []
-    for constant, start, scale in zip(
-        structure.constants, sizes.constants, sizes.constant_scales, strict=True
-    ):
-        constants.append(ConstantSpec(_floats(constant.basis), start, scale))
-    return tuple(constants)
+    """Return the constants of M, each with its initial value and its scale."""
+    values = zip(structure.constants, sizes.constants, sizes.constant_scales, strict=True)
+    return tuple(ConstantSpec(_floats(constant.basis), initial, scale) for constant, initial, scale in values)
 
 
 def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
-    """Return C, by which motors' speeds are C qd; empty where each motor moves its own joint alone."""
+    """Return C, with which the motors rotate at C qd; empty if each motor moves its own joint only."""
     speeds = actuation.drives().speeds
     if np.array_equal(speeds, np.eye(actuation.joints)):
         return ()
@@ -133,10 +121,10 @@ def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSetti
         lower = upper = None
     lower, upper = (None if x is None or not isfinite(x) else float(f"{x:.6g}") for x in (lower, upper))
     if not speed or speed > TUNING.largest_speed:
-        speed = TUNING.usual_turning if coordinate.kind == "revolute" else TUNING.usual_sliding
+        speed = TUNING.angular_speed if coordinate.joint_type == "revolute" else TUNING.linear_speed
     return JointSpec(
         name=coordinate.name,
-        joint_type=coordinate.kind,
+        joint_type=coordinate.joint_type,
         lower=lower,
         upper=upper,
         center=float(f"{(low + high) / 2:.6g}"),
@@ -151,7 +139,7 @@ def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSetti
 
 
 def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
-    """The servo of a joint: one that nothing is known of gives its full effort half a unit from its command."""
+    """Return the servo of a joint; an unknown servo has its full effort at half a unit from its command."""
     effort = coordinate.effort
     if not effort or effort > TUNING.largest_effort:
         effort = None
@@ -160,7 +148,7 @@ def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
 
 
 def _guessed_armature(coordinate: Coordinate) -> float:
-    """Return a geared drive's own inertia: its full effort takes ``rise`` seconds to its full speed."""
+    """Return an estimate of the armature: the full effort accelerates it to full speed in ``rise`` seconds."""
     effort, speed = coordinate.effort, coordinate.velocity
     if not effort or not speed or effort > TUNING.largest_effort or speed > TUNING.largest_speed:
         return 0.0
@@ -168,21 +156,20 @@ def _guessed_armature(coordinate: Coordinate) -> float:
 
 
 def _friction(coordinate: Coordinate, sizes: Nominal, index: int) -> float:
-    """Return the size of friction to start from [Nm, N].
+    """Return the initial friction torque [Nm, N].
 
-    It is a share of the drive's effort where the URDF names a plausible one, or of the torques that the nominal arm
-    needs.
+    It is a fraction of the effort in the URDF if plausible, else of the torque of the nominal arm.
     """
     if coordinate.effort and coordinate.effort <= TUNING.largest_effort:
         return TUNING.friction_of_effort * coordinate.effort
-    # a wrist may need next to no torque by itself, but its gear rubs like its neighbour's
+    # The torque of a wrist may be negligible, but the friction of its gear is similar to the friction of other gears.
     return TUNING.friction_of_torque * max(sizes.joint_torque[index], 0.01 * max(sizes.joint_torque))
 
 
 def _with_armature(joints: Sequence[JointSpec], mass: np.ndarray) -> list[JointSpec]:
     """Return the joints with a small armature for drives without data, from the diagonal of M (n,)."""
-    initial = [float(f"{TUNING.least_armature * value:.3g}") for value in mass]
-    return [replace(x, armature=x.armature or least) for x, least in zip(joints, initial, strict=True)]
+    initial = [float(f"{TUNING.min_armature * value:.3g}") for value in mass]
+    return [replace(x, armature=x.armature or value) for x, value in zip(joints, initial, strict=True)]
 
 
 def _floats(weights: Weights) -> Entries:

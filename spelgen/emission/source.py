@@ -60,7 +60,7 @@ def listed_call(start: str, value: Call, indent: int) -> str:
 
 
 def flat(value: object) -> str:
-    """Return a value in one line. Text from a file becomes a string literal of ASCII, whatever it contains."""
+    """Return a value in one line. Any text from a file becomes a string literal of ASCII."""
     if isinstance(value, Code):
         return value.text
     if isinstance(value, str):
@@ -97,7 +97,7 @@ def _items(value: object) -> list[tuple[str, object]]:
 
 
 def _alike(value: object) -> bool:
-    """Return whether a value is a tuple of equal items."""
+    """Test whether a value is a tuple of equal items."""
     return isinstance(value, tuple) and len(value) > _FEW and value.count(value[0]) == len(value)
 
 

@@ -6,18 +6,17 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.design import PRESET_NAMES, Design, load_design
-from spelgen.emission.plan import plan_model
+from spelgen.emission.plan import derive_spec
 from spelgen.emission.text import module_text
 from spelgen.errors import ModuleError
 from spelgen.spec import ModelSpec, Options
-from spelgen.structure.structure import derive
 from spelgen.urdf.robot import Assume
 
 
 def generate(
-    arm: ConfiguredArm | str | Path,
+    arm: Arm | str | Path,
     preset: str | Path | Design = "hybrid",
     *,
     width: int = 64,
@@ -37,7 +36,7 @@ def generate(
 
 
 def make_spec(
-    arm: ConfiguredArm | str | Path,
+    arm: Arm | str | Path,
     preset: str | Path | Design = "hybrid",
     *,
     width: int = 64,
@@ -46,7 +45,7 @@ def make_spec(
     module: Path | None = None,
 ) -> ModelSpec:
     """Return the specification of the model tailored to an arm; arguments and errors as for ``generate``."""
-    arm = arm if isinstance(arm, ConfiguredArm) else load_arm(arm)
+    arm = arm if isinstance(arm, Arm) else load_arm(arm)
     name, design = str(preset), None
     if preset not in PRESET_NAMES:
         name = "own" if isinstance(preset, Design) else Path(preset).stem
@@ -65,21 +64,7 @@ def make_spec(
     return spec if module is None else replace(spec, urdf=_path_of_urdf(module, arm.robot.path))
 
 
-def derive_spec(arm: ConfiguredArm, options: Options) -> ModelSpec:
-    """Return the specification of the model of ``arm`` with these options."""
-    return plan_model(
-        arm.arm,
-        derive(arm.arm, options.assume),
-        arm.actuation,
-        options,
-        urdf=arm.robot.path.name,
-        urdf_sha256=arm.robot.digest,
-        drives={item.name: arm.settings.joint(item.name) for item in arm.arm.coordinates},
-        servos=arm.settings.input == "position",
-    )
-
-
-def arm_of_spec(spec: ModelSpec, urdf: str | Path) -> ConfiguredArm:
+def arm_of_spec(spec: ModelSpec, urdf: str | Path) -> Arm:
     """Return the arm of a specification from its URDF, with the options that the specification was made with."""
     return load_arm(urdf, spec.options.joints, spec.options.tip, spec.options.angle_tolerance)
 

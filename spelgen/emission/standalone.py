@@ -15,7 +15,7 @@ _OURS = "spelgen.runtime."
 
 @dataclass(frozen=True)
 class Definition:
-    """A class, function or constant of the runtime: its text with the comments above it, and the names that it uses."""
+    """A class, function or constant of the runtime: its text with comments, and the names that it uses."""
 
     text: str
     uses: frozenset[str]
@@ -26,7 +26,7 @@ class Definition:
 class Runtime:
     """The source of the runtime.
 
-    definitions: by name, each after those that it uses when it is executed. imports: statements by the name that they
+    definitions: by name, each after the definitions that its execution needs. imports: statements by the name that they
     bind. rows: names of the definitions that the rows of an arm need. public: names that a module imports.
     """
 
@@ -57,11 +57,12 @@ def bundle(arm: str, model: str) -> Bundle:
             used |= new
             pending += new
     names = [name for name in runtime.definitions if name in used]
-    # what the rows are made of must be defined before them; aliases of types that these use as well
-    before = [name for name in names if name in runtime.rows]
-    after = [name for name in names if name not in runtime.rows]
-    blocks = tuple(name for name in after if runtime.definitions[name].is_block)
-    return Bundle(_imports(used, runtime.imports), _joined(runtime, before), _joined(runtime, after), blocks)
+    # classes of the rows are defined before the rows, all other definitions after the arm
+    row_names = [name for name in names if name in runtime.rows]
+    model_names = [name for name in names if name not in runtime.rows]
+    blocks = tuple(name for name in model_names if runtime.definitions[name].is_block)
+    rows, definitions = _joined(runtime, row_names), _joined(runtime, model_names)
+    return Bundle(_imports(used, runtime.imports), rows, definitions, blocks)
 
 
 def _joined(runtime: Runtime, names: Iterable[str]) -> str:
@@ -109,12 +110,12 @@ def load_runtime() -> Runtime:
 
 
 def names_in(tree: ast.AST) -> set[str]:
-    """Every name that is read in a tree, annotations included."""
+    """Return every name that is used in a tree, annotations included."""
     return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
 
 
 def _needs(tree: ast.Module) -> list[str]:
-    """The runtime files that a file imports from, in a stable order."""
+    """Return the runtime files that a file imports from, sorted."""
     needs = []
     for node in tree.body:
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(_OURS):
@@ -123,7 +124,7 @@ def _needs(tree: ast.Module) -> list[str]:
 
 
 def _bound(node: ast.Import | ast.ImportFrom) -> dict[str, str]:
-    """What an import of something outside the runtime binds: the statement, by name."""
+    """Return the names that an import from outside the runtime binds, with their statements."""
     start = ""
     if isinstance(node, ast.ImportFrom):
         module = node.module or ""
@@ -140,7 +141,7 @@ def _bound(node: ast.Import | ast.ImportFrom) -> dict[str, str]:
 
 
 def _defined(node: ast.stmt) -> str | None:
-    """The name that a statement at the top of a file defines."""
+    """Return the name that a statement at the top of a file defines; None for other statements."""
     if isinstance(node, ast.ClassDef | ast.FunctionDef):
         return node.name
     if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
@@ -149,7 +150,7 @@ def _defined(node: ast.stmt) -> str | None:
 
 
 def _text(node: ast.stmt, source: str) -> str:
-    """A statement's lines, with the comment right above it; no definition of the runtime has a decorator."""
+    """Return the lines of a statement and the comment above it; no definition of the runtime has a decorator."""
     lines = source.splitlines()
     first = node.lineno - 1
     while first and lines[first - 1].startswith("#"):
@@ -158,7 +159,7 @@ def _text(node: ast.stmt, source: str) -> str:
 
 
 def _imports(used: Iterable[str], imports: dict[str, str]) -> str:
-    """The imports of the used names, the standard library's first, then torch's, sorted as an import sorter does."""
+    """Return the imports of the used names, from the standard library and then torch, sorted as ruff sorts them."""
     plain: set[str] = set()
     members: dict[str, str] = {}
     for name in sorted(set(imports).intersection(used)):

@@ -45,14 +45,14 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
 
     It imports torch and ``spelgen.runtime``; a standalone one imports torch only and contains the runtime.
     """
-    parts = model_parts(spec)
-    arm = "\n\n\n".join(x for x in ("\n\n".join(_rows(spec, parts)), _mass_entries(spec, parts)) if x)
+    assembly = model_parts(spec)
+    arm = "\n\n\n".join(x for x in ("\n\n".join(_rows(spec, assembly)), _mass_entries(spec, assembly)) if x)
     model = render(
         "model.py.jinja",
-        base=parts.model.callee,
+        base=assembly.model.callee,
         summary=class_summary(spec),
-        has_networks=parts.has_networks,
-        call=listed_call("super().__init__", Call("", parts.model.arguments), 8) + SKIP,
+        has_networks=assembly.uses_networks,
+        call=listed_call("super().__init__", Call("", assembly.model.arguments), 8) + SKIP,
     )
     title = f"Port-Hamiltonian model of an arm with {counted(len(spec.joints), 'joint')}, by `spelgen build`."
     context = {"title": title, "header": header(spec), "arm": arm, "model": model, "spec": spec.to_json()}
@@ -60,7 +60,7 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
         return render("standalone.py.jinja", **bundle(arm, model)._asdict(), **context)
     used = set(re.findall(r"\w+", f"{arm}\n{model}")) & load_runtime().public
     ordered = sorted(used, key=lambda name: (not name[0].isupper(), name))
-    return render("module.py.jinja", names=ordered, has_tensor=parts.has_mass_entries, **context)
+    return render("module.py.jinja", names=ordered, has_tensor=assembly.uses_mass_entries, **context)
 
 
 def class_summary(spec: ModelSpec) -> str:
@@ -139,11 +139,11 @@ def _quoted(name: str) -> str:
     return json.dumps(name)
 
 
-def _rows(spec: ModelSpec, parts: ModelParts) -> list[str]:
+def _rows(spec: ModelSpec, assembly: ModelParts) -> list[str]:
     """Return the statements that define the rows, with their units above them."""
     statements = []
-    for name, rows in parts.rows.items():
-        about = _terms_told(spec) if name in ("FUNCTIONS", "CONSTANTS") else {}
+    for name, rows in assembly.rows.items():
+        about = _term_descriptions(spec) if name in ("FUNCTIONS", "CONSTANTS") else {}
         letter = name[0].lower()
         lines = [*(f"# {line}" for line in _COMMENTS[name]), f"{name} = ("]
         for number, row in enumerate(rows, start=1):
@@ -153,22 +153,22 @@ def _rows(spec: ModelSpec, parts: ModelParts) -> list[str]:
     return statements
 
 
-def _terms_told(spec: ModelSpec) -> dict[str, str]:
-    """Return the entries of M that each function and constant is part of, with the unit of the first."""
-    told = {}
+def _term_descriptions(spec: ModelSpec) -> dict[str, str]:
+    """Return the entries of M that each function and constant contributes to, with the unit of the first."""
+    descriptions = {}
     bases = [x.basis for x in spec.outputs] + [x.basis for x in spec.constants]
     for name, basis in zip(term_names(spec), bases, strict=True):
         entries = [entry_name(row, column) for row, column, _ in basis]
         row, column, _ = basis[0]
         slides = [spec.joints[joint].joint_type for joint in (row, column)].count("prismatic")
-        more = f" and {len(entries) - 2} more" if len(entries) > 2 else ""
-        told[name] = f"{', '.join(entries[:2])}{more} [{('kg m^2', 'kg m', 'kg')[slides]}]"
-    return told
+        suffix = f" and {len(entries) - 2} more" if len(entries) > 2 else ""
+        descriptions[name] = f"{', '.join(entries[:2])}{suffix} [{('kg m^2', 'kg m', 'kg')[slides]}]"
+    return descriptions
 
 
-def _mass_entries(spec: ModelSpec, parts: ModelParts) -> str:
+def _mass_entries(spec: ModelSpec, assembly: ModelParts) -> str:
     """Return the function that makes M from its functions and constants; empty if M is made in another way."""
-    if not parts.has_mass_entries:
+    if not assembly.uses_mass_entries:
         return ""
     names = term_names(spec)
     arguments = ", ".join(f"{name}: Tensor" for name in names)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -14,18 +14,16 @@ from scipy.integrate import cumulative_trapezoid
 from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import States
 from spelgen.dynamics.bristles import bristles_along
+from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.evaluation.horizons import EvaluatedLogs
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.torque import friction_past, mean_nmse, predicted_torques
-from spelgen.evaluation.tuning import TRACES as TUNING
+from spelgen.evaluation.tuning import TUNING
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
-
-if TYPE_CHECKING:
-    from spelgen.dynamics.protocol import RigidDynamics
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -129,7 +127,7 @@ def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
     for samples in [*logs.samples, *(_steps(piece, logs) for piece in slow)]:
         count = min(len(samples.q), round(TUNING.torque_seconds * samples.rate) + 1)
         start = (len(samples.q) - count) // 2
-        motions.append(samples[start : start + count : -(-count // TUNING.samples)])
+        motions.append(samples[start : start + count : -(-count // TUNING.curve_samples)])
     return motions
 
 

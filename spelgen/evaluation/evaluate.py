@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import torch
 
+from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.baseline import EvaluatedArm
 from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import Predictor, accurate_solver, of_dynamics
 from spelgen.baselines.registry import command_followers, torque_predictors
-from spelgen.dynamics.protocol import input_of
-from spelgen.dynamics.residuals import used_parameter_count, without_idle_residuals
+from spelgen.dynamics.parameters import used_parameter_count, without_idle_residuals
+from spelgen.dynamics.protocol import RigidDynamics, input_of
 from spelgen.dynamics.tip import tip_kinematics
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, LogError, in_one_line
 from spelgen.evaluation.horizons import (
     EvaluatedLogs,
@@ -32,6 +33,7 @@ from spelgen.evaluation.torque import TorqueErrors, coarse_torques, torque_error
 from spelgen.evaluation.traces import Traces, motion_traces, replay_traces
 from spelgen.evaluation.truth import mass_errors
 from spelgen.evaluation.tuning import TUNING
+from spelgen.fitting.fitted import Fit
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import SHORTEST, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
@@ -45,12 +47,6 @@ from spelgen.logs.trajectory import (
 )
 from spelgen.logs.windows import Windows
 
-if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import ConfiguredArm
-    from spelgen.dynamics.protocol import RigidDynamics
-    from spelgen.emission.assemble import ArmModel
-    from spelgen.fitting.fitted import Fit
-
 STEPS: Sequence[int] = (1, 10)
 SECONDS: Sequence[float] = (1.0,)
 Progress = Callable[[int, int, str], None]
@@ -60,18 +56,18 @@ def evaluate(
     model: ArmModel | Fit | Path | str,
     logs: Trajectory | Sequence[Trajectory],
     *,
-    arm: ConfiguredArm | Path | str | None = None,
+    arm: Arm | Path | str | None = None,
     baselines: Mapping[str, RigidDynamics] | None = None,
     preprocessing: Preprocessing | None = None,
     steps: Sequence[int] = STEPS,
     seconds: Sequence[float] = SECONDS,
-    truth: ConfiguredArm | Path | str | None = None,
+    truth: Arm | Path | str | None = None,
     progress: Progress | None = None,
 ) -> Results:
     """Predict the states and torques of test logs and measure the errors.
 
     Dynamics are evaluated open loop, and with the constant disturbance that a momentum observer estimates before a
-    prediction starts (see `momentum_observer.py`). The result is deterministic, and nothing is written.
+    prediction starts (see `horizons.observe`). The result is deterministic, and nothing is written.
 
     Args:
         model: an emitted model, a fit, or the folder of a run.
@@ -131,7 +127,7 @@ def _evaluate_torques(
     used: Preprocessing,
     baselines: Mapping[str, RigidDynamics],
     ahead: tuple[Sequence[int], Sequence[float]],
-    truth: ConfiguredArm | Path | str | None,
+    truth: Arm | Path | str | None,
     progress: Progress | None,
 ) -> Results:
     """Evaluate the torques, and the motion under the logged torques."""
@@ -175,11 +171,8 @@ def _evaluate_torques(
     masses = {}
     if truth is not None:
         masses = mass_errors(all_dynamics, truth, tested.joints, torch.from_numpy(joined_column(logs, "q")))
-    return _results(
-        tested,
-        logs,
-        notes,
-        motion_traces(all_dynamics, tests, longest, tip),
+    return replace(
+        _results(tested, logs, notes, motion_traces(all_dynamics, tests, longest, tip)),
         cutoff=used.cutoff or None,
         substeps=solver.substeps,
         horizons=tuple(horizons),
@@ -190,18 +183,19 @@ def _evaluate_torques(
 
 
 def _baselines(
-    tested: Subject, given: Mapping[str, RigidDynamics], probe: Windows, notes: list[Diagnostic]
+    tested: Subject, additional: Mapping[str, RigidDynamics], probe: Windows, notes: list[Diagnostic]
 ) -> list[Predictor]:
     """Return the baselines of the registry, and the given ones. probe: windows that determine integrator steps."""
-    arm = EvaluatedArm(tested.joints, tested.urdf, tested.fitted_baselines, tested.fitted_arm, probe, notes)
+    fitted = tested.fit.baselines if tested.fit else {}
+    arm = EvaluatedArm(tested.joints, tested.urdf, fitted, tested.fitted_arm, probe, notes)
     return [
         *torque_predictors(arm),
-        *(of_dynamics(name, dynamics, probe) for name, dynamics in given.items()),
+        *(of_dynamics(name, dynamics, probe) for name, dynamics in additional.items()),
     ]
 
 
 def _results(
-    tested: Subject, logs: Sequence[Trajectory], notes: Sequence[Diagnostic], traces: Traces, **figures: Any
+    tested: Subject, logs: Sequence[Trajectory], notes: Sequence[Diagnostic], traces: Traces
 ) -> Results:
     """Return the results with the names of the arm and the logs."""
     return Results(
@@ -212,7 +206,6 @@ def _results(
         parameters=used_parameter_count(tested.model),
         diagnostics=tuple(notes),
         traces=traces,
-        **figures,
     )
 
 
@@ -222,7 +215,7 @@ def _evaluate_commands(tested: Subject, logs: Sequence[Trajectory], notes: list[
         require_commands(trajectory)
     followers = command_followers(tested.linear_servos, notes)
     errors, missed = replays(tested.model, logs, followers, notes)
-    return _results(tested, logs, notes, replay_traces(missed), replays=errors)
+    return replace(_results(tested, logs, notes, replay_traces(missed)), replays=errors)
 
 
 def _tip(tested: Subject, notes: list[Diagnostic]) -> TipPosition | None:

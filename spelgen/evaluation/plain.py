@@ -17,7 +17,7 @@ def number(value: float) -> float | None:
     return None
 
 
-def listed(values: np.ndarray) -> Any:
+def listed(values: np.ndarray) -> object:
     """Return an array as nested lists of numbers."""
     if values.ndim == 0:
         return number(values.item())

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import CommandFollower
-from spelgen.dynamics.residuals import without_idle_residuals
+from spelgen.dynamics.parameters import without_idle_residuals
 from spelgen.dynamics.servo_rollout import replayed
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.tuning import TUNING
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 from spelgen.logs.filtering import velocities
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,14 @@ import copy
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
-from spelgen.arm.configured_arm import ConfiguredArm
-from spelgen.baselines.baseline import FittedBaselines, arm_of_model
+from spelgen.arm.configured_arm import Arm
+from spelgen.baselines.baseline import arm_of_model
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
-from spelgen.emission.assemble import spec_of
+from spelgen.emission.assemble import ArmModel, spec_of
 from spelgen.evaluation.tuning import TUNING
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
@@ -24,9 +24,6 @@ from spelgen.settings.fits import OnWindows
 from spelgen.settings.settings import load_mapping
 from spelgen.spec import ModelSpec
 from spelgen.urdf.read import read_urdf
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 
 @dataclass(frozen=True)
@@ -65,13 +62,8 @@ class Subject:
         return frozenset([*self.fit.record.training, *self.fit.record.validation])
 
     @property
-    def fitted_baselines(self) -> FittedBaselines:
-        """The baselines that were fitted with it."""
-        return {} if self.fit is None else self.fit.baselines
-
-    @property
-    def fitted_arm(self) -> ConfiguredArm | None:
-        """The arm that these baselines were fitted for. Raises UrdfError, ArmError or SettingsError."""
+    def fitted_arm(self) -> Arm | None:
+        """The arm that the baselines of its fit were fitted for. Raises UrdfError, ArmError or SettingsError."""
         if self.fit is None or self.fit.urdf is None or not self.fit.baselines:
             return None
         return arm_of_model(self.model, self.fit.urdf)
@@ -84,7 +76,7 @@ class Subject:
         return linear
 
 
-def subject(tested: ArmModel | Fit | Path | str, arm: ConfiguredArm | Path | str | None = None) -> Subject:
+def subject(tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None = None) -> Subject:
     """Return the subject of an evaluation: a model, a fit or the folder of a run; arm: see `evaluate`."""
     if isinstance(tested, str | Path):
         tested = load_run(tested)

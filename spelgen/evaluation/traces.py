@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from spelgen.baselines.names import MODEL, is_drawn
+from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.evaluation.drawn_motions import (
     DrawnMotion,
     PredictedMotion,
@@ -28,12 +28,9 @@ from spelgen.evaluation.drawn_motions import (
 from spelgen.evaluation.horizons import EvaluatedLogs, Predictions, TipPosition
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.replay import PositionErrors
-from spelgen.evaluation.tuning import TRACES as TUNING
+from spelgen.evaluation.tuning import TUNING
 from spelgen.fitting.rollout import AT_REST, loss_scales, position_difference
 from spelgen.logs.trajectory import Trajectory, coverage, joined_column
-
-if TYPE_CHECKING:
-    from spelgen.dynamics.protocol import RigidDynamics
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +136,7 @@ def _growth(predictions: Predictions, errors: Mapping[str, Tensor], tip: TipPosi
     windows = predictions.windows
     seconds = windows.dt.cumsum(dim=1).mean(dim=0).numpy()
     # errors grow by orders of magnitude: as many points for the first tenth as for the last
-    times = np.unique(np.geomspace(1, len(seconds), TUNING.times).round().astype(int)) - 1
+    times = np.unique(np.geomspace(1, len(seconds), TUNING.curve_times).round().astype(int)) - 1
     relative, tips = {}, {}
     for name, (q, _) in predictions.states.items():
         if is_drawn(name):
@@ -156,7 +153,7 @@ def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[Predic
     for k, ((piece, first), error) in enumerate(zip(predictions.starts, errors.tolist(), strict=True)):
         motion = predicted_motion(piece.name, predictions.windows, predictions.states[MODEL], k)
         start = number(piece.t[first] - piece.t[0])
-        motions.append(replace(thinned(motion, TUNING.samples), start=start, error=number(error)))
+        motions.append(replace(thinned(motion, TUNING.curve_samples), start=start, error=number(error)))
     return typical_and_worst(motions)
 
 

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.arm.configured_arm import Arm, load_arm
+from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.evaluation.tuning import TUNING
 
-if TYPE_CHECKING:
-    from spelgen.dynamics.protocol import RigidDynamics
 
-
-def true_mass(robot: ConfiguredArm | Path | str, q: Tensor, joints: Sequence[str] | None = None) -> Tensor:
+def true_mass(robot: Arm | Path | str, q: Tensor, joints: Sequence[str] | None = None) -> Tensor:
     """Return M (T, n, n) [kg m^2, kg m, kg] of a URDF and its settings by Pinocchio, armature included.
 
     Args:
@@ -26,9 +23,9 @@ def true_mass(robot: ConfiguredArm | Path | str, q: Tensor, joints: Sequence[str
     """
     from spelgen.dynamics.pinocchio_arm import arm_dynamics
 
-    path = robot.robot.path if isinstance(robot, ConfiguredArm) else robot
+    path = robot.robot.path if isinstance(robot, Arm) else robot
     loaded = load_arm(path, joints)
-    mass: Tensor = arm_dynamics(loaded.arm, loaded.settings).mass_matrix(q)
+    mass: Tensor = arm_dynamics(loaded.chain, loaded.settings).mass_matrix(q)
     return mass
 
 
@@ -48,7 +45,7 @@ def mass_error(learned: Tensor, true: Tensor) -> float:
 
 
 def mass_errors(
-    dynamics: Mapping[str, RigidDynamics], truth: ConfiguredArm | Path | str, joints: Sequence[str], q: Tensor
+    dynamics: Mapping[str, RigidDynamics], truth: Arm | Path | str, joints: Sequence[str], q: Tensor
 ) -> dict[str, float]:
     """Return the relative error of M by predictor, at evenly spread positions.
 

@@ -53,19 +53,16 @@ class EvaluationTuning:
     # [s] Length of replays that are restarted from the measured state.
     replay_window: float = 1.0
 
-
-@dataclass(frozen=True)
-class TraceTuning:
-    """Resolution of the curves of a report."""
+    # Resolution of the curves of a report.
 
     # [s] Time along a log over which torques are drawn.
     torque_seconds: float = 10.0
     # [1] Samples of a curve along a log or a prediction.
-    samples: int = 240
+    curve_samples: int = 240
     # [1] Samples of the curve of a log that is replayed as a whole.
     log_samples: int = 600
     # [1] Times at which the growth of errors is drawn.
-    times: int = 24
+    curve_times: int = 24
 
 
-TUNING, TRACES = EvaluationTuning(), TraceTuning()
+TUNING = EvaluationTuning()

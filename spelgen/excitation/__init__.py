@@ -1,1 +1,1 @@
-"""Motions that show an arm's parameters."""
+"""Motions that excite the parameters of an arm."""

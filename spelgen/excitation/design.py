@@ -1,4 +1,9 @@
-"""Design the motion that shows an arm's parameters best: random starts, the best of them improved by L-BFGS."""
+"""Design of exciting motions: the best of random motions, improved by L-BFGS.
+
+The criterion is the logarithm of the condition number of the base regressor with columns of unit length (Swevers et
+al., IEEE T-RA 13:730, 1997), plus penalties on violated effort limits and on reduced amplitudes. Unit columns do not
+depend on the amplitude of the motion, but the signal-to-noise ratio of the torque does.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +13,97 @@ from math import inf, isfinite
 import numpy as np
 import torch
 from scipy.optimize import minimize
+from torch import Tensor
 
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.arm import Chain
+from spelgen.arm.configured_arm import Arm
+from spelgen.dynamics.body_regressor import regressor_of
+from spelgen.dynamics.friction import FrictionModel
+from spelgen.dynamics.regressor_dynamics import body_chain, urdf_parameters
 from spelgen.errors import SettingsError
-from spelgen.excitation.criterion import Criterion
 from spelgen.excitation.excitation import Excitation
 from spelgen.excitation.trajectory import ExcitationTrajectory, motion_bounds
 from spelgen.excitation.tuning import TUNING
+from spelgen.identification.base_parameters import base_parameters
+
+FRICTION = FrictionModel()
+
+
+class Criterion:
+    """Criterion to be minimized over the parameters of an `ExcitationTrajectory`."""
+
+    def __init__(self, arm: Chain, trajectory: ExcitationTrajectory) -> None:
+        self.trajectory, self.chain = trajectory, body_chain(arm)
+        self.columns = torch.from_numpy(base_parameters(arm, FRICTION).columns)
+        count = TUNING.samples_per_harmonic * trajectory.harmonics + 1
+        self.times = torch.linspace(0.0, trajectory.duration, count, dtype=torch.float64)
+        self.inertial = torch.from_numpy(urdf_parameters(arm))
+        # without inertials the torque is unknown, and effort limits are ignored
+        is_known = all(body.inertia for body in arm.bodies)
+        efforts = [(is_known and coordinate.effort) or torch.inf for coordinate in arm.coordinates]
+        self.limits = torch.tensor(efforts, dtype=torch.float64)
+
+    def states(self, parameters: np.ndarray) -> Tensor:
+        """Return q, qd and qdd at the samples of the criterion, (3, T, n), for parameters (size,)."""
+        return self.trajectory.states(torch.from_numpy(parameters), self.times)
+
+    def condition(self, states: Tensor) -> float:
+        """Return the condition number of the base regressor with unit columns, for states (3, T, n).
+
+        It is infinite if a column is zero.
+        """
+        return float(self._log_condition(self._rows(states)).exp())
+
+    def efforts(self, states: Tensor) -> np.ndarray:
+        """Return rigid-body torques divided by the effort limits, (T, n), for states (3, T, n); NaN without a limit."""
+        efforts = torch.where(self.limits.isinf(), torch.nan, self._efforts(self._rows(states)))
+        return np.asarray(efforts.numpy())
+
+    def value(self, parameters: np.ndarray) -> float:
+        """Return the criterion for parameters (size,)."""
+        return float(self._value(torch.from_numpy(parameters)))
+
+    def value_and_gradient(self, parameters: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the criterion and its gradient (size,) for parameters (size,) with a finite criterion."""
+        variables = torch.from_numpy(parameters).requires_grad_()
+        value = self._value(variables)
+        (gradient,) = torch.autograd.grad(value, variables)
+        return value.item(), gradient.numpy()
+
+    def _value(self, parameters: Tensor) -> Tensor:
+        """Return the criterion, (), for parameters (size,)."""
+        rows = self._rows(self.trajectory.states(parameters, self.times))
+        overrun = (self._efforts(rows).abs() - TUNING.effort).clamp(min=0.0)
+        penalties = (
+            TUNING.penalty * overrun.square().sum() + self.trajectory.amplitude_reduction(parameters).sum()
+        )
+        return self._log_condition(rows) + penalties
+
+    def _rows(self, states: Tensor) -> Tensor:
+        """Return the regressor (T, n, K) of bodies, then armature and friction in the order of `FRICTION.columns`."""
+        q, qd, qdd = states
+        direction = (qd / FRICTION.coulomb_smoothing_velocity).tanh()
+        effects = torch.stack([qdd, qd, direction, torch.ones_like(qd)])
+        drives = torch.diag_embed(effects).permute(1, 2, 0, 3).flatten(2)
+        return torch.cat([regressor_of(self.chain, q, qd, qdd), drives], dim=2)
+
+    def _efforts(self, rows: Tensor) -> Tensor:
+        """Return rigid-body torques divided by the effort limits, (T, n), from the regressor (T, n, K)."""
+        return rows[:, :, : len(self.inertial)] @ self.inertial / self.limits
+
+    def _log_condition(self, rows: Tensor) -> Tensor:
+        """Return the logarithm of the condition number, (), from the regressor (T, n, K)."""
+        columns = rows[:, :, self.columns].flatten(0, 1)
+        length = columns.norm(dim=0)
+        # a parameter that the motion does not excite
+        if not length.all():
+            return torch.tensor(torch.inf, dtype=torch.float64)
+        condition: Tensor = torch.linalg.cond(columns / length)
+        return condition.log()
 
 
 def excite(
-    arm: ConfiguredArm,
+    arm: Arm,
     *,
     duration: float = 30.0,
     sample_rate: float = 100.0,
@@ -29,14 +114,23 @@ def excite(
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Excitation:
-    """Return an exciting motion of this duration [s], sampled at about `sample_rate` [Hz]; same arguments, same motion.
+    """Return an exciting motion, which starts and ends at rest; the same arguments give the same motion.
 
-    It starts and ends at rest and keeps the part `reach` of the joints' ranges and `speed` of their velocity
-    limits; effort limits too, where the URDF has them and inertials, and where any motion can. Joints that follow
-    others by <mimic> keep their limits as well. Collisions are not checked.
-    harmonics: of the period `duration`; by default 0.4 a second, at least 5. trials: motions that the search looks
-    at, beside 40 at random that it starts from. progress: called with the trials done and all.
-    Raises SettingsError for a value that cannot be, ArmError for a joint without room between its limits.
+    The motion keeps effort limits too if the URDF has limits and inertials, and if any motion that was found keeps
+    them. <mimic> joints keep their own limits. Collisions are not checked.
+
+    Args:
+        arm: configured arm.
+        duration: of the motion, its period [s].
+        sample_rate: approximate sample rate [Hz].
+        harmonics: number of harmonics; default: 0.4 per second, at least 5.
+        reach: fraction of the position ranges that is used.
+        speed: fraction of the velocity limits that is used.
+        trials: evaluations of the criterion by the optimizer, in addition to 40 random motions.
+        seed: of the random motions.
+        progress: is called with the numbers of finished and of all trials.
+
+    Raises SettingsError for an invalid value, ArmError for a joint whose limits are not increasing.
     """
     positive = {"duration": duration, "sample_rate": sample_rate, "reach": reach, "speed": speed}
     for name, value in positive.items():
@@ -45,18 +139,18 @@ def excite(
             expected = "more than 0, at most 1" if is_fraction else "a positive number"
             raise SettingsError(repr(value), element=f"excite: {name}", expected=expected)
     if harmonics is None:
-        harmonics = max(TUNING.fewest_harmonics, round(TUNING.harmonics_per_second * duration))
+        harmonics = max(TUNING.min_harmonics, round(TUNING.harmonics_per_second * duration))
     elif harmonics < 2:
         raise SettingsError(repr(harmonics), element="excite: harmonics", expected="2 or more")
-    bounds = motion_bounds(arm.arm, reach, speed, arm.robot.joint, arm.settings.simulation.positions)
+    bounds = motion_bounds(arm.chain, reach, speed, arm.robot.joint, arm.settings.simulation.positions)
     trajectory = ExcitationTrajectory(duration, harmonics, bounds)
-    criterion = Criterion(arm.arm, trajectory)
+    criterion = Criterion(arm.chain, trajectory)
     starts = np.random.default_rng(seed).standard_normal((TUNING.starts, trajectory.size))
     best = _improved(criterion, min(starts, key=criterion.value), trials, progress)
     motion = trajectory.motion(best, np.linspace(0.0, duration, round(duration * sample_rate) + 1))
     first, states = criterion.states(starts[0]), torch.from_numpy(np.stack([motion.q, motion.qd, motion.qdd]))
     return Excitation(
-        arm=arm.arm,
+        arm=arm.chain,
         motion=motion,
         parameters=len(criterion.columns),
         first=criterion.condition(first),
@@ -67,18 +161,20 @@ def excite(
 
 
 def _improved(
-    criterion: Criterion, start: np.ndarray, trials: int, progress: Callable[[int, int], None]
+    criterion: Criterion, initial: np.ndarray, trials: int, progress: Callable[[int, int], None]
 ) -> np.ndarray:
-    """Return the best of so many trials from a start on.
+    """Return the best parameters (size,) of `trials` evaluations by L-BFGS, from initial parameters (size,).
 
-    The criterion has kinks, where singular values meet and where another sample is the fastest: L-BFGS gets far on
-    such functions (Lewis and Overton, Math. Program. 141:135, 2013), and what it saw counts, not where it ended.
+    The criterion is not differentiable if singular values are equal, or if two samples have the largest speed. L-BFGS
+    is efficient for such functions (Lewis and Overton, Math. Program. 141:135, 2013). Its last iterate need not be the
+    best one, so all evaluations are compared.
     """
-    best, lowest, done = start, criterion.value(start), 0
+    best, lowest, done = initial, criterion.value(initial), 0
     if not isfinite(lowest):
-        return start
+        return initial
 
     def evaluate(parameters: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return criterion and gradient (size,), and keep the best parameters (size,)."""
         nonlocal best, lowest, done
         value, gradient = criterion.value_and_gradient(parameters)
         done += 1
@@ -87,6 +183,6 @@ def _improved(
         progress(min(done, trials), trials)
         return value, gradient
 
-    options = {"maxfun": trials, "maxiter": trials, "maxcor": TUNING.memory, "ftol": 0.0}
-    minimize(evaluate, start, jac=True, method="L-BFGS-B", options=options)
+    options = {"maxfun": trials, "maxiter": trials, "maxcor": TUNING.history, "ftol": 0.0}
+    minimize(evaluate, initial, jac=True, method="L-BFGS-B", options=options)
     return best

@@ -1,4 +1,4 @@
-"""Tell a proposed motion and what it is worth: for a terminal, a notebook, and as CSV for a controller."""
+"""A proposed motion and its quality: for a terminal, a notebook, and as CSV for a controller."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.excitation.trajectory import Motion
 from spelgen.listing import WIDTH, Listing
 
@@ -21,15 +21,14 @@ WARNING = (
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Excitation:
-    """Hold a motion and what it is worth.
+    """A proposed motion and its quality.
 
-    parameters: base parameters, friction and armature included. first, condition: condition number of their
-    regressor (columns of length one) for the first motion at random, and for this one. efforts: largest
-    torque by the URDF's inertials, as part of the limit, (n,); NaN where limit or inertials are not known.
-    first_efforts: of the first motion.
+    parameters: number of base parameters, friction and armature included. condition: condition number of their
+    regressor with unit columns; first: of the first random motion. efforts: (n,) largest torque of the URDF's bodies,
+    divided by the effort limit; NaN without limit or inertials. first_efforts: of the first random motion.
     """
 
-    arm: Arm
+    arm: Chain
     motion: Motion
     parameters: int
     first: float
@@ -38,7 +37,7 @@ class Excitation:
     first_efforts: np.ndarray
 
     def text(self) -> str:
-        """Return what the motion is worth, and how near to the limits it goes, in 80 columns."""
+        """Return the quality of the motion and its use of the limits, in 80 columns."""
         overran = " (which overran effort limits)" if (self.first_efforts > 1).any() else ""
         head = (
             f"{self.arm.name}: {self.motion.t[-1]:g} s, {len(self.motion.t)} samples\n"
@@ -48,7 +47,7 @@ class Excitation:
         paragraphs = [head, self.listing().text()]
         if (self.efforts > 1).any():
             paragraphs.append("warning: effort limits are overrun: no motion was found that keeps them")
-        # a guessed limit may be wrong for this robot: the user is to set it
+        # the default may be wrong for this robot: the user should set the limit
         lacking = [c.name for c in self.arm.coordinates if not c.velocity]
         if lacking:
             summary = f"no velocity limit, 1 rad/s or 0.25 m/s taken: {', '.join(lacking)}"
@@ -56,7 +55,7 @@ class Excitation:
         return "\n\n".join(paragraphs)
 
     def to_dict(self) -> dict[str, object]:
-        """Return what `text` says as numbers; None for efforts that are not known."""
+        """Return the numbers of `text`; None for unknown efforts."""
         efforts = [None if np.isnan(effort) else float(effort) for effort in self.efforts]
         return {
             "robot": self.arm.name,
@@ -69,7 +68,7 @@ class Excitation:
         }
 
     def listing(self) -> Listing:
-        """Return the ranges that the joints move in."""
+        """Return the ranges of position, velocity, acceleration and effort per joint."""
         motion, rows = self.motion, []
         for k, coordinate in enumerate(self.arm.coordinates):
             q, speed = motion.q[:, k], np.abs(motion.qd[:, k]).max()
@@ -85,7 +84,7 @@ class Excitation:
         return Listing("Ranges [rad or m, s]; effort by the URDF's inertials", head, tuple(rows), WARNING)
 
     def csv(self) -> str:
-        """Return columns `t`, then `q_<joint>`, `qd_<joint>` and `qdd_<joint>` by joint, nine decimals."""
+        """Return the columns t, q_<joint>, qd_<joint> and qdd_<joint> with nine decimals."""
         head = ["t"]
         for quantity in ("q", "qd", "qdd"):
             head += [f"{quantity}_{coordinate.name}" for coordinate in self.arm.coordinates]

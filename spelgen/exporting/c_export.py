@@ -1,4 +1,4 @@
-"""--to c: a header and a source, compiled here and held against the model where there is a compiler."""
+"""--to c: a C99 header and source, compiled and compared with the model if there is a compiler."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from spelgen.errors import RunError
-from spelgen.exporting.c_source import MEMORIES, CFunction, c_functions, write_c
+from spelgen.exporting.c_source import FRICTION_STATES, CFunction, c_functions, write_c
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.exported import Exported, folder_export
+from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.tuning import TUNING
 
@@ -22,21 +22,21 @@ _FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared")
 
 
 def export_c(trained: Trained) -> Exported:
-    """Return the C files of a trained model. Raises RunError where they differ from the model."""
+    """Return the C files of a trained model. Raises RunError if they differ from the model."""
     files, checked = c_files(trained)
     name = trained.described.name
     use = (
         f"Add {name}.h and {name}.c to a program and link libm (cc -std=c99 -O2 -c {name}.c); "
         "nothing is allocated or kept, so every function may be called from any thread."
     )
-    about = f"matrices row by row; z is friction's memory, {name}_friction_step moves it along."
-    return folder_export(trained, "c", "in C99", files, use=use, about=about, checked=checked)
+    about = f"matrices row by row; z is the friction state, which {name}_friction_step updates."
+    return with_readme(trained, "c", files, use=use, about=about, summary=[checked])
 
 
 def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
-    """Return header and source by name, and a sentence on how they were checked."""
+    """Return header and source by name, and a sentence with the result of the parity check."""
     functions = c_functions(trained.described, trained.entry_points)
-    checked = "Not checked: no C compiler was there."
+    checked = "Not checked: there is no C compiler"
     program = compiler()
     with tempfile.TemporaryDirectory() as folder:
         source = write_c(trained.described, functions, Path(folder))
@@ -44,12 +44,12 @@ def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
         if program is not None:
             library = called_by_c(compile_library(source, program), functions)
             parity = check_parity(library, trained, list(trained.entry_points), TUNING.tolerance)
-            checked = f"Checked when exported, compiled by {Path(program).name}: {parity.summary}."
+            checked = f"Checked when exported, compiled by {Path(program).name}: {parity.summary}"
     return files, checked
 
 
 def compiler() -> str | None:
-    """Return the C compiler of this machine; None without one."""
+    """Return the path of a C compiler; None if there is none."""
     for name in ("gcc", "clang", "cc"):
         program = shutil.which(name)
         if program:
@@ -58,7 +58,7 @@ def compiler() -> str | None:
 
 
 def compile_library(source: Path, program: str, *flags: str) -> Path:
-    """Compile a C file to a shared library beside it. Raises RunError with the messages of the compiler."""
+    """Compile a C file to a shared library in its folder. Raises RunError with the messages of the compiler."""
     library = source.with_suffix(".so")
     command = [program, *_FLAGS, *flags, str(source), "-o", str(library), "-lm"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -70,25 +70,24 @@ def compile_library(source: Path, program: str, *flags: str) -> Path:
 def called_by_c(
     library: Path, functions: Sequence[CFunction], dtype: type[np.floating] = np.float64
 ) -> Called:
-    """Return what calls the functions of a compiled export, for arrays of states; outputs are float64."""
+    """Return a function that calls a compiled export for arrays of states; its outputs are float64."""
     loaded = ctypes.CDLL(str(library))
     by_name = {function.entry.name: function for function in functions}
-
-    def kind(name: str) -> type[np.floating]:
-        # friction's memory is double in any case
-        return np.float64 if name in MEMORIES else dtype
+    # the friction state is always double
+    dtypes = dict.fromkeys(FRICTION_STATES, np.float64)
 
     def called(name: str, inputs: Values) -> Values:
         function = by_name[name]
-        call = getattr(loaded, function.symbol)
-        # all results are written to arrays
+        call = loaded[function.symbol]
         call.restype = None
         states = len(inputs["q"])
-        arguments = [np.ascontiguousarray(inputs[key], dtype=kind(key)) for key in function.entry.inputs]
+        arguments = []
+        for key in function.entry.inputs:
+            arguments.append(np.ascontiguousarray(inputs[key], dtype=dtypes.get(key, dtype)))
         outputs: Values = {}
         for key, shape in function.shapes.items():
-            # NaN: what the function does not write is noticed
-            outputs[key] = np.full((states, *shape), np.nan, kind(key))
+            # NaN fails the parity check if the function does not write a number
+            outputs[key] = np.full((states, *shape), np.nan, dtypes.get(key, dtype))
         arguments += outputs.values()
         for state in range(states):
             rows = [array[state : state + 1] for array in arguments]

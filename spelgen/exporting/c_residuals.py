@@ -1,6 +1,7 @@
-"""The part of a model beside its rigid bodies as C: networks as loops over tables, functions of single joints.
+"""Residual terms of a model in C: networks as loops over tables, and functions of single joints.
 
-Splines are a polynomial for each interval, harmonics turn a phasor. An entry point calls what its expressions need.
+Splines are tables of polynomials, one per interval; harmonics are powers of a phasor. An entry point calls the
+functions that compute the symbols of its expressions (see `residual_expressions`).
 """
 
 from __future__ import annotations
@@ -29,20 +30,19 @@ _CALLS = (
     (("torque_energy",), "joint_energies(q", ("torque_energy",)),
     (("factor", "factor_slope"), "friction_factors(q", ("factor", "factor_slope")),
 )
-"""By what is needed: the call, and all that it computes; the first call that computes a residual is taken for it."""
+"""Symbols that need a call, the call, and the symbols that it computes; the first row with a symbol is used."""
 
 
 def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the variables, and the calls that compute these residuals of q, and of qd where they need it."""
-    missing = set(names)
+    """Return variables and calls that compute the symbols of residual terms with these names."""
+    uncomputed = set(names)
     symbols = residual_symbols(model)
     variables: list[str] = []
     calls: list[str] = []
     for needed, call, computed in _CALLS:
-        # jets stand first: what they compute is not computed again
-        if not missing.intersection(needed):
+        if not uncomputed.intersection(needed):
             continue
-        missing.difference_update(computed)
+        uncomputed.difference_update(computed)
         arguments = []
         for name in computed:
             variables.append(f"{RESIDUAL}{name}[{symbols[name].numel()}]")
@@ -55,7 +55,7 @@ def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str]
 
 
 def network_source(model: TrainedModel) -> list[str]:
-    """Return the C text of all networks, nothing where there are none."""
+    """Return the C text of all networks; an empty list without networks."""
     n, residuals = model.n, model.residuals
     named = {"mass": residuals.mass, "potential": residuals.potential}
     networks = {name: network for name, network in named.items() if network is not None}
@@ -71,7 +71,7 @@ def network_source(model: TrainedModel) -> list[str]:
         "networks.c.jinja",
         n=n,
         hidden=max(map(len, shapes.values())) - 1,
-        # buffers are of one size, that of the widest layer
+        # the size of buffers, for the widest layer
         width=max(max(shape) for layers in shapes.values() for shape in layers),
         encoded=3 * n,
         lanes=1 + n + n * (n + 1) // 2,
@@ -83,12 +83,20 @@ def network_source(model: TrainedModel) -> list[str]:
 
 
 def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
-    """Return tables of bias, weight by input from first to last that is not zero, first and last."""
+    """Return the tables of a layer: biases, weights, and the first and last outputs that each input affects.
+
+    Masked networks are block structured: only the weights from the first to the last nonzero one of an input are
+    stored.
+
+    Args:
+        name: prefix of the tables.
+        weight: (outputs, inputs).
+        bias: (outputs,).
+    """
     first: list[int] = []
     last: list[int] = []
     packed: list[np.ndarray] = []
     for column in weight.T:
-        # masked networks: an input reaches a block of the outputs
         nonzero = np.flatnonzero(column).tolist() or [0, -1]
         first.append(nonzero[0])
         last.append(nonzero[-1] + 1)
@@ -102,7 +110,7 @@ def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
 
 
 def joint_function_source(model: TrainedModel) -> list[str]:
-    """Return the C text of all functions of single joints, nothing where there are none."""
+    """Return the C text of all functions of single joints; an empty list without them."""
     residuals = model.residuals
     torque, factor = residuals.torque, residuals.friction
     if not (residuals.has_torque or factor):
@@ -111,11 +119,11 @@ def joint_function_source(model: TrainedModel) -> list[str]:
     intervals = 0
     for name, splines in (("torque", torque), ("factor", factor)):
         if splines:
-            pieces = list(map(_pieces, splines.values()))
-            intervals = len(pieces[0])
-            tables.append(_table(f"{name}_pieces", np.concatenate(pieces)))
+            polynomials = list(map(_polynomials, splines.values()))
+            intervals = len(polynomials[0])
+            tables.append(_table(f"{name}_pieces", np.concatenate(polynomials)))
     if torque:
-        # up to where each interval begins
+        # the energy at the start of each interval
         energies = [spline_energy(spline)(spline.t[3:-4]) for spline in torque.values()]
         tables.append(_table("torque_energy", np.concatenate(energies)))
     for k, ripple in enumerate(residuals.ripple, start=1):
@@ -132,16 +140,16 @@ def joint_function_source(model: TrainedModel) -> list[str]:
     return [text.rstrip()]
 
 
-def _pieces(spline: BSpline) -> np.ndarray:
-    """Return coefficients by interval and power of s, from 0 to 1 on it, (intervals, 4)."""
+def _polynomials(spline: BSpline) -> np.ndarray:
+    """Return the coefficients of 1, s, s^2, s^3 per interval, (intervals, 4); s is 0 to 1 in the interval."""
     curve = PPoly.from_spline((np.arange(len(spline.t)), spline.c, 3))
-    # intervals outside of these have no meaning
-    pieces: np.ndarray = curve.c[::-1, 3 : len(spline.c)].T
-    return pieces
+    # without the intervals outside of the knots of the curve
+    coefficients: np.ndarray = curve.c[::-1, 3 : len(spline.c)].T
+    return coefficients
 
 
 def _spline_fields(splines: Mapping[int, BSpline]) -> list[str]:
-    """Return by spline: joint, start, spacing."""
+    """Return joint, first knot and spacing of each spline, as initialisers of C."""
     fields: list[str] = []
     for joint, spline in splines.items():
         spacing = np.ptp(spline.t) / (len(spline.t) - 1)
@@ -150,13 +158,13 @@ def _spline_fields(splines: Mapping[int, BSpline]) -> list[str]:
 
 
 def _table(name: str, values: np.ndarray) -> str:
-    """Return a constant array of C, numbers with all their digits."""
-    kind = "short" if values.dtype.kind == "i" else "real"
+    """Return a constant C array with values (rows,) or (rows, columns), all digits."""
+    scalar = "short" if values.dtype.kind == "i" else "real"
     size = ""
     numbers = ", ".join(map(repr, values.tolist()))
     if values.ndim == 2:
         size = f"[{values.shape[1]}]"
-        # rows in braces of their own
+        # a pair of braces per row
         numbers = numbers.replace("[", "{").replace("]", "}")
     lines = wrap(numbers, _WIDTH, initial_indent="    ", subsequent_indent="    ")
-    return "\n".join([f"static UNUSED const {kind} {name}[]{size} = {{", *lines, "};"])
+    return "\n".join([f"static UNUSED const {scalar} {name}[]{size} = {{", *lines, "};"])

@@ -1,9 +1,10 @@
-"""A trained model -> a C99 header and source that need the standard math library alone."""
+"""C99 header and source of a trained model, which need only the standard math library."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from textwrap import wrap
 
@@ -16,9 +17,9 @@ from spelgen.exporting.model_expressions import expression_functions, residuals_
 from spelgen.templates import render
 
 _WIDTH = 118  # characters of a line
-MEMORIES = ("z", "z_next", "z_start")
-"""Inputs and outputs that are friction's memory: double in any case, where all others are of the type ``real``."""
-# friction's memory is double in any case: tanh has no form for float
+FRICTION_STATES = ("z", "z_next", "z_start")
+"""Inputs and outputs that are friction states, of type double; all others are of type ``real``."""
+# tanh occurs in friction states only
 _FORMS = {
     ca.OP_NEG: "-{0}",
     ca.OP_SQ: "{0} * {0}",
@@ -42,7 +43,7 @@ _FORMS = {
 
 @dataclass(frozen=True)
 class CFunction:
-    """An entry point in C. shapes: of its outputs, (rows,) or (rows, columns)."""
+    """An entry point in C. shapes: of its outputs, (rows,) or (rows, columns). operations: upper bound."""
 
     entry: EntryPoint
     symbol: str
@@ -54,105 +55,89 @@ class CFunction:
 
 
 def c_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> list[CFunction]:
-    """Return these entry points of the model in C."""
+    """Return entry points of a model in C."""
     expressions = expression_functions(model, entries)
     return [_c_function(model, entry, expressions[name]) for name, entry in entries.items()]
 
 
 def write_c(model: TrainedModel, functions: Sequence[CFunction], folder: Path) -> Path:
-    """Write header and source into a folder and return the source's path."""
+    """Write header and source into a folder; return the path of the source."""
     source = folder / f"{model.name}.c"
-    source.write_text(c_source(model, functions))
-    source.with_suffix(".h").write_text(_c_header(model, functions))
+    for suffix, text in c_texts(model, functions).items():
+        source.with_suffix(suffix).write_text(text)
     return source
 
 
-def _c_header(model: TrainedModel, functions: Sequence[CFunction]) -> str:
-    # a bound for control loops: no branch depends on data
+def c_texts(model: TrainedModel, functions: Sequence[CFunction]) -> dict[str, str]:
+    """Return the texts of header and source, by suffix."""
+    # the time is bounded: no branch depends on data
     longest = max(functions, key=lambda function: function.operations)
-    facts = [f"At most {longest.operations} operations, in {longest.entry.name}, beside those of networks."]
+    facts = [f"At most {longest.operations} operations, in {longest.entry.name}, without networks."]
     if model.servos is not None:
         facts += wrap(
             f"Joints are under position servos: tau of {model.name}_servo_torque goes into forward_dynamics, with the "
             f"command of {model.servos.delay:.4g} s before as u.",
             _WIDTH - 4,
         )
-    memory = ": none, and z may be NULL"
-    if model.memory:
-        memory = f": joint by joint, {model.reach.shape[1]} each"
-    return render(
-        "model.h.jinja",
-        facts=facts,
-        joints=", ".join(model.identifiers),
-        name=model.name,
-        upper=model.name.upper(),
-        n=model.n,
-        memory=model.memory,
-        memory_note=memory,
-        functions=functions,
+    note = (
+        f": joint by joint, {model.breakaway.shape[1]} each" if model.memory else ": none, and z may be NULL"
     )
-
-
-def c_source(model: TrainedModel, functions: Sequence[CFunction]) -> str:
-    """Return the source."""
-    return render(
-        "model.c.jinja",
-        n=model.n,
-        name=model.name,
-        upper=model.name.upper(),
-        residuals=network_source(model) + joint_function_source(model),
-        functions=functions,
-    )
+    names = {"name": model.name, "upper": model.name.upper(), "n": model.n, "functions": functions}
+    joints, residuals = ", ".join(model.identifiers), network_source(model) + joint_function_source(model)
+    header = {"facts": facts, "joints": joints, "memory": model.memory, "memory_note": note}
+    return {
+        ".h": render("model.h.jinja", **names, **header),
+        ".c": render("model.c.jinja", **names, residuals=residuals),
+    }
 
 
 def _c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -> CFunction:
-    # residuals first, for the statements read them
+    # the statements use the residual terms
     residuals, calls = residual_calls(model, residuals_needed(function))
     variables, lines = _statements(function, list(entry.outputs))
-    # the compiler would refuse a parameter that is not used
+    # casts to void avoid warnings of unused parameters
     body = [" ".join(f"(void){name};" for name in (*entry.inputs, *entry.outputs))]
     if residuals or variables:
-        # in single precision a small displacement would be lost beside what z is already
-        kind = "double" if entry.name == "friction_step" else "real"
-        body.append(f"{kind} {', '.join((*residuals, *variables))};")
+        # in single precision a small displacement would be lost in the sum with z
+        scalar = "double" if entry.name == "friction_step" else "real"
+        body.append(f"{scalar} {', '.join((*residuals, *variables))};")
     body += calls + lines
     real, size = f"{model.name}_real", f"{model.name.upper()}_N"
     parameters: list[str] = []
     for name in entry.inputs:
-        # NULL where friction has no memory: no array of C is empty
+        # a pointer, NULL without friction state: C has no empty arrays
         parameters.append("const double *z" if name == "z" else f"const {real} {name}[{size}]")
     shapes: dict[str, tuple[int, ...]] = {}
     results: list[str] = []
     for k, (name, unit) in enumerate(entry.outputs.items()):
         rows, columns = function.size_out(k)
         shapes[name] = (rows, columns) if columns > 1 else (rows,)
-        parameters.append(f"double *{name}" if name in MEMORIES else f"{real} {name}[{rows * columns}]")
+        parameters.append(
+            f"double *{name}" if name in FRICTION_STATES else f"{real} {name}[{rows * columns}]"
+        )
         results.append(f"{name} ({', '.join(map(str, shapes[name]))}) [{unit}]")
     about = f"{entry.about[0].upper()}{entry.about[1:]}: {', '.join(results)}."
     symbol = f"{model.name}_{entry.name}"
     listed = ",\n    ".join(parameters)
     signature = f"void {symbol}(\n    {listed})"
-    written: list[str] = []
-    for line in body:
-        written += wrap(line, _WIDTH, initial_indent="    ", subsequent_indent="        ")
+    wrapped = [wrap(line, _WIDTH, initial_indent="    ", subsequent_indent="        ") for line in body]
     return CFunction(
         entry=entry,
         symbol=symbol,
         shapes=shapes,
         about="\n * ".join(wrap(about, _WIDTH - 6)),
         signature=signature,
-        definition="\n".join([signature, "{", *written, "}"]),
+        definition="\n".join([signature, "{", *chain(*wrapped), "}"]),
         operations=len(lines) - function.nnz_out(),
     )
 
 
 def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the variables of a C function and its statements, one a step, in the order that CasADi has.
+    """Return the variables of a C function and its statements, one per CasADi instruction.
 
-    It reads arrays of the names of the function's inputs and writes ``outputs``, matrices row by row; outputs are
-    dense, so that each of their numbers is written once.
+    Arrays have the names of the inputs of `function` and of ``outputs``, and are row-major. Outputs are dense, so that
+    each number is written once. A variable is a slot of CasADi's work vector, which is reused.
     """
-    # CasADi reuses slots: as few variables as live at a time
     inputs = function.name_in()
     shapes = [function.size_out(k) for k in range(function.n_out())]
     variables: dict[str, None] = {}
@@ -163,16 +148,16 @@ def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str
         if operation == ca.OP_OUTPUT:
             output, index = writes
             rows, columns = shapes[output]
-            row_by_row = index % rows * columns + index // rows  # CasADi has column by column
+            row_by_row = index % rows * columns + index // rows  # from CasADi's column-major order
             lines.append(f"{outputs[output]}[{row_by_row}] = a{reads[0]};")
             continue
         if operation == ca.OP_INPUT:
             value = f"{inputs[reads[0]]}[{reads[1]}]"
         elif operation == ca.OP_CONST:
-            value = f"R({function.instruction_constant(k)!r})"  # with all its digits
+            value = f"R({function.instruction_constant(k)!r})"  # all digits
         else:
             value = _FORMS[operation].format(*(f"a{slot}" for slot in reads))
-        # a dict keeps the order in which CasADi first writes them
+        # a dict: unique names in the order of their first assignment
         variables[f"a{writes[0]}"] = None
         lines.append(f"a{writes[0]} = {value};")
     return list(variables), lines

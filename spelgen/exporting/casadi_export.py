@@ -1,4 +1,4 @@
-"""--to casadi: each entry point as a file of a CasADi function, with derivatives by CasADi's own."""
+"""--to casadi: a file with a CasADi function for each entry point."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.entry_points import ENTRY_POINTS, EntryPoint
-from spelgen.exporting.exported import Exported, folder_export
+from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.model_expressions import expression_functions, residuals_needed
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.residual_expressions import residual_values
@@ -20,22 +20,22 @@ from spelgen.exporting.tuning import TUNING
 
 
 def export_casadi(trained: Trained) -> Exported:
-    """Return a file for each entry point. Raises RunError where they differ from the model."""
+    """Return a file for each entry point. Raises RunError if a function differs from the model."""
     model = trained.described
     functions = casadi_functions(model, trained.entry_points)
     parity = check_parity(called_by_state(functions), trained, list(functions), TUNING.tolerance)
-    checked = f"Checked when exported, by CasADi {ca.CasadiMeta.version()}: {parity.summary}."
+    checked = f"Checked when exported, by CasADi {ca.CasadiMeta.version()}: {parity.summary}"
     use = (
         "qdd = casadi.Function.load('forward_dynamics.casadi')(q, qd, tau, z) takes numbers or symbols: "
         "its derivatives, of any order, are CasADi's."
     )
     about = f"z is the friction state, {model.memory} numbers: casadi.DM(0, 1) where there are none."
     files = {f"{name}.casadi": _saved(function) for name, function in functions.items()}
-    return folder_export(trained, "casadi", "in CasADi", files, use=use, about=about, checked=checked)
+    return with_readme(trained, "casadi", files, use=use, about=about, summary=[checked])
 
 
 def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
-    """Return functions by name: rigid bodies and friction by scalars, residuals by matrices."""
+    """Return functions by name: SX expressions of bodies and friction, MX expressions of residual terms."""
     if not model.residuals:
         return expression_functions(model, entries)
     bases = {name: ENTRY_POINTS[name.removesuffix("_derivatives")] for name in entries}
@@ -49,6 +49,7 @@ def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> 
 
 
 def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Function) -> ca.Function:
+    """Return a function of the states only, with the residual terms computed inside."""
     needed = residuals_needed(function)
     if not needed:
         return function
@@ -60,18 +61,18 @@ def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Functio
 
 
 def _derivatives(entry: EntryPoint, function: ca.Function) -> ca.Function:
+    """Return the derivatives of a function with respect to its first inputs, one per output of the entry point."""
     arguments = function.mx_in()
     (output,) = function.call(arguments)
     derivatives: list[ca.MX] = []
-    # by as many of the inputs as there are outputs
     for argument, _ in zip(arguments, entry.outputs, strict=False):
-        # who calls it reads n x n numbers, whatever is zero
+        # dense: callers expect n x n numbers
         derivatives.append(ca.densify(ca.jacobian(output, argument)))
     return ca.Function(entry.name, arguments, derivatives, list(entry.inputs), list(entry.outputs))
 
 
 def _saved(function: ca.Function) -> bytes:
-    # CasADi writes to files alone
+    # CasADi can write to files only
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "function.casadi")
         function.save(str(path))
@@ -79,12 +80,12 @@ def _saved(function: ca.Function) -> bytes:
 
 
 def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
-    """Return what calls CasADi's functions, state by state."""
+    """Return a function that calls CasADi functions, state by state."""
 
     def called(name: str, inputs: Values) -> Values:
         function = functions[name]
         states = zip(*(inputs[key] for key in function.name_in()), strict=True)
-        # one by one: a map over states would compile another function
+        # a loop: a map over states would be another function than the exported one
         results = [function.call(list(map(ca.DM, state))) for state in states]
         outputs: Values = {}
         for key, values in zip(function.name_out(), zip(*results, strict=True), strict=True):

@@ -1,4 +1,4 @@
-"""The description of a trained model that exporters to source code read: plain numbers."""
+"""Description of a trained model for exporters of source code: plain numbers and arrays."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import BSpline
 
-from spelgen.arm.arm import Arm, Body
+from spelgen.arm.arm import Body, Chain
 
 
 @dataclass(frozen=True, eq=False)
 class Tip:
-    """The frame of a link: ``pose``, (4, 4), in the frame of the body ``carrier``, -1 for the root link.
+    """The frame of the tip link.
 
-    bodies: those of the arm, by the angles that the URDF has: the tip is compared with other readers of the file.
+    carrier: index of the body that carries the link; -1: the root link. pose: (4, 4), in the frame of this body.
+    bodies: of the arm with the unrounded angles of the URDF, since the tip is compared with other readers of the file.
     """
 
     link: str
@@ -25,10 +26,10 @@ class Tip:
 
 
 @dataclass(frozen=True, eq=False)
-class Network:
-    """A network of cos q, sin q and q: layers of sigmoids, the last one linear.
+class SigmoidNetwork:
+    """A network with the inputs cos q, sin q and q: layers of sigmoids, then a linear layer.
 
-    weights: by layer, (units, units below).
+    weights: of each layer, (units, units of the layer before). biases: (units,).
     """
 
     weights: tuple[np.ndarray, ...]
@@ -37,7 +38,7 @@ class Network:
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """A joint's torque [Nm]: cosines @ cos(k frequency q) + sines @ sin(k frequency q), k from 1 on."""
+    """Torque ripple of a joint [Nm]: sum over k = 1, 2, ... of cosines[k] cos(k frequency q) + sines[k] sin(...)."""
 
     joint: int
     frequency: float
@@ -47,16 +48,16 @@ class Harmonics:
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """The parts of a model beside its rigid bodies, as far as they are not zero.
+    """The residual terms of a model that are not zero.
 
-    mass: is added to M at these entries of its lower triangle, a row each; potential: to V, one row. torque and ripple:
-    dV/dq by joint [Nm, N]. friction: by joint, the logarithm of a factor on its drive's friction. Splines are cubic,
-    with zero where they begin and end, and beyond.
+    entries: row and column of the entries of M's lower triangle that ``mass`` is added to, one per output. potential:
+    is added to V, one output. torque, ripple: contributions to dV/dq [Nm, N] per joint. friction: logarithm of a factor
+    on the friction of a drive, per joint. Splines are cubic, and zero outside of their knots.
     """
 
     entries: tuple[tuple[int, int], ...]
-    mass: Network | None
-    potential: Network | None
+    mass: SigmoidNetwork | None
+    potential: SigmoidNetwork | None
     torque: dict[int, BSpline]
     ripple: tuple[Harmonics, ...]
     friction: dict[int, BSpline]
@@ -66,12 +67,12 @@ class Residuals:
 
     @property
     def has_torque(self) -> bool:
-        """Whether some joint has a torque of its own."""
+        """Whether any joint has a torque spline or ripple."""
         return bool(self.torque or self.ripple)
 
 
 def spline_energy(spline: BSpline) -> BSpline:
-    """Return the integral of a torque's spline; as in the runtime, half of its area lies on either side of zero."""
+    """Return the integral of a torque spline; as in the runtime, its values at both ends have the same magnitude."""
     energy = spline.antiderivative()
     count = len(energy.t) - energy.k - 1
     half = energy(spline.t[-4]) / 2
@@ -80,7 +81,7 @@ def spline_energy(spline: BSpline) -> BSpline:
 
 @dataclass(frozen=True, eq=False)
 class Servos:
-    """``runtime.position_servo``: kp, kd, limit, infinite where nothing limits, dead_zone, (n,); delay [s]."""
+    """Constants of ``runtime.position_servo``, (n,), and the delay [s]. limit: infinite without an effort limit."""
 
     kp: np.ndarray
     kd: np.ndarray
@@ -91,25 +92,24 @@ class Servos:
 
 @dataclass(frozen=True, eq=False)
 class TrainedModel:
-    """A trained arm of n joints. Units: rad and Nm, or m and N.
+    """A trained model of an arm with n joints, in rad and Nm, or m and N.
 
-    name, identifiers: of robot and joints, for code. inertias: (bodies, 10) about the joints' frames. constant_mass: of
-    rotors and other constants in M, (n, n). motors: (n, n), the drives' speeds by the joints', which friction follows.
-    friction: the ``FrictionConstants`` of the runtime, as arrays. reach: of the bristles that are its memory, (n, K)
-    [rad, m].
-    inputs: G, (n, n); actuated: (n,), 0 for a passive joint. friction_compensation: (n,) torque that the drives add by
-    velocity, unseen.
+    name, identifiers: of the robot and of the joints, for code. inertias: (bodies, 10) inertial parameters in the
+    frames of the joints. constant_mass: (n, n) part of M that does not depend on q, armature included. motors: C, (n,
+    n), motor velocities per joint velocities. friction: the ``FrictionConstants`` of the runtime, as arrays. breakaway:
+    (n, K) break-away displacements of the bristles [rad, m]. inputs: G, (n, n). actuated: (n,), 0 for a passive joint.
+    torque_offset: (n,). friction_compensation: (n,) torque per velocity that the drives add and do not measure.
     """
 
     name: str
-    arm: Arm
+    arm: Chain
     identifiers: tuple[str, ...]
     inertias: np.ndarray
     constant_mass: np.ndarray
     motors: np.ndarray
     residuals: Residuals
     friction: Any
-    reach: np.ndarray
+    breakaway: np.ndarray
     inputs: np.ndarray
     actuated: np.ndarray
     torque_offset: np.ndarray
@@ -119,10 +119,10 @@ class TrainedModel:
 
     @property
     def n(self) -> int:
-        """How many joints."""
+        """Number of joints."""
         return len(self.arm.coordinates)
 
     @property
     def memory(self) -> int:
-        """How many numbers the memory of friction has."""
-        return int(self.reach.size)
+        """Number of bristles, the size of the friction state z."""
+        return int(self.breakaway.size)

@@ -1,4 +1,4 @@
-"""The quantities that a deployed model computes: one list for all formats."""
+"""Entry points: the functions of an export, one list for all formats."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from spelgen.exporting.description import TrainedModel
 class EntryPoint:
     """A function of an export.
 
-    inputs: among q, qd, qdd, tau, u, dq (n numbers each) and z (the memory of friction). outputs: their units by name.
+    inputs: names among q, qd, qdd, tau, u, dq (n numbers each) and z (the friction state). outputs: units by name.
     """
 
     name: str
@@ -88,24 +88,24 @@ ENTRY_POINTS = {entry.name: entry for entry in _ENTRY_POINTS}
 
 
 def entry_points(model: TrainedModel, names: Sequence[str] = ()) -> dict[str, EntryPoint]:
-    """Return the functions of this model that are named, by default all but derivatives. Raises RunError for others."""
+    """Return entry points of a model by name; no names: all except derivatives. Raises RunError for unknown names."""
     available = list(ENTRY_POINTS)
     if model.servos is None:
         available.remove("servo_torque")
     if not names:
-        # derivatives are two thirds of the code, and few need them
+        # derivatives are two thirds of the code, and rarely needed
         names = [name for name in available if not name.endswith("_derivatives")]
-    return {name: ENTRY_POINTS[name] for name in chosen(names, available)}
+    return {name: ENTRY_POINTS[name] for name in select_names(names, available)}
 
 
-def chosen(names: Sequence[str], functions: Iterable[str]) -> list[str]:
-    """Return which of the functions are named, all where none is. Raises RunError for other names."""
-    options = list(functions)
+def select_names(names: Sequence[str], available: Iterable[str]) -> list[str]:
+    """Return the names in the order of those available; no names: all. Raises RunError for unknown names."""
+    options = list(available)
     for name in names:
         if name not in options:
             expected = f"one of {', '.join(options)}"
             raise RunError(f"the function {name!r}", expected=expected, do=suggestion(name, options))
     if not names:
         return options
-    # in their own order: the same choice gives the same files
+    # in a fixed order: the same names give the same files
     return [name for name in options if name in names]

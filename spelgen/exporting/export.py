@@ -1,4 +1,4 @@
-"""The function ``export``: a trained model for other tools."""
+"""The function ``export``: write a trained model in the format of another tool."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import Arm
 from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import RunError, suggestion
 from spelgen.exporting.describe import Trained
@@ -24,23 +24,29 @@ def export(
     to: str = "urdf",
     path: Path | str | None = None,
     *,
-    arm: ConfiguredArm | Path | str | None = None,
+    arm: Arm | Path | str | None = None,
     force: bool = False,
     entries: Sequence[str] = (),
 ) -> Exported:
-    """Return a fit, the folder of a run or a model in the format of another tool, written where a path is given.
+    """Return a trained model in the format of another tool, after a comparison with the model.
 
-    to: ``urdf``, FILE.urdf with its settings and friction beside it; ``mjcf``, FILE.xml for MuJoCo; ``c``, a folder
-    with a C99 header and source; ``ros2``, a colcon package around these; ``casadi``, ``onnx`` and ``torch``, a folder
-    with a file for each function. The export is compared with the model first. arm: of ``load_arm`` or the path
-    of a URDF; by default the fit's. entries: of c, casadi, onnx and torch, names of the functions that are written; by
-    default all but derivatives. Raises RunError where there is no arm, for a preset or a path that does not go with the
-    format, where the comparison fails, and where a file exists and ``force`` is not given.
+    Args:
+        trained: a fit, the folder of a run, or a model.
+        to: ``urdf``: FILE.urdf, with settings and friction in further files; ``mjcf``: FILE.xml for MuJoCo; ``c``: a
+            folder with a C99 header and source; ``ros2``: a colcon package with the C files; ``casadi``, ``onnx``,
+            ``torch``: a folder with a file for each function.
+        path: is written to; None: nothing is written.
+        arm: from ``load_arm``, or the path of a URDF; default: the arm of the fit.
+        force: replace existing files.
+        entries: names of the functions for c, casadi, onnx and torch; default: all except derivatives.
+
+    Raises RunError without an arm, for a preset or a path that the format does not allow, if the comparison fails, and
+    if a file exists without ``force``.
     """
     if to not in EXPORTERS:
         do = suggestion(to, EXPORTERS)
         raise RunError(f"the format {to!r}", expected=f"one of {', '.join(EXPORTERS)}", do=do)
-    # before a run is loaded and exported, which takes seconds
+    # checked first: loading and exporting a run takes seconds
     if path is not None:
         require_fitting(to, Path(path))
     if isinstance(trained, str | Path):
@@ -54,9 +60,9 @@ def export(
     if arm is None:
         expected = "a run of `spelgen train --robot FILE.urdf`, or an arm"
         raise RunError("no robot.urdf", element="export", expected=expected)
-    if not isinstance(arm, ConfiguredArm):
+    if not isinstance(arm, Arm):
         arm = arm_of_spec(required_spec(trained), arm)
-    # its module is imported now: what it needs may be an extra
+    # imported here: the packages of a format may be extras that are not installed
     exported: Exported = pkgutil.resolve_name(exporter.function_name)(Trained(trained, arm, tuple(entries)))
     if path is not None:
         exported.write(path, force=force)

@@ -1,4 +1,4 @@
-"""The formats, a trained model as files of one of them, and how they are written."""
+"""The formats of exports, and a trained model as files of one format."""
 
 from __future__ import annotations
 
@@ -21,26 +21,28 @@ UNITS = "Units: rad and Nm for revolute joints, m and N for prismatic ones"
 class Exporter:
     """A format of exports.
 
-    function_name: of what takes a ``Trained`` to an ``Exported``; it is imported when it is used, because the
-    packages that most formats need are extras. suffix: of a format of one file; all others are folders. choice: whether
-    functions can be chosen.
+    function_name: module and name of a function from ``Trained`` to ``Exported``, imported on use, because most formats
+    need packages that are extras. title: end of the title of the README. suffix: of the file; empty for a format that
+    is a folder. choice: whether the functions can be selected.
     """
 
     function_name: str
+    title: str = ""
     suffix: str = ""
     choice: bool = False
 
 
 EXPORTERS = {
-    "urdf": Exporter("spelgen.exporting.urdf_export:export_urdf", suffix=".urdf"),
-    "mjcf": Exporter("spelgen.exporting.mjcf_export:export_mjcf", suffix=".xml"),
-    "c": Exporter("spelgen.exporting.c_export:export_c", choice=True),
-    "casadi": Exporter("spelgen.exporting.casadi_export:export_casadi", choice=True),
-    "onnx": Exporter("spelgen.exporting.onnx_export:export_onnx", choice=True),
-    "torch": Exporter("spelgen.exporting.torch_export:export_torch", choice=True),
-    "ros2": Exporter("spelgen.exporting.ros2_export:export_ros2"),
+    "urdf": Exporter("spelgen.exporting.urdf_export:export_urdf", "as a URDF", suffix=".urdf"),
+    "mjcf": Exporter("spelgen.exporting.mjcf_export:export_mjcf", "for MuJoCo", suffix=".xml"),
+    "c": Exporter("spelgen.exporting.c_export:export_c", "in C99", choice=True),
+    "casadi": Exporter("spelgen.exporting.casadi_export:export_casadi", "in CasADi", choice=True),
+    "onnx": Exporter("spelgen.exporting.onnx_export:export_onnx", "in ONNX", choice=True),
+    "torch": Exporter("spelgen.exporting.torch_export:export_torch", "in torch", choice=True),
+    "ros2": Exporter("spelgen.exporting.ros2_export:export_ros2", "for ROS 2"),
 }
-"""The formats by the names that --to takes."""
+"""The formats, by the values of --to."""
+_BY_SUFFIX = {exporter.suffix: name for name, exporter in EXPORTERS.items() if exporter.suffix}
 
 if TYPE_CHECKING:
     Format = str
@@ -50,10 +52,10 @@ else:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Exported:
-    """A trained model for another tool.
+    """A trained model in the format of another tool.
 
-    files: contents by name in the folder; of a format of one file, by what follows its stem. summary: what a user
-    should know, a sentence each.
+    files: contents, by path in the folder, or by the end of the name after the stem for a format of one file. summary:
+    sentences for the user.
     """
 
     to: str
@@ -64,7 +66,7 @@ class Exported:
     def write(self, path: Path | str, *, force: bool = False) -> tuple[Path, ...]:
         """Write the files and return their paths.
 
-        Raises RunError for a path that contradicts the format, and for what exists, unless forced.
+        Raises RunError for a path that contradicts the format, and for existing files without ``force``.
         """
         path = Path(path)
         require_fitting(self.to, path)
@@ -73,7 +75,7 @@ class Exported:
             outputs = paths
         else:
             paths = [path / name for name in self.files]
-            outputs = [path]  # a folder of another export is no less in the way than a file
+            outputs = [path]  # an existing folder is not replaced either
         for output in outputs:
             if output.exists() and not force:
                 raise RunError("this output exists already", file=output, do="force replaces it")
@@ -86,11 +88,10 @@ class Exported:
 
 
 def format_by_extension(path: Path) -> str:
-    """Return the format whose files have this extension. Raises RunError where there is none."""
-    name = _format_of(path)
-    if name is None:
+    """Return the format of files with this extension. Raises RunError if there is none."""
+    if path.suffix not in _BY_SUFFIX:
         raise RunError(f"the name {path.name!r}", expected="FILE.urdf, FILE.xml or --to FORMAT")
-    return name
+    return _BY_SUFFIX[path.suffix]
 
 
 def require_fitting(to: str, path: Path) -> None:
@@ -99,30 +100,25 @@ def require_fitting(to: str, path: Path) -> None:
     if path.suffix == suffix or (not suffix and path.is_dir()):
         return
     expected = f"FILE{suffix}" if suffix else "a folder, named without an extension"
-    fitting = _format_of(path)
-    advice = None if fitting is None else f"--to {fitting} writes such a file"
+    advice = None
+    if path.suffix in _BY_SUFFIX:
+        advice = f"--to {_BY_SUFFIX[path.suffix]} writes such a file"
     raise RunError(f"the name {path.name!r} for --to {to}", expected=expected, do=advice)
 
 
-def _format_of(path: Path) -> str | None:
-    """Return the format of one file with this extension."""
-    for name, exporter in EXPORTERS.items():
-        if exporter.suffix and exporter.suffix == path.suffix:
-            return name
-    return None
-
-
-def folder_export(
-    trained: Trained, to: str, tool: str, files: Mapping[str, bytes], *, use: str, about: str, checked: str
+def with_readme(
+    trained: Trained, to: str, files: Mapping[str, bytes], *, use: str, about: str, summary: Sequence[str]
 ) -> Exported:
-    """Return an export of several files, with a README beside them; ``about``: what stands behind the units."""
-    title = f"Dynamics of {trained.robot} {tool}"
-    text = readme(title, use, trained.joint_names, f"{UNITS}; {about}", checked)
-    return Exported(to, trained.robot, {**files, "README.md": text}, (checked,))
+    """Return an export with a README. about: follows the units in its conventions. summary: without full stops."""
+    exporter, conventions = EXPORTERS[to], f"{UNITS}; {about}"
+    title, result = f"Dynamics of {trained.robot} {exporter.title}", f"{'; '.join(summary)}."
+    name = f"{exporter.suffix}.README.md" if exporter.suffix else "README.md"
+    text = readme(title, use, trained.joint_names, conventions, result)
+    return Exported(to, trained.robot, {**files, name: text}, tuple(summary))
 
 
 def readme(title: str, use: str, joints: Sequence[str], conventions: str, checked: str) -> bytes:
-    """Return the five lines beside an export: title, use, joints in their order, conventions, result of the check."""
-    # names come from a file that anyone may have written
+    """Return the five lines of a README: title, use, order of the joints, conventions, result of the parity check."""
+    # names come from an untrusted file
     lines = [f"# {title}", use, f"Joints, in this order: {', '.join(joints)}.", conventions, checked]
     return ("\n".join(map(printable, lines)) + "\n").encode()

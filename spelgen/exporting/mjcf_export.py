@@ -1,24 +1,30 @@
-"""--to mjcf: a file that MuJoCo loads, held against the model in MuJoCo itself."""
+"""--to mjcf: a file for MuJoCo, with bodies in the frames of their joints, compared with the model in MuJoCo."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 import torch
+from lxml import etree
 
-from spelgen.arm.arm import Arm
-from spelgen.exporting.describe import Trained
-from spelgen.exporting.exported import UNITS, Exported, readme
-from spelgen.exporting.mjcf_file import mjcf_text
+from spelgen.arm.arm import Chain, Coordinate
+from spelgen.dynamics.body_regressor import about_center, quaternion
+from spelgen.exporting.describe import Trained, tip_frame
+from spelgen.exporting.description import Servos
+from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Parity, Values, random_inputs, relative, require_parity
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection, rigid_body_projection
 from spelgen.exporting.tuning import TUNING
 
+SECTIONS = ("worldbody", "equality", "tendon", "actuator")
+
 
 def export_mjcf(trained: Trained) -> Exported:
-    """Return the MJCF of a trained model: its own bodies where it has such, else the nearest ones.
+    """Return the MJCF of a trained model, with its rigid bodies or the nearest ones.
 
-    Raises RunError where MuJoCo's M, bias and forward dynamics are not those bodies'.
+    Raises RunError if M, bias and forward dynamics of these bodies differ in MuJoCo.
     """
     projection = rigid_body_projection(trained.model, trained.arm)
     text = mjcf_text(projection)
@@ -36,23 +42,21 @@ def export_mjcf(trained: Trained) -> Exported:
         "mujoco.MjModel.from_xml_path(FILE.xml): bodies by the names of the links that their joints move, armature, "
         f"viscous friction as damping and Coulomb friction as frictionloss, {actuators}"
     )
-    about = f"{UNITS}; a body's frame has its joint's axis as z; torque offsets of the sensors are left out."
-    result = f"{'; '.join((checked, *projection.summary))}."
-    text_of_readme = readme(f"{trained.robot} for MuJoCo", use, trained.joint_names, about, result)
-    files = {".xml": text, ".xml.README.md": text_of_readme}
-    return Exported("mjcf", trained.robot, files, (*projection.summary, checked))
+    about = "a body's frame has its joint's axis as z; torque offsets of the sensors are left out."
+    summary = [*projection.summary, checked]
+    return with_readme(trained, "mjcf", {".xml": text}, use=use, about=about, summary=summary)
 
 
 def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNING.states) -> Parity:
-    """Compare M, bias and forward dynamics without friction, of MuJoCo and of the bodies' own model. Raises RunError.
+    """Compare M, bias and forward dynamics without friction in MuJoCo with the model of the bodies. Raises RunError.
 
-    Under position servos the actuators are given commands.
+    Inputs of the actuators are torques, or commands of position servos.
     """
-    arm, servos = projection.arm.arm, projection.servos
+    arm, servos = projection.arm.chain, projection.servos
     random = random_inputs(arm.coordinates, states)
     controls = torques = random["tau"]
     if servos is not None:
-        # MuJoCo's position actuators have no dead zone
+        # without dead zone, as MuJoCo's position actuators
         controls = random["u"]
         torques = servos.kp * (controls - random["q"]) - servos.kd * random["qd"]
         torques = np.clip(torques, -servos.limit, servos.limit)
@@ -67,13 +71,20 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
     return require_parity(differences, TUNING.mujoco_tolerance, states)
 
 
-def _simulated(text: bytes, arm: Arm, q: np.ndarray, qd: np.ndarray, controls: np.ndarray) -> Values:
-    """Return M, bias and, where no joint follows another, accelerations of states, by the coordinates of the arm."""
+def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls: np.ndarray) -> Values:
+    """Return M, bias and, without mimic joints, accelerations in MuJoCo, in the coordinates of the arm.
+
+    Args:
+        text: MJCF.
+        arm: with n coordinates.
+        q, qd: (states, n).
+        controls: inputs of the actuators, (states, n).
+    """
     model = mujoco.MjModel.from_xml_string(text.decode())
-    # MuJoCo's friction is not the model's: it is left out of the comparison
+    # without friction, which has another form in MuJoCo
     model.dof_damping[:] = 0.0
     model.dof_frictionloss[:] = 0.0
-    # followers move with their leaders
+    # positions and velocities of all joints, mimic joints included, from the coordinates
     jacobian = np.zeros((model.nv, len(arm.coordinates)))
     offset = np.zeros(model.nv)
     for body in arm.bodies:
@@ -93,7 +104,118 @@ def _simulated(text: bytes, arm: Arm, q: np.ndarray, qd: np.ndarray, controls: n
         values["mass_matrix"].append(jacobian.T @ full @ jacobian)
         values["bias"].append(jacobian.T @ data.qfrc_bias)
         values["forward_dynamics"].append(jacobian.T @ data.qacc)
-    # MuJoCo's constraint for followers is soft
+    # mimic joints are soft constraints in MuJoCo
     if model.nv > len(arm.coordinates):
         del values["forward_dynamics"]
     return {name: np.array(rows) for name, rows in values.items()}
+
+
+def mjcf_text(projection: RigidBodyProjection) -> bytes:
+    """Return the MJCF of a projection.
+
+    Actuators are motors, one per nonzero column of G, or a position actuator per joint with a position servo.
+    """
+    arm = projection.arm.chain
+    root = etree.Element("mujoco", model=arm.name)
+    # the default is degrees; autolimits: a given range is a limit
+    _add(root, "compiler", angle="radian", autolimits="true")
+    _add(root, "option", gravity=arm.gravity)
+    world, equality, tendons, actuators = (etree.SubElement(root, tag) for tag in SECTIONS)
+    is_coupled = np.count_nonzero(projection.motors, axis=1) > 1
+    elements = [world]
+    for body, inertia in zip(arm.bodies, projection.inertias, strict=True):
+        name = projection.arm.robot.joint[body.name].child
+        pose = {"pos": body.translation, "quat": quaternion(body.rotation)}
+        element = _add(elements[body.parent + 1], "body", name=name, **pose)
+        elements.append(element)
+        mass, center, tensor = about_center(inertia)
+        # the order of MuJoCo: xx, yy, zz, xy, xz, yz
+        moments = tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        _add(element, "inertial", mass=mass, pos=center, fullinertia=moments)
+        joint_type = "hinge" if body.joint_type == "revolute" else "slide"
+        joint = {"name": body.name, "axis": (0, 0, 1), "type": joint_type}
+        leader = arm.coordinates[body.coordinate]
+        if leader.name == body.name:
+            _add(element, "joint", **joint, **_drive(projection, body.coordinate, is_coupled))
+            continue
+        # a mimic joint has no motor, friction and limits; in MuJoCo it is a soft constraint, with a polynomial of the
+        # leader's position
+        _add(element, "joint", **joint)
+        polynomial = body.offset, body.multiplier, 0, 0, 0
+        _add(equality, "joint", joint1=body.name, joint2=leader.name, polycoef=polynomial)
+    tip = tip_frame(projection.arm)
+    pose = {"pos": tip.pose[:3, 3], "quat": quaternion(tip.pose[:3, :3])}
+    _add(elements[tip.carrier + 1], "site", name=tip.link, **pose)
+    for k in np.flatnonzero(is_coupled).tolist():
+        rotor = _add_tendon(tendons, f"rotor{k + 1}", arm.coordinates, projection.motors[k])
+        rotor.set("armature", _text(projection.armature[k]))
+    if projection.servos is None:
+        _add_motors(actuators, tendons, projection)
+    else:
+        _add_servos(actuators, arm.coordinates, projection.servos)
+    for section in (equality, tendons):
+        if not len(section):
+            root.remove(section)
+    # indented for people
+    etree.indent(root)
+    text: bytes = etree.tostring(root, xml_declaration=True, encoding="utf-8")
+    return text + b"\n"
+
+
+def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> dict[str, object]:
+    """Return motor and friction attributes of joint k, which is no mimic joint; is_coupled: (n,)."""
+    friction = projection.friction
+    return {
+        # the rotor of a motor that several joints rotate is the armature of a tendon
+        "armature": 0.0 if is_coupled[k] else projection.armature[k],
+        "damping": friction.viscous[k],
+        "frictionloss": friction.coulomb[k],
+        "solimpfriction": " ".join(f"{number:g}" for number in TUNING.friction_impedance),
+        "range": projection.arm.chain.coordinates[k].limits,
+    }
+
+
+def _add_motors(actuators: etree._Element, tendons: etree._Element, projection: RigidBodyProjection) -> None:
+    """Add a motor for each input: at a joint, or at a tendon if it acts on several joints."""
+    joints = projection.arm.chain.coordinates
+    for k, column in enumerate(projection.inputs.T):
+        name, driven = joints[k].name, np.flatnonzero(column)
+        if driven.size == 1:
+            (index,) = driven
+            _add(actuators, "motor", name=name, joint=joints[index].name, gear=column[index])
+        elif driven.size > 1:
+            _add_tendon(tendons, f"motor{k + 1}", joints, column)
+            _add(actuators, "motor", name=name, tendon=f"motor{k + 1}")
+
+
+def _add_servos(actuators: etree._Element, joints: Sequence[Coordinate], servos: Servos) -> None:
+    """Add a position actuator for each joint, whose control is the delayed command."""
+    for k, joint in enumerate(joints):
+        limit = servos.limit[k]
+        force = (-limit, limit) if np.isfinite(limit) else None
+        gains = {"kp": servos.kp[k], "kv": servos.kd[k]}
+        _add(actuators, "position", name=joint.name, joint=joint.name, **gains, forcerange=force)
+
+
+def _add_tendon(
+    tendons: etree._Element, name: str, joints: Sequence[Coordinate], coefficients: np.ndarray
+) -> etree._Element:
+    """Add a tendon whose length is the sum of joint positions times coefficients (n,)."""
+    tendon = _add(tendons, "fixed", name=name)
+    for joint, coefficient in zip(joints, coefficients, strict=True):
+        if coefficient:
+            _add(tendon, "joint", joint=joint.name, coef=coefficient)
+    return tendon
+
+
+def _add(parent: etree._Element, tag: str, **attributes: object) -> etree._Element:
+    """Add an element; attributes that are None are omitted."""
+    texts = {name: _text(value) for name, value in attributes.items() if value is not None}
+    return etree.SubElement(parent, tag, texts)
+
+
+def _text(value: object) -> str:
+    """Return a text unchanged, or numbers with all digits."""
+    if isinstance(value, str):
+        return value
+    return " ".join(f"{float(number):.17g}" for number in np.ravel(value))  # type: ignore[call-overload]

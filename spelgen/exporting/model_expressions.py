@@ -1,4 +1,4 @@
-"""The quantities of a trained model as CasADi expressions of q, qd and symbols of its residuals."""
+"""Entry points of a trained model as CasADi expressions of q, qd, the friction state and symbols of residual terms."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ import numpy as np
 
 from spelgen.exporting.description import Servos, TrainedModel
 from spelgen.exporting.entry_points import EntryPoint
-from spelgen.exporting.friction_expressions import bristle_step, friction_torque, sliding_bristles
 from spelgen.exporting.residual_expressions import (
     Symbols,
     coriolis,
     residual_symbols,
-    symbol_slopes,
+    symbol_jacobians,
     symmetric,
 )
 from spelgen.exporting.rigid_expressions import (
@@ -26,13 +25,13 @@ from spelgen.exporting.rigid_expressions import (
 )
 
 RESIDUAL = "residual_"
-"""Stands before the names of residuals among a function's inputs."""
+"""Prefix of the names of residual terms among the inputs of a function."""
 
 Outputs = dict[str, tuple[ca.SX, ...]]
 
 
 def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
-    """Return entry points as functions of their inputs, then of the residuals that they need; outputs are dense."""
+    """Return entry points as functions of their inputs and of the residual terms that they need; outputs are dense."""
     names = ("q", "qd", "qdd", "tau", "dq", "u")
     inputs = {name: ca.SX.sym(name, model.n) for name in names}
     inputs["z"] = ca.SX.sym("z", model.memory)
@@ -48,30 +47,35 @@ def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint])
             if symbols.nnz() and ca.depends_on(ca.veccat(*outputs), symbols):
                 arguments[RESIDUAL + key] = symbols
         labels = list(arguments), list(entry.outputs)
-        # what is computed twice becomes one step: by cse
+        # cse: common subexpressions are computed once
         functions[name] = ca.Function(name, list(arguments.values()), outputs, *labels, {"cse": True})
     return functions
 
 
 def residuals_needed(function: ca.Function) -> list[str]:
-    """Return the names of the residuals that a function of ``expression_functions`` takes."""
+    """Return the names of the residual terms among the inputs of a function of ``expression_functions``."""
     return [name.removeprefix(RESIDUAL) for name in function.name_in() if name.startswith(RESIDUAL)]
 
 
 def _expressions(
     model: TrainedModel, inputs: Symbols, residuals: Symbols, *, derivatives: bool = False
 ) -> Outputs:
-    """Return all but derivatives by name of the entry point, of M(q) qdd + h(q, qd) + friction = G (tau - offset).
+    """Return all entry points except derivatives, of M(q) qdd + h(q, qd) + friction = G (tau - offset) + compensation.
 
-    inputs: symbols of n rows, z of K n. derivatives: whether residuals come with their derivatives by q. ``force`` is
-    M qdd + h + friction, less what the drives add unseen, (n, 1).
+    ``force`` is M qdd + h + friction - compensation, (n, 1).
+
+    Args:
+        model: description.
+        inputs: symbols q, qd, qdd, tau, dq, u, (n, 1) each, and z, (n K, 1).
+        residuals: symbols of the residual terms.
+        derivatives: whether the residual terms are given with their derivatives with respect to q.
     """
     q, qd, qdd, tau, dq, u, z = inputs.values()
     standstill = ca.SX(model.n, 1)
     motors = constant(model.motors)
     frames = body_frames(model.arm.bodies, q)
     rigid_mass, rigid_potential = mass_and_potential(model, q)
-    # of drives and residuals
+    # of motors and residual terms
     added_mass = constant(model.constant_mass) + symmetric(model, residuals["mass"])
     mass = rigid_mass + added_mass
     rigid_gravity = rigid_torque(model, frames, standstill, standstill)
@@ -85,7 +89,7 @@ def _expressions(
         drive_friction[joint] *= ca.exp(residuals["factor"][k])
     friction = motors.T @ drive_friction
     compensation = constant(model.friction_compensation) * qd
-    # one pass of Newton and Euler, where M qdd + h would take two
+    # one recursive Newton-Euler pass; M qdd + h would take two
     force = rigid_torque(model, frames, qd, qdd) + added_mass @ qdd + added_bias + friction - compensation
     applied = constant(model.inputs) @ (tau - model.torque_offset)
     momentum = mass @ qd
@@ -99,10 +103,8 @@ def _expressions(
         "bias": bias,
         "gravity": rigid_gravity + added_gravity,
         "friction": friction,
-        "friction_step": bristle_step(model.reach, z, motors @ dq),
-        "friction_memory": sliding_bristles(
-            model.reach, model.friction.coulomb_smoothing_velocity, motors @ qd
-        ),
+        "friction_step": bristle_step(model.breakaway, z, motors @ dq),
+        "friction_memory": sliding_bristles(model, motors @ qd),
         "momentum": momentum,
         "energy": ca.vertcat(0.5 * ca.dot(qd, momentum), potential),
         "tip_pose": pose,
@@ -113,13 +115,72 @@ def _expressions(
     return {name: (output,) for name, output in outputs.items()}
 
 
+def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) -> ca.SX:
+    """Return the friction torque of the motors, (n, 1) [Nm, N], as ``runtime.friction_laws``.
+
+    Args:
+        model: description.
+        qd: velocities of the motors, (n, 1).
+        gravity: gravity torques of the motors, (n, 1).
+        z: friction state, (n K, 1), the K elements of the first joint first.
+    """
+    constants = model.friction
+    # ca.reshape is column-major: a column for the elements of each joint
+    deflection = ca.reshape(
+        z * (constants.bristle_fractions / model.breakaway).ravel(), model.breakaway.shape[1], model.n
+    )
+    # of dry friction, in [-1, 1]: depends on velocity or on bristles
+    direction = constants.memoryless * _smooth_sign(qd, constants.coulomb_smoothing_velocity)
+    direction += ca.sum1(deflection).T
+    load = ca.sqrt(gravity**2 + constants.min_load**2)
+    speed = ca.fabs(qd) / constants.stribeck_velocity
+    rounding = constants.stribeck_rounding
+    slow = 1 / (1 + (1 + rounding) / 8 * speed**2 / (speed + rounding))
+    for _ in range(3):  # to the power of 8
+        slow = slow * slow
+    dry = constants.coulomb + constants.load_dependence * load + constants.stribeck * slow
+    viscous = constants.viscous * qd + constants.saturation * _smooth_sign(qd, constants.saturation_velocity)
+    torque: ca.SX = viscous + dry * direction
+    return torque
+
+
+def _smooth_sign(velocity: ca.SX, width: np.ndarray) -> ca.SX:
+    """Return the direction of velocities (n, 1), smoothed over widths (n,), (n, 1)."""
+    return velocity / ca.sqrt(velocity**2 + width**2)
+
+
+def sliding_bristles(model: TrainedModel, qd: ca.SX) -> ca.SX:
+    """Return z, (n K, 1), of motors that have moved at qd (n, 1) for a long time."""
+    direction = ca.tanh(qd / model.friction.coulomb_smoothing_velocity)
+    z: ca.SX = _per_element(model.breakaway, direction) * model.breakaway.ravel()
+    return z
+
+
+def bristle_step(breakaway: np.ndarray, z: ca.SX, dq: ca.SX) -> ca.SX:
+    """Return z, (n K, 1), after a monotonic displacement of the motors.
+
+    Args:
+        breakaway: break-away displacements, (n, K).
+        z: before, (n K, 1).
+        dq: displacements, (n, 1).
+    """
+    limit = breakaway.ravel()
+    z_next: ca.SX = ca.fmin(ca.fmax(z + _per_element(breakaway, dq), -limit), limit)
+    return z_next
+
+
+def _per_element(breakaway: np.ndarray, values: ca.SX) -> ca.SX:
+    """Return values (n, 1) repeated for the K elements of each joint, (n K, 1)."""
+    return ca.vec(ca.repmat(values.T, breakaway.shape[1], 1))
+
+
 def _inputs(model: TrainedModel, force: ca.SX) -> ca.SX:
-    """Return the inputs that make these forces, (n, columns)."""
-    # a passive joint's own torque is what it lacks
+    """Return the inputs for generalised forces (n, columns); of a passive joint, the torque that it would need."""
     return constant(np.linalg.inv(model.inputs + np.diag(1 - model.actuated))) @ force
 
 
 def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
+    """Return the torque of position servos, (n, 1), for delayed commands u, q and qd, (n, 1)."""
     error = u - q
     if servos.dead_zone.any():
         error -= ca.fmin(ca.fmax(error, -servos.dead_zone), servos.dead_zone)
@@ -131,22 +192,22 @@ def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
 
 
 def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Outputs:
-    """Return derivatives of inverse and forward dynamics by q, qd and tau, (n, n) each.
+    """Return derivatives of inverse and forward dynamics with respect to q, qd and tau, (n, n) each.
 
-    Those of forward dynamics are M^-1 times those of the force at its qdd (Carpentier and Mansard, RSS 2018).
+    dqdd/dx = -M^-1 dforce/dx at qdd of the forward dynamics (Carpentier and Mansard, RSS 2018).
     """
     expressions = _expressions(model, inputs, residuals, derivatives=True)
     (force,), (mass,) = expressions["force"], expressions["mass_matrix"]
     symbols = [inputs["q"]]
-    slopes = [ca.SX.eye(model.n)]
-    # the chain rule through what the program computes by loops
-    for symbol, slope in symbol_slopes(model, residuals):
+    jacobians = [ca.SX.eye(model.n)]
+    # the chain rule: residual terms, which a program computes by loops, are symbols that depend on q
+    for symbol, jacobian in symbol_jacobians(model, residuals):
         symbols.append(symbol)
-        slopes.append(slope)
-    by_position = ca.jtimes(force, ca.vertcat(*symbols), ca.vertcat(*slopes))
+        jacobians.append(jacobian)
+    by_position = ca.jtimes(force, ca.vertcat(*symbols), ca.vertcat(*jacobians))
     by_velocity = ca.jacobian(force, inputs["qd"])
     right = ca.horzcat(-by_position, -by_velocity, constant(model.inputs))
-    # the derivatives at the acceleration that the torques give
+    # at the accelerations of the forward dynamics
     right = ca.substitute(right, inputs["qdd"], *expressions["forward_dynamics"])
     return {
         "inverse_dynamics_derivatives": (_inputs(model, by_position), _inputs(model, by_velocity)),
@@ -155,13 +216,13 @@ def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Ou
 
 
 def _solve(matrix: ca.SX, right: ca.SX) -> ca.SX:
-    """Return matrix^-1 right by L D L^T, (n, columns); matrix is positive definite.
+    """Return matrix^-1 right, (n, columns), by L D L^T; matrix: positive definite, (n, n).
 
-    Its lower triangle is never read, so that CasADi computes half of it. ``ca.ldl`` divides 21 times where this
-    divides 6 times.
+    The lower triangle is not used, so CasADi computes only one triangle. For n = 6 there are 6 divisions; ``ca.ldl``
+    needs 21.
     """
     n = matrix.shape[0]
-    # copies: they are changed
+    # copies, which are changed in place
     matrix = ca.SX(matrix)
     right = ca.SX(right)
     factors: list[ca.SX] = []

@@ -1,4 +1,4 @@
-"""--to onnx: the programs of torch.export as ONNX files, any batch size, float64."""
+"""--to onnx: programs of torch.export as ONNX files in float64, for any batch size."""
 
 from __future__ import annotations
 
@@ -18,37 +18,37 @@ from torch.overrides import TorchFunctionMode
 
 from spelgen.dynamics.prepared import PreparedModel
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.entry_points import chosen
-from spelgen.exporting.exported import Exported, folder_export
+from spelgen.exporting.entry_points import select_names
+from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.torch_export import PROGRAMS, export_program, program_inputs, program_output
 from spelgen.exporting.tuning import TUNING
 
 
 def export_onnx(trained: Trained) -> Exported:
-    """Return an .onnx for each entry point. Raises RunError where ONNX Runtime and the model differ."""
+    """Return an .onnx file for each entry point. Raises RunError if ONNX Runtime and the model differ."""
     model = trained.model.prepared()
     models, files = {}, {}
-    for name in chosen(trained.entries, PROGRAMS):
+    for name in select_names(trained.entries, PROGRAMS):
         models[name] = files[f"{name}.onnx"] = onnx_model(model, name)
     parity = check_parity(called_by_onnx(models), trained, list(models), TUNING.onnx_tolerance)
-    checked = f"Checked when exported, by ONNX Runtime {onnxruntime.__version__}: {parity.summary}."
+    checked = f"Checked when exported, by ONNX Runtime {onnxruntime.__version__}: {parity.summary}"
     use = (
         "onnxruntime.InferenceSession('forward_dynamics.onnx').run(['qdd'], {'q': q, 'qd': qd, 'tau': tau}), "
         "float64 (batch, n), any batch."
     )
     size = model.n * model.elements
-    about = f"one file an entry point: {', '.join(models)}."
+    about = f"one file per entry point: {', '.join(models)}."
     if size:
-        about = f"z, friction's memory, is (batch, {size}); {about}"
-    return folder_export(trained, "onnx", "in ONNX", files, use=use, about=about, checked=checked)
+        about = f"z, the friction state, is (batch, {size}); {about}"
+    return with_readme(trained, "onnx", files, use=use, about=about, summary=[checked])
 
 
 def onnx_model(model: PreparedModel, name: str) -> bytes:
     """Return the serialised ONNX model of an entry point."""
     with _silent_exporter():
-        with _WrittenOut():
-            program = export_program(model, name, flat_memory=True)
+        with _Decomposed():
+            program = export_program(model, name, flat_state=True)
         exported = torch.onnx.export(
             program,
             dynamo=True,
@@ -59,7 +59,7 @@ def onnx_model(model: PreparedModel, name: str) -> bytes:
         )
     assert exported is not None
     content = exported.model_proto
-    # torch's own names for each node: two thirds of the file
+    # without torch's metadata of each node, two thirds of the file
     for described in (content, content.graph, *content.graph.node):
         described.ClearField("metadata_props")
     serialised: bytes = content.SerializeToString()
@@ -68,7 +68,7 @@ def onnx_model(model: PreparedModel, name: str) -> bytes:
 
 @contextmanager
 def _silent_exporter() -> Iterator[None]:
-    """Silence torch, which tells that torchvision is absent, and that it uses what is deprecated."""
+    """Suppress warnings of torch about absent torchvision and deprecated functions."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -79,18 +79,18 @@ def _silent_exporter() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _cross(left: Tensor, right: Tensor, *, dim: int) -> Tensor:
-    """Return the cross product of vectors along a dimension."""
-    following, last = torch.tensor([1, 2, 0]), torch.tensor([2, 0, 1])
-    forward = left.index_select(dim, following) * right.index_select(dim, last)
-    return forward - left.index_select(dim, last) * right.index_select(dim, following)
+def _cross(a: Tensor, b: Tensor, *, dim: int) -> Tensor:
+    """Return the cross product along a dimension of size 3; a, b: (...,), of equal shapes."""
+    second, third = torch.tensor([1, 2, 0]), torch.tensor([2, 0, 1])
+    forward = a.index_select(dim, second) * b.index_select(dim, third)
+    return forward - a.index_select(dim, third) * b.index_select(dim, second)
 
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
-    """Return matrix^-1 right by Gauss and Jordan; M is positive definite and needs no pivoting."""
-    n = matrix.shape[-1]  # a constant of the program, so that the loop is written out
+    """Return matrix^-1 right, (..., n, columns), by Gauss-Jordan elimination; no pivoting: definite matrix."""
+    n = matrix.shape[-1]  # constant, so the program has the unrolled loop
     identity = torch.eye(n, dtype=matrix.dtype)
-    # a matrix of inputs has no batch, nor has a right side that is the identity
+    # the matrix or the right-hand side may have no batch dimension
     batch = torch.broadcast_shapes(matrix.shape[:-2], right.shape[:-2])
     rows = torch.cat([matrix.expand(*batch, n, n), right.expand(*batch, *right.shape[-2:])], dim=-1)
     for k in range(n):
@@ -101,7 +101,7 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
 
 
 def _solve_triangular(matrix: Tensor, right: Tensor, *, upper: bool, unitriangular: bool) -> Tensor:
-    """Return matrix^-1 right, of a matrix whose other triangle is zero and whose diagonal stands for ones."""
+    """Return matrix^-1 right, (..., n, columns), for a triangular matrix (..., n, n) whose diagonal counts as ones."""
     identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype)
     return _solve(matrix - matrix * identity + identity, right)
 
@@ -112,34 +112,34 @@ class _Cholesky(NamedTuple):
 
 
 def _cholesky_ex(matrix: Tensor) -> _Cholesky:
-    """Return in place of a Cholesky factor the matrix, and 1 where it is not positive definite, else 0.
+    """Return the matrix, (..., n, n), and info (...): 0 if it is positive definite, otherwise 1.
 
-    Networks of M use the second alone.
+    Networks of M use info only, so the factor is not computed.
     """
     rows = matrix
     info = torch.zeros(matrix.shape[:-2], dtype=torch.int32)
     for k in range(matrix.shape[-1]):
         pivot = rows[..., k : k + 1, k : k + 1]
-        # a pivot that is NaN counts as not positive
+        # also 1 for NaN
         info = torch.where(pivot[..., 0, 0] > 0, info, 1)
         rows = rows - rows[..., k : k + 1] * rows[..., k : k + 1, :] / pivot
     return _Cholesky(matrix, info)
 
 
 def _scalar_tensor(s: float, dtype: int = onnx.TensorProto.DOUBLE, **options: object) -> onnxscript.ir.Value:
-    """Return a constant: torch's own translation rounds it to float32 first, an error of 1e-8 in networks."""
+    """Return a constant. The translation of torch rounds it to float32, an error of 1e-8 in networks."""
     value = np.array(s, dtype=onnx.helper.tensor_dtype_to_np_dtype(dtype))
     constant = onnxscript.opset18.Constant(value=onnx.numpy_helper.from_array(value))
     return cast("onnxscript.ir.Value", constant)
 
 
 def _softplus(x: Tensor) -> Tensor:
-    """Return log(1 + exp x), and x where that is it to all digits: ONNX Runtime has it in float32 alone."""
+    """Return log(1 + exp x), (...), or x if both are equal in float64; ONNX Runtime has float32 only."""
     return torch.where(x > 20.0, x, x.exp().log1p())
 
 
-class _WrittenOut(TorchFunctionMode):
-    """Write out by others, while a program is traced, what ONNX has no operators for."""
+class _Decomposed(TorchFunctionMode):
+    """Replace functions without ONNX operators by decompositions while a program is traced."""
 
     functions: ClassVar[dict[object, Callable[..., object]]] = {
         torch.nn.functional.softplus: _softplus,
@@ -156,12 +156,12 @@ class _WrittenOut(TorchFunctionMode):
         args: tuple[object, ...] = (),
         kwargs: dict[str, object] | None = None,
     ) -> object:
-        """Call in place of a function the one that stands for it."""
+        """Call the decomposition of a function, if there is one."""
         return self.functions.get(func, func)(*args, **(kwargs or {}))
 
 
 def called_by_onnx(files: Mapping[str, bytes]) -> Called:
-    """Return what calls the entry points in ONNX Runtime, for arrays of states."""
+    """Return a function that calls entry points in ONNX Runtime, for arrays of states."""
     sessions = {name: onnx_session(content) for name, content in files.items()}
 
     def called(name: str, inputs: Values) -> Values:
@@ -173,10 +173,10 @@ def called_by_onnx(files: Mapping[str, bytes]) -> Called:
 
 
 def onnx_session(content: bytes) -> onnxruntime.InferenceSession:
-    """Return a session on one core: the matrices are small."""
+    """Return a session with one thread."""
     options = onnxruntime.SessionOptions()
-    # threads cost more than they take off such small matrices
+    # synchronisation would take longer than operations with small matrices
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
-    options.log_severity_level = 3  # an input that a graph does not need is no matter
+    options.log_severity_level = 3  # no warnings of unused inputs
     return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])

@@ -1,10 +1,11 @@
-"""The parity check: the largest difference between an export and the torch model at random states."""
+"""Parity check: the largest difference between an export and the torch model at random states."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,39 +24,54 @@ from spelgen.structure.nominal import working_range
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
 
-_USUAL_SPEED = {"revolute": 1.0, "prismatic": 0.3}  # rad/s, m/s where the URDF names none
-
-_METHODS = {
-    "bias": "nonlinear_effects",
-    "friction": "friction_torque",
-    "friction_step": "memory_after",
-    "friction_memory": "memory",
-    "servo_torque": "servo",
-}
-"""The model's names of entry points, where they are others."""
+# Speeds of joints without a velocity limit [rad/s], [m/s].
+_NOMINAL_SPEEDS = {"revolute": 1.0, "prismatic": 0.3}
 
 Values = dict[str, np.ndarray]
+"""Inputs or outputs of an entry point by name, (states, ...) each."""
 Called = Callable[[str, Values], Mapping[str, np.ndarray]]
-"""An export: takes an entry point's name and its inputs, (states, n) each, to its outputs, (states, ...)."""
+"""A function that calls an entry point of an export, by name, with inputs (states, n), and returns its outputs."""
+
+
+def _energy(model: ArmModel, q: Tensor, qd: Tensor) -> Tensor:
+    """Return kinetic and potential energy, (states, 2) [J], for q and qd (states, n)."""
+    kinetic = 0.5 * (model.momentum(q, qd) * qd).sum(dim=-1)
+    return torch.stack([kinetic, model.potential_energy(q)], dim=-1)
+
+
+_REFERENCES: dict[str, Callable[..., Tensor]] = {
+    "inverse_dynamics": lambda model, *inputs: model.inverse_dynamics(*inputs),
+    "forward_dynamics": lambda model, *inputs: model.forward_dynamics(*inputs),
+    "mass_matrix": lambda model, q: model.mass_matrix(q),
+    "bias": lambda model, q, qd: model.nonlinear_effects(q, qd),
+    "gravity": lambda model, q: model.gravity(q),
+    "friction": lambda model, *inputs: model.friction_torque(*inputs),
+    "friction_step": lambda model, z, dq: model.memory_after(z, dq).flatten(-2),
+    "friction_memory": lambda model, qd: model.memory(qd).flatten(-2),
+    "momentum": lambda model, q, qd: model.momentum(q, qd),
+    "energy": _energy,
+    "servo_torque": lambda model, u, q, qd: model.servo(u, q, qd),
+}
+"""The outputs of entry points by the torch model, except for derivatives and the tip."""
 
 
 @dataclass(frozen=True)
 class Parity:
-    """The largest difference to the torch model by entry point, relative to the largest value; a sentence on them."""
+    """Largest difference to the torch model of each entry point, relative to its largest value; summary: a sentence."""
 
     differences: dict[str, float]
     summary: str
 
 
 def require_parity(differences: dict[str, float], tolerance: float, states: int) -> Parity:
-    """Return the differences at so many states. Raises RunError where one is larger than allowed."""
-    # what the tip is compared with rounds
+    """Return the parity of differences by entry point. Raises RunError if a difference is above the tolerance."""
+    # the reference of the tip rounds to float32
     tolerances = {
         name: max(tolerance, TUNING.tip_tolerance) if name.startswith("tip_") else tolerance
         for name in differences
     }
     for name, difference in differences.items():
-        if not difference <= tolerances[name]:  # NaN is refused as well
+        if not difference <= tolerances[name]:  # also true for NaN
             raise RunError(
                 f"{name} differs from the model by {difference:.1e}",
                 element="parity check",
@@ -79,82 +95,85 @@ def check_parity(
     states: int = TUNING.states,
     dtype: type = np.float64,
 ) -> Parity:
-    """Compare ``called`` with the torch model at random states, at each of these entry points. Raises RunError.
+    """Compare an export with the torch model at random states. Raises RunError for a difference above the tolerance.
 
-    dtype: of the export, to which the states are rounded for both.
+    Args:
+        called: calls the export.
+        trained: model and arm.
+        names: of the entry points.
+        tolerance: relative to the largest value of an output.
+        states: number of random states.
+        dtype: of the export; the inputs of both are rounded to it.
     """
-    inputs = random_inputs(trained.arm.arm.coordinates, states, trained.memory)
+    inputs = random_inputs(trained.arm.chain.coordinates, states, trained.memory)
     inputs = {key: value.astype(dtype).astype(np.float64) for key, value in inputs.items()}
-    # float32 of a model on another device would be the larger error
+    # in double precision: the rounding of a float32 model would exceed the tolerance
     exact = copy.deepcopy(trained.model).double().cpu().requires_grad_(False)
     differences: dict[str, float] = {}
     for name in names:
         outputs = called(name, inputs)
         expected = _expected(exact, trained, name, inputs)
-        # of one joint a matrix and a vector are one number, whichever a format makes of it
+        # reshaped: formats differ in the shape of matrices and vectors of one joint
         errors = [relative(outputs[key].reshape(value.shape), value) for key, value in expected.items()]
-        differences[name] = float(np.max(errors))  # NaN wins
+        differences[name] = float(np.max(errors))  # np.max returns NaN if any error is NaN
     return require_parity(differences, tolerance, states)
 
 
 def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 0) -> Values:
-    """Return states over the joints' ranges at their usual speeds, (states, n) each, and z, (states, memory)."""
-    # the same states each time: an export is reproducible
+    """Return random states in the joints' ranges, (states, n) each, and z, (states, memory).
+
+    They are the same in each call, since exports are reproducible.
+    """
     random = np.random.default_rng(0)
-    speed = usual_speeds(coordinates)
+    speed = nominal_speeds(coordinates)
     q = np.stack([random.uniform(*working_range(joint), states) for joint in coordinates], axis=-1)
     return {
         "q": q,
         "qd": 0.5 * speed * random.standard_normal(q.shape),
         "qdd": 2.0 * speed * random.standard_normal(q.shape),
         "dq": 0.05 * speed * random.standard_normal(q.shape),
-        # bristles bend by fractions of a milliradian before they slide
+        # break-away displacements are fractions of a milliradian
         "z": 1e-4 * random.standard_normal((states, memory)),
         "tau": 10.0 * random.standard_normal(q.shape),
         "u": q + 0.3 * random.standard_normal(q.shape),
     }
 
 
-def usual_speeds(coordinates: Sequence[Coordinate]) -> np.ndarray:
-    """Return the URDF's limits of velocity, or usual speeds where it has none, (n,) [rad/s, m/s]."""
-    return np.array([joint.velocity or _USUAL_SPEED[joint.kind] for joint in coordinates])
+def nominal_speeds(coordinates: Sequence[Coordinate]) -> np.ndarray:
+    """Return the velocity limits of the URDF, or nominal speeds of joints without a limit, (n,) [rad/s, m/s]."""
+    return np.array([joint.velocity or _NOMINAL_SPEEDS[joint.joint_type] for joint in coordinates])
 
 
 def relative(values: np.ndarray, expected: np.ndarray) -> float:
-    """Return the largest difference, relative to the largest value; NaN where one is NaN."""
+    """Return the largest difference of arrays (...,), relative to the largest expected value; NaN if any is NaN."""
     if not expected.size:
         return 0.0
-    # a quantity that is zero everywhere is compared as it is
+    # absolute if all expected values are zero
     size = np.abs(expected).max() or 1.0
     with np.errstate(invalid="ignore"):
         return float(np.abs(values - expected).max() / size)
 
 
 def _expected(model: ArmModel, trained: Trained, name: str, inputs: Values) -> Values:
-    """Return an entry point's outputs by the model in float64, (states, ...), by name."""
+    """Return the outputs of an entry point by the torch model, (states, ...), for inputs (states, n)."""
     entry = ENTRY_POINTS[name]
-    tensors: list[Tensor] = []
+    arguments: list[Tensor] = []
     for key in entry.inputs:
-        tensor = torch.from_numpy(inputs[key])
+        value = torch.from_numpy(inputs[key])
         if key != "z":
-            tensors.append(tensor)
+            arguments.append(value)
         elif trained.memory:
-            # joint by joint, as the model has it
-            tensors.append(tensor.unflatten(-1, (model.n, -1)))
+            arguments.append(value.unflatten(-1, (model.n, -1)))
+    outputs: Sequence[Tensor]
     if name.endswith("_derivatives"):
-        function = getattr(model, name.removesuffix("_derivatives"))
-        outputs: Sequence[Tensor] = batched_jacobians(function, len(entry.outputs), *tensors)
-    elif name == "energy":
-        q, qd = tensors
-        kinetic = 0.5 * (model.momentum(q, qd) * qd).sum(dim=-1)
-        outputs = [torch.stack([kinetic, model.potential_energy(q)], dim=-1)]
-    elif name in ("friction_step", "friction_memory"):
-        outputs = [tensors[0][:, :0]]
-        if trained.memory:
-            outputs = [getattr(model, _METHODS[name])(*tensors).flatten(-2)]
-    elif name in ("tip_pose", "tip_jacobian"):
-        outputs = [getattr(tip_kinematics(trained.arm), name.removeprefix("tip_"))(*tensors)]
+        function = partial(_REFERENCES[name.removesuffix("_derivatives")], model)
+        outputs = batched_jacobians(function, len(entry.outputs), *arguments)
+    elif name.startswith("tip_"):
+        tip = tip_kinematics(trained.arm)
+        outputs = [(tip.pose if name == "tip_pose" else tip.jacobian)(*arguments)]
+    elif name.startswith("friction_") and not trained.memory:
+        outputs = [arguments[0][:, :0]]
     else:
-        outputs = [getattr(model, _METHODS.get(name, name))(*tensors)]
+        outputs = [_REFERENCES[name](model, *arguments)]
     arrays = [output.detach().numpy() for output in outputs]
     return dict(zip(entry.outputs, arrays, strict=True))

@@ -1,12 +1,17 @@
-"""The part of a model beside its rigid bodies, as CasADi symbols and as CasADi expressions of q.
+"""Residual terms of a model, as CasADi symbols and as CasADi expressions of q.
 
-The scalar expressions of a model take it as symbols, so that a program may loop over weights and look up splines. Of
-M's entries that a network reaches (m of them) there are, by name: ``mass`` (m, 1); ``rate``, their change along qd;
-``kinetic``, d/dq of their 1/2 qd^T M qd (n, 1); of V's network ``energy`` and ``gravity``, dV/dq (n, 1); of single
-joints ``torque`` (n, 1) and ``torque_energy``; of the joints whose friction varies the logarithms ``factor`` (k, 1).
+Scalar expressions of a model contain residual terms as symbols, so that a program can compute them by loops over
+weights and lookup of splines. The symbols are, for R the part of M that the network of M adds to (m entries of its
+lower triangle), and k joints whose friction varies with q:
 
-Derivatives need, in place of rate and kinetic, ``first`` (m, n) and ``second`` (m, n n) by q, n columns for each joint;
-``stiffness`` (n, n) of V; ``torque_slope`` and ``factor_slope``.
+- ``mass`` (m, 1), entries of R; ``rate`` (m, 1), their time derivatives; ``kinetic`` (n, 1), d/dq of 1/2 qd^T R qd;
+- ``energy`` and ``gravity`` (n, 1), the network of V and its derivative with respect to q;
+- ``torque`` (n, 1) and ``torque_energy``, functions of single joints and their integral;
+- ``factor`` (k, 1), logarithms of the factors on friction.
+
+Derivatives need ``first`` (m, n) and ``second`` (m, n n) instead of rate and kinetic: derivatives of mass with respect
+to q, second derivatives in blocks of n columns per joint. They also need ``stiffness`` (n, n), d gravity / dq, and the
+derivatives ``torque_slope`` and ``factor_slope`` with respect to the position of the joint.
 """
 
 from __future__ import annotations
@@ -17,7 +22,7 @@ import casadi as ca
 import numpy as np
 from scipy.interpolate import BSpline
 
-from spelgen.exporting.description import Network, Residuals, TrainedModel, spline_energy
+from spelgen.exporting.description import Residuals, SigmoidNetwork, TrainedModel, spline_energy
 from spelgen.exporting.rigid_expressions import constant
 
 Symbols = dict[str, ca.SX]
@@ -25,17 +30,17 @@ Scalars = TypeVar("Scalars", ca.SX, ca.MX)
 
 
 def residual_symbols(model: TrainedModel) -> Symbols:
-    """Return symbols for all that a model may have, zeros for what it has not."""
+    """Return the symbols by name; structural zeros for terms that the model does not have."""
     n = model.n
     residuals = model.residuals
     entries, factors = len(residuals.entries), len(residuals.friction)
     has_potential = residuals.potential is not None
     sizes = {
         "mass": (entries, entries, 1),
-        # first derivatives along qd: a program takes them in one sweep, without n^2 numbers
+        # directional derivatives: a program computes them in one sweep, without all n columns of first
         "rate": (entries, entries, 1),
         "kinetic": (entries, n, 1),
-        # jets: second derivatives of forces need these
+        # for derivatives of forces
         "first": (entries, entries, n),
         "second": (entries, entries, n * n),
         "energy": (has_potential, 1, 1),
@@ -54,7 +59,7 @@ def residual_symbols(model: TrainedModel) -> Symbols:
 
 
 def symmetric(model: TrainedModel, values: ca.SX) -> ca.SX:
-    """Return the symmetric matrix, (n, n), with the values at the entries that the networks' part of M has."""
+    """Return the symmetric matrix, (n, n), with values (m, 1) at the entries of R."""
     matrix = ca.SX(model.n, model.n)
     for k, (row, column) in enumerate(model.residuals.entries):
         matrix[row, column] = matrix[column, row] = values[k]
@@ -62,7 +67,7 @@ def symmetric(model: TrainedModel, values: ca.SX) -> ca.SX:
 
 
 def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: bool) -> ca.SX:
-    """Return dR/dt qd - d/dq (1/2 qd^T R qd), (n, 1), of the networks' part R of M."""
+    """Return dR/dt qd - d/dq (1/2 qd^T R qd), (n, 1); qd: (n, 1). derivatives: whether ``first`` replaces rate."""
     if not derivatives:
         return symmetric(model, symbols["rate"]) @ qd - symbols["kinetic"]
     kinetic = symbols["first"].T @ _in_kinetic_energy(model, qd)
@@ -70,33 +75,33 @@ def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: b
 
 
 def _in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
-    """Return what each entry of M is multiplied by in 1/2 qd^T M qd, (entries, 1)."""
+    """Return the factor of each entry of R in 1/2 qd^T R qd, (m, 1); qd: (n, 1)."""
     products = []
     for row, column in model.residuals.entries:
-        # an entry beside the diagonal stands in M twice
+        # an off-diagonal entry occurs twice in R
         weight = 0.5 if row == column else 1.0
         products.append(weight * qd[row] * qd[column])
     return ca.vertcat(*products)
 
 
-def symbol_slopes(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX, ca.SX]]:
-    """Return the symbols that depend on q, (k, 1) each, with their derivatives by it, (k, n)."""
-    # the factor of a joint depends on that joint alone
+def symbol_jacobians(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX, ca.SX]]:
+    """Return the symbols that depend on q, (k, 1) each, with their derivatives with respect to q, (k, n)."""
+    # the factor of a joint depends on the position of this joint only
     joints = np.eye(model.n)[list(model.residuals.friction)]
     by_joint = ca.horzsplit(symbols["second"], model.n)
-    slopes = [
+    jacobians = [
         (symbols["factor"], symbols["factor_slope"] * ca.SX(joints)),
         (symbols["mass"], symbols["first"]),
         (ca.vec(symbols["first"]), ca.vertcat(*by_joint)),
         (symbols["gravity"], symbols["stiffness"]),
         (symbols["torque"], ca.diag(symbols["torque_slope"])),
     ]
-    # zeros of what a model has not depend on nothing
-    return [(symbol, slope) for symbol, slope in slopes if symbol.nnz()]
+    # without the terms that the model does not have
+    return [(symbol, jacobian) for symbol, jacobian in jacobians if symbol.nnz()]
 
 
 def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
-    """Return what the symbols stand for at q, without derivatives, as expressions of matrices."""
+    """Return expressions for the symbols, without derivatives, at q and qd (n, 1); qd: None if not needed."""
     residuals = model.residuals
     values: dict[str, ca.MX] = {}
     encoded = ca.vertcat(ca.cos(q), ca.sin(q), q)
@@ -107,7 +112,7 @@ def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str
             values["kinetic"] = ca.jtimes(mass, q, _in_kinetic_energy(model, qd), True)
     if residuals.potential is not None:
         values["energy"] = _network(residuals.potential, encoded)
-        # reverse sweep of CasADi: as cheap as the network itself
+        # reverse mode: takes about the time of the network
         values["gravity"] = ca.gradient(values["energy"], q)
     if residuals.has_torque:
         values["torque_energy"] = _torque_energy(residuals, q)
@@ -118,22 +123,22 @@ def residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str
     return values
 
 
-def _network(network: Network, encoded: ca.MX) -> ca.MX:
+def _network(network: SigmoidNetwork, encoded: ca.MX) -> ca.MX:
+    """Return the outputs, (outputs, 1), for inputs (3 n, 1)."""
     layer = encoded
     for weight, bias in zip(network.weights[:-1], network.biases[:-1], strict=True):
-        # CasADi has no sigmoid
+        # the sigmoid, which CasADi does not have
         layer = 1 / (1 + ca.exp(-(constant(weight) @ layer + bias)))
     return constant(network.weights[-1]) @ layer + network.biases[-1]
 
 
 def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
-    """Return V of single joints."""
+    """Return the potential energy of functions of single joints, (1, 1) [J], at q (n, 1)."""
     energy = ca.MX(0)
     for joint, spline in residuals.torque.items():
         energy += _spline(spline_energy(spline), q[joint])
     for ripple in residuals.ripple:
         frequencies = ripple.frequency * np.arange(1, len(ripple.cosines) + 1)
-        # (harmonics,)
         phase = frequencies * q[ripple.joint]
         energy += ca.dot(ripple.cosines / frequencies, ca.sin(phase))
         energy -= ca.dot(ripple.sines / frequencies, ca.cos(phase))
@@ -141,7 +146,7 @@ def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
 
 
 def _spline(spline: BSpline, q: ca.MX) -> ca.MX:
-    """Return the value at q; beyond the ends it stays as it is there."""
+    """Return the value at q, (1, 1); outside of the knots it is constant."""
     knots, degree = spline.t, spline.k
     inside = ca.fmin(ca.fmax(q, knots[degree]), knots[-degree - 1])
     return ca.bspline(inside, ca.DM(spline.c), [knots.tolist()], [degree], 1, {})

@@ -1,8 +1,8 @@
-"""Rigid bodies as CasADi expressions: torques by recursive Newton-Euler, M and V by the structure's own recursion.
+"""Rigid bodies as CasADi expressions: torques by recursive Newton-Euler, M and V by the recursion of the structure.
 
-Each body is seen in its joint's frame, whose z the joint turns about or slides along (Featherstone, Rigid Body Dynamics
-Algorithms, 2008, section 5.3, in the classical form of Khalil and Dombre, 2002, section 9.5). CasADi leaves
-out what is structurally zero: zeros of the geometry, and velocities that are given as ``ca.SX(n, 1)``.
+Bodies are expressed in the frames of their joints, whose z is the joint axis (Featherstone, Rigid Body Dynamics
+Algorithms, 2008, section 5.3, in the classical form of Khalil and Dombre, 2002, section 9.5). CasADi omits structural
+zeros: of the geometry, and velocities of ``ca.SX(n, 1)``.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ _Z = ca.sparsify(ca.DM([0, 0, 1]))
 
 
 def constant(values: object) -> ca.DM:
-    """Return numbers as a CasADi matrix whose zeros are structural."""
+    """Return numbers (rows, columns) as a CasADi matrix with structural zeros."""
     return ca.sparsify(ca.DM(np.array(values, dtype=float)))
 
 
 def body_frames(bodies: Sequence[Body], q: ca.SX) -> list[tuple[ca.SX, ca.SX]]:
-    """Return rotation and position of each body's frame in its parent's, at q, (n, 1)."""
+    """Return rotation (3, 3) and position (3, 1) of each body's frame in the frame of its parent, at q (n, 1)."""
     frames: list[tuple[ca.SX, ca.SX]] = []
     for body in bodies:
         rotation = ca.SX(constant(body.rotation))
         position = ca.SX(constant(body.translation))
         displacement = float(body.multiplier) * q[body.coordinate] + body.offset
-        if body.kind == "revolute":
+        if body.joint_type == "revolute":
             rotation = rotation @ rotation_about_z(displacement)
         else:
             position = position + rotation[:, 2] * displacement
@@ -40,9 +40,16 @@ def body_frames(bodies: Sequence[Body], q: ca.SX) -> list[tuple[ca.SX, ca.SX]]:
 
 
 def rigid_torque(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.SX, qdd: ca.SX) -> ca.SX:
-    """Return the torques of this motion of rigid bodies in gravity, without armature, (n, 1) [Nm, N]."""
+    """Return the torques of the rigid bodies, without armature, (n, 1) [Nm, N].
+
+    Args:
+        model: description.
+        frames: from `body_frames` at q.
+        qd, qdd: (n, 1); structural zeros are omitted.
+    """
     bodies = model.arm.bodies
-    # of the base, then of the bodies, in their own frames; in place of gravity the base accelerates upwards
+    # angular velocity, angular acceleration, acceleration and spin of the base, then of the bodies, in their frames;
+    # instead of gravity the base accelerates upwards
     gravity = np.array(model.arm.gravity, dtype=float)
     motions = [(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-gravity), ca.SX(3, 3))]
     forces: list[ca.SX] = []
@@ -55,13 +62,13 @@ def rigid_torque(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.
         acceleration = rotation.T @ (acceleration + spin @ position)
         w, rate = rotation.T @ w, rotation.T @ rate
         turning = ca.cross(w, _Z) * speed
-        if body.kind == "revolute":
+        if body.joint_type == "revolute":
             w = w + _Z * speed
             rate = rate + _Z * added + turning
         else:
-            # Coriolis: twice, for the point moves and its direction turns
+            # Coriolis acceleration: 2 w x v
             acceleration = acceleration + _Z * added + 2 * turning
-        # takes points of the body to their accelerations
+        # spin p is the acceleration of point p relative to the origin
         spin = ca.skew(rate) + w @ w.T - ca.dot(w, w) * ca.SX.eye(3)
         motions.append((w, rate, acceleration, spin))
         m, x, y, z, xx, xy, xz, yy, yz, zz = ten.tolist()
@@ -72,11 +79,11 @@ def rigid_torque(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.
         torque = ca.cross(moment, acceleration) + inertia @ rate
         torques.append(torque + ca.cross(w, inertia @ w))
     joint_torques = ca.SX(model.n, 1)
-    # children stand behind their parents
+    # children come after their parents
     for index in reversed(range(len(bodies))):
         body, force, torque = bodies[index], forces[index], torques[index]
-        along_axis = torque[2] if body.kind == "revolute" else force[2]
-        # several bodies share a joint where one follows another
+        along_axis = torque[2] if body.joint_type == "revolute" else force[2]
+        # mimic joints share the coordinate of their leader
         joint_torques[body.coordinate] += float(body.multiplier) * along_axis
         if body.parent >= 0:
             rotation, position = frames[index]
@@ -87,7 +94,7 @@ def rigid_torque(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.
 
 
 def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return M, (n, n), and V [J] of the rigid bodies: the recursion of the structure, over CasADi's scalars."""
+    """Return M, (n, n), and V, (1, 1) [J], of the rigid bodies at q (n, 1), by the recursion of `structure`."""
     positions = []
     for joint, base in enumerate(base_denominators(model.arm)):
         angle = q[joint] / base
@@ -95,13 +102,13 @@ def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     result = energies(model.arm, positions, model.inertias.tolist(), float)
     mass = ca.SX(model.n, model.n)
     for (row, column), entry in result.mass.items():
-        # one expression for both triangles: half of the work
+        # one expression for both triangles
         mass[row, column] = mass[column, row] = entry
     return mass, ca.SX(result.potential)
 
 
 def tip_kinematics(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return the tip link's pose in the root link's frame, (4, 4), and its Jacobian, (6, n): linear, then angular."""
+    """Return pose (4, 4) and Jacobian (6, n), linear then angular, of the tip link in the root frame, at q (n, 1)."""
     bodies = model.tip.bodies
     frames = body_frames(bodies, q)
     # poses of the root link, then of all bodies
@@ -116,7 +123,7 @@ def tip_kinematics(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
         # the axis is z of the body's frame
         axis, origin = poses[index + 1][:3, 2], poses[index + 1][:3, 3]
         column = ca.vertcat(axis, ca.SX(3, 1))
-        if body.kind == "revolute":
+        if body.joint_type == "revolute":
             column = ca.vertcat(ca.cross(axis, pose[:3, 3] - origin), axis)
         jacobian[:, body.coordinate] += float(body.multiplier) * column
         index = body.parent
@@ -124,7 +131,7 @@ def tip_kinematics(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 
 def rotation_about_z(angle: ca.SX) -> ca.SX:
-    """Return the rotation about z, (3, 3)."""
+    """Return the rotation about z, (3, 3), by an angle (1, 1)."""
     c, s = ca.cos(angle), ca.sin(angle)
     rotation = ca.SX(3, 3)
     rotation[0, 0] = rotation[1, 1] = c

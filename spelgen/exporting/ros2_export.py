@@ -1,4 +1,4 @@
-"""--to ros2: a colcon package around the C, a plugin of the package inverse_dynamics_solver."""
+"""--to ros2: a colcon package with the C files and a plugin of the package inverse_dynamics_solver."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from spelgen.exporting.c_export import c_files
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.exported import Exported, folder_export
+from spelgen.exporting.exported import Exported, with_readme
 from spelgen.templates import render
 
 _CALLED = (
@@ -14,7 +14,7 @@ _CALLED = (
 )  # fmt: skip
 """The functions that the plugin calls."""
 
-_PLACES = {
+_PATHS = {
     "package.xml": "package.xml",
     "CMakeLists.txt": "CMakeLists.txt",
     "plugin.xml": "plugin.xml",
@@ -23,13 +23,13 @@ _PLACES = {
 
 
 def export_ros2(trained: Trained) -> Exported:
-    """The package. Raises RunError where its C does not give what the model gives."""
+    """Return the package. Raises RunError if its C differs from the model."""
     trained = replace(trained, entries=_CALLED)
     model = trained.described
     sources, checked = c_files(trained)
     package = f"{model.name}_solver"
     files = {f"src/{name}": content for name, content in sources.items()}
-    for template, place in _PLACES.items():
+    for template, path in _PATHS.items():
         text = render(
             f"ros2/{template}.jinja",
             package=package,
@@ -37,13 +37,13 @@ def export_ros2(trained: Trained) -> Exported:
             upper=model.name.upper(),
             joints=", ".join(model.identifiers),
         )
-        files[place] = text.encode()
+        files[path] = text.encode()
     use = (
         f"Put this folder into a workspace, colcon build --packages-select {package}; "
-        f"the plugin is {package}/Solver, for whatever loads an inverse_dynamics_solver::InverseDynamicsSolver."
+        f"the plugin {package}/Solver is an inverse_dynamics_solver::InverseDynamicsSolver."
     )
     about = (
-        "getTorques includes friction, whose state follows the positions of its calls; "
-        "initialize starts it anew."
+        "getTorques includes friction, and updates its state by the positions of successive calls; "
+        "initialize resets it."
     )
-    return folder_export(trained, "ros2", "for ROS 2", files, use=use, about=about, checked=checked)
+    return with_readme(trained, "ros2", files, use=use, about=about, summary=[checked])

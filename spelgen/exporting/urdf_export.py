@@ -1,4 +1,4 @@
-"""--to urdf: the arm's own files with the learned numbers in them, and the friction that no URDF has words for."""
+"""--to urdf: the arm's URDF and settings with the trained parameters, and a file with the friction model."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from lxml import etree
 
 from spelgen.arm.chain import choose_chain
 from spelgen.arm.lump_links import lump_links
-from spelgen.dynamics.residuals import friction_factor
-from spelgen.dynamics.rigid_bodies import about_center
+from spelgen.dynamics.body_regressor import about_center
+from spelgen.dynamics.parameters import friction_factor
 from spelgen.exporting.describe import Trained, array
-from spelgen.exporting.exported import UNITS, Exported, readme
+from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.rigid_body_projection import (
     RigidBodyProjection,
     rigid_body_projection,
@@ -22,7 +22,7 @@ from spelgen.urdf.document import urdf_bytes
 _LAW = (
     "viscous qd + saturation turned(qd, saturation_velocity) + dry direction, with "
     "dry = coulomb + stribeck / (1 + (1 + r) v^2 / (v + r) / 8)^8 + "
-    "load_dependence sqrt(gravity torque^2 + least_load^2), v = |qd| / stribeck_velocity, r = stribeck_rounding "
+    "load_dependence sqrt(gravity torque^2 + min_load^2), v = |qd| / stribeck_velocity, r = stribeck_rounding "
     "and turned(x, width) = x / sqrt(x^2 + width^2); direction: memoryless turned(qd, coulomb_smoothing_velocity) "
     "plus the sum of bristle_fractions z / bristle_reach, with z' = qd up to |z| = bristle_reach; "
     "all of it times a factor that goes with the joint's position, between the two numbers of "
@@ -34,32 +34,30 @@ _SERVO = (
 
 
 def export_urdf(trained: Trained) -> Exported:
-    """Return the URDF, its settings, and the friction of a trained model."""
+    """Return the URDF, the settings, and the friction of a trained model."""
     projection = rigid_body_projection(trained.model, trained.arm)
     use = (
         "The .urdf contains inertials, viscous and Coulomb friction, which simulators ignore; the .yaml beside it, "
         "which spelgen reads, rotor inertia and friction in both directions; .urdf.friction.yaml the model's own law."
     )
-    about = f"{UNITS}; inertials of a body stand with the link that its joint moves."
-    title, checked = f"{trained.robot} as a URDF", f"{'; '.join(projection.summary)}."
+    about = "the link that a joint moves has the inertial of the whole body."
     files = {
         ".urdf": _urdf_text(projection),
         ".yaml": _settings_text(projection).encode(),
         ".urdf.friction.yaml": _friction_text(trained, projection).encode(),
-        ".urdf.README.md": readme(title, use, trained.joint_names, about, checked),
     }
-    return Exported("urdf", trained.robot, files, projection.summary)
+    return with_readme(trained, "urdf", files, use=use, about=about, summary=projection.summary)
 
 
 def _urdf_text(projection: RigidBodyProjection) -> bytes:
-    """Return the arm's URDF with these inertials and friction.
+    """Return the arm's URDF with the inertials and friction of a projection.
 
-    A link that a joint moves gets all that moves with it; the links it carries by fixed or locked joints lose
-    their inertials to it.
+    The link of a moving joint gets the inertia of its body; links that are fixed to it by fixed or locked joints lose
+    their <inertial>.
     """
     robot = projection.arm.robot
-    arm = projection.arm.arm
-    # a robot's file may come from anywhere
+    arm = projection.arm.chain
+    # the URDF is untrusted
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
     root = etree.fromstring(urdf_bytes(robot.path), parser)
     links = {element.get("name"): element for element in root.findall("link")}
@@ -70,31 +68,29 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
         for link in body.links:
             _remove(links[link.name], "inertial")
         name = body.joint.child
-        # of the body's frame, whose z is the joint's axis, in the link's
+        # from the body frame, whose z is the joint axis, to the link frame
         rotation = np.array(lumped.frames[name].rotation.T, dtype=float)
         _set_inertial(links[name], inertia, rotation)
-    # a URDF has one Coulomb friction for both directions
     friction = projection.friction
-    coulomb = (friction.forward - friction.backward) / 2
     for index, coordinate in enumerate(arm.coordinates):
         element = joints[coordinate.name]
         _remove(element, "dynamics")
-        values = {"damping": _number(friction.viscous[index]), "friction": _number(coulomb[index])}
+        values = {"damping": _number(friction.viscous[index]), "friction": _number(friction.coulomb[index])}
         etree.SubElement(element, "dynamics", values)
     text: bytes = etree.tostring(root, xml_declaration=True, encoding="utf-8")
     return text + b"\n"
 
 
 def _settings_text(projection: RigidBodyProjection) -> str:
-    """Return the settings beside the arm's URDF with these drives and friction, in both directions."""
+    """Return the settings of the arm with the armature and friction of a projection."""
     path = projection.arm.robot.path.with_suffix(".yaml")
     content: dict[str, dict[str, dict[str, object]]] = {}
     if path.exists():
         content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     joints = content.setdefault("joints", {})
     friction = projection.friction
-    for index, coordinate in enumerate(projection.arm.arm.coordinates):
-        # settings have the rotor's own inertia, the model that of the joint's side
+    for index, coordinate in enumerate(projection.arm.chain.coordinates):
+        # settings have the inertia at the rotor, the model has the inertia at the joint
         gear = projection.arm.settings.joint(coordinate.name).gear
         joint = joints.setdefault(coordinate.name, {})
         joint["rotor_inertia"] = _rounded(projection.armature[index] / gear**2)
@@ -105,16 +101,16 @@ def _settings_text(projection: RigidBodyProjection) -> str:
 
 
 def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
-    """Return YAML: viscous and Coulomb friction of each joint, and its own law and servo where the model has one."""
+    """Return YAML: viscous and Coulomb friction per joint, and constants of the friction model and the servos."""
     content: dict[str, object] = {
         "units": "Nm, Nm s/rad and rad/s of revolute joints; N, N s/m and m/s of prismatic ones",
         "viscous_coulomb": "viscous qd + coulomb[0] where qd > 0, + coulomb[1] where qd < 0",
     }
     coulomb = np.stack([projection.friction.forward, projection.friction.backward], axis=1)
-    # by section and name, (n, ...) each
+    # by section and name: (n,) or (n, K) each
     sections = {"viscous_coulomb": {"viscous": projection.friction.viscous, "coulomb": coulomb}}
-    # networks have no law with constants
-    if projection.own:
+    # friction networks have no constants
+    if projection.exact:
         content["law"] = _LAW
         sections["law"] = _law_constants(trained, projection)
     servos = projection.servos
@@ -133,29 +129,35 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
 
 
 def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[str, np.ndarray]:
-    """Return the constants of the model's own law of friction by name, (n, ...) each."""
+    """Return the constants of the friction model by name, (n,) or (n, K) each."""
     model = trained.model
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}
-    factor = array(friction_factor(model, sampled_positions(projection.arm.arm)))
+    factor = array(friction_factor(model, sampled_positions(projection.arm.chain)))
     if (factor != 1).any():
         constants["position_factor"] = np.stack([factor.min(axis=0), factor.max(axis=0)], axis=-1)
     return constants
 
 
 def _plain(value: np.ndarray) -> float | list[float]:
-    """Return a number, or a row of numbers, for YAML."""
+    """Return the numbers of an array () or (K,) for YAML."""
     if value.ndim == 0:
         return _rounded(float(value))
     return list(map(_rounded, value.tolist()))
 
 
 def _rounded(value: float) -> float:
-    """Return a number of twelve digits: what a person may read, far beyond what a fit finds."""
+    """Return a number rounded to twelve digits: readable, and more precise than any fit."""
     return float(_number(value))
 
 
 def _set_inertial(link: etree._Element, inertia: np.ndarray, rotation: np.ndarray) -> None:
-    """Set the inertial of a link in whose frame the body's stands at ``rotation``."""
+    """Replace the <inertial> of a link.
+
+    Args:
+        link: of the URDF.
+        inertia: (10,), in the body frame.
+        rotation: (3, 3), from the body frame to the link frame.
+    """
     _remove(link, "inertial")
     mass, center, tensor = about_center(inertia)
     center = rotation @ center
@@ -166,7 +168,7 @@ def _set_inertial(link: etree._Element, inertia: np.ndarray, rotation: np.ndarra
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     moments = list(map(_number, tensor[np.triu_indices(3)]))
     etree.SubElement(inertial, "inertia", dict(zip(names, moments, strict=True)))
-    # first, as most URDFs have it
+    # as the first child, as in most URDFs
     link.insert(0, inertial)
 
 

@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from spelgen.dynamics.bristles import BristleReach
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.rollout import LossScales, choose_substeps, loss_scales, rollout_loss
-from spelgen.fitting.run_record import Content
-from spelgen.fitting.tuning import ValidationTuning
+from spelgen.fitting.tuning import TUNING
 from spelgen.logs.checks import check
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 from spelgen.logs.windows import Split, Windows, cut_windows, split_validation, thinned
 from spelgen.settings.fits import DEFAULTS, Solver
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-
-TUNING = ValidationTuning()
 
 
 @dataclass(frozen=True)
@@ -103,7 +96,7 @@ def prepare_data(
     windows = choice.windows(split.training, resolved)
     return TrainingData(
         training=windows,
-        validation=thinned(choice.windows(split.validation, resolved), TUNING.windows),
+        validation=thinned(choice.windows(split.validation, resolved), TUNING.validation_windows),
         scales=loss_scales(windows, joint_types),
         preprocessing=resolved,
         training_names=tuple(x.name for x in split.training),
@@ -132,15 +125,6 @@ def digest(trajectories: Iterable[Trajectory]) -> str:
     return numbers.hexdigest()
 
 
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """Weights of a model, their integration steps between samples, and their validation loss."""
-
-    substeps: int
-    loss: float
-    weights: Content
-
-
 class Validation:
     """Validation windows, and a probe of the training windows for the integrator's steps.
 
@@ -162,7 +146,7 @@ class Validation:
         self.size = len(data.validation)
         self.scales = data.scales.to(device)
         self.batches = data.validation.to(device).split(4 * batch)
-        self.probe = data.training[:: -(-len(data.training) // TUNING.probe)].to(device)
+        self.probe = data.training[:: -(-len(data.training) // TUNING.probe_windows)].to(device)
 
     def loss(self, substeps: int) -> float:
         """Return `rollout_loss` of the validation windows; infinite if they diverge."""
@@ -187,7 +171,7 @@ class Validation:
             return self.prescribed
         return choose_substeps(self.model, self.probe, self.scales, start=present or 1)
 
-    def measure(self) -> Measured:
-        """Return the validation of the model with its current weights."""
+    def measure(self) -> tuple[int, float]:
+        """Return the integration steps that the model needs between samples, and its validation loss."""
         substeps = self.substeps()
-        return Measured(substeps, self.loss(substeps), copy.deepcopy(self.model.state_dict()))
+        return substeps, self.loss(substeps)

@@ -5,18 +5,23 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
 
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.baseline import FittedBaselines, arm_of_model
 from spelgen.baselines.registry import fit_baselines
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, RunError, SpelgenError
 from spelgen.files import write_json
 from spelgen.fitting.fitted import Fit, load_run, required_spec
 from spelgen.fitting.objective import FitRequest, Objective, RunOptions, Status, new_record
 from spelgen.fitting.objectives import FitOptions, choose_config, objective_of
-from spelgen.fitting.process import locked, require_device, termination_as_interrupt, threads_of_torch
-from spelgen.fitting.progress import TrainingProgress
+from spelgen.fitting.process import (
+    TrainingProgress,
+    locked,
+    require_device,
+    termination_as_interrupt,
+    threads_of_torch,
+)
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_record import Checkpoint
 from spelgen.logs.dynamics_samples import SHORTEST
@@ -24,20 +29,9 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import FitConfig
 
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-    from spelgen.urdf.robot import Robot
-
 __all__ = ["Fit", "RunOptions", "fit", "load_run"]
 
 AUTOMATIC = Preprocessing()
-
-
-class ArmOfFile(Protocol):
-    """An arm that was loaded from a file, as `spelgen.load_arm` gives it."""
-
-    @property
-    def robot(self) -> Robot: ...
 
 
 QUIET = RunOptions()
@@ -51,7 +45,7 @@ def fit(
     preprocessing: Preprocessing = AUTOMATIC,
     validation: float | Sequence[Trajectory] = 0.25,
     seed: int = 0,
-    arm: ArmOfFile | Path | str | None = None,
+    arm: Arm | Path | str | None = None,
     folder: Path | str | None = None,
     options: RunOptions = QUIET,
 ) -> Fit:
@@ -174,7 +168,7 @@ class _Fitting:
             if self.run is not None:
                 write_json(self.run.config, self.record.to_dict())
 
-    def _baseline_arm(self) -> ConfiguredArm | None:
+    def _baseline_arm(self) -> Arm | None:
         """Return the arm that baselines are fitted for; None if its URDF is unknown, or if they are fitted already.
 
         A URDF that cannot be read is reported, and the model is fitted without baselines.
@@ -189,7 +183,7 @@ class _Fitting:
             self.notes.append(Diagnostic("warning", "no-baselines", "run", None, message))
             return None
 
-    def _fit_baselines(self, arm: ConfiguredArm) -> None:
+    def _fit_baselines(self, arm: Arm) -> None:
         logs = list(self.request.logs)
         if not isinstance(self.request.validation, float):
             logs += self.request.validation
@@ -203,8 +197,8 @@ def sample_rates(logs: Sequence[Trajectory]) -> list[float]:
     return [log.sample_rate for log in logs if log.duration >= SHORTEST]
 
 
-def _urdf(arm: ArmOfFile | Path | str | None) -> Path | None:
+def _urdf(arm: Arm | Path | str | None) -> Path | None:
     """Return the file of a loaded arm, or a path."""
     if arm is None:
         return None
-    return Path(arm) if isinstance(arm, str | Path) else Path(arm.robot.path)
+    return Path(arm) if isinstance(arm, str | Path) else arm.robot.path

@@ -7,19 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
-from spelgen.dynamics.residuals import used_parameter_count
+from spelgen.dynamics.parameters import used_parameter_count
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.files import write_json
 from spelgen.fitting.objective import Status
 from spelgen.fitting.process import locked
-from spelgen.fitting.run_folder import RunFolder, trained_model
+from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import Checkpoint, Content, Record
 from spelgen.listing import Listing
 from spelgen.logs.dynamics_samples import dynamics_samples
@@ -30,9 +29,6 @@ from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import FitConfig
 from spelgen.spec import ModelSpec
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -212,7 +208,7 @@ def load_run(folder: Path | str) -> Fit:
     run = RunFolder(folder)
     record = run.read_record()  # a missing run is reported before its model is assembled
     return Fit(
-        model=trained_model(run),
+        model=fitted_model(run).requires_grad_(False).eval(),
         history=run.read_metrics(),
         diagnostics=(),
         status=None,

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TypeVar
 
 import torch
 from torch.func import functional_call
 
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
+from spelgen.emission.assemble import ArmModel
 
 NamedTensors = Mapping[str, torch.Tensor]
 """Tensors by the names of a model's parameters and buffers."""
@@ -24,11 +23,13 @@ class _Caller(torch.nn.Module):
         super().__init__()
         self.model = model
 
-    def forward(self, function: Callable[[Any], Result]) -> Result:
+    def forward(self, function: Callable[[ArmModel], Result]) -> Result:
         return function(self.model)
 
 
-def evaluate_with(model: ArmModel, parameters: NamedTensors, function: Callable[[Any], Result]) -> Result:
+def evaluate_with(
+    model: ArmModel, parameters: NamedTensors, function: Callable[[ArmModel], Result]
+) -> Result:
     """Return function(model) with the given parameters; all other parameters of the model keep their values."""
     named = {f"model.{name}": tensor for name, tensor in parameters.items()}
     result: Result = functional_call(_Caller(model), named, (function,))

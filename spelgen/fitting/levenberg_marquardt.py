@@ -15,9 +15,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import torch
 
-from spelgen.fitting.tuning import DampingTuning
-
-TUNING = DampingTuning()
+from spelgen.fitting.tuning import TUNING
 
 Parameters = TypeVar("Parameters")
 
@@ -64,17 +62,9 @@ class SolverState(Generic[Parameters]):
     steps: int = 0
 
 
-class Iteration(NamedTuple):
-    """Log entry of an accepted step: cost after the step, its predicted decrease, its damping."""
-
-    cost: float
-    predicted_decrease: float
-    damping: float
-
-
 @dataclass(frozen=True, eq=False)
 class SolverResult(Generic[Parameters]):
-    """Last iterate, reason of termination, and the log of the accepted steps.
+    """Last iterate and reason of termination.
 
     normal_equations: of the last linearization. It is at the last iterate, unless a threshold or the maximum number of
     steps ended the solver right after a step; then it is at the iterate before that step.
@@ -82,7 +72,6 @@ class SolverResult(Generic[Parameters]):
 
     state: SolverState[Parameters]
     termination: Termination
-    log: tuple[Iteration, ...]
     normal_equations: NormalEquations
 
 
@@ -107,7 +96,10 @@ class LeastSquaresProblem(Protocol[Parameters]):
 
 
 def initial_state(
-    problem: LeastSquaresProblem[Parameters], x: Parameters, damping: float = TUNING.initial, steps: int = 0
+    problem: LeastSquaresProblem[Parameters],
+    x: Parameters,
+    damping: float = TUNING.initial_damping,
+    steps: int = 0,
 ) -> SolverState[Parameters]:
     """Return the state at x before the first step."""
     residual = problem.residual(x)
@@ -133,20 +125,18 @@ def levenberg_marquardt(
         min_relative_decrease: likewise relative to the cost after the step.
         callback: is called with the state after each accepted step.
     """
-    log: list[Iteration] = []
     normal = problem.normal_equations(state.x, state.residual)
     for number in range(max_steps):
         if number:
             normal = problem.normal_equations(state.x, state.residual)
         accepted = _accepted_step(problem, state, normal, min_decrease)
         if isinstance(accepted, Termination):
-            return SolverResult(state, accepted, tuple(log), normal)
-        decrease, (state, entry) = state.cost - accepted[0].cost, accepted
-        log.append(entry)
+            return SolverResult(state, accepted, normal)
+        decrease, state = state.cost - accepted.cost, accepted
         callback(state)
         if decrease < max(min_decrease, min_relative_decrease * state.cost):
-            return SolverResult(state, Termination.SMALL_DECREASE, tuple(log), normal)
-    return SolverResult(state, Termination.MAX_STEPS, tuple(log), normal)
+            return SolverResult(state, Termination.SMALL_DECREASE, normal)
+    return SolverResult(state, Termination.MAX_STEPS, normal)
 
 
 def _accepted_step(
@@ -154,8 +144,8 @@ def _accepted_step(
     state: SolverState[Parameters],
     normal: NormalEquations,
     min_decrease: float,
-) -> tuple[SolverState[Parameters], Iteration] | Termination:
-    """Return the state after one step that lowers the cost, with its log entry, or the reason why there is none."""
+) -> SolverState[Parameters] | Termination:
+    """Return the state after one step that lowers the cost, or the reason why there is none."""
     damping = state.damping
     for _ in range(TUNING.max_trials):
         step = normal.step(damping)
@@ -164,9 +154,8 @@ def _accepted_step(
             return Termination.SMALL_PREDICTION
         best = _best_candidate(problem, state, step, predicted)
         if best.cost < state.cost:
-            next_damping = max(damping / TUNING.factor, TUNING.min_damping)
-            return replace(best, damping=next_damping), Iteration(best.cost, predicted, damping)
-        damping *= TUNING.factor
+            return replace(best, damping=max(damping / TUNING.damping_factor, TUNING.min_damping))
+        damping *= TUNING.damping_factor
     return Termination.NO_DECREASE
 
 

@@ -6,13 +6,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import input_of
-from spelgen.emission.assemble import spec_of
+from spelgen.emission.assemble import ArmModel, spec_of
 from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import TrainingData, WindowChoice, prepare_data
+from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.rollout import LossScales
 from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.urdf_regularizer import UrdfRegularizer, urdf_regularizer
@@ -22,10 +23,6 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import FitConfig
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.messages import validated
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-    from spelgen.fitting.progress import TrainingProgress
 
 Status = Literal["finished", "stopped early", "out of time", "interrupted"]
 
@@ -182,10 +179,7 @@ def new_record(request: FitRequest, prepared: PreparedLogs) -> Record:
     config, fraction = prepared.config, None
     if prepared.validation and isinstance(request.validation, float):
         fraction = request.validation
-    scales = {}
-    if prepared.scales is not None:
-        scales["scales"] = {name: x.tolist() for name, x in prepared.scales._asdict().items()}
-    return Record(
+    record = Record(
         schema=2,
         robot=spec.robot if spec else type(model).__name__,
         preset=spec.options.preset if spec else None,
@@ -203,5 +197,8 @@ def new_record(request: FitRequest, prepared: PreparedLogs) -> Record:
         mapping=request.options.mapping or LogMapping(input=input_of(model)),
         device=request.options.device,
         threads=request.options.threads,
-        **scales,
     )
+    if prepared.scales is None:
+        return record
+    scales = {name: x.tolist() for name, x in prepared.scales._asdict().items()}
+    return record.model_copy(update={"scales": scales})

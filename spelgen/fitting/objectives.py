@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from spelgen.dynamics.protocol import input_of
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import OptionError, SettingsError
 from spelgen.fitting.objective import FitRequest, Objective
 from spelgen.fitting.servo.objective import ServoObjective
@@ -16,9 +16,6 @@ from spelgen.fitting.window.rollout import RolloutObjective
 from spelgen.logs.rates import shows_accelerations
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import FitConfig, fit_config
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 ALL: tuple[type[Objective], ...] = (TorqueObjective, MomentumObjective, RolloutObjective, ServoObjective)
 OBJECTIVES = {objective.name: objective for objective in ALL}

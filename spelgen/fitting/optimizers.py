@@ -14,10 +14,8 @@ from collections.abc import Callable, Iterable
 import torch
 
 from spelgen.fitting.run_record import Content
-from spelgen.fitting.tuning import OptimizerTuning
+from spelgen.fitting.tuning import TUNING
 from spelgen.logs.windows import Windows
-
-TUNING = OptimizerTuning()
 
 Loss = Callable[[Windows], torch.Tensor]
 LearningRate = Callable[[int], float]
@@ -130,7 +128,7 @@ class LBFGS(WindowOptimizer):
         self._decay, self._finite = weight_decay, True
         self._optimizer = _EagerLBFGS(
             self._parameters,
-            history_size=TUNING.history,
+            history_size=TUNING.lbfgs_history,
             line_search_fn="strong_wolfe",
             tolerance_grad=1e-12,
             tolerance_change=1e-15,
@@ -157,7 +155,7 @@ class LBFGS(WindowOptimizer):
         except torch.linalg.LinAlgError:
             return math.nan
         loss, (last, last_penalised) = total.item(), group["last"]
-        progress = loss <= TUNING.stalled * last or penalised <= TUNING.stalled * last_penalised
+        progress = loss <= TUNING.lbfgs_stalled * last or penalised <= TUNING.lbfgs_stalled * last_penalised
         group["last"], group["waits"] = (loss, penalised), 0 if progress else group["waits"] + 1
         return loss
 
@@ -201,6 +199,6 @@ def minimise(model: torch.nn.Module, summands: Summands, evaluations: int, weigh
     """
     optimizer, count = LBFGS(model, weight_decay), 0
     while count < evaluations and not optimizer.stalled:
-        optimizer.minimise(summands, TUNING.call)
-        count += TUNING.call
+        optimizer.minimise(summands, TUNING.lbfgs_call)
+        count += TUNING.lbfgs_call
     return count

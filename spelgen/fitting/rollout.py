@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
 from spelgen.dynamics.equations import mass_as_learned, runge_kutta
 from spelgen.dynamics.protocol import known_past, memory_after, memory_along, sliding_memory
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import LogError
-from spelgen.fitting.tuning import AdaptiveTuning, IntegrationTuning
+from spelgen.fitting.tuning import TUNING
 from spelgen.logs.windows import Windows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import Solver
 
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-
-TUNING, ADAPTIVE = IntegrationTuning(), AdaptiveTuning()
-SOLVER: dict[str, Any] = {"method": "dopri5", "rtol": ADAPTIVE.relative, "atol": ADAPTIVE.absolute}
+SOLVER: dict[str, Any] = {
+    "method": "dopri5",
+    "rtol": TUNING.adaptive_rtol,
+    "atol": TUNING.adaptive_atol,
+}
 AT_REST = 1e-6  # [rad, m] below the resolution of encoders
 
 
@@ -174,27 +175,23 @@ def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> torc
         windows: measured motion (W, K, n) and inputs (W, K-1, n).
         scales: its scale of the torque (n,) is used.
     """
-    q, qd, tau = windows.q, windows.qd, windows.tau  # (W, K, n), (W, K, n), (W, K-1, n)
-    dynamics, dt = model, windows.dt.unsqueeze(-1)
+    q, qd, tau, dt = windows.q, windows.qd, windows.tau, windows.dt.unsqueeze(-1)
     # M need not be positive definite here, since velocities are measured; constrained to it, the descent would end at
     # the boundary
     with mass_as_learned(model):
-        at = dynamics.configuration(q, model.prepare())
-    p = (at.mass @ qd.unsqueeze(-1)).squeeze(-1)
-    force = dynamics.lagrangian_gradient(at, qd)
+        configuration = model.configuration(q, model.prepare())
+    p = (configuration.mass @ qd.unsqueeze(-1)).squeeze(-1)
     past = known_past(model, memory_along(model, q, qd, windows.z))
-    force = force - dynamics.friction_torque(at, qd, *past)
-    driven = [
-        dynamics.input_force(at, qd, torch.cat(held, dim=1))
-        for held in ((tau, tau[:, -1:]), (tau[:, :1], tau))  # over the interval after each sample, and before
-    ]
-    mean = (force[:, :-1] + driven[0][:, :-1] + force[:, 1:] + driven[1][:, 1:]) / 2
+    force = model.lagrangian_gradient(configuration, qd) - model.friction_torque(configuration, qd, *past)
+    # the input is constant in each interval: at a sample, it has the values of the intervals after and before it
+    input_after = model.input_force(configuration, qd, torch.cat((tau, tau[:, -1:]), dim=1))
+    input_before = model.input_force(configuration, qd, torch.cat((tau[:, :1], tau), dim=1))
+    mean = (force[:, :-1] + input_after[:, :-1] + force[:, 1:] + input_before[:, 1:]) / 2
     residual = (p[:, 1:] - p[:, :1] - (dt * mean).cumsum(dim=1)) / dt.cumsum(dim=1)
     with torch.no_grad():
-        inputs = dynamics.input_matrix(q).abs()
-    unit = (inputs @ scales.tau).mean(
-        dim=(0, 1)
-    )  # of joint torques: there may be gears between motors and joints
+        inputs = model.input_matrix(q).abs()
+    # of joint torques: there may be gears between motors and joints
+    unit = (inputs @ scales.tau).mean(dim=(0, 1))
     result: torch.Tensor = (residual / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
     return result
 
@@ -215,7 +212,7 @@ def integration_error(coarse: torch.Tensor, fine: torch.Tensor) -> float:
         coarse: (W, K-1, 2n) scaled errors of the rollout.
         fine: (W, K-1, 2n) scaled errors with twice as many steps.
     """
-    model_error = max(fine.square().mean().sqrt().item(), TUNING.least_error)
+    model_error = max(fine.square().mean().sqrt().item(), TUNING.min_model_error)
     error = (coarse - fine).square().mean().sqrt().item() / model_error
     return error if math.isfinite(error) else math.inf
 
@@ -223,9 +220,9 @@ def integration_error(coarse: torch.Tensor, fine: torch.Tensor) -> float:
 def choose_substeps(model: ArmModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
     """Return the minimum number of rk4 steps per sample interval, at least `start`, with a small integration error."""
     substeps, coarse = start, probed(model, windows, scales, start)
-    while substeps < TUNING.most_substeps:
+    while substeps < TUNING.max_substeps:
         fine = probed(model, windows, scales, 2 * substeps)
-        if integration_error(coarse, fine) < TUNING.fraction:
+        if integration_error(coarse, fine) < TUNING.integration_fraction:
             break
         substeps, coarse = 2 * substeps, fine
     return substeps

@@ -135,14 +135,14 @@ class RunFolder:
         require_regular_file(path, RunError)
         try:
             _require_unpacked_size(path)
-            found = torch.load(path, map_location="cpu", weights_only=True)
+            state = torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:  # torch names no common type for what a broken file raises
             raise RunError(
                 f"unreadable ({type(error).__name__})", file=path, expected="a file of `spelgen train`"
             ) from error
-        if not isinstance(found, dict):
-            raise RunError(type(found).__name__, file=path, expected="a file of `spelgen train`")
-        return found
+        if not isinstance(state, dict):
+            raise RunError(type(state).__name__, file=path, expected="a file of `spelgen train`")
+        return state
 
     def read_spec(self) -> ModelSpec:
         """Return spec.json. Raises RunError if there is none, ModuleError if it is no specification."""
@@ -206,11 +206,4 @@ def fitted_model(run: RunFolder) -> ArmModel:
         model.load_state_dict(weights)
     except (RuntimeError, TypeError, AttributeError) as error:
         raise RunError("weights of another model", file=run.weights, do="start a new run") from error
-    return model
-
-
-def trained_model(run: RunFolder) -> ArmModel:
-    """Return the model of a run with its best weights, which take no gradients."""
-    model = fitted_model(run)
-    model.requires_grad_(False).eval()
     return model

@@ -99,11 +99,11 @@ class Record(BaseModel):
                 file=folder,
                 do="give the same --data or start a new run",
             )
-        before, after = self._settings(), resumed._settings()
+        original, changed_settings = self._settings(), resumed._settings()
         changed = []
-        for name in before | after:
-            if name not in MAY_CHANGE and before.get(name) != after.get(name):
-                changed.append(f"{name} {after.get(name)} instead of {before.get(name)}")
+        for name in original | changed_settings:
+            if name not in MAY_CHANGE and original.get(name) != changed_settings.get(name):
+                changed.append(f"{name} {changed_settings.get(name)} instead of {original.get(name)}")
         if changed:
             raise RunError(
                 ", ".join(changed),

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from spelgen.emission.loading import load_module
 from spelgen.errors import Diagnostic, ModuleError, RunError
@@ -19,12 +18,8 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import BoundedLogs, read_bounded_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import FitConfig
-from spelgen.settings.log_mapping import LogMapping
 from spelgen.spec import ModelSpec
 from spelgen.urdf.document import urdf_bytes
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 
 def train(
@@ -68,7 +63,7 @@ def train(
 
     @cache
     def logs() -> BoundedLogs:
-        return open_logs(model, data, options.mapping)
+        return read_bounded_logs(list(data), model, options.mapping, role="train")
 
     # an option that does not apply is reported before logs are read, which may take long
     config = choose_config(model, config, lambda: sample_rates(logs().trajectories))
@@ -80,14 +75,6 @@ def train(
         model, opened, config, preprocessing=preprocessing, validation=validation or 0.25, seed=seed or 0, arm=robot,
         folder=folder, options=replace(options, notes=[*options.notes, *notes]),
     )  # fmt: skip
-
-
-def open_logs(model: ArmModel, paths: Iterable[Path | str], mapping: LogMapping | None = None) -> BoundedLogs:
-    """Return the training part of log files, within the bound of memory of `read_bounded_logs`.
-
-    Raises LogError, and SettingsError if the mapping does not fit the joints.
-    """
-    return read_bounded_logs(list(paths), model, mapping, role="train")
 
 
 def robot_of(

@@ -6,16 +6,18 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class DampingTuning:
-    """Damping of Gauss-Newton steps, relative to the diagonal of the curvature (`fitting.levenberg_marquardt`)."""
+class FittingTuning:
+    """Constants of the solvers and of fits to windows, by the file that reads them."""
+
+    # Damping of Gauss-Newton steps, relative to the diagonal of the curvature (`fitting.levenberg_marquardt`).
 
     # [1] Damping of the first step (Marquardt, J. SIAM 11:431, 1963: 1e-2).
-    initial: float = 1e-3
+    initial_damping: float = 1e-3
     # [1] Smallest damping: below it steps equal Gauss-Newton steps to nine digits.
     min_damping: float = 1e-9
     # [1] Factor by which the damping is lowered after a step that decreases the cost, and raised otherwise
     # (Marquardt: 10).
-    factor: float = 10.0
+    damping_factor: float = 10.0
     # [1] Dampings tried for one step: from the smallest to 1e6, at which steps are negligible.
     max_trials: int = 15
     # [1] Predicted reduction of the cost, as a fraction of the cost, below which a step is rounding and is not tried.
@@ -23,20 +25,14 @@ class DampingTuning:
     # [1] Gain ratio (decrease divided by predicted reduction) below which the second way of a step is tried, too.
     min_gain_ratio: float = 0.5
 
-
-@dataclass(frozen=True)
-class ValidationTuning:
-    """Windows on which a fit is validated (`fitting.dataset`)."""
+    # Windows on which a fit is validated (`fitting.dataset`).
 
     # [1] Largest number of validation windows: validation is a measurement and needs no more.
-    windows: int = 2048
+    validation_windows: int = 2048
     # [1] Training windows on which the integration error is monitored.
-    probe: int = 64
+    probe_windows: int = 64
 
-
-@dataclass(frozen=True)
-class WindowTuning:
-    """Steps on windows (`fitting.window.momentum`)."""
+    # Steps on windows (`fitting.window.momentum`).
 
     # [1] Smallest number of steps per epoch; few windows are passed several times between validations.
     epoch_steps: int = 20
@@ -49,10 +45,7 @@ class WindowTuning:
     # [1] Factor on the learning rate of momentum steps, which are cheap and noisy.
     momentum_factor: float = 10.0
 
-
-@dataclass(frozen=True)
-class LoopTuning:
-    """Epochs of predicted windows (`fitting.window.rollout`)."""
+    # Epochs of predicted windows (`fitting.window.rollout`).
 
     # [1] Largest fraction of all steps or minutes during which residual terms of rigid bodies are constant.
     first_stage: float = 0.8
@@ -61,57 +54,48 @@ class LoopTuning:
     # [1] Epochs between choices of the integration step: trained friction may have become too stiff for it.
     probe_every: int = 5
     # [1] Attempts at half the learning rate each, before a fit is abandoned.
-    rollbacks: int = 8
+    max_rollbacks: int = 8
 
-
-@dataclass(frozen=True)
-class IntegrationTuning:
-    """Integration step of rollouts (`fitting.rollout`)."""
+    # Integration step of rollouts (`fitting.rollout`).
 
     # [1] Largest number of rk4 steps between samples.
-    most_substeps: int = 32
+    max_substeps: int = 32
     # [1] Allowed integration error, as a fraction of the model's error.
-    fraction: float = 0.03
+    integration_fraction: float = 0.03
     # [1] Smallest expected error of a model, in units of the loss's scales.
-    least_error: float = 1e-2
+    min_model_error: float = 1e-2
 
-
-@dataclass(frozen=True)
-class AdaptiveTuning:
-    """Rollouts by dopri5 (`fitting.rollout`)."""
+    # Rollouts by dopri5 (`fitting.rollout`).
 
     # [1] Relative tolerance of a step.
-    relative: float = 1e-7
+    adaptive_rtol: float = 1e-7
     # [rad, m, and momenta] Absolute tolerance of a step.
-    absolute: float = 1e-9
+    adaptive_atol: float = 1e-9
 
-
-@dataclass(frozen=True)
-class OptimizerTuning:
-    """Optimizers of networks (`fitting.optimizers`)."""
+    # Optimizers of networks (`fitting.optimizers`).
 
     # [1] Factor on the learning rate of constants and biases.
     number_factor: float = 5.0
     # [1] Largest norm of the gradient of the scaled loss; larger gradients are scaled down to it.
     gradient_norm: float = 1.0
     # [1] Steps from which L-BFGS approximates the curvature.
-    history: int = 50
+    lbfgs_history: int = 50
     # [1] Evaluations of the loss between tests of convergence.
-    call: int = 20
+    lbfgs_call: int = 20
     # [1] A call of L-BFGS that ends above this fraction of the previous loss has made no progress.
-    stalled: float = 1 - 1e-3
+    lbfgs_stalled: float = 1 - 1e-3
     # [1] Value of a loss that is not finite, so that the line search reverses.
     too_large: float = 1e12
 
-
-@dataclass(frozen=True)
-class RegularizerTuning:
-    """Regularizer towards the URDF (`fitting.urdf_regularizer`)."""
+    # Regularizer towards the URDF (`fitting.urdf_regularizer`).
 
     # [1] Random positions at which M and gravity are compared.
-    points: int = 200
+    regularizer_points: int = 200
     # [1] Margin on both sides of the range of the logs, as a fraction of it: a model is used slightly outside its
     # logs.
-    widened: float = 0.5
+    regularizer_margin: float = 0.5
     # [1] Smallest scale of the gravity torque of a joint, as a fraction of the largest joint.
-    least_scale: float = 0.05
+    min_gravity_scale: float = 0.05
+
+
+TUNING = FittingTuning()

@@ -7,18 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 
-from spelgen.dynamics.pinocchio_urdf import urdf_dynamics
-from spelgen.fitting.tuning import RegularizerTuning
+from spelgen.dynamics.pinocchio_dynamics import urdf_dynamics
+from spelgen.emission.assemble import ArmModel
+from spelgen.fitting.tuning import TUNING
 from spelgen.logs.windows import Windows
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-
-TUNING = RegularizerTuning()
 
 
 class UrdfRegularizer(NamedTuple):
@@ -60,17 +56,20 @@ def urdf_regularizer(urdf: Path, joints: Sequence[str], model: ArmModel, windows
     dynamics = urdf_dynamics(urdf, joints)
     positions = windows.q.flatten(0, 1)
     low, high = positions.amin(dim=0), positions.amax(dim=0)
-    low, high = low - TUNING.widened * (high - low), high + TUNING.widened * (high - low)
+    low, high = (
+        low - TUNING.regularizer_margin * (high - low),
+        high + TUNING.regularizer_margin * (high - low),
+    )
     generator = torch.Generator().manual_seed(0)
     q = low + (high - low) * torch.rand(
-        TUNING.points, len(joints), dtype=positions.dtype, generator=generator
+        TUNING.regularizer_points, len(joints), dtype=positions.dtype, generator=generator
     )
     with torch.no_grad():
         whitening = torch.linalg.inv(torch.linalg.cholesky(model.mass_matrix(q).mean(dim=0)))
     gravity = dynamics.gravity(q)
     scale = gravity.square().mean(dim=0).sqrt()
     largest = scale.max().item()
-    floor = TUNING.least_scale * largest
+    floor = TUNING.min_gravity_scale * largest
     if not largest:
         floor = 1.0  # no gravity torque at any joint: the unit is arbitrary
     scale = scale.clamp(min=floor)

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.arm.arm import Arm
-from spelgen.dynamics.linear_friction import BRISTLES, FrictionModel
-from spelgen.dynamics.regressor import regressor
+from spelgen.arm.arm import Chain
+from spelgen.dynamics.friction import BRISTLES, FrictionModel
+from spelgen.dynamics.regressor_dynamics import regressor
 from spelgen.identification.tuning import TUNING
 from spelgen.structure.base_parameters import base_parameters as body_base_parameters
 from spelgen.structure.base_parameters import parameter_name
@@ -52,7 +52,7 @@ class BaseParameters:
         return result
 
 
-def base_parameters(arm: Arm, friction: FrictionModel, motors: np.ndarray | None = None) -> BaseParameters:
+def base_parameters(arm: Chain, friction: FrictionModel, motors: np.ndarray | None = None) -> BaseParameters:
     """Return the base parameters of an arm with friction.
 
     Args:
@@ -82,7 +82,7 @@ def base_parameters(arm: Arm, friction: FrictionModel, motors: np.ndarray | None
     return BaseParameters(tuple(base_names), chosen, combination, tuple(names), len(exact))
 
 
-def _columns(arm: Arm, friction: FrictionModel, motors: np.ndarray | None, count: int) -> np.ndarray:
+def _columns(arm: Chain, friction: FrictionModel, motors: np.ndarray | None, count: int) -> np.ndarray:
     """Return the regressor of all parameters at random states, (rows, count)."""
     n = len(arm.coordinates)
     shape = (2 * count // n + 1, n)  # twice as many equations as parameters

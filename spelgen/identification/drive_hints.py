@@ -19,7 +19,7 @@ from scipy.special import stdtrit
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.body_regressor import chain_regressor
-from spelgen.dynamics.linear_friction import FrictionModel
+from spelgen.dynamics.friction import FrictionModel
 from spelgen.identification.drive_samples import DriveSamples
 from spelgen.identification.least_squares import block_products, normal_solution, varying
 from spelgen.identification.tuning import HINTS, TUNING

@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.bristles import reach_of
-from spelgen.dynamics.linear_friction import FrictionModel
+from spelgen.dynamics.friction import FrictionModel
 from spelgen.identification.tuning import HINTS
 from spelgen.logs.dynamics_samples import (
     FREQUENCY,

@@ -84,7 +84,7 @@ def single_changes(problem: GeometryProblem, base: Fit, factors: Sequence[np.nda
     changed = [*_senses(reading), *_swapped(reading), *_scaled(reading, factors)]
     fits = [problem.fit(hypothesis) for hypothesis in changed]
     for k, coordinate in enumerate(problem.arm.coordinates):
-        fits += _with_offset(problem, base, k, coordinate.kind == "revolute")
+        fits += _with_offset(problem, base, k, coordinate.joint_type == "revolute")
     return fits + _with_gravity(problem, base)
 
 

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from spelgen.arm.actuation import Drives
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.bristles import reach_of
-from spelgen.dynamics.linear_friction import FrictionModel
+from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.errors import Diagnostic
 from spelgen.identification.base_parameters import BaseParameters
@@ -56,7 +56,7 @@ class Identification:
     torque_delay: by which logged torques were moved.
     """
 
-    arm: Arm
+    arm: Chain
     method: LeastSquares
     base: BaseParameters
     parameters: np.ndarray
@@ -145,7 +145,7 @@ class Identification:
         """Return two tables: the torque residual per joint, and the base parameters."""
         joints: list[tuple[str, ...]] = []
         for x, rms, nmse in zip(self.arm.coordinates, self.residual, self.nmse, strict=True):
-            joints.append((x.name, f"{rms:.4g}", UNITS[x.kind].torque, f"{nmse:.3g}"))
+            joints.append((x.name, f"{rms:.4g}", UNITS[x.joint_type].torque, f"{nmse:.3g}"))
         parameters: list[tuple[str, ...]] = []
         values = zip(self.base.names, self.values, self.deviations, self.determined, strict=True)
         for name, value, deviation, word in values:
@@ -193,7 +193,7 @@ class Identification:
 
 
 def identified_dynamics(
-    arm: Arm, friction: FrictionModel, parameters: np.ndarray, drives: Drives
+    arm: Chain, friction: FrictionModel, parameters: np.ndarray, drives: Drives
 ) -> RegressorDynamics:
     """Return the dynamics of an arm with these parameters, (K,): bodies, friction, drives."""
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from spelgen.arm.actuation import Drives
-from spelgen.arm.arm import Arm
-from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.arm.arm import Chain
+from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.dynamics.bristles import reach_of
-from spelgen.dynamics.linear_friction import FrictionModel
-from spelgen.dynamics.regressor import body_chain, regressor
+from spelgen.dynamics.friction import FrictionModel
+from spelgen.dynamics.regressor_dynamics import body_chain, regressor
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.identification import Identification, LeastSquares
@@ -28,7 +28,7 @@ from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 
 
 def identify(
-    arm: ConfiguredArm | Path | str,
+    arm: Arm | Path | str,
     logs: Trajectory | Sequence[Trajectory],
     method: LeastSquares | None = None,
     *,
@@ -45,20 +45,20 @@ def identify(
     Raises:
         LogError: for logs without torques or without motion.
     """
-    if not isinstance(arm, ConfiguredArm):
+    if not isinstance(arm, Arm):
         arm = load_arm(arm)
     logs = [logs] if isinstance(logs, Trajectory) else logs
     return identify_by(arm, logs, [method or LeastSquares()], preprocessing or Preprocessing())[0]
 
 
 def identify_by(
-    arm: ConfiguredArm,
+    arm: Arm,
     logs: Sequence[Trajectory],
     methods: Sequence[LeastSquares],
     preprocessing: Preprocessing,
 ) -> list[Identification]:
     """Return the result of each method for the same logs, which are filtered once; see `identify`."""
-    joints, joint_types = arm.arm.joint_names, arm.arm.joint_types
+    joints, joint_types = arm.chain.joint_names, arm.chain.joint_types
     for trajectory in logs:
         require_joints(trajectory, joints)
     require_torques(logs)
@@ -66,7 +66,7 @@ def identify_by(
     drives = arm.actuation.drives()
     delay = TorqueDelay(preprocessing.torque_delay or 0.0)
     if preprocessing.torque_delay is None:
-        delay = find_torque_delay(logs, joint_types, drives, body_chain(arm.arm), preprocessing)
+        delay = find_torque_delay(logs, joint_types, drives, body_chain(arm.chain), preprocessing)
         preprocessing = replace(preprocessing, torque_delay=delay.delay)
         notes += delay.notes
     reach = None
@@ -78,12 +78,12 @@ def identify_by(
         message = f"sampled too slowly or too short for accelerations: {', '.join(unused)}"
         notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
     # the rows of the regressor are joint torques
-    equations = _Equations(arm.arm, [replace(x, tau=x.tau @ drives.inputs.T) for x in samples], drives)
+    equations = _Equations(arm.chain, [replace(x, tau=x.tau @ drives.inputs.T) for x in samples], drives)
     return [replace(equations.solved(x), diagnostics=tuple(notes), torque_delay=delay) for x in methods]
 
 
 def least_squares(
-    arm: Arm,
+    arm: Chain,
     samples: Sequence[DynamicsSamples],
     method: LeastSquares | None = None,
     drives: Drives | None = None,
@@ -106,7 +106,7 @@ def least_squares(
 class _Equations:
     """Linear equations of samples, one block at a time; the columns of the bodies are common to all friction models."""
 
-    def __init__(self, arm: Arm, samples: Sequence[DynamicsSamples], drives: Drives) -> None:
+    def __init__(self, arm: Chain, samples: Sequence[DynamicsSamples], drives: Drives) -> None:
         self.arm, self.samples, self.drives = arm, samples, drives
         self._blocks: list[DynamicsSamples] = []
         for x in samples:

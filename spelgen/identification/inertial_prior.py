@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.identification.tuning import GEOMETRY
 
 
@@ -23,7 +23,7 @@ class InertialPrior:
     freedom: float
 
 
-def inertial_prior(arm: Arm) -> InertialPrior:
+def inertial_prior(arm: Chain) -> InertialPrior:
     """Return the prior of an arm; a body without an inertial has a wide one about 0."""
     masses = [float(body.inertia[0]) for body in arm.bodies if body.inertia and body.inertia[0] > 0]
     typical = float(np.median(masses)) if masses else 1.0

@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spelgen.arm.arm import Arm
-from spelgen.dynamics.regressor import body_chain
+from spelgen.arm.arm import Chain
+from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.identification.drive_hints import drive_rows
 from spelgen.identification.inertial_prior import InertialPrior, inertial_prior
 from spelgen.identification.least_squares import block_products, varying
@@ -58,7 +58,7 @@ class Hypothesis:
     gravity: Vector3
 
     @classmethod
-    def unchanged(cls, arm: Arm) -> Hypothesis:
+    def unchanged(cls, arm: Chain) -> Hypothesis:
         """Return the hypothesis of the unchanged log, in SI units and without offsets."""
         joints = len(arm.coordinates)
         order, ones = np.arange(joints), np.ones(joints)
@@ -107,7 +107,7 @@ class GeometryProblem:
 
     def __init__(
         self,
-        arm: Arm,
+        arm: Chain,
         samples: MotionSamples,
         speeds: np.ndarray,
         seconds: float,

@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import stdtrit
 
 from spelgen.arm.actuation import Drives
-from spelgen.dynamics.linear_friction import FrictionModel
+from spelgen.dynamics.friction import FrictionModel
 from spelgen.errors import Diagnostic
 from spelgen.identification.drive_hints import Coupling, DriveProblem, drive_problem, find_coupling
 from spelgen.identification.drive_samples import SHIFTS, DriveLog

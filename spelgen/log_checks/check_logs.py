@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from spelgen.dynamics.regressor import body_chain
+from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.drive_samples import DriveLog, DriveSamples
@@ -33,16 +33,14 @@ from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
 
 if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import ConfiguredArm
+    from spelgen.arm.configured_arm import Arm
     from spelgen.settings.log_mapping import LogMapping
 
 COUPLED, WRONG_VELOCITY, WRONG_LINK = "coupled-motors", "velocity-is-no-derivative", "urdf-inertials"
 ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED, WRONG_LINK, *GEOMETRY_CODES}
 
 
-def check_logs(
-    logs: Iterable[Trajectory], arm: ConfiguredArm, mapping: LogMapping | None = None
-) -> LogReport:
+def check_logs(logs: Iterable[Trajectory], arm: Arm, mapping: LogMapping | None = None) -> LogReport:
     """Report all about the logs of an arm, read once, one trajectory after another; nothing is repaired or raised.
 
     The report's `errors` prevent training. mapping: of the logs, by default from the arm's settings; units that
@@ -50,12 +48,13 @@ def check_logs(
     torques. Raises LogError without any trajectory, for another number of joints, and without commands if the
     arm's settings have 'input: position'.
     """
-    joints = arm.arm.joint_names
+    joints = arm.chain.joint_names
     checked: TorqueLogs | ServoLogs = TorqueLogs(arm, mapping or arm.settings.logs)
     if arm.settings.input == "position":
         checked = ServoLogs(arm)
     types = [
-        "continuous" if x.kind == "revolute" and x.limits is None else x.kind for x in arm.arm.coordinates
+        "continuous" if x.joint_type == "revolute" and x.limits is None else x.joint_type
+        for x in arm.chain.coordinates
     ]
     log_checks = LogChecks(joints, types)
     measured: list[Statistics] = []
@@ -72,11 +71,11 @@ def check_logs(
         raise LogError("no trajectory", expected="at least one")
     summary = log_checks.findings()
     reports = []
-    for index, coordinate in enumerate(arm.arm.coordinates):
+    for index, coordinate in enumerate(arm.chain.coordinates):
         reports.append(joint_report(index, coordinate, measured, log_checks.products))
     completed, tables = checked.check(reports, summary)
     return LogReport(
-        robot=arm.arm.name,
+        robot=arm.chain.name,
         trajectories=tuple(x.clock for x in measured),
         joints=completed,
         tables=tables,
@@ -87,7 +86,7 @@ def check_logs(
 
 
 def require_sound_logs(
-    logs: Sequence[Trajectory], arm: ConfiguredArm, mapping: LogMapping | None = None
+    logs: Sequence[Trajectory], arm: Arm, mapping: LogMapping | None = None
 ) -> list[Diagnostic]:
     """Return the findings of `check_logs` about an arm and its logs; raise LogError where they cannot be trained on."""
     # the same checks as the command: a fit and `spelgen logs` refuse the same logs
@@ -100,10 +99,10 @@ def require_sound_logs(
 class TorqueLogs:
     """Check logs of torques with the model of their arm, from samples that are kept while the logs go by."""
 
-    def __init__(self, arm: ConfiguredArm, mapping: LogMapping) -> None:
+    def __init__(self, arm: Arm, mapping: LogMapping) -> None:
         self._arm, self._mapping, self._drives = arm, mapping, arm.actuation.drives()
         self._samples: list[np.ndarray] = []
-        self._moving = DriveLog(arm.arm.joint_types, self._drives, Preprocessing())
+        self._moving = DriveLog(arm.chain.joint_types, self._drives, Preprocessing())
         self._declared: list[set[str]] = []
         self._seconds, self._is_bag = 0.0, False
 
@@ -125,10 +124,10 @@ class TorqueLogs:
         accepted = set(self._mapping.accept) | set.intersection(*self._declared)
         motion = joined(self._samples)
         completed = []
-        fits = fit_gravity(self._arm.arm, motion)
+        fits = fit_gravity(self._arm.chain, motion)
         for report, gravity in zip(reports, fits, strict=True):
             completed.append(replace(report, gravity=gravity))
-        evidence = list(map(JointEvidence, self._arm.arm.coordinates, completed))
+        evidence = list(map(JointEvidence, self._arm.chain.coordinates, completed))
         # with wrong velocities friction is wrong too, and hints about drives would be wrong with wrong torques
         has_errors = bool(summary.errors)
         is_sound = not has_errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
@@ -161,7 +160,7 @@ class TorqueLogs:
 
         moving: filtered samples; None: the logs are too slow for accelerations, and motion (4, S, n) is used.
         """
-        arm = self._arm.arm
+        arm = self._arm.chain
         q, qd, qdd, tau = motion
         samples = MotionSamples(q, qd, qdd, tau)
         if moving is not None:
@@ -185,7 +184,7 @@ class TorqueLogs:
 
     def _check_drives(self, moving: DriveSamples, summary: Findings) -> None:
         """Add a coupling of motors that the logs show, or else a delay of the torques."""
-        late = delay_of(drive_problem(body_chain(self._arm.arm), self._drives, moving))
+        late = delay_of(drive_problem(body_chain(self._arm.chain), self._drives, moving))
         if late.coupling is not None:
             summary.notes.append(_coupling_hint(self._arm, *late.coupling))
         else:
@@ -202,9 +201,9 @@ def _link_notes(problem: GeometryProblem, fit: Fit) -> Iterator[Diagnostic]:
         yield Diagnostic("warning", WRONG_LINK, f"link {problem.arm.bodies[k].link!r}", None, message)
 
 
-def _coupling_hint(arm: ConfiguredArm, coupling: Coupling, remaining: float) -> Diagnostic:
+def _coupling_hint(arm: Arm, coupling: Coupling, remaining: float) -> Diagnostic:
     """Return a coupling that the logs show, in the sidecar's words."""
-    names = arm.arm.joint_names
+    names = arm.chain.joint_names
     pair = [coupling.moved_by, coupling.joint]
     matrix = np.array([[1.0, coupling.ratio], [0.0, 1.0]]) * np.diag(arm.actuation.matrix())[pair]
     joints = json.dumps([names[k] for k in pair])

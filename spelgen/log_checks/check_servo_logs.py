@@ -21,7 +21,7 @@ from spelgen.logs.trajectory import Trajectory, require_commands, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, SIGNALS
 
 if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import ConfiguredArm
+    from spelgen.arm.configured_arm import Arm
 
 MOVING = SAMPLES.moving
 DELAYS = np.arange(TUNING.earliest_delay, TUNING.latest_delay + 1e-9, TUNING.delay_step).round(9)
@@ -105,7 +105,7 @@ def _midpoints(x: np.ndarray) -> np.ndarray:
 class ServoLogs:
     """Check logs of commanded positions against their arm."""
 
-    def __init__(self, arm: ConfiguredArm) -> None:
+    def __init__(self, arm: Arm) -> None:
         self._arm = arm
         self._logs: list[Trajectory] = []
 
@@ -118,9 +118,9 @@ class ServoLogs:
         self, reports: Sequence[JointReport], summary: Findings
     ) -> tuple[list[JointReport], tuple[Listing, ...]]:
         """Return the reports with the tracking of commands, and tables; add the findings to the summary."""
-        names = self._arm.arm.joint_names
+        names = self._arm.chain.joint_names
         saturation = np.full(len(names), np.inf)
-        for k, coordinate in enumerate(self._arm.arm.coordinates):
+        for k, coordinate in enumerate(self._arm.chain.coordinates):
             kp = self._arm.settings.joint(coordinate.name).kp
             if coordinate.effort and kp:
                 saturation[k] = coordinate.effort / kp
@@ -129,7 +129,7 @@ class ServoLogs:
             message = f"no {FILTER_SAMPLES} samples without a gap: no servo is determined"
             summary.notes.append(Diagnostic("warning", "idle-command", "logs", None, message))
         completed = []
-        for k, (coordinate, report) in enumerate(zip(self._arm.arm.coordinates, reports, strict=True)):
+        for k, (coordinate, report) in enumerate(zip(self._arm.chain.coordinates, reports, strict=True)):
             odd = None
             if following is not None:
                 report = replace(report, following=following.joints[k])

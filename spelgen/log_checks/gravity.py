@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import orth
 
-from spelgen.arm.arm import Arm
-from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.arm.arm import Chain
+from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.log_checks.tuning import TUNING
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SAMPLES
@@ -56,7 +56,7 @@ def joined(samples: Sequence[np.ndarray]) -> np.ndarray:
     return motion[:, :: -(-motion.shape[1] // TUNING.all_gravity_samples) or 1]
 
 
-def fit_gravity(arm: Arm, motion: np.ndarray) -> list[GravityFit]:
+def fit_gravity(arm: Chain, motion: np.ndarray) -> list[GravityFit]:
     """Return the fit of gravity per joint. motion: samples (4, S, n)."""
     q, qd, qdd, tau = motion
     # with fewer, gravity and friction are confounded

@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 
 from spelgen.arm.actuation import Drives
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.geometry_search import Comparison
 from spelgen.identification.log_geometry import Fit, Hypothesis
@@ -23,7 +23,7 @@ GEOMETRY_CODES = (
 RIGHT = "joints, zeros, units and gravity as the URDF and the settings state them"
 
 
-def mapped_reading(arm: Arm, mapping: LogMapping, drives: Drives) -> Hypothesis:
+def mapped_reading(arm: Chain, mapping: LogMapping, drives: Drives) -> Hypothesis:
     """Return the unchanged reading of a log: scales and offsets of its mapping, and gears of single joints."""
     joints = arm.joint_names
     gears = np.diag(drives.inputs) if np.count_nonzero(drives.inputs) == len(joints) else np.ones(len(joints))
@@ -44,7 +44,7 @@ class Remedies:
     """
 
     unchanged: Hypothesis
-    arm: Arm
+    arm: Chain
     mapping: LogMapping
     by_name: bool
 
@@ -124,7 +124,7 @@ class Remedies:
             shifts = np.where(reversed_motion, 0.0, reading.offset - unchanged.offset)
             k = int(np.abs(shifts).argmax())
             shift = f"{np.rad2deg(shifts[k]):.3g} degrees"
-            if self.arm.coordinates[k].kind == "prismatic":
+            if self.arm.coordinates[k].joint_type == "prismatic":
                 shift = f"{shifts[k]:.3g} m"
             return shifts != 0, f"positions with another zero, by {shift}"
         return order >= 0, self._gravity_text(code, reading)

@@ -171,7 +171,7 @@ def joint_report(
         visited = (high["q"] - low["q"]) / (coordinate.limits[1] - coordinate.limits[0])
     return JointReport(
         name=coordinate.name,
-        kind=coordinate.kind,
+        kind=coordinate.joint_type,
         low=low,
         high=high,
         range_fraction=visited,

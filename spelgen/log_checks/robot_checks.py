@@ -46,7 +46,7 @@ class JointEvidence(NamedTuple):
 def find_beyond_limits(joint: JointEvidence) -> str | None:
     """Find positions, measured or commanded, beyond the limits."""
     findings = []
-    (lower, upper), unit = joint.limits(), UNITS[joint.coordinate.kind].position
+    (lower, upper), unit = joint.limits(), UNITS[joint.coordinate.joint_type].position
     for name in ("q", "u"):
         low, high = joint.report.low.get(name, inf), joint.report.high.get(name, -inf)
         # a limit overrun by less is the rounding of a logger
@@ -60,7 +60,7 @@ def find_beyond_limits(joint: JointEvidence) -> str | None:
 def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
     """Find a quantity above the joint's limit, "velocity" or "effort"."""
     bound: float | None = getattr(joint.coordinate, limit)
-    unit = getattr(UNITS[joint.coordinate.kind], MEASURES[quantity])
+    unit = getattr(UNITS[joint.coordinate.joint_type], MEASURES[quantity])
     largest = joint.report.largest(quantity)
     if not bound or largest <= bound * (1 + TUNING.limit_noise):
         return None
@@ -133,7 +133,7 @@ def find_one_way(joint: JointEvidence) -> str | None:
     # of a velocity that is not dq/dt nothing follows for the motion
     if slower >= TUNING.one_way * faster or not (joint.report.velocity_correlation or 0.0) > TUNING.seen:
         return None
-    unit = UNITS[joint.coordinate.kind].velocity
+    unit = UNITS[joint.coordinate.joint_type].velocity
     return (
         f"moves one way only, qd from {joint.report.low['qd']:.3g} to {joint.report.high['qd']:.3g} {unit}: its dry "
         "friction is indistinguishable from gravity and a torque offset; record its motion both ways"

@@ -10,7 +10,7 @@ from spelgen.errors import LogError
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.messages import validated
 from spelgen.settings.settings import Settings, load_mapping
-from spelgen.settings.yaml_document import Document
+from spelgen.settings.yaml_document import YamlDocument
 from spelgen.urdf.robot import Robot
 
 GivenMapping = LogMapping | Mapping[str, object] | Path | str | None
@@ -31,7 +31,7 @@ class DescribedArm(Protocol):
     """Loaded arm with the settings that describe its logs. turning_joints: revolute, without position limits."""
 
     @property
-    def arm(self) -> JointNames: ...
+    def chain(self) -> JointNames: ...
     @property
     def turning_joints(self) -> Sequence[str]: ...
     @property
@@ -71,7 +71,7 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
             log_mapping = log_mapping.model_copy(update={"input": "position"})
         # an angle without limits may be logged in any interval of one turn
         log_mapping = log_mapping.with_turns(arm.turning_joints)
-        return LogSource(tuple(arm.arm.joint_names), tuple(arm.arm.joint_types), log_mapping)
+        return LogSource(tuple(arm.chain.joint_names), tuple(arm.chain.joint_types), log_mapping)
     if isinstance(arm, JointNames):
         joints = tuple(arm.joint_names)
         log_mapping = _mapping(mapping, joints)
@@ -91,7 +91,7 @@ def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | 
     if isinstance(mapping, str | Path):
         given = load_mapping(mapping, joints)
     else:
-        given = validated(LogMapping, dict(mapping or {}), Document(Path("mapping"), None))
+        given = validated(LogMapping, dict(mapping or {}), YamlDocument(Path("mapping"), None))
     if stated is None:
         return given
     return LogMapping.model_validate(

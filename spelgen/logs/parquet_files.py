@@ -17,7 +17,7 @@ from spelgen.files import read_json, require_regular_file
 from spelgen.logs.tables import LogFormat, LogTable, reading, stored_columns, table_layout
 from spelgen.settings.log_mapping import LogMapping, MotorCalibration
 from spelgen.settings.messages import validated
-from spelgen.settings.yaml_document import Document
+from spelgen.settings.yaml_document import YamlDocument
 
 INFO = "meta/info.json"  # of a data set of LeRobot
 STATE, ACTION, TIMESTAMP = "observation.state", "action", "timestamp"
@@ -121,7 +121,7 @@ def _calibration(folder: Path) -> dict[str, MotorCalibration]:
     """Return the calibration of the motors that lies in a data set, empty without one."""
     for file in (folder / "calibration.json", folder / "meta" / "calibration.json"):
         if file.is_file():
-            document = Document(file, None)
+            document = YamlDocument(file, None)
             return validated(LogMapping, {"calibration": read_json(file, LogError)}, document).calibration
     return {}
 

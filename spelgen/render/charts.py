@@ -1,7 +1,7 @@
-"""Charts as inline SVG: coloured by the page's style sheet, so they follow light, dark and print.
+"""Charts as inline SVG. The page's style sheet sets the colours, for light, dark and print.
 
-All charts have the same margins: where they stand below each other, their times do as well. What a script needs to
-tell values from pixels stands in `data-` attributes.
+All charts have the same margins, so that the time axes of charts in a column are aligned. `data-` attributes of an SVG
+element contain the axes, from which a script computes the values at a pixel.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 @dataclass(frozen=True)
 class Margins:
-    """Room around the curves [pixels]. bare: below a chart whose x axis has no numbers."""
+    """Margins around the curves [pixels]. bare: bottom margin of a chart whose x axis has no numbers."""
 
-    start: int = 52
-    end: int = 14
+    left: int = 52
+    right: int = 14
     top: int = 22
     bottom: int = 36
     bare: int = 8
@@ -35,7 +35,7 @@ MARGINS = Margins()
 
 @dataclass(frozen=True)
 class Axis:
-    """Values low..high shown from pixel `start` to pixel `end`, straight or logarithmic."""
+    """Linear or logarithmic scale: the values low..high lie at the pixels start..end."""
 
     low: float
     high: float
@@ -44,7 +44,7 @@ class Axis:
     log: bool = False
 
     def pixels(self, values: np.ndarray) -> np.ndarray:
-        """Return where values lie; a value outside the axis lies on its edge."""
+        """Return the pixels (T,) of values (T,); a value outside the axis lies on its edge."""
         clipped, low, high = np.clip(values, self.low, self.high), self.low, self.high
         if self.log:
             clipped, low, high = np.log(clipped), math.log(low), math.log(high)
@@ -52,40 +52,40 @@ class Axis:
         return pixels
 
     def contains(self, values: np.ndarray) -> np.ndarray:
-        """Return which values lie within the axis."""
+        """Return a mask (T,): true for the values (T,) within the axis."""
         inside: np.ndarray = (values >= self.low) & (values <= self.high)
         return inside
 
     def ticks(self) -> list[tuple[float, str]]:
-        """Return about five round values within the axis, as pixel and label."""
+        """Return about five round values within the axis: pixel and label of each."""
         steps = _log_steps if self.log else _steps
         values, labels = steps(self.low, self.high)
         return list(zip(self.pixels(values).tolist(), labels, strict=True))
 
     def data(self) -> str:
-        """Return first and last pixel, their values and whether it is logarithmic, for a script."""
+        """Return first and last pixel, their values, and 1 for a logarithmic axis, for a script."""
         return f"{self.start:g} {self.end:g} {self.low:.6g} {self.high:.6g} {int(self.log)}"
 
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """One curve: x and y of equal length, broken where a value is not finite. `style` is its CSS class."""
+    """One curve: x and y, (T,), with a gap at values that are not finite. style: its CSS class."""
 
     label: str
     x: Values
     y: Values
     style: str
-    kind = "line"
+    shape = "line"
 
     @property
     def heights(self) -> np.ndarray:
-        """Return what the axis of y has to show."""
+        """All values of y, (T,), for the range of the axis."""
         return _floats(self.y)
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return pieces of line, in steps of tenths of a pixel from corner to corner."""
+        """Return the SVG path of the segments between gaps, in relative steps of tenths of a pixel."""
         x, y = _floats(self.x), _floats(self.y)
-        # samples that are evenly spread, the last one among them: the line ends where the data do
+        # evenly spaced samples with the last one included: the line ends at the last value
         rows = np.linspace(0, len(x) - 1, min(len(x), TUNING.points)).round().astype(int)
         x, y = x[rows], y[rows]
         gaps = ~(np.isfinite(x) & np.isfinite(y))
@@ -93,22 +93,22 @@ class Line:
             gaps |= y <= 0
         corners = np.stack([x_axis.pixels(x), y_axis.pixels(y)], axis=1)
         corners[gaps] = np.nan
-        pieces = []
-        for piece in np.split(np.round(corners, 1), np.flatnonzero(gaps)):
-            drawn = piece[np.isfinite(piece[:, 0])]
-            if len(drawn) > 1:
-                pieces.append(f"M{_spaced(drawn[0])}l{_spaced(np.diff(drawn, axis=0))}")
-        return "".join(pieces)
+        segments = []
+        for segment in np.split(np.round(corners, 1), np.flatnonzero(gaps)):
+            finite = segment[np.isfinite(segment[:, 0])]
+            if len(finite) > 1:
+                segments.append(f"M{_spaced(finite[0])}l{_spaced(np.diff(finite, axis=0))}")
+        return "".join(segments)
 
 
 @dataclass(frozen=True, eq=False)
 class Dots(Line):
-    """Points that nothing connects."""
+    """Points without a connecting line."""
 
-    kind = "dots"
+    shape = "dots"
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return lines without length, whose round ends are the dots; those outside are left out."""
+        """Return lines of length zero, whose round caps are the dots, for the points within both axes."""
         x, y = _floats(self.x), _floats(self.y)
         inside = x_axis.contains(x) & y_axis.contains(y)
         dots = np.stack([x_axis.pixels(x[inside]), y_axis.pixels(y[inside])], axis=1)
@@ -117,25 +117,25 @@ class Dots(Line):
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """The area between two curves over x."""
+    """The area between two curves low and high over x, (T,) each."""
 
     label: str
     x: Values
     low: Values
     high: Values
     style: str
-    kind = "band"
+    shape = "band"
 
     @property
     def heights(self) -> np.ndarray:
-        """Return what the axis of y has to show."""
+        """All values of both curves, (2 T,), for the range of the axis."""
         return np.concatenate([_floats(self.low), _floats(self.high)])
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return the outline; what exceeds the axis ends at its edge, and so does what is not finite."""
-        # a prediction that left all bounds has no upper end, but still a lower one
+        """Return the outline, clipped to the axis; values that are not finite lie on its upper edge."""
+        # the upper quantile of a diverged prediction may be infinite while the lower one is finite
         low, high = (np.nan_to_num(_floats(y), nan=np.inf) for y in (self.low, self.high))
-        # along the lower curve, and back along the upper one
+        # along the lower curve, then backwards along the upper curve
         x = x_axis.pixels(_floats(self.x))
         columns = np.concatenate([x, x[::-1]])
         rows = y_axis.pixels(np.concatenate([low, high[::-1]]))
@@ -146,7 +146,7 @@ Mark = Line | Band
 
 
 @dataclass(frozen=True)
-class Entry:
+class LegendEntry:
     """A line of a legend: CSS classes of the mark, and its label."""
 
     style: str
@@ -155,10 +155,10 @@ class Entry:
 
 @dataclass(frozen=True)
 class Chart:
-    """An SVG element, and the legend of the marks that are visible in it."""
+    """An SVG element, and the legend of its visible marks."""
 
     svg: str
-    legend: tuple[Entry, ...]
+    legend: tuple[LegendEntry, ...]
 
     def __html__(self) -> str:
         """Return the element, for templates."""
@@ -178,11 +178,19 @@ def line_chart(
     width: int = 400,
     height: int = 190,
 ) -> Chart:
-    """Return lines, bands and dots over axes and grid.
+    """Return lines, bands and dots over axes and grid; without any finite value, a chart with a note.
 
-    log, log_x: logarithmic axes. motion: name of the motion whose time x is, which a script may follow. limits: of y,
-    in place of its values'; the chart names the lines beyond them. Without an x_label the x axis has no numbers: those
-    of the chart below are its own. Without a finite value the chart says so.
+    Args:
+        marks: Curves in the order of the legend.
+        title: Accessible name of the chart.
+        x_label: Label of the x axis; "": no label and no numbers, for a chart above another one with the same axis.
+        y_label: Label of the y axis.
+        log: Whether the y axis is logarithmic.
+        log_x: Whether the x axis is logarithmic.
+        motion: Name of the animated motion whose time is x; a script marks the current time.
+        limits: Range of the y axis in place of the range of the values; lines beyond it are named in the chart.
+        width: Width [pixels].
+        height: Height [pixels].
     """
     size = {"title": title, "width": width, "height": height}
     x_values = _shown([_floats(mark.x) for mark in marks], log_x)
@@ -192,15 +200,15 @@ def line_chart(
     if not x_values.size or not y_values.size:
         return Chart(render("chart.html.jinja", **size, x=None), ())
     bottom = height - (MARGINS.bottom if x_label else MARGINS.bare)
-    x_axis = _axis(x_values, MARGINS.start, width - MARGINS.end, pad=0.0, log=log_x)
-    # SVG counts pixels downwards: the axis of y starts at the bottom
+    x_axis = _axis(x_values, MARGINS.left, width - MARGINS.right, pad=0.0, log=log_x)
+    # SVG counts pixels downwards: the y axis starts at the bottom
     y_axis = _axis(y_values, bottom, MARGINS.top, pad=0.0 if limits else 0.06, log=log)
     legend, beyond = [], []
     for mark in marks:
         inside = y_axis.contains(_shown([mark.heights], log))
         if inside.any():
-            legend.append(Entry(f"{mark.kind} {mark.style}", mark.label))
-        if mark.kind == "line" and not inside.all():
+            legend.append(LegendEntry(f"{mark.shape} {mark.style}", mark.label))
+        if mark.shape == "line" and not inside.all():
             beyond.append(mark.label)
     svg = render(
         "chart.html.jinja",
@@ -210,8 +218,8 @@ def line_chart(
         x_label=x_label,
         y_label=y_label,
         motion=motion,
-        # lines are drawn above bands and dots, the model's above those of baselines that it agrees with
-        marks=sorted(marks, key=lambda mark: (mark.kind == "line", mark.style == "model")),
+        # lines are drawn above bands and dots, the model's line above the baselines' lines
+        marks=sorted(marks, key=lambda mark: (mark.shape == "line", mark.style == "model")),
         beyond=beyond,
     )
     return Chart(svg, tuple(legend))
@@ -222,12 +230,12 @@ def _floats(values: Values) -> np.ndarray:
 
 
 def _spaced(pixels: np.ndarray) -> str:
-    """Return numbers in tenths."""
+    """Return the numbers of pixels (T, 2) or (2,) rounded to tenths and separated by blanks."""
     return " ".join(f"{round(pixel, 1):g}" for pixel in pixels.ravel().tolist())
 
 
 def _shown(columns: Sequence[np.ndarray], positive: bool) -> np.ndarray:
-    """Return all finite values, or those that a logarithmic axis can show."""
+    """Return the finite values of all columns (T,), for `positive` the positive ones only, (K,)."""
     values = np.concatenate([np.zeros(0), *columns])
     drawable = np.isfinite(values)
     if positive:
@@ -237,21 +245,23 @@ def _shown(columns: Sequence[np.ndarray], positive: bool) -> np.ndarray:
 
 
 def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool) -> Axis:
-    """Return an axis that holds the values, and `pad` of their range on both sides."""
+    """Return an axis for the values (K,) with margins of `pad` times their range on both sides."""
     low, high = float(values.min()), float(values.max())
     if log:
         low = max(low, high * 10.0**-TUNING.decades)
+        # margins of equal width on a logarithmic axis are equal factors
         factor = (high / low) ** pad if high > low else 2.0
         return Axis(low / factor, high * factor, start, end, log=True)
     room = pad * (high - low)
-    # rounding alone would otherwise fill the chart with noise of 1e-16
+    # otherwise the rounding errors of a constant, about 1e-16, would fill the chart
     if high - low <= 1e-9 * max(abs(low), abs(high)):
-        room = 0.5 * abs(high) or 1.0  # a flat line lies in the middle
+        room = 0.5 * abs(high) or 1.0  # a constant line lies in the middle
     return Axis(low - room, high + room, start, end)
 
 
 def _log_steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
-    """Return powers of ten; 1, 2 and 5 times these, or linear steps, where there are fewer than three."""
+    """Return ticks (K,) and labels: powers of ten; for fewer than three, 1, 2 and 5 times these, or `_steps`."""
+    # the tolerance keeps a power of ten at the end of the axis in spite of rounding
     first, last = math.ceil(math.log10(low) - 1e-9), math.floor(math.log10(high) + 1e-9)
     powers = range(first, last + 1, max(1, (last - first) // 5 + 1))
     if len(powers) >= 3:
@@ -265,9 +275,12 @@ def _log_steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
 
 
 def _steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
-    """Return multiples of 1, 2 or 5 times a power of ten."""
+    """Return ticks (K,) and labels: multiples of 1, 2 or 5 times a power of ten."""
+    # the smallest step of 1, 2, 5 or 10 times a power of ten that gives at most five intervals
     rough = (high - low) / 5
     fine = 10.0 ** math.floor(math.log10(rough)) * np.array([1, 2, 5, 10])
-    step = fine[fine >= rough * (1 - 1e-9)][0]  # rounding must not skip a step that just fits
+    step = fine[fine >= rough * (1 - 1e-9)][
+        0
+    ]  # the tolerance keeps a step that equals rough but for rounding
     values = step * np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
     return values, [f"{value:.6g}" for value in values]

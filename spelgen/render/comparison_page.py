@@ -1,4 +1,4 @@
-"""Write a comparison as one self-contained HTML page: the result in a sentence and a table, then curves."""
+"""The page of a comparison: the result in a sentence and a table, then curves."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from spelgen.comparison.figures import SimulatedFigures
 from spelgen.comparison.inputs import ArmInputs
 from spelgen.comparison.study import Study
-from spelgen.comparison.tables import ArmSection, comparison_sentence
+from spelgen.comparison.tables import ArmResults, comparison_sentence
 from spelgen.evaluation.plain import array
 from spelgen.evaluation.truth import true_mass
 from spelgen.files import write_text
@@ -34,7 +34,7 @@ class SimulatedCurves:
     mass: list[Panel]
 
 
-def write_comparison(study: Study, sections: Sequence[ArmSection]) -> Path:
+def write_comparison(study: Study, sections: Sequence[ArmResults]) -> Path:
     """Write comparison.html into the study's folder; return its path."""
     curves = {}
     jobs = {job.arm: job for job in study.jobs}
@@ -56,14 +56,15 @@ def write_comparison(study: Study, sections: Sequence[ArmSection]) -> Path:
     return write_text(study.folder / "comparison.html", text)
 
 
-def _curves(study: Study, section: ArmSection, inputs: ArmInputs, truth: Path) -> SimulatedCurves:
+def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -> SimulatedCurves:
+    """Return the curves of one arm; truth: URDF of the simulated arm."""
     first: dict[str, SimulatedFigures] = {}
     for result in section.results:
         if result.simulated is not None:
             first.setdefault(result.preset, result.simulated)
     styles = dict(zip(first, STYLES, strict=False))
     folders = {job.preset: job.folder for job in reversed(study.jobs) if job.arm == section.name}
-    arm = inputs.load().arm
+    arm = inputs.load().chain
     examples = {name: figures.example for name, figures in first.items() if figures.example is not None}
     prediction, mass = [], []
     if examples:
@@ -79,7 +80,7 @@ def _curves(study: Study, section: ArmSection, inputs: ArmInputs, truth: Path) -
 
 
 def _losses(folders: Mapping[str, Path], styles: Mapping[str, str]) -> Chart:
-    """Return the validation loss of each preset by training step."""
+    """Return the best validation loss of each preset over the training steps; folders, styles: by preset."""
     lines = []
     for name, style in styles.items():
         records = RunFolder(folders[name]).read_metrics()

@@ -1,11 +1,11 @@
-"""A report on logs as one self-contained HTML page, with what was logged drawn joint by joint."""
+"""The page of a report on logs, with charts of the logged quantities of each joint."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from spelgen.arm.arm import Arm
-from spelgen.dynamics.regressor import regressor, urdf_parameters
+from spelgen.arm.arm import Chain
+from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.labels import named_joints
 from spelgen.log_checks.report import LogReport
 from spelgen.logs.trajectory import Trajectory, joined_column, split_at_gaps
@@ -14,11 +14,8 @@ from spelgen.render.plots import JointRow, Panel, stacks
 from spelgen.render.tuning import TUNING
 
 
-def page(report: LogReport, arm: Arm, inputs: np.ndarray) -> str:
-    """Return the page about the report. It needs no other file, and names are escaped.
-
-    inputs: G (n, n), which takes logged torques to the joints'.
-    """
+def page(report: LogReport, arm: Chain, inputs: np.ndarray) -> str:
+    """Return the page about the report. inputs: G, (n, n), joint torques = G times logged torques."""
     return render_page(
         "logs.html.jinja",
         robot=report.robot,
@@ -30,19 +27,22 @@ def page(report: LogReport, arm: Arm, inputs: np.ndarray) -> str:
     )
 
 
-def charts(log: Trajectory, arm: Arm, inputs: np.ndarray) -> list[Panel]:
-    """Return by joint q; qd beside dq/dt; torque beside the URDF's gravity torque. Of servos: q beside u."""
-    # gaps are kept: no line is drawn over one by a slope across it
-    pieces = [piece[:: -(-len(log.t) // TUNING.points)] for piece in split_at_gaps(log)]
-    t, q = joined_column(pieces, "t"), joined_column(pieces, "q")
+def charts(log: Trajectory, arm: Chain, inputs: np.ndarray) -> list[Panel]:
+    """Return charts of each joint: position; velocity with dq/dt; torque with the URDF's gravity torque.
+
+    Of position servos: position with command. inputs: G, (n, n), see `page`.
+    """
+    # split first, so that dq/dt has no difference across a gap
+    segments = [segment[:: -(-len(log.t) // TUNING.points)] for segment in split_at_gaps(log)]
+    t, q = joined_column(segments, "t"), joined_column(segments, "q")
     position = [("logged", q, "truth")]
     rows = [JointRow("position", "position", "position", position)]
     if log.u is not None:
-        position.append(("commanded", joined_column(pieces, "u"), "predicted"))
+        position.append(("commanded", joined_column(segments, "u"), "predicted"))
     else:
-        slope = np.concatenate(list(map(_slope, pieces)))
-        velocity = [("logged", joined_column(pieces, "qd"), "truth"), ("dq/dt", slope, "predicted")]
-        torque = [("logged", joined_column(pieces, "tau") @ inputs.T, "truth")]
+        derivative = np.concatenate(list(map(_derivative, segments)))
+        velocity = [("logged", joined_column(segments, "qd"), "truth"), ("dq/dt", derivative, "predicted")]
+        torque = [("logged", joined_column(segments, "tau") @ inputs.T, "truth")]
         if any(body.inertia for body in arm.bodies):
             still = np.zeros_like(q)
             gravity = regressor(arm, q, still, still) @ urdf_parameters(arm)  # (T, n)
@@ -52,9 +52,9 @@ def charts(log: Trajectory, arm: Arm, inputs: np.ndarray) -> list[Panel]:
     return stacks(t, rows, named_joints(arm.joint_names, arm.joint_types))
 
 
-def _slope(piece: Trajectory) -> np.ndarray:
-    """Return dq/dt (T, n) by differences of what is drawn; NaN for a sample alone."""
-    if len(piece.t) < 2:
-        return np.full_like(piece.q, np.nan)
-    slope: np.ndarray = np.gradient(piece.q, piece.t, axis=0)
-    return slope
+def _derivative(segment: Trajectory) -> np.ndarray:
+    """Return dq/dt, (T, n) [rad/s, m/s], by differences of the subsampled positions; NaN for a single sample."""
+    if len(segment.t) < 2:
+        return np.full_like(segment.q, np.nan)
+    derivative: np.ndarray = np.gradient(segment.q, segment.t, axis=0)
+    return derivative

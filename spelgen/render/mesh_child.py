@@ -1,7 +1,9 @@
-"""Reads what a URDF shows, in a process of bounded time and memory: [URDF, LINK...] as JSON -> NPZ on stdout.
+"""Process of limited time and memory that reads visual shapes: [URDF, LINK...] as JSON on stdin -> NPZ on stdout.
 
-Readers of a dozen formats unpack archives, follow names of other files and repeat parts as often as a file says.
+The limits are needed because mesh formats contain archives, names of other files and repetition counts.
 """
+
+from __future__ import annotations
 
 import gc
 import io
@@ -10,7 +12,7 @@ import os
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,43 +20,46 @@ from spelgen.errors import SpelgenError
 from spelgen.files import read_bytes
 from spelgen.render.tuning import TUNING
 
+if TYPE_CHECKING:
+    from yourdfpy import Visual
+
 MEMORY = 1_073_741_824  # bytes
-SECONDS = 30  # of processor time: imports and simplification of fine meshes take most of it
-LARGEST = 50_000_000  # bytes of a file
-FACES = 2_000_000  # of a link: more are an archive that unpacks to no end
+SECONDS = 30  # of processor time, of which imports and the simplification of fine meshes take most
+MAX_BYTES = 50_000_000  # of a file
+MAX_FACES = 2_000_000  # of a link: a limit for archives that expand without end
 
 
-class Neighbours:
-    """Opens what a mesh names: regular files of its own folder alone, as trimesh asks for them."""
+class MeshFolder:
+    """Resolver of trimesh for the files that a mesh names: only regular files in the folder of the mesh."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def get(self, name: str) -> bytes:
-        """Return what a file holds. Raises SpelgenError."""
-        return read_bytes(self._folder / Path(name.strip()).name, SpelgenError, largest=LARGEST)
+        """Return the content of a file. Raises SpelgenError."""
+        return read_bytes(self._folder / Path(name.strip()).name, SpelgenError, largest=MAX_BYTES)
 
     __getitem__ = get
 
 
 def mesh_file(urdf: Path, name: str) -> Path:
-    """Return the file of a mesh by what the URDF calls it. Raises FileNotFoundError.
+    """Return the path of a mesh from its name in the URDF. Raises FileNotFoundError.
 
-    It is looked for beside the URDF and in all folders above, which a package's name may stand for.
+    The folder of the URDF and all its parents are searched, since any of these may be the folder of a package.
     """
-    scheme, _, rest = name.rpartition("://")
-    path = Path(rest)
+    scheme, _, path_text = name.rpartition("://")
+    path = Path(path_text)
     inner = Path(*path.parts[scheme == "package" :])
-    for place in (urdf.parent / inner, path, *(folder / inner for folder in urdf.parents)):
-        if os.path.isfile(place):  # unlike Path.is_file it answers for names that no system takes
-            return place
+    for file in (urdf.parent / inner, path, *(folder / inner for folder in urdf.parents)):
+        if os.path.isfile(file):  # unlike Path.is_file it raises no error for an invalid name
+            return file
     raise FileNotFoundError(name)
 
 
 def main(urdf: str, links: list[str], output: IO[bytes]) -> None:
-    """Write the arrays v0, f0, v1, f1, ...: vertices (V, 3) and faces (F, 3) of each link that the URDF shows.
+    """Write the arrays v0, f0, v1, f1, ...: vertices (V, 3) [m] and faces (F, 3) of each link with visual shapes.
 
-    Raises where a file is missing or is no mesh: an arm with holes is worse than tubes.
+    Raises an error if a file is missing or is not a mesh: tubes show an arm better than an incomplete set of meshes.
     """
     with suppress(ImportError):  # not on Windows
         import resource
@@ -69,23 +74,24 @@ def main(urdf: str, links: list[str], output: IO[bytes]) -> None:
     for link in model.robot.links:
         if link.name not in links or not link.visuals:
             continue
-        gc.collect()  # meshes refer to themselves: those of other links would fill the memory
+        gc.collect()  # meshes contain reference cycles, so the meshes of other links would fill the memory
         mesh: Any = trimesh.util.concatenate([_shape(visual, Path(urdf)) for visual in link.visuals])
-        # a box without size has an area of 0, corners that are no numbers or too far away have none
-        if not (np.isfinite(mesh.vertices).all() and mesh.area < np.inf) or len(mesh.faces) > FACES:
+        # the area overflows for corners that are too far away
+        if not (np.isfinite(mesh.vertices).all() and mesh.area < np.inf) or len(mesh.faces) > MAX_FACES:
             raise ValueError(f"{link.name}: too many triangles, or corners that are no numbers")
         if len(mesh.faces) > TUNING.faces // len(links):
+            # an equal number of faces per link bounds the size of the page
             mesh = mesh.simplify_quadric_decimation(face_count=TUNING.faces // len(links), aggression=3)
         index = links.index(link.name)
         arrays |= {f"v{index}": np.asarray(mesh.vertices), f"f{index}": np.asarray(mesh.faces)}
-    # in memory first: NumPy writes an archive by going back in its file, which a pipe does not allow
+    # in memory first: NumPy seeks backwards while it writes an archive, and a pipe cannot seek
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     output.write(buffer.getbuffer())
 
 
-def _shape(visual: Any, urdf: Path) -> Any:
-    """Return a visual of the URDF as a mesh in its link's frame."""
+def _shape(visual: Visual, urdf: Path) -> Any:
+    """Return the mesh of one <visual> in the frame of its link."""
     from trimesh import creation
 
     geometry = visual.geometry
@@ -105,13 +111,13 @@ def _shape(visual: Any, urdf: Path) -> Any:
 
 
 def _read(path: Path) -> Any:
-    """Return the mesh in a file."""
+    """Return the mesh in a file. Raises ValueError if it has no triangles."""
     import trimesh
 
-    content = io.BytesIO(read_bytes(path, SpelgenError, largest=LARGEST))
-    kind, neighbours = path.suffix.lower().lstrip("."), Neighbours(path.parent)
-    mesh: Any = trimesh.load(content, file_type=kind, resolver=neighbours, force="mesh")  # type: ignore[arg-type]
-    # files give each triangle or patch corners of its own: apart, they would tear when they are simplified
+    content = io.BytesIO(read_bytes(path, SpelgenError, largest=MAX_BYTES))
+    format, resolver = path.suffix.lower().lstrip("."), MeshFolder(path.parent)
+    mesh: Any = trimesh.load(content, file_type=format, resolver=resolver, force="mesh")  # type: ignore[arg-type]
+    # files repeat the vertices of each triangle: unmerged, the surface would tear when it is simplified
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     if not len(mesh.faces):
         raise ValueError(f"{path}: no triangles")

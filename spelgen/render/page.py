@@ -1,4 +1,4 @@
-"""What every page has: its style, its scripts, and a policy that lets it run these and load nothing."""
+"""The frame of every page: style sheet, scripts, and a policy that forbids all other scripts and all loading."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ SCRIPTS = ("page.js", "arm.js")
 
 
 def render_page(template: str, **context: object) -> str:
-    """Return one self-contained page.
+    """Return one self-contained HTML page from a template.
 
-    Its Content-Security-Policy admits the style and the scripts in it by their digests, and nothing else: no file or
-    address can be loaded, and no text that came through can run.
+    The Content-Security-Policy of the page admits its own style sheet and scripts by their digests and nothing else:
+    the page loads no file or address, and text from a user's file cannot run as a script.
     """
     style, *scripts = _assets()
     return render(
@@ -34,8 +34,8 @@ def render_page(template: str, **context: object) -> str:
 
 
 def json_data(data: object) -> Markup:
-    """JSON that may stand in a <script> element: none of its text can end the element."""
-    # NaN is no JSON: better an error here than a page whose script stops
+    """Return JSON for a <script> element: without the characters that could end the element."""
+    # NaN is not valid JSON: an error here, instead of a script that stops in the browser
     text = json.dumps(data, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
 

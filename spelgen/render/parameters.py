@@ -1,26 +1,28 @@
-"""Tables of what a model has learned that is a number: inertial parameters, drives and friction."""
+"""Tables of the numerical parameters of a model: inertial parameters, drives, friction, constants of M."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from spelgen.arm.configured_arm import ConfiguredArm
-from spelgen.dynamics.linear_friction import FrictionModel
+from spelgen.arm.configured_arm import Arm
+from spelgen.dynamics.body_regressor import about_center
+from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.parameters import parameters_of_kind
-from spelgen.dynamics.regressor import urdf_parameters
-from spelgen.dynamics.rigid_bodies import about_center
+from spelgen.dynamics.regressor_dynamics import urdf_parameters
 from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
+from spelgen.fitting.run_record import Content
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.labels import UNITS, entry_name
 from spelgen.listing import Listing
-from spelgen.render.plots import Record
 from spelgen.render.tuning import TUNING
+from spelgen.runtime.constant_mass import ConstantMass
 from spelgen.runtime.derived_mass import DerivedMass
+from spelgen.runtime.network_dynamics import NetworkDynamics
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
@@ -32,59 +34,54 @@ DETERMINED = ("firm", "fair")
 
 @dataclass(frozen=True)
 class ParameterTable(Listing):
-    """A table whose first column is a name. folded: rows that are folded away."""
+    """A table with a name in the first column. folded: rows that a page shows on request."""
 
     folded: Rows = ()
     folded_title: str = ""
 
 
-def parameter_tables(
-    model: ArmModel | None, arm: ConfiguredArm | None, identified: Record | None
-) -> list[Listing]:
-    """Return the tables of a run's parameters; `identified`: by least squares on the same logs."""
+def parameter_tables(model: ArmModel | None, arm: Arm | None, identified: Content | None) -> list[Listing]:
+    """Return the tables of a run's parameters; `identified`: result of least squares on the same logs."""
     tables: list[Listing] = []
     if arm is not None and identified and "base_parameters" in identified:
         tables.append(base_table(model, arm, identified))
-    bodies = body_parameters(model)
-    if bodies is not None:
-        tables.append(_body_table(bodies, arm))
-    if model is not None and hasattr(model, "armature"):
+    if isinstance(model, RigidBodyDynamics):
+        tables.append(_body_table(body_parameters(model), arm))
         tables.append(_joint_table(model, arm))
-    if len(getattr(getattr(model, "mass", None), "raw_constants", ())):
-        tables.append(_constant_table(model))
+    elif isinstance(model, NetworkDynamics):
+        mass = model.mass
+        if isinstance(mass, DerivedMass | ConstantMass) and len(mass.raw_constants):
+            tables.append(_constant_table(mass, model.joint_types))
     return tables
 
 
-def body_parameters(model: ArmModel | None) -> np.ndarray | None:
-    """Return (bodies, 10) of a model of rigid bodies, as ``Body.inertia`` has them; None of another or of none."""
-    if model is None or not isinstance(model, RigidBodyDynamics):
-        return None
+def body_parameters(model: RigidBodyDynamics) -> np.ndarray:
+    """Return the inertial parameters in the order of ``Body.inertia``, (bodies, 10) [kg, kg m, kg m^2]."""
     values: np.ndarray = model.inertial_parameters.detach().numpy()
     return values
 
 
-def base_table(model: ArmModel | None, arm: ConfiguredArm, identified: Record) -> ParameterTable:
-    """Return what least squares found, beside the URDF and, where there is one, a model of rigid bodies."""
+def base_table(model: ArmModel | None, arm: Arm, identified: Content) -> ParameterTable:
+    """Return the base parameters by least squares, from the URDF and of a rigid-body model."""
     effects = identified["method"]["effects"]
     friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
-    base = base_parameters(arm.arm, friction, arm.actuation.drives().speeds)
+    base = base_parameters(arm.chain, friction, arm.actuation.drives().speeds)
     parameters = identified["base_parameters"]
     names, determined, formulas = [], [], []
     for parameter in parameters:
         names.append(parameter["name"])
         determined.append(parameter["determined"])
         formulas.append("" if parameter["formula"] == parameter["name"] else parameter["formula"])
-    nominal = base.combination[:, : 10 * len(arm.arm.bodies)] @ urdf_parameters(arm.arm)
-    # a file says nothing of friction and drives, and some say nothing of bodies
+    nominal = base.combination[:, : 10 * len(arm.chain.bodies)] @ urdf_parameters(arm.chain)
+    # no URDF has friction and drives in this form, and some have no inertials
     nominal[base.bodies :] = np.nan
-    if not arm.arm.has_inertials:
+    if not arm.chain.inertials_complete:
         nominal[:] = np.nan
     columns = {"parameter": names, "URDF": list(map(_number, nominal))}
     note = "The intervals are those of least squares on the training logs [kg, m, s]"
-    bodies = body_parameters(model)
-    if model is not None and bodies is not None:
-        # ten a body, then those of drives, of which a model has the armature in common with least squares
-        common = np.concatenate([bodies.ravel(), model.armature.detach().numpy()])
+    if isinstance(model, RigidBodyDynamics):
+        # the inertial parameters of all bodies, then of the drives only the armature, as the friction models differ
+        common = np.concatenate([body_parameters(model).ravel(), model.armature.detach().numpy()])
         learned = base.combination[:, : len(common)] @ common
         for k in range(base.bodies, len(names)):
             if not names[k].startswith("armature"):
@@ -114,27 +111,28 @@ def base_table(model: ArmModel | None, arm: ConfiguredArm, identified: Record) -
 
 
 def _number(value: float) -> str:
-    """Return four digits; nothing for NaN."""
+    """Return four digits; "" for NaN."""
     return f"{value:.4g}".replace("nan", "")
 
 
-def _interval(parameter: Record) -> str:
-    """Return the value of a base parameter, with its interval where it has one."""
+def _interval(parameter: Content) -> str:
+    """Return the value of a base parameter with its confidence interval, if it has one."""
     value = f"{parameter['value']:.4g}"
     if parameter["deviation"] is not None:
         value += f" ± {TUNING.interval * parameter['deviation']:.2g}"
     return value
 
 
-def _body_table(values: np.ndarray, arm: ConfiguredArm | None) -> Listing:
+def _body_table(values: np.ndarray, arm: Arm | None) -> Listing:
+    """Return mass, centre of mass and principal moments of each body; values: (bodies, 10)."""
     names = [f"body {k + 1}" for k in range(len(values))]
     nominal = None
     if arm is not None:
-        names = [body.name for body in arm.arm.bodies]
-        if arm.arm.has_inertials:
-            nominal = urdf_parameters(arm.arm).reshape(-1, 10)
+        names = [body.name for body in arm.chain.bodies]
+        if arm.chain.inertials_complete:
+            nominal = urdf_parameters(arm.chain).reshape(-1, 10)
     rows = []
-    # the URDF below the model, body by body: differences are read down a column
+    # the URDF's values below the model's values of the same body, so that a column shows their difference
     for k, name in enumerate(names):
         rows.append((name, "model", *_about_center(values[k])))
         if nominal is not None:
@@ -149,7 +147,7 @@ def _body_table(values: np.ndarray, arm: ConfiguredArm | None) -> Listing:
 
 
 def _about_center(body: np.ndarray) -> tuple[str, str, str]:
-    """Return mass, centre of mass and principal moments about it, of ten parameters."""
+    """Return mass, centre of mass and principal moments about it, as text; body: inertial parameters, (10,)."""
     if body[0] <= 0:
         return f"{body[0]:.4g}", "", ""
     mass, center, tensor = about_center(body)
@@ -160,32 +158,29 @@ def _listed(values: np.ndarray) -> str:
     return ", ".join(f"{value:.3g}" for value in values)
 
 
-def _joint_table(model: ArmModel, arm: ConfiguredArm | None) -> Listing:
-    """Return armature, friction and torque offset of each joint of a model that has an armature."""
-    names, inertias, torques, slopes = [], [], [], []
-    for number, kind in enumerate(model.joint_types, start=1):
-        unit = UNITS[kind]
-        names.append(f"joint {number}")
-        inertias.append(unit.inertia)
-        torques.append(unit.torque)
-        slopes.append(f"{unit.torque} s/{unit.position}")
-    columns = {"joint": names, "armature": _with_units(model.armature.tolist(), inertias)}
+def _joint_table(model: ArmModel, arm: Arm | None) -> Listing:
+    """Return armature, friction and torque offset of each joint of a rigid-body model."""
+    units = [UNITS[joint_type] for joint_type in model.joint_types]
+    torques = [unit.torque for unit in units]
+    dampings = [f"{unit.torque} s/{unit.position}" for unit in units]
+    columns = {
+        "joint": [f"joint {number + 1}" for number in range(model.n)],
+        "armature": _with_units(model.armature.tolist(), [unit.inertia for unit in units]),
+    }
     note = ""
     if arm is not None:
-        joints = arm.arm.coordinates
-        columns["joint"] = list(arm.arm.joint_names)
-        if isinstance(model, RigidBodyDynamics):
-            viscous, forward, backward, _ = nearest_friction(arm.arm, model, sampled_positions(arm.arm))
-            note = "Viscous and Coulomb friction are fitted to the model's friction law, as in exports."
-            # the damping of a drive's control contains its joint's viscous friction
-            if not parameters_of_kind(model, "damping"):
-                columns["viscous"] = _with_units(viscous, slopes)
-            columns["Coulomb, qd > 0"] = _with_units(forward, torques)
-            columns["Coulomb, qd < 0"] = _with_units(backward, torques)
-        columns["URDF: viscous"] = _with_units([joint.damping for joint in joints], slopes)
+        joints = arm.chain.coordinates
+        columns["joint"] = list(arm.chain.joint_names)
+        viscous, forward, backward, _ = nearest_friction(arm.chain, model, sampled_positions(arm.chain))
+        note = "Viscous and Coulomb friction are fitted to the model's friction law, as in exports."
+        # the damping of a servo's controller contains the viscous friction of its joint
+        if not parameters_of_kind(model, "damping"):
+            columns["viscous"] = _with_units(viscous, dampings)
+        columns["Coulomb, qd > 0"] = _with_units(forward, torques)
+        columns["Coulomb, qd < 0"] = _with_units(backward, torques)
+        columns["URDF: viscous"] = _with_units([joint.damping for joint in joints], dampings)
         columns["URDF: Coulomb"] = _with_units([joint.friction for joint in joints], torques)
-    if isinstance(model, RigidBodyDynamics):
-        columns["torque offset"] = _with_units(model.torque_offset.tolist(), torques)
+    columns["torque offset"] = _with_units(model.torque_offset.tolist(), torques)
     return Listing("Drives and friction", tuple(columns), tuple(zip(*columns.values(), strict=True)), note)
 
 
@@ -193,11 +188,10 @@ def _with_units(values: Sequence[float] | np.ndarray, units: Sequence[str]) -> l
     return [f"{value:.3g} {unit}" for value, unit in zip(values, units, strict=True)]
 
 
-def _constant_table(model: Any) -> Listing:
-    """Return the learned constants of M, in the units of the first entries that they are in."""
-    mass = model.mass
+def _constant_table(mass: DerivedMass | ConstantMass, joint_types: Sequence[str]) -> Listing:
+    """Return the learned constants of M with the entries that contain them."""
     count = len(mass.raw_constants)
-    # what each constant adds to M, (constants, n, n)
+    # dM / d constant, (constants, n, n): M is linear in its functions and constants
     functions = len(mass.function_mean) if isinstance(mass, DerivedMass) else 0
     zeros = torch.zeros(functions, count, dtype=torch.float64)
     units = torch.eye(count, dtype=torch.float64)
@@ -206,7 +200,8 @@ def _constant_table(model: Any) -> Listing:
     for basis, value in zip(bases, mass.constants().tolist(), strict=True):
         indices = basis.tril().nonzero().tolist()
         terms = [f"{basis[row, column].item():+.4g} {entry_name(row, column)}" for row, column in indices]
-        first, second = (UNITS[model.joint_types[k]].inertia for k in indices[0])
+        # a constant that occurs in entries of different units has the unit of the first one
+        first, second = (UNITS[joint_types[k]].inertia for k in indices[0])
         unit = first if first == second else "kg m"
         entries = " ".join(terms).replace("+1 ", "+ ").removeprefix("+ ")
         rows.append((entries, f"{value:.4g}", unit))

@@ -1,4 +1,4 @@
-"""A run folder -> one self-contained HTML page. What the folder lacks is said, not guessed."""
+"""The page of a run. Files that the run folder does not have are named on the page."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from jinja2 import TemplateError
 
-from spelgen.arm.configured_arm import ConfiguredArm
+from spelgen.arm.configured_arm import Arm
 from spelgen.emission.specify import arm_of_spec
 from spelgen.emission.text import header
 from spelgen.errors import RunError, SpelgenError, in_one_line
@@ -18,22 +18,16 @@ from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.traces import Traces
 from spelgen.evaluation.verdict import Limits, Verdict, verdict
 from spelgen.files import write_json, write_text
-from spelgen.fitting.run_folder import RunFolder, trained_model
+from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.labels import UNITS, named_joints
 from spelgen.render.arm_section import arm_section, matrix
-from spelgen.render.curves import curves
 from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, parameter_tables
-from spelgen.render.plots import coverage_panels, loss_chart
-from spelgen.render.run_facts import (
-    best_epoch,
-    commands,
-    head_numbers,
-    settings,
-    training_facts,
-)
+from spelgen.render.report_charts import coverage_panels, evaluation_charts, loss_chart
+from spelgen.render.run_facts import best_epoch, commands, head_numbers, settings, training_facts
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.spec import ModelSpec
 from spelgen.structure.structure import derive
 
@@ -41,7 +35,7 @@ if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
 
 SCHEMA = 1
-"""Of the page as data."""
+"""Version of the JSON form of a report."""
 
 
 @dataclass(frozen=True)
@@ -57,25 +51,25 @@ class Run:
     config: Record | None
     results: Results | None
     baselines: Content
-    arm: ConfiguredArm | None
+    arm: Arm | None
 
     @property
     def limits(self) -> Limits:
-        """Return the joints' limits, None of a joint without."""
+        """Position limits of the joints [rad, m]; None for a joint without limits."""
         if self.arm is None:
             return [None] * len(self.spec.joints)
-        return [joint.limits for joint in self.arm.arm.coordinates]
+        return [joint.limits for joint in self.arm.chain.coordinates]
 
     @property
     def verdict(self) -> Verdict | None:
-        """Return what the model is good for; None before it is evaluated."""
+        """Assessment of the model; None before its evaluation."""
         if self.results is None:
             return None
         return verdict(self.results, self.baselines, self.limits)
 
 
 def open_run(path: Path | str) -> Run:
-    """Return what a run folder holds. Raises RunError or ModuleError."""
+    """Return the content of a run folder. Raises RunError or ModuleError."""
     folder = RunFolder(path)
     evaluation = _record(folder, folder.evaluation)
     arm = None
@@ -100,11 +94,15 @@ def _record(folder: RunFolder, path: Path) -> Content | None:
 def write_report(
     folder: Path | str, output: Path | str | None = None, robot: Path | str | None = None
 ) -> Path:
-    """Write the page about a run, by default as report.html in its folder; return its path.
+    """Write the page about a run; return its path.
 
-    A name that ends with .json: the same as data. robot: the run's URDF where its meshes lie beside it.
+    Args:
+        folder: Run folder.
+        output: File of the page, report.html in the run folder by default; .json writes the data of the page.
+        robot: URDF with its meshes, for the picture of the arm; default: the URDF in the run folder.
 
-    Raises RunError or ModuleError when the folder is no run, or a file of it cannot be read.
+    Raises:
+        RunError, ModuleError: The folder is not a run folder, or a file in it cannot be read.
     """
     folder = Path(folder)
     path = Path(output or folder / "report.html")
@@ -114,16 +112,13 @@ def write_report(
 
 
 def report_data(folder: Path | str) -> Content:
-    """Return all that the page shows, for programs: the verdict, the evaluation, least squares, the parameters."""
+    """Return the data of the page for programs: assessment, evaluation, baselines and parameters."""
     run = open_run(folder)
     model = _trained(run)
-    bodies = body_parameters(model)
-    if bodies is not None:
-        bodies = bodies.tolist()
     return {
         "schema": SCHEMA,
         "verdict": None if run.verdict is None else asdict(run.verdict),
-        "bodies": bodies,
+        "bodies": body_parameters(model).tolist() if isinstance(model, RigidBodyDynamics) else None,
         "tables": list(map(asdict, parameter_tables(model, run.arm, run.baselines))),
         "evaluation": _record(run.folder, run.folder.evaluation),
         "least_squares": run.baselines or None,
@@ -131,12 +126,12 @@ def report_data(folder: Path | str) -> Content:
 
 
 def _trained(run: Run) -> ArmModel | None:
-    """Return the trained model."""
-    return trained_model(run.folder) if run.folder.weights.is_file() else None
+    """Return the trained model; None of a run without weights."""
+    return fitted_model(run.folder).requires_grad_(False).eval() if run.folder.weights.is_file() else None
 
 
 def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
-    """Return the page about a run as HTML; the same folder gives the same text. robot: see ``write_report``."""
+    """Return the page about a run as HTML, deterministically. robot: see ``write_report``."""
     folder = Path(folder)
     if not RunFolder(folder).path.is_dir():
         raise RunError(
@@ -145,7 +140,7 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
             expected="a folder with spec.json",
             do="make one with `spelgen train`",
         )
-    # files of a run folder may come from anywhere and hold anything
+    # the files of a run folder are untrusted: each of them may have any content
     try:
         return _rendered(open_run(folder), robot)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, TemplateError) as error:
@@ -162,17 +157,17 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
     traces, tables = Traces({}), []
     if run.results is not None:
         traces, tables = run.results.traces, result_tables(run.results)
-    sections = dict.fromkeys(("arm", "cells", "training", "settings", "losses")) | curves(traces, spec)
+    sections = dict.fromkeys(("arm", "cells", "training", "settings", "losses"))
+    sections |= evaluation_charts(traces, spec)
     if run.arm is not None:
-        sections["arm"] = arm_section(run.arm.arm, Path(robot or run.arm.robot.path), traces)
-        sections["cells"] = matrix(run.arm.arm, derive(run.arm.arm, spec.options.assume))
+        sections["arm"] = arm_section(run.arm.chain, Path(robot or run.arm.robot.path), traces)
+        sections["cells"] = matrix(run.arm.chain, derive(run.arm.chain, spec.options.assume))
     if record is not None:
         sections["training"] = training_facts(record, metrics, run.baselines, model)
         sections["settings"] = settings(record)
     if metrics:
         sections["losses"] = loss_chart(metrics, best_epoch(metrics))
-    # the sentences about the model
-    docstring = header(spec)
+    docstring = header(spec)  # its second paragraph describes the structure
     joints = named_joints(spec.joint_names, spec.joint_types)
     return render_page(
         "report.html.jinja",

@@ -1,4 +1,4 @@
-"""A run in figures and words: what a reader wants first, how it was trained, what it lies in, how it is made again."""
+"""Facts about a run: its most important figures, its training, its options, and the commands that reproduce it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spelgen.dynamics.residuals import used_parameter_count
+from spelgen.dynamics.parameters import used_parameter_count
 from spelgen.errors import shortened
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import figures
@@ -19,6 +19,7 @@ from spelgen.fitting.torque.report import terms_in_use
 from spelgen.labels import counted
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.runtime.residual_dynamics import ResidualDynamics
 from spelgen.settings.fits import CONFIGS
 from spelgen.settings.training import TrainingSettings
 from spelgen.spec import ModelSpec, Options
@@ -33,14 +34,17 @@ def head_numbers(
     metrics: Sequence[Content],
     results: Results | None,
 ) -> list[tuple[str, str]]:
-    """Return the most important figures with their labels, as far as the run has come.
+    """Return the most important figures with their labels.
 
-    record: None and metrics: [] if the run has none.
+    Args:
+        model: The trained model; None before it is trained.
+        record: Record of the fit; None before the fit.
+        metrics: Records of the epochs; empty for a fit without epochs.
+        results: Evaluation of the model; None before it is evaluated.
     """
     numbers = []
     if results is not None:
-        for figure in figures(results):
-            numbers.append((figure.text(), figure.label))
+        numbers = [(figure.text(), figure.label) for figure in figures(results)]
     summary = None if record is None else servo_summary(record.servo)
     if summary is not None:
         numbers.append(summary.headline)
@@ -53,7 +57,8 @@ def head_numbers(
 
 
 def best_epoch(metrics: Sequence[Content]) -> int:
-    """Return the epoch of the model that was kept; 0: no epoch was better than the start."""
+    """Return the epoch of the best model; 0: no epoch was better than the initial model."""
+    # the last record has the smallest validation loss, which is the initial loss if no epoch improved it
     best = metrics[-1]["best"]
     return next((epoch["epoch"] for epoch in metrics if epoch["validation"] == best), 0)
 
@@ -61,7 +66,7 @@ def best_epoch(metrics: Sequence[Content]) -> int:
 def training_facts(
     record: Record, metrics: Sequence[Content], baselines: Content, model: ArmModel | None
 ) -> dict[str, str]:
-    """Return the logs, the preprocessing and the length of a fit, for people."""
+    """Return the logs, the preprocessing and the length of a fit as text, by label."""
     preprocessing = record.preprocessing
     facts = {
         "objective": record.objective,
@@ -73,8 +78,8 @@ def training_facts(
     if "samples" in baselines:
         count = f"{baselines['samples']:,}"
         facts["dense samples"] = f"{count} that move, from which least squares is fitted as well"
-    if model is not None and hasattr(model, "residuals"):
-        facts["beside rigid bodies"] = "; ".join(terms_in_use(model)) or "nothing selected"
+    if isinstance(model, ResidualDynamics):
+        facts["residual terms"] = "; ".join(terms_in_use(model)) or "none selected"
     # fits to torques have no epochs
     if metrics:
         last, best = metrics[-1], best_epoch(metrics)
@@ -93,17 +98,15 @@ def training_facts(
 
 
 def settings(record: Record) -> dict[str, str]:
-    """Return the options of the fit, for people."""
+    """Return the options of the fit as text, by label."""
     options = record.options.items()
     return {key.replace("_", " "): str(value) for key, value in options if value is not None}
 
 
 def _names(trajectories: Sequence[str]) -> str:
-    return (
-        f"{counted(len(trajectories), 'trajectory')}: {shortened(trajectories, 5)}"
-        if trajectories
-        else "none"
-    )
+    if not trajectories:
+        return "none"
+    return f"{counted(len(trajectories), 'trajectory')}: {shortened(trajectories, 5)}"
 
 
 def _duration(seconds: float) -> str:
@@ -114,11 +117,11 @@ def _duration(seconds: float) -> str:
 
 
 def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str]:
-    """Return the commands that reproduce a run; LOGS stands for the logs, since a run does not keep their path."""
+    """Return the commands that reproduce a run, with LOGS in place of the logs, whose paths are not recorded."""
     options = asdict(spec.options)
-    if spec.options.design is not None:  # of a file that the run does not keep
+    if spec.options.design is not None:  # the run folder has no copy of the YAML file
         options["preset"] += ".yaml"
-    # the module may name a folder of another machine before its URDF
+    # without its folder, which may be one of another machine
     robot, option = shlex.quote(Path(spec.urdf).name), ""
     if run.urdf.exists():
         robot = f"RUN/{run.urdf.name}"
@@ -144,7 +147,7 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str
 
 
 def _changed(options: Mapping[str, object], defaults: Mapping[str, object]) -> dict[str, object]:
-    """Return the options that are set to something else than by default."""
+    """Return the options that differ from their defaults; groups of options are omitted."""
     changed = {}
     for key, value in options.items():
         if value is not None and value != defaults.get(key) and not isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Write a self-contained HTML page that compares the evaluations of several run folders."""
+"""The page that compares the evaluations of several runs."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def render_runs(folders: Sequence[Path]) -> str:
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
-    """Return the shortest distinct ends of the folders' paths; complete paths would show home folders on the page."""
+    """Return the shortest distinct ends of the folders' paths; complete paths would disclose home folders."""
     paths = list(map(Path.resolve, folders))
     names: list[str] = []
     for count in range(1, max(len(path.parts) for path in paths) + 1):
@@ -58,7 +58,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 
 def _verdict(runs: Mapping[str, Results]) -> str:
-    """Return a sentence with the run that has the smallest error, for each figure that all runs have."""
+    """Return a sentence that states, for each figure that all runs have, the run with the smallest error."""
     errors: dict[str, list[tuple[float, str, str]]] = {}
     for run, results in runs.items():
         for figure in figures(results):

@@ -1,7 +1,7 @@
-"""A URDF -> the arm as a page draws it: links that hang on one another, each with its triangles.
+"""The kinematic tree and the triangles of an arm, for the animated picture on a page.
 
-The triangles are those of the file's visual shapes where these are found, simplified to fit a page; else tubes from
-joint to joint, with a drum about the axis of each that turns.
+The triangles are the simplified visual shapes of the URDF. If a mesh is not found, links are drawn as tubes from joint
+to joint, and joints as drums about their axes.
 """
 
 from __future__ import annotations
@@ -18,15 +18,16 @@ from spelgen.evaluation.plain import Curve
 from spelgen.render.shapes import Shape, joined, tube, visual_shapes
 from spelgen.render.tuning import TUNING
 from spelgen.urdf.read import read_urdf
-from spelgen.urdf.robot import Joint, Robot
+from spelgen.urdf.robot import Robot, UrdfJoint
 
 
 @dataclass(frozen=True, eq=False)
 class SceneLink:
-    """Hold a link, and the joint that carries it.
+    """A link and its motion relative to its parent.
 
-    It stands at rotation (3, 3) and position (3,) in its parent's frame and then turns about its axis, or slides along
-    it, by ratio * q[joint] + offset. joint: -1, it is fixed.
+    rotation (3, 3) and position (3,) [m] are the pose of the joint frame in the parent's frame. In the joint frame the
+    link rotates about axis (3,), or for `slides` moves along it, by ratio * q[joint] + offset [rad, m].
+    parent, joint: indices, -1 for the root and for a fixed link.
     """
 
     name: str
@@ -43,29 +44,29 @@ class SceneLink:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Links, parents first, and how far the arm reaches [m]. has_meshes: whether the shapes are the file's own."""
+    """Links, parents first; extent: sum of the lengths between joints [m]; has_meshes: whether no link is a tube."""
 
     links: tuple[SceneLink, ...]
-    reach: float
+    extent: float
     has_meshes: bool
 
 
 def scene(urdf: Path, joints: Sequence[str]) -> Scene:
-    """Return the arm of these joints. Raises what reading the URDF raises."""
+    """Return the scene of the arm with these moving joints. Raises the errors of ``read_urdf``."""
     robot = read_urdf(urdf)
     constraint = mimic_constraint(robot, joints)
     names = _links(robot, joints)
     shapes = visual_shapes(urdf, names)
     lengths = [np.linalg.norm(joint.xyz) for name, joint in robot.joint_above.items() if name in names]
-    reach = max(float(sum(lengths)), 1e-3)  # an arm of joints in one point has a size, too
+    extent = max(float(sum(lengths)), 1e-3)  # positive even if all joints lie in one point
     links = []
     for name in names:
         if shapes:
             shape = shapes.get(name, joined([]))
         else:
-            shape = _tubes(robot, name, names, TUNING.tube_radius * reach)
+            shape = _tubes(robot, name, names, TUNING.tube_radius * extent)
         links.append(_link(robot, name, names, constraint, shape))
-    return Scene(tuple(links), reach, bool(shapes))
+    return Scene(tuple(links), extent, bool(shapes))
 
 
 def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint, shape: Shape) -> SceneLink:
@@ -75,7 +76,7 @@ def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint,
         return SceneLink(name, -1, np.eye(3), root, np.array([0.0, 0.0, 1.0]), False, -1, 0.0, 0.0, shape)
     driver, ratio, offset = -1, 0.0, 0.0
     if joint.moves:
-        # a mimic joint follows the joint that drives it; a locked one follows none
+        # a mimic joint depends on its driving joint, a locked joint on none
         row = constraint.names.index(joint.name)
         offset = float(constraint.offset[row])
         drivers = np.flatnonzero(constraint.jacobian[row])
@@ -97,15 +98,12 @@ def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint,
 
 
 def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
-    """Return the links from the root to the last joint and what the joints carry; parents first.
-
-    What is fixed to these links is among them.
-    """
+    """Return the links of the chain of `joints`, the links that it carries and links fixed to it, parents first."""
     leading = {joint.name for name in joints for joint in robot.path_to(robot.joint[name].child)}
     carried: set[str] = set()
     visible = [robot.root]
     for joint in robot.joints_from_root:
-        # whatever hangs on a carried link is carried, too
+        # the children of a carried link are carried as well
         if joint.name in joints or joint.parent in carried:
             carried.add(joint.child)
         fixed = joint.parent in visible and not joint.moves
@@ -115,32 +113,34 @@ def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
 
 
 def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shape:
-    """Return tubes from the link's origin to the joints that it carries; the last link ends at its centre of mass."""
+    """Return tubes from the link's origin to its child joints, or to the centre of mass of the last link."""
     joint, inertial = robot.joint_above.get(name), robot.link[name].inertial
     below = [joint for joint in robot.joints_below[name] if joint.child in names]
     meshes = []
     for carried in below:
         end = np.array(carried.xyz, dtype=float)
         meshes += tube(np.zeros(3), end, radius)
-        if carried.type == "prismatic":  # its rail
+        if carried.type == "prismatic":  # a thin tube along its travel
             travel = max(abs(carried.lower or 0.0), abs(carried.upper or 0.0))
             meshes += tube(end, end + travel * _rotation(carried) @ _axis(carried), 0.4 * radius)
     if not below and inertial is not None:
         meshes += tube(np.zeros(3), np.array(inertial.com, dtype=float), 0.7 * radius)
     if joint is not None and joint.moves:
+        # a square block for a prismatic joint, a drum for a revolute joint; radius and half length in tube radii
         sides, width, half = (4, 1.8, 2.4) if joint.type == "prismatic" else (10, 1.5, 1.725)
         ends = half * radius * _axis(joint)
         meshes += tube(-ends, ends, width * radius, sides)
     return joined(meshes)
 
 
-def _axis(joint: Joint) -> np.ndarray:
+def _axis(joint: UrdfJoint) -> np.ndarray:
+    """Return the unit vector of the axis, (3,)."""
     axis = np.array(joint.axis, dtype=float)
     unit: np.ndarray = axis / (np.linalg.norm(axis) or 1.0)
     return unit
 
 
-def _rotation(joint: Joint) -> np.ndarray:
-    """Return the rotation of roll, pitch and yaw, about fixed axes."""
+def _rotation(joint: UrdfJoint) -> np.ndarray:
+    """Return the rotation matrix (3, 3) of roll, pitch and yaw about fixed axes."""
     matrix: np.ndarray = Rotation.from_euler("xyz", joint.rpy).as_matrix()
     return matrix

@@ -1,4 +1,4 @@
-"""Shapes of links as triangles: tubes of our own, and what a URDF shows of its links."""
+"""Shapes of links as triangles: tubes, and the visual shapes of a URDF."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Vertices (V, 3) [m] in the link's frame, and triangles of them (F, 3), seen from outside counterclockwise."""
+    """Vertices (V, 3) [m] in the link frame; triangles as vertex indices (F, 3), counterclockwise from outside."""
 
     vertices: Curve
     faces: Annotated[np.ndarray, PlainValidator(np.array), PlainSerializer(np.ndarray.tolist)]
 
 
 def joined(meshes: Sequence[Trimesh]) -> Shape:
-    """Return all meshes in one shape."""
+    """Return one shape with the triangles of all meshes."""
     import trimesh
 
     if not meshes:
@@ -42,7 +42,14 @@ def joined(meshes: Sequence[Trimesh]) -> Shape:
 
 
 def tube(start: np.ndarray, end: np.ndarray, radius: float, sides: int = 10) -> list[Trimesh]:
-    """Return a prism from start to end, with its lids; none where they are nearer than half its radius."""
+    """Return a closed prism, or nothing if it would be shorter than half its radius.
+
+    Args:
+        start: First end of the axis, (3,) [m].
+        end: Last end of the axis, (3,) [m].
+        radius: Radius of the circumscribed cylinder [m].
+        sides: Number of sides.
+    """
     import trimesh
 
     if np.linalg.norm(end - start) <= radius / 2:
@@ -51,30 +58,30 @@ def tube(start: np.ndarray, end: np.ndarray, radius: float, sides: int = 10) -> 
 
 
 def visual_shapes(urdf: Path, links: Sequence[str]) -> dict[str, Shape]:
-    """Return what the URDF shows of these links, simplified to fit a page; nothing where a mesh is not found."""
+    """Return the simplified visual shapes of these links; an empty dict if any mesh cannot be read."""
     command = [sys.executable, "-P", "-m", mesh_child.__name__]
     shapes = {}
     try:
-        if not _are_visuals_there(urdf, links):  # a process takes seconds to start
+        if not _any_visual(urdf, links):  # a process takes seconds to start
             return {}
-        # as JSON, which is ASCII: arguments may hold no name that the locale has no letters for
+        # ASCII JSON on stdin: arguments of a process are limited to the characters of the locale
         names = json.dumps([str(urdf), *links]).encode()
-        # a file may say that it is a thousand times as large as it is, or name one that never ends
+        # a process with limits: a mesh may declare any size, and may name a file without an end
         run = subprocess.run(command, input=names, capture_output=True, timeout=60, check=True)
         arrays = np.load(io.BytesIO(run.stdout))
         for index, name in enumerate(links):
             if f"v{index}" in arrays:
                 shapes[name] = Shape(arrays[f"v{index}"], arrays[f"f{index}"])
     except (OSError, ValueError, EOFError, etree.LxmlError, zipfile.BadZipFile, subprocess.SubprocessError):
-        return {}  # the page stands without
+        return {}  # the page shows tubes
     return shapes
 
 
-def _are_visuals_there(urdf: Path, links: Sequence[str]) -> bool:
-    """Return whether a URDF shows any of these links. Raises FileNotFoundError where a mesh is missing."""
+def _any_visual(urdf: Path, links: Sequence[str]) -> bool:
+    """Return True if any of these links has a visual shape. Raises FileNotFoundError if a mesh is not found."""
     root = etree.fromstring(urdf.read_bytes(), etree.XMLParser(resolve_entities=False, no_network=True))
-    shown = [link for link in root.iterfind("link") if link.get("name") in links]
-    for link in shown:
+    elements = [link for link in root.iterfind("link") if link.get("name") in links]
+    for link in elements:
         for mesh in link.iterfind("visual/geometry/mesh"):
             mesh_child.mesh_file(urdf, mesh.get("filename", ""))
-    return any(link.find("visual") is not None for link in shown)
+    return any(link.find("visual") is not None for link in elements)

@@ -1,1 +1,1 @@
-"""What a URDF does not say about a robot: the sidecar YAML beside it, checked key by key."""
+"""The settings file of a robot: values that a URDF cannot express."""

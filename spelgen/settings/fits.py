@@ -1,6 +1,6 @@
-"""What a model is fitted to, and how: one class for each objective, with the options that apply to it and no others.
+"""Configurations of fits: one class per objective, which has exactly the options that apply to it.
 
-`OWNERS` says of every option which objectives it belongs to; an option of another one is an `OptionError`.
+`OWNERS` lists the objectives of each option; an option of another objective is an `OptionError`.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ Optimizer = Literal["adamw", "lbfgs"]
 Adaptation = Literal["load", "friction", "unit"]
 Solver = Literal["rk4", "dopri5"]
 Window = Annotated[Count, Field(ge=2)]
-Substeps = Annotated[Count, Field(le=1000)]  # more never end
+Substeps = Annotated[Count, Field(le=1000)]  # a limit for the duration of a fit
 
 
 @dataclass(frozen=True)
 class WindowFitDefaults:
-    """Defaults of the optimizers of fits to windows; chosen on the arms of `benchmarks/arms.py`."""
+    """Defaults of the optimizers of window fits, chosen on the arms of `benchmarks/arms.py`."""
 
-    # [1] Up to this number of windows L-BFGS takes all of them in every step; AdamW is the default for more.
+    # [1] Largest number of windows for which L-BFGS, with all windows in each step, is the default; else AdamW.
     few_windows: int = 1024
     # [1] Weight decay of L-BFGS: factor of half the sum of squared weights, in units of the loss.
     lbfgs_decay: float = 2e-5
@@ -40,7 +40,7 @@ class WindowFitDefaults:
 
 
 DEFAULTS = WindowFitDefaults()
-UNLESS = {  # options that belong to one value of another option
+UNLESS = {  # option: (option that it depends on, its required value, its excluded value)
     "batch": ("optimizer", "adamw", "lbfgs"),
     "learning_rate": ("optimizer", "adamw", "lbfgs"),
     "substeps": ("solver", "rk4", "dopri5"),
@@ -48,15 +48,27 @@ UNLESS = {  # options that belong to one value of another option
 
 
 class GaussianPrior(Group):
-    """How far the weights of a model of rigid bodies may be from where they start: standard deviations.
+    """Standard deviations of the Gaussian prior of rigid-body and friction parameters, about their initial values.
 
-    The weights are logarithms or fractions and so have no unit. bodies: of log-Cholesky parameters, 0.1 is 10 % in
-    mass and in the size along each axis. offset: in usual sizes of friction. armature, sizes and velocities of
-    friction, fractions of its bristles: of each joint by itself; shared_*: of all joints together, of one effect
-    (`shared_sizes`), of one element of bristles (`shared_fractions`) or of all friction (`shared_friction`).
-    friction_compensation: of a drive, in usual sizes of friction at usual speed, where logs show one.
-    bodies, armature and offset are first guesses, which count as `degrees_of_freedom` weights: how far those turn out
-    to be from where they start is found by the fit (see `update_widths`).
+    The parameters are logarithms or fractions without unit. The fit estimates the standard deviations of bodies,
+    armature and offset; the values here are their initial values.
+
+    Attributes:
+        bodies: Log-Cholesky parameters of the inertias; 0.1 is about 10 % of the mass and of the radii of gyration.
+        offset: Torque offset, divided by the typical friction torque.
+        gains: Logarithm of the motor gains.
+        armature: Logarithm of the armature, per joint.
+        sizes: Logarithm of the friction coefficients, per joint.
+        velocities: Logarithm of the velocity scales of friction, per joint.
+        fractions: Logarithm of the bristle fractions, per joint.
+        shared_armature: Common factor of the armatures of all joints.
+        shared_sizes: Common factor of one friction effect of all joints.
+        shared_velocities: Common factor of one velocity scale of all joints.
+        shared_fractions: Common factor of one bristle fraction of all joints.
+        shared_friction: Common factor of all friction of all joints.
+        friction_compensation: Friction compensation of a drive, divided by typical friction per typical speed, if the
+            logs show any.
+        degrees_of_freedom: Weight of the initial standard deviations, as a number of parameters.
     """
 
     bodies: Positive = 0.75
@@ -76,7 +88,7 @@ class GaussianPrior(Group):
 
 
 class FitConfig(Group):
-    """What the objectives have in common: to know which options are theirs."""
+    """Options of one objective. of_rigid_bodies, of_networks: options for models of this type only."""
 
     objective: ClassVar[Objective]
     of_rigid_bodies: ClassVar[tuple[str, ...]] = ()
@@ -96,21 +108,22 @@ class FitConfig(Group):
 
     @model_validator(mode="after")
     def _agree(self) -> Self:
-        for name, (other, needed, against) in UNLESS.items():
-            if getattr(self, name, None) is not None and getattr(self, other, None) == against:
-                raise OptionError(name, f"belongs to the {other} {needed}, this is {against}")
+        options = dict(self)
+        for name, (condition, required, excluded) in UNLESS.items():
+            if options.get(name) is not None and options.get(condition) == excluded:
+                raise OptionError(name, f"belongs to the {condition} {required}, this is {excluded}")
         return self
 
     def require(self, *, rigid_bodies: bool) -> None:
-        """Raise OptionError for an option that was given and does not apply to this kind of model."""
+        """Raise OptionError if an option was set that does not apply to this type of model."""
         if rigid_bodies and self.objective == "momentum":
             raise OptionError(
                 "objective", "momentum belongs to models of networks alone, this is one of rigid bodies"
             )
-        kind = "models of networks alone" if rigid_bodies else "models of rigid bodies"
+        models = "models of networks alone" if rigid_bodies else "models of rigid bodies"
         for name in self.unused(rigid_bodies=rigid_bodies):
             if name in self.model_fields_set:
-                raise OptionError(name, f"with the objective {self.objective} belongs to {kind}")
+                raise OptionError(name, f"with the objective {self.objective} belongs to {models}")
 
     def record(self, *, rigid_bodies: bool) -> dict[str, object]:
         """Return the options that apply, for config.json."""
@@ -119,18 +132,23 @@ class FitConfig(Group):
 
     @classmethod
     def unused(cls, *, rigid_bodies: bool) -> tuple[str, ...]:
-        """Return the options that do not apply to this kind of model."""
+        """Return the options that do not apply to this type of model."""
         return cls.of_networks if rigid_bodies else cls.of_rigid_bodies
 
 
 class TorqueFit(FitConfig):
-    """Fit the torque of the model's inverse dynamics to the measured one, on samples at 100 Hz that move.
+    """Fit of inverse dynamics to measured torques, on samples at 100 Hz with motion.
 
-    Rigid bodies by Gauss-Newton steps to their most probable weights after `prior`. A model of networks by L-BFGS, with
-    at most `evaluations` of the loss, to which are added `weight_decay` times half the sum of squares of all
-    weights, and `urdf_weight` times the distance from the URDF (see `UrdfRegularizer`).
-    adapt: what of a fitted model moves, from where it is: a `load` at the tip (the last body; of networks M and V), the
-    `friction` of another day with the torque offsets, or all that differs in another `unit` of the same arm.
+    Rigid-body models: MAP estimate by Levenberg-Marquardt. Network models: L-BFGS on the squared torque residual, with
+    weight decay and a regularization towards the URDF (see `UrdfRegularizer`).
+
+    Attributes:
+        prior: Prior of the parameters of rigid-body models.
+        adapt: Parameters of a fitted model that are updated: of a `load` at the tip (last body; M and V of networks),
+            of `friction` and torque offsets, or of another `unit` of the same arm.
+        evaluations: Largest number of evaluations of the loss.
+        weight_decay: Factor of half the sum of squared weights.
+        urdf_weight: Factor of the squared difference from the URDF's M and gravity; 0: no regularization.
     """
 
     objective: ClassVar[Objective] = "torque"
@@ -145,15 +163,19 @@ class TorqueFit(FitConfig):
 
 
 class OnWindows(FitConfig):
-    """Options of the objectives that step down a loss of windows.
+    """Options of fits that minimize a loss of windows.
 
-    window: samples predicted together. stride: samples from the start of one window to the next.
-    optimizer: AdamW on batches or L-BFGS on all windows at once; None: L-BFGS where these are few.
-    batch: windows in a step of AdamW. learning_rate: of AdamW, at its largest. weight_decay: of AdamW, or the weight
-    of L-BFGS's penalty; None: what suits the optimizer.
-    momentum_steps: on the weak form of the equations (see `momentum_loss`).
-    urdf_weight: of staying near the URDF's own M and gravity (see `UrdfRegularizer`); 0: none.
-    max_minutes: the learning rate is annealed within this time too.
+    Attributes:
+        window: Samples per window.
+        stride: Samples from the start of one window to the start of the next.
+        momentum_steps: Training steps on the weak form of the equations.
+        optimizer: AdamW on batches, or L-BFGS on all windows; default: lbfgs for at most 1,024 windows, else adamw.
+        batch: Windows per step of AdamW; default: 256.
+        learning_rate: Largest learning rate of AdamW; default: 0.001.
+        weight_decay: Weight decay of AdamW, default: 0.2; or factor of half the sum of squared weights in the loss of
+            L-BFGS, default: 2e-05.
+        urdf_weight: Factor of the squared difference from the URDF's M and gravity; 0: no regularization.
+        max_minutes: Time limit, within which the learning rate is annealed [min].
     """
 
     window: Window = 5
@@ -167,7 +189,7 @@ class OnWindows(FitConfig):
     max_minutes: NonNegative | None = None
 
     def resolved(self, windows: int) -> Self:
-        """Return the same with optimizer, batch, learning rate and weight decay decided for so many windows."""
+        """Return the configuration with optimizer, batch, learning rate and weight decay for a number of windows."""
         optimizer = self.optimizer or ("lbfgs" if windows <= DEFAULTS.few_windows else "adamw")
         update: dict[str, object] = {"optimizer": optimizer, "batch": None, "learning_rate": None}
         decay = DEFAULTS.lbfgs_decay
@@ -181,22 +203,27 @@ class OnWindows(FitConfig):
 
 
 class MomentumFit(OnWindows):
-    """Fit the weak form of the equations alone: change of momentum against impulse along measured windows.
+    """Fit of the weak form of the equations only: change of momentum and impulse along measured windows.
 
-    Neither accelerations nor an ODE solver are needed. Kept only if it predicts the validation windows better than
-    the model did before.
+    Neither accelerations nor an ODE solver are needed. The result is kept only if it predicts the validation windows
+    better than the initial model.
     """
 
     objective: ClassVar[Objective] = "momentum"
 
 
 class Rollout(OnWindows):
-    """Fit predicted windows, in up to three stages: torque, momentum, windows (SPEL, Algorithm 1, no PD penalty).
+    """Fit of predicted windows in up to three stages (SPEL, Algorithm 1, without the PD penalty).
 
-    First, with `torque_first`, rigid bodies are fitted to torques as `TorqueFit` does. Then come
-    `momentum_steps` as of `MomentumFit`, kept where they help. Then windows are predicted by `solver`: rk4 with
-    `substeps` per sample interval (None: as many as the robot needs) or dopri5 of torchdiffeq.
-    epochs: passes over all windows, at most. patience: epochs without a better validation loss before the end.
+    The stages are a torque fit of rigid bodies (see `TorqueFit`), a momentum fit (see `MomentumFit`), and the fit of
+    predicted windows.
+
+    Attributes:
+        torque_first: Whether the torque fit is made.
+        epochs: Largest number of passes over all windows.
+        patience: Number of epochs without a better validation loss after which the fit ends.
+        solver: Integrator of the predictions: rk4 with fixed steps, or dopri5 of torchdiffeq.
+        substeps: Steps of rk4 per sample interval; default: determined from the robot.
     """
 
     objective: ClassVar[Objective] = "rollout"
@@ -210,7 +237,7 @@ class Rollout(OnWindows):
 
 
 class ServoFit(FitConfig):
-    """Fit position servos, friction and weight of an arm to what follows its commands (see `fitting.servo`)."""
+    """Fit of position servos, friction and gravity to positions measured under commands (see `fitting.servo`)."""
 
     objective: ClassVar[Objective] = "servo"
 
@@ -237,18 +264,22 @@ def fit_config(
     options: Mapping[str, object] | None = None,
     defaults: Mapping[str, object] | None = None,
 ) -> FitConfig:
-    """Return the configuration of an objective. Raises OptionError for an option that does not apply to what is fitted.
+    """Return the configuration of an objective.
 
-    Of ``defaults``, a robot's settings for whatever is fitted, those that do not apply are left out.
+    Args:
+        objective: Key of ``CONFIGS``.
+        rigid_bodies: Whether the model is one of rigid bodies.
+        options: Options of the caller. Raises OptionError for an option that does not apply.
+        defaults: Settings of the robot; options that do not apply are ignored.
     """
-    kind, options, settings = CONFIGS[objective], dict(options or {}), dict(defaults or {})
-    for name in settings.keys() - (kind.model_fields.keys() - kind.unused(rigid_bodies=rigid_bodies)):
-        del settings[name]
-    for name, (other, _, against) in UNLESS.items():
-        if options.get(other, settings.get(other)) == against:
+    config_type, options = CONFIGS[objective], dict(options or {})
+    applicable = config_type.model_fields.keys() - config_type.unused(rigid_bodies=rigid_bodies)
+    settings = {name: value for name, value in (defaults or {}).items() if name in applicable}
+    for name, (condition, _, excluded) in UNLESS.items():
+        if options.get(condition, settings.get(condition)) == excluded:
             settings.pop(name, None)
-        elif name in options and other not in options and settings.get(other) == against:
-            settings.pop(other)
-    config = validated(kind, settings | options)
+        elif name in options and condition not in options and settings.get(condition) == excluded:
+            settings.pop(condition)
+    config = validated(config_type, settings | options)
     config.require(rigid_bodies=rigid_bodies)
     return config

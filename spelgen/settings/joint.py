@@ -1,4 +1,4 @@
-"""The drive of one joint, and motors that move several joints together."""
+"""The drive of one joint, and motors that are coupled to several joints."""
 
 from __future__ import annotations
 
@@ -11,16 +11,18 @@ from spelgen.settings.values import Group, Inputs, NonNegative, Number, Positive
 
 
 class JointSettings(Group):
-    """Drive of one joint; N and m in place of Nm and rad when it is prismatic.
+    """Drive of one joint. A prismatic joint has m in place of rad, N in place of Nm and kg in place of kg m^2.
 
-    rotor_inertia: of the motor, before the gear [kg m^2].
-    gear: motor turns per joint turn.
-    viscous: friction torque per joint velocity, after the gear [Nm s/rad].
-    coulomb: friction torque for qd > 0 and for qd < 0, after the gear [Nm], e.g. (0.395, -0.435).
-    actuated: False for a passive joint, which never gets an input.
-    kp: of a position servo whose gain is known [Nm/rad]; None: it is trained.
-    gain: "trained" where the gear between logged motor torques and the joint is to be learned; it starts at `gear`.
-    inputs: the torques it draws from in a simulation, in place of `simulation.inputs` [Nm].
+    Attributes:
+        rotor_inertia: Rotor inertia of the motor, before the gear [kg m^2].
+        gear: Motor revolutions per joint revolution.
+        viscous: Viscous friction coefficient, after the gear [Nm s/rad].
+        coulomb: Coulomb friction torque for qd > 0 and for qd < 0, after the gear, e.g. [0.395, -0.435] [Nm].
+        actuated: False for a passive joint, which has no input.
+        kp: Known stiffness of a position servo; without a value it is trained [Nm/rad].
+        gain: "trained" if the factor from logged motor torques to joint torques is trained, with `gear` as its initial
+            value.
+        inputs: Torques of this joint in random-inputs simulations, in place of `simulation.inputs` [Nm].
     """
 
     rotor_inertia: NonNegative = 0.0
@@ -34,7 +36,7 @@ class JointSettings(Group):
 
     @property
     def armature(self) -> float:
-        """Rotor inertia as the joint feels it [kg m^2]."""
+        """Rotor inertia on the joint side of the gear [kg m^2]."""
         return self.rotor_inertia * self.gear**2
 
     @field_validator("coulomb")
@@ -45,18 +47,23 @@ class JointSettings(Group):
         return value
 
 
-class Coupling(Group):
-    """Joints that the same motors move: their torques are ``matrix`` times the torques of as many motors."""
+class MotorCoupling(Group):
+    """Joints that are driven by the same motors: joint torques = `matrix` times motor torques.
+
+    Attributes:
+        joints: Names of the n coupled joints.
+        matrix: Rows of the invertible (n, n) matrix, one row per joint and one column per motor.
+    """
 
     joints: Annotated[tuple[str, ...], Field(min_length=2)]
     matrix: tuple[tuple[Number, ...], ...]
 
     @model_validator(mode="after")
-    def _invertible(self) -> Coupling:
+    def _invertible(self) -> MotorCoupling:
         if {len(self.matrix), *map(len, self.matrix)} != {len(self.joints)}:
             raise ValueError("as many rows, and as many numbers in each, as joints")
         rows = np.array(self.matrix)
-        # motors in other units than their neighbours' are not dependent
+        # the rank is tested after scaling each row, as the motors of different joints may have different units
         largest = np.abs(rows).max(axis=1, keepdims=True, initial=0.0)
         if np.linalg.matrix_rank(rows / np.where(largest > 0, largest, 1.0)) < len(self.joints):
             raise ValueError("a matrix with an inverse: as many independent motors as joints")

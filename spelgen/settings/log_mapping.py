@@ -1,4 +1,4 @@
-"""Describe how a user's logs are named and measured: the group `logs` of a sidecar file, or a mapping file of its own.
+"""Names, units and signs of logged columns: the group `logs` of a settings file, or a separate mapping file.
 
 q = sign * unit * value + offset, and so is u, a commanded position; qd = sign * unit * value,
 tau = sign * gain * unit * value + torque_offset. Before that, words of a register become values by `sign_bit` and
@@ -19,7 +19,7 @@ from spelgen.settings.values import Group, Number, Positive
 
 _MILLI = 1e-3
 TIMES = {unit: _MILLI**power for power, unit in enumerate(("s", "ms", "us", "ns"))}
-# factors to SI units, which are not listed themselves
+# factors to SI units; SI units themselves are not listed
 LENGTHS = {"deg": pi / 180, "turns": 2 * pi, "mm": _MILLI}
 SPEEDS = {f"{name}/s": scale for name, scale in LENGTHS.items()} | {"rpm": 2 * pi / 60}
 SCALES = {**LENGTHS, **SPEEDS, "mNm": _MILLI, "mA": _MILLI}
@@ -28,7 +28,7 @@ COUNTS = ("counts", "counts/s")
 # -100..100 of the calibrated range of a motor, as LeRobot stores positions by default
 NORMALISED = "normalised"
 SERVO_TURN = 4096  # counts in a revolution of the servos that LeRobot calibrates
-ONLY = {  # units that a joint of this kind cannot have
+ONLY = {  # units that a joint of this type cannot have
     "revolute": ("m", "mm", "m/s", "mm/s", "N"),
     "prismatic": ("normalised", "rad", "deg", "turns", "rad/s", "deg/s", "turns/s", "rpm", "Nm", "mNm"),
 }
@@ -49,7 +49,16 @@ Effort = Literal["Nm", "mNm", "N", "A", "mA"]
 
 
 class LogColumns(Group):
-    """Names of the columns. `{joint}` is replaced by the joint's `name`, `{trajectory}` (NPZ) by any text."""
+    """Names of the columns; `{joint}` is replaced by the joint's `name`, and `{trajectory}` (NPZ) by any text.
+
+    Attributes:
+        t: Time.
+        trajectory: Name of the trajectory, if a file has several.
+        q: Position.
+        qd: Velocity.
+        tau: Torque.
+        u: Commanded position of a position servo.
+    """
 
     t: str = "t"
     trajectory: str = "trajectory"
@@ -60,11 +69,18 @@ class LogColumns(Group):
 
 
 PLAIN = LogColumns().model_dump()
-"""Columns as spelgen itself writes them."""
+"""Columns of files that spelgen writes."""
 
 
 class JointColumns(Group):
-    """Names of the columns of one joint, in place of the pattern of all joints."""
+    """Names of the columns of one joint, in place of the names for all joints.
+
+    Attributes:
+        q: Position.
+        qd: Velocity.
+        tau: Torque.
+        u: Commanded position.
+    """
 
     q: str | None = None
     qd: str | None = None
@@ -73,7 +89,14 @@ class JointColumns(Group):
 
 
 class JointUnits(Group):
-    """Units of one joint's columns; None: the units of all joints."""
+    """Units of the columns of one joint, in place of the units of all joints.
+
+    Attributes:
+        q: Position.
+        qd: Velocity.
+        tau: Torque, force or motor current.
+        u: Commanded position; default: as q.
+    """
 
     q: Position | None = None
     qd: Velocity | None = None
@@ -82,7 +105,11 @@ class JointUnits(Group):
 
 
 class LogUnits(JointUnits):
-    """Units of all columns; None: SI units, and degrees are still detected."""
+    """Units of all columns; default: SI units. Positions in degrees are then still detected.
+
+    Attributes:
+        t: Time.
+    """
 
     t: Time = "s"
 
@@ -113,14 +140,22 @@ class MotorCalibration(Group):
 
 
 class JointLog(Group):
-    """Mapping of one joint.
+    """Columns of one joint.
 
-    name: the joint's name in the log; None: the URDF's. counts_per_turn, counts_per_metre: of the joint.
-    sign: -1 if the log's sense is the opposite of the URDF's, of position, velocity and torque.
-    offset: the joint's position at the logged position 0 [rad, m]. gain: torque per logged unit, e.g. gear x
-    motor constant [Nm/A]; negative if current and velocity have opposite senses. torque_offset [Nm, N].
-    period: at which values start again, e.g. 65536 counts of a 16-bit register, 360 degrees of an angle; joints without
-    position limits have one turn. sign_bit: from it on, a value is minus its excess, as 32768 + x of a servo is -x.
+    Attributes:
+        name: Name of the joint in the log; default: its name in the URDF.
+        columns: Names of its columns.
+        units: Units of its columns.
+        counts_per_turn: Encoder counts per revolution of the joint.
+        counts_per_metre: Encoder counts per metre of the joint.
+        sign: -1 if position, velocity and torque in the log have the opposite sense of the URDF's axis.
+        offset: Joint position at the logged value 0 [rad, m].
+        gain: Torque per logged unit, e.g. gear times motor constant; negative if current and velocity have opposite
+            senses [Nm/A].
+        torque_offset: Torque at the logged value 0 [Nm, N].
+        period: Interval after which logged values start again, e.g. 65536 counts of a 16-bit register or 360 degrees;
+            default: one turn for the positions of joints without limits.
+        sign_bit: Logged value from which on values are negative: 32768 + x of a servo is -x.
     """
 
     name: str | None = None
@@ -143,16 +178,24 @@ class JointLog(Group):
 
 
 class LogMapping(Group):
-    """From a log's columns to t, q, qd, tau in SI units, or to t, q and the commanded positions u.
+    """Mapping of logged columns to t, q, qd, tau in SI units, or to t, q and commanded positions u.
 
-    input: "position" if positions are commanded: u is read, and neither qd nor tau are.
-    topic: of the ROS bag, if it has several with joint states. velocity: "differentiated" if the log has none.
-    torque_delay: delay of torques after positions in the log [s]; `spelgen logs` suggests it.
-    accept: codes of errors in logs that are correct. dropouts: "dropped" removes rows in which a signal
-    falls to 0 or deviates from its neighbours for a moment, and rows that repeat the row before. sample_rate [Hz]: rows
-    of a recording are evenly spaced by it; their times are ignored. calibration: of motors by their names in the log,
-    the content of LeRobot's calibration file, for the unit "normalised".
-    The mapping does not apply to files that spelgen wrote.
+    It does not apply to files that spelgen has written.
+
+    Attributes:
+        topic: Topic of a ROS bag that has joint states in several topics.
+        columns: Names of the columns.
+        units: Units of the columns.
+        input: "position" for position servos: u is read instead of qd and tau.
+        velocity: "differentiated" for logs without velocities.
+        torque_delay: Delay of the logged torques relative to the positions; `spelgen logs` suggests a value [s].
+        joints: Columns of single joints, by the joint's name in the URDF.
+        accept: Codes of errors of `spelgen logs` to ignore.
+        dropouts: "dropped" removes rows in which a signal falls to 0 or deviates from its neighbours for a moment, and
+            rows that repeat the row before.
+        sample_rate: Rate of evenly spaced rows, whose times are ignored [Hz].
+        calibration: Calibration of the motors by their names in the log, the content of LeRobot's calibration file, for
+            the unit "normalised".
     """
 
     topic: str | None = None
@@ -169,7 +212,7 @@ class LogMapping(Group):
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """The quantities that a log must hold."""
+        """Required quantities of a log."""
         if self.input == "position":
             return ("q", "u")
         if self.velocity == "differentiated":
@@ -181,7 +224,7 @@ class LogMapping(Group):
         return list(product(self.quantities, joints))
 
     def joint(self, name: str) -> JointLog:
-        """Return the mapping of a joint, by its URDF name."""
+        """Return the columns of a joint, by its URDF name."""
         return self.joints.get(name, JointLog())
 
     def log_name(self, joint: str) -> str:
@@ -189,7 +232,7 @@ class LogMapping(Group):
         return self.joint(joint).name or joint
 
     def column(self, quantity: str, joint: str) -> str:
-        """Return the column that holds "q", "qd", "tau" or "u" of a joint."""
+        """Return the column of "q", "qd", "tau" or "u" of a joint."""
         name: str | None = getattr(self.joint(joint).columns, quantity)
         pattern: str = getattr(self.columns, quantity)
         return name or pattern.replace("{joint}", self.log_name(joint))
@@ -200,7 +243,7 @@ class LogMapping(Group):
         return self.model_copy(update={"columns": LogColumns(**named)})
 
     def with_joint_columns(self, columns: Mapping[str, Mapping[str, str | None]]) -> LogMapping:
-        """Return the mapping with these columns of joints, per joint and quantity."""
+        """Return the mapping with these columns: joint -> quantity -> column."""
         joints = dict(self.joints)
         for joint, names in columns.items():
             logged = self.joint(joint)
@@ -229,14 +272,14 @@ class LogMapping(Group):
         return size
 
     def unit(self, quantity: str, joint: str) -> str | None:
-        """Return the unit of "q", "qd", "tau" or "u" of a joint, None without one; u has the unit of q."""
+        """Return the unit of "q", "qd", "tau" or "u" of a joint, None without a setting; u has the unit of q."""
         unit: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
         if unit is None and quantity == "u":
             return self.unit("q", joint)
         return unit
 
     def scale(self, quantity: str, joint: str) -> float:
-        """Return the factor of a logged value, sign included."""
+        """Return the factor from a logged value to SI units, with its sign."""
         logged, unit = self.joint(joint), self.unit(quantity, joint)
         factor = SCALES.get(unit or "", 1.0)
         if quantity == "tau" and logged.gain is not None:
@@ -251,14 +294,14 @@ class LogMapping(Group):
         return logged.sign * factor
 
     def offset(self, quantity: str, joint: str) -> float:
-        """Return the offset that is added after that."""
+        """Return the offset that is added after multiplication by `scale`."""
         logged = self.joint(joint)
         if quantity == "tau":
             return logged.torque_offset
         return logged.offset if quantity in ("q", "u") else 0.0
 
     def misfits(self, joints: Sequence[str], joint_types: Sequence[str] | None = None) -> list[SettingsError]:
-        """Return errors of keys that the mapping lacks for these joints, or that contradict them; empty if it fits."""
+        """Return the errors of the mapping for these joints: missing keys, and units of the wrong joint type."""
         errors = []
         kinds: Sequence[str | None] = joint_types or [None] * len(joints)
         for joint, kind in zip(joints, kinds, strict=True):
@@ -276,7 +319,7 @@ class LogMapping(Group):
         if unit == NORMALISED and joint not in self.calibration:
             return f"the content of LeRobot's calibration file as 'calibration', with {joint!r} in it"
         if unit in COUNTS:
-            # of a joint whose kind is not known either will do
+            # for an unknown joint type, either key is accepted
             in_turns = logged.counts_per_turn if kind != "prismatic" else None
             in_metres = logged.counts_per_metre if kind != "revolute" else None
             if not (in_turns or in_metres):

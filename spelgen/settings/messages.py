@@ -1,16 +1,17 @@
-"""Say what is wrong in a settings file, with file, line and key."""
+"""Errors of a settings file, with file, line and key."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar, get_args
+from typing import TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from spelgen.errors import SettingsError, collect, suggestion
-from spelgen.settings.yaml_document import Document, Location
+from spelgen.settings.yaml_document import Location, YamlDocument
 
-LONGEST_VALUE = 60  # characters of a value that a message repeats
+MAX_VALUE_LENGTH = 60  # characters of a value in a message
 EXPECTED = {
     "missing": "a value",
     "model_type": "keys with values",
@@ -20,10 +21,10 @@ EXPECTED = {
 Checked = TypeVar("Checked", bound=BaseModel)
 
 
-def validated(group: type[Checked], content: object, document: Document | None = None) -> Checked:
-    """Return what a file or a caller says as a group of settings, the defaults of None.
+def validated(group: type[Checked], content: object, document: YamlDocument | None = None) -> Checked:
+    """Return the content of a file, or arguments of a caller, as a group of settings; None: the defaults.
 
-    Raises SettingsError, or SpelgenErrors with all that is wrong; see `explain`.
+    Raises SettingsError, or SpelgenErrors for several errors; see `explain`.
     """
     try:
         return group.model_validate({} if content is None else content)
@@ -32,56 +33,57 @@ def validated(group: type[Checked], content: object, document: Document | None =
         raise
 
 
-def explain(detail: Mapping[str, Any], document: Document | None, group: type[BaseModel]) -> SettingsError:
-    """Return one of pydantic's `ValidationError.errors` as an error with its line and what was expected there.
+def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[BaseModel]) -> SettingsError:
+    """Return one of pydantic's `ValidationError.errors` as an error with its line and the expected value.
 
     document: None for values of the command line, which have no lines.
     """
-    location, kind = tuple(detail["loc"]), detail["type"]
-    if kind == "extra_forbidden":
+    location, error_type = detail["loc"], detail["type"]
+    if error_type == "extra_forbidden":
         names = _group_at(group, location[:-1]).model_fields
         return unknown_name(location, "key", str(location[-1]), names, document)
-    expected = EXPECTED.get(kind) or detail["msg"].removeprefix("Input should be ").removeprefix(
+    expected = EXPECTED.get(error_type) or detail["msg"].removeprefix("Input should be ").removeprefix(
         "Value error, "
     )
-    # pydantic has this place for a key of a dict that is none
+    # this is pydantic's location of an invalid key of a dict
     if location[-1:] == ("[key]",):
         location, expected = location[:-1], "a name; write it in quotes"
-        if kind == "string_pattern_mismatch":
+        if error_type == "string_pattern_mismatch":
             expected = "a name of letters, digits, '.', '_' and '-'"
     got = repr(detail["input"])
-    if kind == "missing" and isinstance(detail["input"], Mapping):
+    if error_type == "missing" and isinstance(detail["input"], Mapping):
         got = "nothing"
-    elif kind == "value_error" and not location:
+    elif error_type == "value_error" and not location:
         got = "these settings"
-    # a list of a thousand numbers would bury the message
-    if len(got) > LONGEST_VALUE:
-        got = got[: LONGEST_VALUE - 3] + "..."
-    return SettingsError(got, expected=expected, **_place(location, document))
+    if len(got) > MAX_VALUE_LENGTH:
+        got = got[: MAX_VALUE_LENGTH - 3] + "..."
+    error = _error_at(location, document, got)
+    error.expected = expected
+    return error
 
 
 def unknown_name(
-    location: Location, kind: str, name: str, names: Iterable[str], document: Document | None
+    location: Location, noun: str, name: str, names: Iterable[str], document: YamlDocument | None
 ) -> SettingsError:
-    """Return the error for a name that a file speaks of and nothing has, with the known name that is closest."""
-    fields = _place(location, document)
-    fields["element"] = dotted(location[:-1])
-    return SettingsError(f"unknown {kind} {name!r}", do=suggestion(name, names), **fields)
+    """Return the error for a name that is not among `names`, with the nearest known name; noun: key or joint."""
+    error = _error_at(location, document, f"unknown {noun} {name!r}")
+    error.element, error.do = dotted(location[:-1]), suggestion(name, names)
+    return error
 
 
 def dotted(location: Location) -> str | None:
-    """Return the place in a file as `joints.joint1.gear`; None for the whole file."""
+    """Return the location in a file as `joints.joint1.gear`; None for the whole file."""
     return ".".join(map(str, location)) or None
 
 
-def _place(location: Location, document: Document | None) -> dict[str, Any]:
+def _error_at(location: Location, document: YamlDocument | None, got: str) -> SettingsError:
     if document is None:
-        return {"element": dotted(location)}
-    return {"file": document.path, "line": document.line(location), "element": dotted(location)}
+        return SettingsError(got, element=dotted(location))
+    return SettingsError(got, file=document.path, line=document.line(location), element=dotted(location))
 
 
 def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
-    """Return the group of keys at a place in a file; keys of a dict and numbers of a list lead into the next one."""
+    """Return the group of keys at a location; the location may contain keys of dicts and indices of lists."""
     for key in location:
         field = group.model_fields.get(str(key))
         if field is not None:
@@ -90,6 +92,7 @@ def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
 
 
 def _first_group(annotation: object) -> type[BaseModel] | None:
+    """Return the first group of keys in an annotation such as `dict[str, Group] | None`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     for argument in get_args(annotation):

@@ -1,51 +1,59 @@
-"""What a URDF does not say about a robot: the sidecar `rpr.yaml` beside `rpr.urdf`, checked key by key.
+"""Read the settings of a robot, `rpr.yaml` for `rpr.urdf`, and check them key by key.
 
-A group of keys that one step alone reads refuses that step alone.
+An error in a group of keys that only one step reads is raised by that step only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal, NoReturn
 
 from pydantic import Field, field_validator, model_validator
 
 from spelgen.errors import Diagnostic, SettingsError, SpelgenError, SpelgenErrors, collect
-from spelgen.settings.comparison import ComparisonSettings
-from spelgen.settings.joint import Coupling, JointSettings
+from spelgen.settings.joint import JointSettings, MotorCoupling
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.messages import unknown_name, validated
 from spelgen.settings.simulation import SimulationSettings, TrackingSettings
-from spelgen.settings.training import TrainingSettings
+from spelgen.settings.training import ComparisonSettings, TrainingSettings
 from spelgen.settings.values import Group, Number
-from spelgen.settings.yaml_document import Document, Location, read_document
+from spelgen.settings.yaml_document import Location, YamlDocument, read_document
 
 OF_A_STEP = ("simulation", "tracking", "training", "comparison", "logs")
-"""Groups that one step reads; all others belong to the arm."""
+"""Groups that only one step reads; all others belong to the arm."""
 
 
 class Unusable:
-    """Stand in the place of a group that cannot be read: whoever reads it gets the errors."""
+    """Placeholder of a group with errors, which it raises when an attribute is read."""
 
     def __init__(self, errors: Sequence[SpelgenError]) -> None:
         self.errors = tuple(errors)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> NoReturn:
         if not name.startswith("__"):
             collect(self.errors)
         raise AttributeError(name)
 
 
 class Settings(Group):
-    """One robot's sidecar file. about: why the robot is here and where its values come from.
+    """Settings of one robot.
 
-    gravity: in the frame of the root link [m/s^2]. joints: by URDF name; a joint not listed has the defaults.
-    tip, moving_joints: what `--tip` and `--joints` say, so that no command has to repeat it; one of the two.
-    input: what commands the joints and is logged: torques, or positions ("u") of servos that hold them like springs.
-    torque: whether the logs' tau are joint torques, or motor torques before the gear. couplings: of motors that move
-    several joints: their friction and rotors belong to the motors, whatever the logged torques are.
-    logs: how this robot's logs are named and measured.
+    Attributes:
+        about: Description of the robot and sources of the values.
+        tip: Last link of the arm, as `--tip`; not together with `moving_joints`.
+        moving_joints: Names of the moving joints, as `--joints`.
+        input: Quantity that commands the joints: joint torques, or positions of servos ("u").
+        torque: Torques in the logs: joint torques, or motor torques before the gear.
+        couplings: Motors that drive several joints. Their friction and rotor inertia belong to the motors, also if
+            joint torques are logged.
+        gravity: Gravitational acceleration in the frame of the root link [m/s^2].
+        joints: Drives, by the joint's name in the URDF; a joint without settings has the defaults.
+        simulation: Simulated logs.
+        tracking: Controlled motions of `simulation.protocol: tracking`.
+        training: Defaults of `spelgen train`.
+        comparison: Training by `spelgen compare`.
+        logs: Names, units and signs of logged columns.
     """
 
     about: str = ""
@@ -53,7 +61,7 @@ class Settings(Group):
     moving_joints: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     input: Literal["torque", "position"] = "torque"
     torque: Literal["joint", "motor"] = "joint"
-    couplings: tuple[Coupling, ...] = ()
+    couplings: tuple[MotorCoupling, ...] = ()
     gravity: tuple[Number, Number, Number] = (0.0, 0.0, -9.81)
     joints: dict[str, JointSettings] = Field(default={})
     simulation: SimulationSettings = SimulationSettings()
@@ -85,25 +93,26 @@ class Settings(Group):
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
-        """Return warnings of groups that cannot be read: the steps that need them will stop."""
-        diagnostics = []
-        for name in OF_A_STEP:
-            group = getattr(self, name)
-            for error in group.errors if isinstance(group, Unusable) else ():
-                diagnostics.append(Diagnostic("warning", "unusable-settings", "settings", None, str(error)))
-        return tuple(diagnostics)
+        """Warnings of groups with errors, which the steps that read these groups will raise."""
+        unusable = [group for _, group in self if isinstance(group, Unusable)]
+        errors = [error for group in unusable for error in group.errors]
+        return tuple(Diagnostic("warning", "unusable-settings", "settings", None, str(x)) for x in errors)
 
     def joint(self, name: str) -> JointSettings:
-        """Return the settings of a joint, the defaults when the file does not list it."""
+        """Return the settings of a joint; the defaults if the file does not list it."""
         return self.joints.get(name, JointSettings())
 
 
 def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) -> Settings:
-    """Return the settings beside a URDF (`arm.urdf` -> `arm.yaml`), the defaults when there is no such file.
+    """Return the settings of a URDF (`arm.yaml` for `arm.urdf`); the defaults if the file does not exist.
 
-    ``joints``: all that the URDF has; then unknown names are wrong too. Raises SettingsError, told with file,
-    line and key, or SpelgenErrors with all that is wrong in the file; a group that one step alone reads
-    (``OF_A_STEP``) raises them when it is read.
+    Args:
+        urdf_path: Path of the URDF.
+        joints: Names of all its joints; settings of any other joint are then errors.
+
+    Raises:
+        SettingsError, SpelgenErrors: One or several errors, with file, line and key. The errors of a group in
+            ``OF_A_STEP`` are raised when the group is read.
     """
     path = Path(urdf_path).with_suffix(".yaml")
     if not path.exists():
@@ -121,15 +130,15 @@ def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) ->
             break
         except SpelgenError as error:
             errors = error.errors if isinstance(error, SpelgenErrors) else (error,)
-        # a group that one step reads must not stop the others: it is taken out, and told when it is read
-        for wrong in errors:
-            group = (wrong.element or "").partition(".")[0]
+        # a group that only one step reads must not stop the other steps: it is replaced by a placeholder
+        for each in errors:
+            group = (each.element or "").partition(".")[0]
             if group not in OF_A_STEP:
-                collect([*errors, *(x for other in unusable.values() for x in other.errors)])
-            earlier = unusable.get(group, Unusable(()))
-            unusable[group] = Unusable((*earlier.errors, wrong))
+                collect([*errors, *(x for placeholder in unusable.values() for x in placeholder.errors)])
+            previous = unusable.get(group, Unusable(()))
+            unusable[group] = Unusable((*previous.errors, each))
             content.pop(group, None)
-    # the arm says once what it is commanded by; its logs follow
+    # the logs have the input of the arm, so that a file states it only once
     if settings.input == "position" and not isinstance(settings.logs, Unusable):
         logs = settings.logs.model_copy(update={"input": "position"})
         settings = settings.model_copy(update={"logs": logs})
@@ -137,7 +146,7 @@ def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) ->
 
 
 def load_mapping(path: Path | str, joints: Iterable[str]) -> LogMapping:
-    """Return the mapping of logs in a YAML file of its own: what a sidecar file holds under `logs`.
+    """Return the mapping of logs in a separate YAML file, which has the keys of `logs` in the settings.
 
     Raises SettingsError as `load_settings` does, and for joints that are not among `joints`.
     """
@@ -148,17 +157,17 @@ def load_mapping(path: Path | str, joints: Iterable[str]) -> LogMapping:
     return mapping
 
 
-def _read(document: Document, content: object, joint_names: list[str] | None) -> Settings:
-    """Return the settings in ``content``. Raises what `validated` raises, and SettingsError for unknown joints."""
+def _read(document: YamlDocument, content: object, joint_names: list[str] | None) -> Settings:
+    """Return the settings in ``content``. Raises the errors of `validated`, and SettingsError for unknown joints."""
     settings = validated(Settings, content, document)
     if joint_names is not None:
-        unknown = [(place, name) for place, name in _joint_names(settings) if name not in joint_names]
-        collect([unknown_name(place, "joint", name, joint_names, document) for place, name in unknown])
+        unknown = [(location, name) for location, name in _joint_names(settings) if name not in joint_names]
+        collect([unknown_name(location, "joint", name, joint_names, document) for location, name in unknown])
     return settings
 
 
 def _joint_names(settings: Settings) -> Iterator[tuple[Location, str]]:
-    """Yield the places in a file that name a joint, and the names."""
+    """Yield the name of each joint in a file with its location."""
     for name in settings.joints:
         yield ("joints", name), name
     for name in settings.simulation.positions or ():

@@ -1,4 +1,4 @@
-"""How `spelgen simulate` makes logs: the motion, and how it is seen."""
+"""Settings of `spelgen simulate`: motions, torques and measurement."""
 
 from __future__ import annotations
 
@@ -10,21 +10,24 @@ from spelgen.settings.values import Count, Group, Inputs, NonNegative, Number, P
 
 
 class SimulationSettings(Group):
-    """How `spelgen simulate` makes logs.
+    """Simulated logs.
 
-    protocol: random-inputs; tracking: controlled motions, see `TrackingSettings`; prescribed: motions that are
-        performed exactly, torques by inverse dynamics. Without a protocol and `inputs`: tracking, of fewer and longer
-        trajectories than these (`ControlledSimulation`).
-    trajectories: number, each from its own initial position, at rest.
-    duration: of each [s]. sample_rate: of samples and of the inputs, which are held in between [Hz].
-    inputs: the torques each actuated joint draws from, every sample anew [Nm].
-    test_fraction: part of the trajectories kept for testing; with tracking, of each trajectory, its end.
-    presliding: of prescribed motions: the displacement over which dry friction builds up after a reversal (hysteresis)
-        [rad]; a tenth of it [m] for prismatic joints; 0: none.
-    torque_noise: of prescribed motions: standard deviation of white noise, relative to that of each joint's torque.
-    positions: joint -> (lowest, highest) initial position [rad]; not given: its limits, +-pi if continuous.
-    coulomb_smoothing_velocity: width of the tanh in place of Coulomb friction's jump [rad/s].
-    delay: of the commands of position servos [s], whose motions are of their own kind, see `simulation.servo_motions`.
+    Attributes:
+        protocol: random-inputs: random torques; tracking: controlled motions, see `tracking`; prescribed: exact
+            motions with torques by inverse dynamics. If neither a protocol nor `inputs` are set: tracking.
+        trajectories: Number of trajectories; each starts at rest from a random position.
+        duration: Duration of each trajectory [s].
+        sample_rate: Sample rate; random inputs are constant between samples [Hz].
+        inputs: Torques from which random-inputs draws one per actuated joint and sample [Nm].
+        positions: Lowest and highest initial position of each joint; default: its limits, +-pi without limits [rad].
+        coulomb_smoothing_velocity: Velocity scale of the tanh that replaces the step of Coulomb friction [rad/s].
+        test_fraction: Fraction of the trajectories for testing; with tracking, of each trajectory, at its end.
+        presliding: Displacement over which dry friction builds up after a reversal (hysteresis) in prescribed motions,
+            0.1 times this number in m for prismatic joints; 0: no hysteresis [rad].
+        torque_noise: Standard deviation of the white torque noise of prescribed motions, divided by the standard
+            deviation of each joint's torque.
+        delay: Delay of the commands of position servos [s].
+        seed: Seed of all random numbers.
     """
 
     protocol: Literal["random-inputs", "tracking", "prescribed"] = "random-inputs"
@@ -50,7 +53,7 @@ class SimulationSettings(Group):
 
 
 class ControlledSimulation(SimulationSettings):
-    """Defaults of arms that are controlled where nobody says how they are driven: fewer and longer trajectories."""
+    """Defaults of controlled arms, if neither a protocol nor inputs are set."""
 
     protocol: Literal["random-inputs", "tracking", "prescribed"] = "tracking"
     trajectories: Count = 4
@@ -60,7 +63,7 @@ class ControlledSimulation(SimulationSettings):
 
 
 class ServoSimulation(SimulationSettings):
-    """Defaults of arms under position servos."""
+    """Defaults of arms with position servos."""
 
     trajectories: Count = 6
     duration: Positive = 20.0
@@ -69,17 +72,21 @@ class ServoSimulation(SimulationSettings):
 
 
 class TrackingSettings(Group):
-    """How an arm moves and is seen in `simulation.protocol: tracking`.
+    """Motion, control and measurement with `simulation.protocol: tracking`.
 
-    amplitude [rad; m], frequency [Hz]: of each joint's sine about the middle of `simulation.positions`, where `paths`
-        are not excitation; unless said, less amplitude where the range is narrow.
-    paths: "same": all trajectories follow one closed path, each beginning further on; "own": each has phases of
-    its own, so that its test part lies where no training part was; "excitation": each goes its own way from rest to
-    rest, through five frequencies, as `spelgen excite` begins its search with.
-    control: "pid" of each joint by itself, or "computed-torque", which knows the arm: for arms that fall otherwise.
-    bandwidths: of the controllers of the first, second, ... trajectory, then over again [Hz].
-    control_rate: of the controllers, which hold their torques; simulation.sample_rate is a multiple of it [Hz].
-    resolution: of the encoders [rad; m]. cutoff: of the zero-phase low-pass on their positions [Hz].
+    Attributes:
+        amplitude: Amplitude of each joint's sine about the middle of `simulation.positions`; the default is reduced
+            for a joint with a smaller range [rad, m].
+        frequency: Frequency of the sines [Hz].
+        paths: "same": one closed path with a different first point per trajectory; "own": random phases per
+            trajectory; "excitation": random paths of five frequencies from rest to rest, like the first candidates of
+            `spelgen excite`.
+        control: "pid": one independent controller per joint; "computed-torque": with the dynamics of the arm, for arms
+            that PID control cannot support.
+        bandwidths: Bandwidths of the controllers of successive trajectories, repeated cyclically [Hz].
+        control_rate: Rate of the controllers, of which `simulation.sample_rate` is a multiple [Hz].
+        resolution: Resolution of the encoders [rad, m].
+        cutoff: Cutoff frequency of the zero-phase low-pass filter on the measured positions [Hz].
     """
 
     amplitude: Positive = 0.5235987755982988

@@ -1,4 +1,4 @@
-"""A sidecar file to begin with: every key at the value that holds without it, commented out and explained."""
+"""The settings file of `spelgen init`: the main keys with their defaults, commented out and explained."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ ARM = """\
 ## of hobby arms. A servo whose kp [Nm/rad] is known: kp, among the drives below.
 # input: torque
 
-## Whether the logs' tau are those of the joints, or of the motors, before the gears: joint or motor.
+## Torques (tau) in the logs: of the joints, or of the motors, before the gears: joint or motor.
 # torque: joint
 
 ## Drives. rotor_inertia [kg m^2] before the gear; gear: motor turns per joint turn; viscous [Nm s/rad] and
 ## coulomb [Nm], for qd > 0 and for qd < 0, after the gear; actuated: false for a passive joint; gain:
-## trained where the gear between logged motor torques and the joint is to be learned.
+## trained if the factor from logged motor torques to joint torques is to be trained.
 # joints:
 {drives}
 ## How this arm's logs are named and measured: docs/logs.md; `spelgen logs LOG --robot ROBOT --suggest FILE`
-## drafts the same keys from a log. velocity: differentiated where none is logged; sign: -1 where the log's
-## sense is the opposite of the URDF's axis; offset: the position where the log says 0 [rad, m].
+## drafts the same keys from a log. velocity: differentiated if none is logged; sign: -1 if the sense of the
+## log is opposite to the URDF's axis; offset: joint position at the logged value 0 [rad, m].
 # logs:
 #   velocity: logged
 #   columns: {{t: t, trajectory: trajectory, q: "q_{{joint}}", qd: "qd_{{joint}}", tau: "tau_{{joint}}"}}
@@ -52,29 +52,35 @@ UNITS = {
 
 
 class StarterJoint(NamedTuple):
-    """What a URDF says of a joint. kind: "revolute" or "prismatic"; damping, friction: its <dynamics>."""
+    """A joint of a URDF. joint_type: "revolute" or "prismatic"; damping, friction: attributes of its <dynamics>."""
 
     name: str
-    kind: str
+    joint_type: str
     damping: float
     friction: float
 
 
 def starter(urdf: str, joints: Sequence[StarterJoint]) -> str:
-    """YAML for the URDF of this file name: prose after ``##``, settings after ``# ``; without that they are said."""
+    """Return YAML for the URDF with this file name: explanations begin with ``##``, settings with ``# ``."""
     drives, logs = "", ""
     for joint in joints:
         drive = {
             "rotor_inertia": 0.0, "gear": 1.0, "viscous": joint.damping,
             "coulomb": [joint.friction, -joint.friction], "actuated": True, "gain": "known",
         }  # fmt: skip
-        log = {"name": joint.name, "sign": 1, "offset": 0.0, "torque_offset": 0.0, "units": UNITS[joint.kind]}
+        log = {
+            "name": joint.name,
+            "sign": 1,
+            "offset": 0.0,
+            "torque_offset": 0.0,
+            "units": UNITS[joint.joint_type],
+        }
         drives += f"#   {json.dumps(joint.name)}: {_flow(drive)}\n"
         logs += f"#     {json.dumps(joint.name)}: {_flow(log)}\n"
     return ARM.format(urdf=json.dumps(urdf), drives=drives, logs=logs)
 
 
 def _flow(keys: Mapping[str, object]) -> str:
-    """Keys and values on one line of YAML."""
+    """Return keys and values on one line of YAML."""
     pairs = [f"{key}: {_flow(x) if isinstance(x, dict) else json.dumps(x)}" for key, x in keys.items()]
     return f"{{{', '.join(pairs)}}}"

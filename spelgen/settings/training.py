@@ -1,4 +1,4 @@
-"""Defaults of `spelgen train` for one robot."""
+"""Settings of `spelgen train` and `spelgen compare` for one robot."""
 
 from __future__ import annotations
 
@@ -10,13 +10,22 @@ from spelgen.settings.fits import OWNERS, GaussianPrior, Objective, Optimizer, S
 from spelgen.settings.log_mapping import LONGEST_DELAY
 from spelgen.settings.values import Count, Group, NonNegative, Number, Positive, Whole
 
+PREPROCESSING = {"cutoff", "decimation", "gap", "torque_delay"}
+
 
 class TrainingSettings(Group):
-    """Hold the defaults of `spelgen train` for a robot; command-line flags override them. None: not set here.
+    """Defaults of `spelgen train` for one robot; options of the command line take precedence.
 
-    objective: what is fitted; an option that belongs to others only is an error beside it. The options are those of
-    `TorqueFit`, `MomentumFit` and `Rollout`; those of `Preprocessing` stand beside them.
-    validation_fraction: part of the training trajectories held out to watch the validation loss.
+    Attributes:
+        objective: Objective of the fit; default: torque for rigid bodies, rollout for networks only, servo for
+            position servos. With an objective, options of other objectives are errors.
+        cutoff: Cutoff frequency of the zero-phase low-pass filter on q, qd and tau; 0: no filter; default: 8 Hz, and
+            no filter for windows of logs at 50 Hz or less [Hz].
+        decimation: Samples from one sample of a window to the next; default: the largest number that the filter allows.
+        gap: A recording is split at time steps longer than this number of median steps.
+        torque_delay: Delay of the logged torques relative to the positions; default: estimated in a torque fit [s].
+        validation_fraction: Fraction of the training trajectories for the validation loss.
+        seed: Seed of all random numbers.
     """
 
     objective: Objective | None = None
@@ -54,11 +63,57 @@ class TrainingSettings(Group):
         return value
 
     @property
-    def options(self) -> dict[str, Any]:
+    def options(self) -> dict[str, object]:
         """Options of any objective that are set."""
         return self.model_dump(include=set(OWNERS), exclude_none=True)
 
     @property
     def preprocessing(self) -> dict[str, Any]:
         """Options of `Preprocessing` that are set."""
-        return self.model_dump(include={"cutoff", "decimation", "gap", "torque_delay"}, exclude_none=True)
+        return self.model_dump(include=PREPROCESSING, exclude_none=True)
+
+
+class PublishedFigures(Group):
+    """Figures of one preset on this robot in a publication; without a value: not published.
+
+    Attributes:
+        parameters: Number of trained parameters.
+        step_seconds: Duration of a training step on the authors' machine [s].
+        train_loss: Squared error of predicted training windows, summed over the joints.
+        test_loss: Squared error of predicted test windows, summed over the joints.
+        prediction_loss: Squared error of long predictions, summed over the joints.
+        velocity: Mean squared error of the velocity over 1 s, summed over the joints.
+        position: Mean squared error of the position over 1 s, summed over the joints.
+    """
+
+    parameters: Count | None = None
+    step_seconds: Positive | None = None
+    train_loss: Positive | None = None
+    test_loss: Positive | None = None
+    prediction_loss: Positive | None = None
+    velocity: Positive | None = None
+    position: Positive | None = None
+
+
+class ComparisonSettings(Group):
+    """Training of all presets on simulated logs of this robot by `spelgen compare`.
+
+    Attributes:
+        first: Duration of the initial part of each training motion that is used; default: the whole motion [s].
+        steps: Smallest number of training steps on predicted windows.
+        momentum_steps: Number of training steps on the weak form before these.
+        weight_decay: Weight decay of all presets; default: as in `training`.
+        seeds: Number of runs of each preset.
+        width: Units per hidden layer.
+        depth: Number of hidden layers.
+        published: Published figures, by preset.
+    """
+
+    first: Positive | None = None
+    steps: Count = 1500
+    momentum_steps: Whole = 1000
+    weight_decay: NonNegative | None = None
+    seeds: Count = 5
+    width: Count = 64
+    depth: Count = 2
+    published: dict[str, PublishedFigures] = Field(default_factory=dict)

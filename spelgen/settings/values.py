@@ -1,4 +1,4 @@
-"""What values of a settings file may be, and what its groups of keys have in common."""
+"""Types of the values in a settings file, and the base class of its groups of keys."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-MAX_MAGNITUDE = 1e12  # of a number in settings: products of a few are still numbers
+MAX_MAGNITUDE = 1e12  # of a number in settings, so that products of several numbers do not overflow
 
 
 def no_bool(value: object) -> object:
-    """The value; ValueError for true and false."""
-    if isinstance(value, bool):  # float(True) is 1.0: a misplaced `yes` would pass for a number
+    """Return the value. Raises ValueError for true and false."""
+    if isinstance(value, bool):  # float(True) is 1.0: a misplaced `yes` would be accepted as a number
         raise ValueError("a number")
     return value
 
 
 def bounded(value: float) -> float:
-    """The value; ValueError where products of a few such would be no float."""
+    """Return the value. Raises ValueError if its magnitude exceeds MAX_MAGNITUDE."""
     if abs(value) > MAX_MAGNITUDE:
         raise ValueError(f"a number within +-{MAX_MAGNITUDE:g}")
     return value
@@ -33,6 +33,6 @@ Inputs = Annotated[tuple[Number, ...], Field(min_length=1)]
 
 
 class Group(BaseModel):
-    """Keys that belong together; an unknown one is an error."""
+    """A group of keys; an unknown key is an error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -1,4 +1,4 @@
-"""Bytes -> plain YAML values that know their lines; what makes YAML unsafe or ambiguous is refused here."""
+"""Read YAML with the line of each value; unsafe or ambiguous constructs of YAML are errors."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ MAX_DEPTH = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Document:
-    """A YAML file: its node tree, None when the file is empty."""
+class YamlDocument:
+    """A YAML file and its node tree, None for an empty file."""
 
     path: Path
     root: yaml.Node | None
 
     def value(self) -> Any:
-        """Return the file's content as dicts, lists and scalars; raises SettingsError for a date that is none."""
+        """Return the file's content as dicts, lists and scalars. Raises SettingsError for an invalid date."""
         if self.root is None:
             return None
         try:
@@ -38,7 +38,7 @@ class Document:
             raise SettingsError(f"not plain YAML: {error}", file=self.path) from error
 
     def line(self, location: Location) -> int | None:
-        """Return the line of a key or list item, or of the nearest thing around it that is there."""
+        """Return the line of a key or list item, or of the innermost existing group that would contain it."""
         if self.root is None:
             return None
         node, line = self.root, int(self.root.start_mark.line) + 1
@@ -52,7 +52,7 @@ class Document:
 
 
 def _entry(node: yaml.Node, key: int | str) -> tuple[yaml.Node, yaml.Node] | None:
-    """Return the nodes of a key and of its value, of a list item twice the same; None where there is none."""
+    """Return the nodes of a key and of its value, or the node of a list item twice; None if it does not exist."""
     if isinstance(node, yaml.MappingNode):
         for name, value in node.value:
             if name.value == str(key):
@@ -72,7 +72,8 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
         mark = event.start_mark
         if self.check_event(yaml.AliasEvent):
             raise ComposerError(None, None, "an alias", mark)
-        if getattr(event, "tag", None) is not None:  # "!!bool maybe" means nothing
+        is_tagged = isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent) and event.tag is not None
+        if is_tagged:  # a tag may contradict its value, as in "!!bool maybe"
             raise ComposerError(None, None, f"the tag {event.tag}", mark)
         if self.depth == MAX_DEPTH:
             raise ComposerError(None, None, f"more than {MAX_DEPTH} levels", mark)
@@ -93,11 +94,11 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
         return node
 
 
-def read_document(path: Path) -> Document:
-    """Return a small YAML file of one document; raises SettingsError where it is no such thing."""
+def read_document(path: Path) -> YamlDocument:
+    """Return the content of a small YAML file with one document. Raises SettingsError for any other file."""
     content = read_bytes(path, SettingsError, "a YAML file", MAX_BYTES)
     try:
-        return Document(path, _Loader(content.decode("utf-8")).get_single_node())
+        return YamlDocument(path, _Loader(content.decode("utf-8")).get_single_node())
     except UnicodeDecodeError as error:
         raise SettingsError("bytes that are not UTF-8", file=path, expected="YAML text") from error
     except yaml.YAMLError as error:
@@ -105,7 +106,8 @@ def read_document(path: Path) -> Document:
 
 
 def _yaml_error(error: yaml.YAMLError, path: Path) -> SettingsError:
-    mark = getattr(error, "problem_mark", None)
-    problem = getattr(error, "problem", None) or "characters that YAML does not allow"
-    problem = problem.removeprefix("but ")  # of a sentence whose first half PyYAML keeps apart
+    problem, mark = "characters that YAML does not allow", None
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem:
+        # PyYAML begins the second half of some sentences with "but"
+        problem, mark = error.problem.removeprefix("but "), error.problem_mark
     return SettingsError(f"not plain YAML: {problem}", file=path, line=mark.line + 1 if mark else None)

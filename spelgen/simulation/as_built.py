@@ -10,19 +10,20 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from lxml import etree
 
-from spelgen.arm.configured_arm import ConfiguredArm, load_arm
+from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SpelgenError
 from spelgen.excitation.trajectory import SPEEDS, motion_bounds
 from spelgen.files import write_bytes, write_text
-from spelgen.simulation.perturbed_urdf import perturbed_urdf
 from spelgen.simulation.tuning import AS_BUILT
+from spelgen.urdf.document import urdf_bytes
 
 ABOUT = "The arm as built, from seed {}: the ground truth of simulated logs. `spelgen simulate` on it makes more logs."
 
 
-def as_built(arm: ConfiguredArm, seed: int, path: Path | str) -> ConfiguredArm:
+def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
     """Write the URDF and the settings of an arm as it may have been built, and return that arm.
 
     The arm can be simulated, and `evaluate` compares mass matrices with it. Raises ArmError if a moving link has no
@@ -38,7 +39,7 @@ def as_built(arm: ConfiguredArm, seed: int, path: Path | str) -> ConfiguredArm:
         raise SpelgenError(
             "the URDF of the arm itself", file=path, expected="another file for the arm as built"
         )
-    arm_dynamics(arm.arm, arm.settings)  # complains of missing inertials under the name of the user's file
+    arm_dynamics(arm.chain, arm.settings)  # complains of missing inertials under the name of the user's file
     settings, sidecar = _settings(arm, seed), path.with_suffix(".yaml")
     write_bytes(path, perturbed_urdf(arm.robot.path, AS_BUILT.inertial_error, seed))
     # magnitudes of friction and armature follow from the perturbed rigid bodies, without drives
@@ -49,21 +50,21 @@ def as_built(arm: ConfiguredArm, seed: int, path: Path | str) -> ConfiguredArm:
     return load_arm(path, angle_tolerance=arm.angle_tolerance)
 
 
-def _settings(arm: ConfiguredArm, seed: int) -> dict[str, object]:
+def _settings(arm: Arm, seed: int) -> dict[str, object]:
     """Return the settings of the arm as built, without drives: how it is mounted, wired and moved."""
-    given = arm.settings
-    own = given.model_dump(
+    nominal = arm.settings
+    carried = nominal.model_dump(
         mode="json",
         include={"gravity", "input", "torque", "couplings", "simulation", "tracking"},
         exclude_unset=True,
     )
-    names = list(arm.arm.joint_names)
-    settings: dict[str, object] = {"about": ABOUT.format(seed), "moving_joints": names} | own
+    names = list(arm.chain.joint_names)
+    settings: dict[str, object] = {"about": ABOUT.format(seed), "moving_joints": names} | carried
     # a joint without a motor cannot be moved along a path: such an arm is driven as its own settings state
-    if given.input == "position" or any(joint.passive for joint in arm.arm.coordinates):
-        settings["simulation"] = own.get("simulation", {}) | {"seed": seed}
+    if nominal.input == "position" or any(joint.passive for joint in arm.chain.coordinates):
+        settings["simulation"] = carried.get("simulation", {}) | {"seed": seed}
         return settings
-    bounds = motion_bounds(arm.arm, 1.0, 1.0, arm.robot.joint)
+    bounds = motion_bounds(arm.chain, 1.0, 1.0, arm.robot.joint)
     ranges = np.stack([bounds.low, bounds.high], axis=1).tolist()
     settings["simulation"] = {
         "protocol": "prescribed",
@@ -73,16 +74,15 @@ def _settings(arm: ConfiguredArm, seed: int) -> dict[str, object]:
         "test_fraction": 0.5,
         "presliding": AS_BUILT.presliding,
         "torque_noise": AS_BUILT.torque_noise,
-        "positions": dict(zip(names, ranges, strict=True)) | own.get("simulation", {}).get("positions", {}),
+        "positions": dict(zip(names, ranges, strict=True))
+        | carried.get("simulation", {}).get("positions", {}),
         "seed": seed,
     }
     settings["tracking"] = {"paths": "excitation", "resolution": AS_BUILT.resolution}
     return settings
 
 
-def _drives(
-    arm: ConfiguredArm, bodies: ConfiguredArm, rng: np.random.Generator
-) -> dict[str, dict[str, object]]:
+def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[str, object]]:
     """Return random friction and armature of each joint, as settings.
 
     Coulomb friction is a fraction of the rigid-body torque of moderate motion (at most half the effort limit), armature
@@ -93,12 +93,12 @@ def _drives(
         bodies: The arm as built, without drives.
         rng: Source of the random numbers.
     """
-    joints = bodies.arm.coordinates
-    bounds = motion_bounds(bodies.arm, AS_BUILT.range_fraction, 1.0)
+    joints = bodies.chain.coordinates
+    bounds = motion_bounds(bodies.chain, AS_BUILT.range_fraction, 1.0)
     q = rng.uniform(bounds.low, bounds.high, (AS_BUILT.positions, len(joints)))
-    dynamics = arm_dynamics(bodies.arm, bodies.settings)
+    dynamics = arm_dynamics(bodies.chain, bodies.settings)
     inertia = np.einsum("tii->i", dynamics.mass_matrix(q)) / len(q)
-    speed = np.array([min(joint.velocity or np.inf, SPEEDS[joint.kind]) for joint in joints])
+    speed = np.array([min(joint.velocity or np.inf, SPEEDS[joint.joint_type]) for joint in joints])
     torque = np.hypot(
         np.sqrt(np.square(dynamics.gravity(q)).mean(axis=0)), AS_BUILT.acceleration * speed * inertia
     )
@@ -109,10 +109,12 @@ def _drives(
     armature = rng.uniform(*AS_BUILT.armature, len(joints)) * inertia
     drives: dict[str, dict[str, object]] = {}
     for k, joint in enumerate(joints):
-        given = arm.settings.joint(joint.name)
-        kept = given.model_dump(mode="json", include={"gear", "actuated", "kp", "inputs"}, exclude_none=True)
-        drives[joint.name] = kept | {
-            "rotor_inertia": _rounded(armature[k] / given.gear**2),
+        drive = arm.settings.joint(joint.name)
+        unchanged = drive.model_dump(
+            mode="json", include={"gear", "actuated", "kp", "inputs"}, exclude_none=True
+        )
+        drives[joint.name] = unchanged | {
+            "rotor_inertia": _rounded(armature[k] / drive.gear**2),
             "viscous": _rounded(viscous[k]),
             "coulomb": [
                 _rounded(coulomb[k] * (1 + asymmetry[k])),
@@ -130,3 +132,78 @@ def _rounded(value: float) -> float:
 def _yaml(settings: dict[str, object]) -> str:
     text: str = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True)
     return text
+
+
+MASSLESS = 1e-9
+"""Links of at most this mass [kg] are placeholders and stay unchanged."""
+MIN_SPREAD = 0.01
+"""Smallest principal second moment of mass, relative to the largest, that replaces a negative one."""
+
+
+def perturbed_urdf(robot: Path, error: float, seed: int) -> bytes:
+    """Return the URDF without friction, visuals and collisions, and with perturbed inertials.
+
+    Per link, mass and inertia about the centre of mass are scaled by independent factors exp(error N(0, 1)); the centre
+    of mass is shifted by error N(0, 1) times the body's radius of gyration, along each axis of the link frame. An
+    inertia tensor that no body can have is replaced by a physically consistent one.
+
+    Args:
+        robot: URDF or xacro file, which was read before.
+        error: Relative standard deviation: 0.3 is 30 %.
+        seed: Seed of the random factors; the same seed gives the same bytes.
+    """
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
+    tree = etree.ElementTree(etree.fromstring(urdf_bytes(robot), parser))
+    for element in list(tree.iter("dynamics", "visual", "collision")):
+        element.getparent().remove(element)
+    rng = np.random.default_rng(seed)
+    for inertial in tree.iterfind(".//link/inertial"):
+        _perturb(inertial, error * rng.normal(size=2), error * rng.normal(size=3))
+    text: bytes = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
+    return text
+
+
+def _perturb(inertial: etree._Element, log_factors: np.ndarray, displacement: np.ndarray) -> None:
+    """Scale mass and inertia of an <inertial> and shift its centre of mass.
+
+    Args:
+        inertial: The element, changed in place.
+        log_factors: (2,) logarithms of the factors of the mass and of the inertia per mass.
+        displacement: (3,) shift of the centre of mass, relative to the radius of gyration.
+    """
+    mass, tensor = inertial.find("mass"), inertial.find("inertia")
+    if mass is None or float(mass.get("value", "0")) <= MASSLESS:
+        return
+    mass_factor, inertia_factor = np.exp(log_factors).tolist()
+    kilograms, trace = float(mass.get("value")), 0.0
+    mass.set("value", repr(mass_factor * kilograms))
+    if tensor is not None:
+        _make_consistent(tensor)
+        trace = sum(float(tensor.get(name, "0")) for name in ("ixx", "iyy", "izz"))
+        for name, value in tensor.attrib.items():
+            tensor.set(name, repr(mass_factor * inertia_factor * float(value)))
+    gyration_radius = np.sqrt(max(trace, 0.0) / 2 / kilograms)
+    origin = inertial.find("origin")
+    if origin is None:
+        origin = etree.SubElement(inertial, "origin")
+    center = np.array(origin.get("xyz", "0 0 0").split(), dtype=float)
+    origin.set("xyz", " ".join(map(repr, (center + gyration_radius * displacement).tolist())))
+
+
+def _make_consistent(tensor: etree._Element) -> None:
+    """Replace an inertia tensor that violates the triangle inequality: clip its second moments of mass.
+
+    The second moments are S = trace(I)/2 1 - I; a body has S >= 0 (Wensing, Kim, Slotine, IEEE RA-L 3:60, 2018).
+    """
+    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    upper = np.triu_indices(3)
+    inertia = np.zeros((3, 3))
+    inertia[upper] = [float(tensor.get(name, "0")) for name in names]
+    inertia = inertia + np.triu(inertia, 1).T
+    moments, axes = np.linalg.eigh(np.trace(inertia) / 2 * np.eye(3) - inertia)
+    if moments.min() >= -1e-9 * np.abs(moments).max():
+        return
+    second = (axes * np.maximum(moments, MIN_SPREAD * np.abs(moments).max())) @ axes.T
+    inertia = np.trace(second) * np.eye(3) - second
+    for name, value in zip(names, inertia[upper].tolist(), strict=True):
+        tensor.set(name, repr(value))

@@ -7,25 +7,72 @@ bristles an integrator would resolve by microseconds.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 
 from spelgen.arm.actuation import Drives
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.bristles import BristleReach, bristles_along
-from spelgen.dynamics.joint_friction import DriveFriction
+from spelgen.dynamics.friction import DriveFriction
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
-from spelgen.errors import SettingsError
+from spelgen.errors import LogError, SettingsError, in_one_line
 from spelgen.excitation.trajectory import Motion
+from spelgen.files import require_regular_file
+from spelgen.logs.csv_files import csv_columns
 from spelgen.settings.settings import Settings
-from spelgen.simulation.paths import paths
-from spelgen.simulation.protocol import SimulatedLogs, make_friction
+from spelgen.simulation.protocol import SimulatedLogs, make_friction, paths, sample_times
 from spelgen.simulation.tracking import Recording, measured, quantized
 from spelgen.simulation.tuning import AS_BUILT
 
+MIN_SAMPLES = 20
+
+
+def read_motion(file: Path, joints: Sequence[str]) -> Motion:
+    """Return the motion in a CSV file with the columns `t`, and `q_`, `qd_`, `qdd_` per joint.
+
+    Raises LogError for a file without these columns, for a value that is no finite number, for times that do not
+    increase by equal steps from row to row, and for fewer than 20 rows.
+
+    Args:
+        file: The file.
+        joints: Names of the n joints, in the order of the coordinates.
+    """
+    require_regular_file(file, LogError)
+    columns = ["t", *(f"{quantity}_{joint}" for quantity in ("q", "qd", "qdd") for joint in joints)]
+    do = "`spelgen excite` writes such files for the same arm"
+    try:
+        table = csv_columns(file)
+        missing = [name for name in columns if name not in table.column_names]
+        if missing:
+            raise LogError(
+                f"no column {', '.join(missing[:3])}",
+                file=file,
+                expected="t, q_, qd_ and qdd_ per joint",
+                do=do,
+            )
+        values = np.stack([table[name].cast(pa.float64()).to_numpy() for name in columns], axis=1)
+    except (pa.ArrowException, UnicodeError) as error:
+        raise LogError(
+            f"unreadable ({in_one_line(error)})", file=file, expected="CSV of numbers", do=do
+        ) from error
+    if len(values) < MIN_SAMPLES or not np.isfinite(values).all():
+        got = f"{len(values)} rows" if len(values) < MIN_SAMPLES else "a value that is no finite number"
+        raise LogError(got, file=file, expected=f"{MIN_SAMPLES} rows of numbers or more", do=do)
+    t = values[:, 0]
+    steps = np.diff(t)
+    if steps.min() <= 0 or np.ptp(steps) > 0.01 * steps.mean():
+        row = int(np.argmax(np.abs(steps - np.median(steps))))
+        raise LogError(
+            f"a step of {steps[row]:g} s after {t[row]:g} s", file=file, line=row + 3, element="t",
+            expected=f"equal steps (most are {np.median(steps):g} s)", do=do,
+        )  # fmt: skip
+    return Motion(t - t[0], *np.split(values[:, 1:], 3, axis=1))
+
 
 def prescribed(
-    arm: Arm,
+    arm: Chain,
     settings: Settings,
     drives: Drives | None = None,
     *,
@@ -55,8 +102,7 @@ def prescribed(
     dynamics = arm_dynamics(arm, settings)
     to_motors = np.eye(len(arm.coordinates)) if drives is None else np.linalg.inv(drives.inputs)
     if not motions:
-        t = np.arange(round(protocol.duration * protocol.sample_rate) + 1) / protocol.sample_rate
-        motions = paths(arm, settings, t)
+        motions = paths(arm, settings, sample_times(protocol))
     logs = []
     for number, motion in enumerate(motions):
         rng = np.random.default_rng([protocol.seed, number])
@@ -68,11 +114,10 @@ def prescribed(
         recording = Recording(motion.t, states, quantized(motion.q, settings.tracking), tau)
         logs.append(measured(recording, settings.tracking, f"motion_{number:02d}"))
         progress(number + 1, len(motions))
-    trained = len(logs) - min(round(protocol.test_fraction * len(logs)), len(logs) - 1)
-    return SimulatedLogs(logs[:trained], logs[trained:])
+    return SimulatedLogs.split(logs, protocol.test_fraction)
 
 
-def friction_along(friction: DriveFriction, arm: Arm, motion: Motion, presliding: float) -> np.ndarray:
+def friction_along(friction: DriveFriction, arm: Chain, motion: Motion, presliding: float) -> np.ndarray:
     """Return the friction torque (T, n) [Nm; N] along a motion.
 
     Maxwell-slip model (Al-Bender, Lampaert, Swevers, IEEE TAC 50:1883, 2005): elements in parallel, each of which

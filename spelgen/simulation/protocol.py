@@ -1,4 +1,4 @@
-"""Parts that all simulation protocols share: friction, the range of initial positions, and the resulting logs."""
+"""Parts that all simulation protocols share: friction, initial positions, desired motions, and the resulting logs."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from spelgen.arm.arm import Arm
-from spelgen.dynamics.joint_friction import DriveFriction, joint_friction
-from spelgen.errors import SettingsError, collect
+from spelgen.arm.arm import Chain
+from spelgen.dynamics.friction import DriveFriction, joint_friction
+from spelgen.errors import SettingsError, SpelgenError, collect
+from spelgen.excitation.trajectory import SPEEDS, ExcitationTrajectory, Motion, MotionBounds
+from spelgen.excitation.tuning import TUNING as EXCITATION
 from spelgen.logs.trajectory import Trajectory, trajectory_listing
 from spelgen.settings.settings import Settings
+from spelgen.settings.simulation import SimulationSettings
+from spelgen.simulation.tuning import TUNING as SIMULATION
 
 
 class SimulatedLogs(list[Trajectory]):
@@ -20,6 +24,12 @@ class SimulatedLogs(list[Trajectory]):
         super().__init__([*train, *test])
         self.train, self.test = tuple(train), tuple(test)
 
+    @classmethod
+    def split(cls, logs: Sequence[Trajectory], test_fraction: float) -> SimulatedLogs:
+        """Return the logs, the last of which are for testing; at least one remains for training."""
+        trained = len(logs) - min(round(test_fraction * len(logs)), len(logs) - 1)
+        return cls(logs[:trained], logs[trained:])
+
     def __repr__(self) -> str:
         return f"<SimulatedLogs: {len(self.train)} to train, {len(self.test)} to test>"
 
@@ -27,7 +37,12 @@ class SimulatedLogs(list[Trajectory]):
         return trajectory_listing(self).html()
 
 
-def make_friction(arm: Arm, settings: Settings, speeds: np.ndarray | None = None) -> DriveFriction:
+def sample_times(simulation: SimulationSettings) -> np.ndarray:
+    """Return the times of the samples of one trajectory, (T,) [s]."""
+    return np.arange(round(simulation.duration * simulation.sample_rate) + 1) / simulation.sample_rate
+
+
+def make_friction(arm: Chain, settings: Settings, speeds: np.ndarray | None = None) -> DriveFriction:
     """Return the friction of the drives: from a joint's settings if it has any, else from its URDF's <dynamics>.
 
     Args:
@@ -40,7 +55,7 @@ def make_friction(arm: Arm, settings: Settings, speeds: np.ndarray | None = None
     return joint_friction(arm.coordinates, settings.joints, width, speeds)
 
 
-def initial_range(arm: Arm, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
+def initial_range(arm: Chain, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and the highest initial position, (n,) each [rad; m]; SettingsError if a joint has no range."""
     positions = settings.simulation.positions or {}
     ranges, errors = [], []
@@ -58,3 +73,69 @@ def initial_range(arm: Arm, settings: Settings) -> tuple[np.ndarray, np.ndarray]
     collect(errors)
     lowest, highest = np.array(ranges, dtype=float).T
     return lowest, highest
+
+
+def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
+    """Return the desired motion of each trajectory, as `settings.tracking` specifies.
+
+    The first motions are the same for any number of trajectories. Raises SettingsError if sines exceed a joint's range,
+    or if a joint has no range.
+
+    Args:
+        arm: The arm.
+        settings: `simulation` and `tracking` are used.
+        t: Times (T,) [s].
+    """
+    count = settings.simulation.trajectories
+    seeds = np.random.SeedSequence(settings.simulation.seed).spawn(count)
+    randoms = list(map(np.random.default_rng, seeds))
+    low, high = initial_range(arm, settings)
+    if settings.tracking.paths == "excitation":
+        # moderate: the middle of the ranges at moderate speeds, as for the first motion of an unknown arm
+        middle, half = (low + high) / 2, SIMULATION.used_range * (high - low) / 2
+        speeds = []
+        for joint in arm.coordinates:
+            speeds.append(min(SIMULATION.used_range * (joint.velocity or np.inf), SPEEDS[joint.joint_type]))
+        bounds = MotionBounds(middle - half, middle + half, np.array(speeds))
+        motions = ExcitationTrajectory(float(t[-1]), EXCITATION.min_harmonics, bounds)
+        return [motions.motion(random.standard_normal(motions.size), t) for random in randoms]
+    middle, amplitude = (low + high) / 2, _amplitude(arm, settings, low, high)
+    drawn = [random.uniform(0, 2 * np.pi, len(middle)) for random in randoms]
+    if settings.tracking.paths == "same":
+        drawn = [drawn[0] + 2 * np.pi * number / count for number in range(count)]
+    return [sines(middle, amplitude, settings.tracking.frequency, phase, t) for phase in drawn]
+
+
+def sines(
+    middle: np.ndarray, amplitude: np.ndarray | float, frequency: float, phase: np.ndarray, t: np.ndarray
+) -> Motion:
+    """Return the motion middle + amplitude sin(2 pi frequency t + phase), (T, n).
+
+    Args:
+        middle: Mean positions (n,) [rad; m].
+        amplitude: Amplitudes (n,) [rad; m].
+        frequency: Frequency of all joints [Hz].
+        phase: Phases (n,) [rad].
+        t: Times (T,) [s].
+    """
+    omega = 2 * np.pi * frequency
+    angle = omega * t[:, None] + phase
+    swing = amplitude * np.sin(angle)
+    return Motion(t, middle + swing, amplitude * omega * np.cos(angle), -(omega**2) * swing)
+
+
+def _amplitude(arm: Chain, settings: Settings, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the amplitudes (n,) [rad; m] of sines within low..high, (n,) each; SettingsError if they exceed these."""
+    amplitude, errors = np.full(len(low), settings.tracking.amplitude), list[SpelgenError]()
+    if "amplitude" not in settings.tracking.model_fields_set:
+        amplitude = np.minimum(amplitude, SIMULATION.used_range * (high - low) / 2)
+    for joint, lowest, highest, swing in zip(arm.coordinates, low, high, amplitude, strict=True):
+        if highest - lowest < 2 * swing:
+            error = SettingsError(
+                f"{swing:g} beside the range {lowest:g} to {highest:g} of {joint.name!r}",
+                element="tracking.amplitude", expected="sines within the range",
+                do="make it smaller or give the joint wider simulation.positions",
+            )  # fmt: skip
+            errors.append(error)
+    collect(errors)
+    return amplitude

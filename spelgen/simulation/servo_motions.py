@@ -7,12 +7,12 @@ from collections.abc import Callable
 import numpy as np
 
 from spelgen.arm.actuation import Drives
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
-from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction
-from spelgen.simulation.tuning import SERVOS as TUNING
+from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction, sample_times
+from spelgen.simulation.tuning import TUNING
 
 SWEEPS = 4  # Gauss-Seidel iterations over the joints, for dry friction
 ENCODER = 2 * np.pi / 4096  # [rad], 12 bits per revolution; a tenth of it [m] for prismatic joints
@@ -20,7 +20,7 @@ EFFORT, LAG = 5.0, 0.05  # [Nm], [s]: torque limit and time constant kd / kp of 
 
 
 def servo_motions(
-    arm: Arm,
+    arm: Chain,
     settings: Settings,
     drives: Drives | None = None,
     *,
@@ -32,9 +32,9 @@ def servo_motions(
     """
     protocol = settings.simulation
     lowest, highest = initial_range(arm, settings)
-    middle, width = (lowest + highest) / 2, np.minimum((highest - lowest) / 2, TUNING.widest)
-    t = np.arange(round(protocol.duration * protocol.sample_rate) + 1) / protocol.sample_rate
-    encoder = np.array([ENCODER if x.kind == "revolute" else ENCODER / 10 for x in arm.coordinates])
+    middle, width = (lowest + highest) / 2, np.minimum((highest - lowest) / 2, TUNING.command_amplitude)
+    t = sample_times(protocol)
+    encoder = np.array([ENCODER if x.joint_type == "revolute" else ENCODER / 10 for x in arm.coordinates])
     logs: list[Trajectory] = []
     for number, seed in enumerate(np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories)):
         u = middle + width * _commands(np.random.default_rng(seed), t, len(middle))
@@ -43,21 +43,20 @@ def servo_motions(
         qd, tau = np.gradient(q, t, axis=0), np.zeros((len(t), 0))
         logs.append(Trajectory(t, q, qd, tau, f"traj_{number:02d}", u=u))
         progress(number + 1, protocol.trajectories)
-    trained = len(logs) - min(round(protocol.test_fraction * len(logs)), len(logs) - 1)
-    return SimulatedLogs(logs[:trained], logs[trained:])
+    return SimulatedLogs.split(logs, protocol.test_fraction)
 
 
 def _commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:
     """Return random commands (T, n) in [-1, 1] at times t (T,) [s]: the mean of sines and of random levels."""
-    low, high = np.log(TUNING.lowest_frequency), np.log(TUNING.highest_frequency)
+    low, high = np.log(TUNING.min_command_frequency), np.log(TUNING.max_command_frequency)
     frequencies = np.exp(random.uniform(low, high, (3, n)))
     phases = random.uniform(0, 2 * np.pi, (3, n))
     sines = np.sin(2 * np.pi * frequencies * t[:, None, None] + phases).mean(axis=1)
-    levels = random.uniform(-1, 1, (int(t[-1] / TUNING.held_level) + 1, n))
-    return np.asarray(0.5 * (sines + levels[(t / TUNING.held_level).astype(int)]))
+    levels = random.uniform(-1, 1, (int(t[-1] / TUNING.command_interval) + 1, n))
+    return np.asarray(0.5 * (sines + levels[(t / TUNING.command_interval).astype(int)]))
 
 
-def _positions(arm: Arm, settings: Settings, t: np.ndarray, u: np.ndarray) -> np.ndarray:
+def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Return positions (T, n) [rad; m] from rest at the first command.
 
     Method: semi-implicit Euler with dry friction as impulses. The impulse of a joint's dry friction stops it, within
@@ -77,7 +76,7 @@ def _positions(arm: Arm, settings: Settings, t: np.ndarray, u: np.ndarray) -> np
         kp[joint] = settings.joint(coordinate.name).kp or kp[joint]
     kd = LAG * kp
     interval = t[1] - t[0]
-    steps = int(np.ceil(interval / TUNING.step))
+    steps = int(np.ceil(interval / TUNING.servo_step))
     h, delay = interval / steps, round(settings.simulation.delay * steps / interval)
     damping = np.diag(h / 2 * (kd + friction.viscous))  # implicit midpoint rule of the damping torques
     impulses = -h * np.stack([friction.forward, friction.backward])

@@ -1,29 +1,83 @@
-"""Simulate logs of an arm, in memory, by the protocol that its settings name."""
+"""Simulate logs of an arm, in memory, by the protocol that its settings name; random torques are one."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from spelgen.arm.configured_arm import ConfiguredArm
+import numpy as np
+
+from spelgen.arm.actuation import Drives
+from spelgen.arm.arm import Chain
+from spelgen.arm.configured_arm import Arm
+from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SettingsError
 from spelgen.excitation.trajectory import Motion
+from spelgen.logs.trajectory import Trajectory, set_aside
 from spelgen.settings.messages import validated
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import ControlledSimulation, ServoSimulation, SimulationSettings
-from spelgen.settings.yaml_document import Document
+from spelgen.settings.yaml_document import YamlDocument
+from spelgen.simulation.integration import rollout
 from spelgen.simulation.prescribed import prescribed
-from spelgen.simulation.protocol import SimulatedLogs
-from spelgen.simulation.random_inputs import random_inputs
+from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction, sample_times
 from spelgen.simulation.servo_motions import servo_motions
 from spelgen.simulation.tracking import track
 from spelgen.simulation.tuning import TUNING
+
+
+def random_inputs(
+    arm: Chain,
+    settings: Settings,
+    drives: Drives | None = None,
+    *,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> SimulatedLogs:
+    """Return trajectories under random inputs; the same settings give the same logs.
+
+    Each trajectory starts at rest at a random position and has round(duration * sample_rate) + 1 samples; tau[k] acts
+    from t[k] to t[k+1]. Raises ArmError without inertials, SettingsError for a joint without a range of initial
+    positions, and RunError if the motion cannot be integrated.
+
+    Args:
+        arm: The arm.
+        settings: `simulation` and `joints` are used.
+        drives: Matrices of coupled motors: inputs are motor torques, joints get G tau, friction is the motors'.
+        progress: Called with (trajectories done, all) after each trajectory.
+    """
+    protocol = settings.simulation
+    dynamics = arm_dynamics(arm, settings, make_friction(arm, settings, drives and drives.speeds))
+    lowest, highest = initial_range(arm, settings)
+    torques = []
+    for coordinate in arm.coordinates:
+        joint = settings.joint(coordinate.name)
+        is_driven = joint.actuated and not coordinate.passive
+        torques.append(np.array(joint.inputs or protocol.inputs) if is_driven else np.zeros(1))
+    t = sample_times(protocol)
+    # one seed per trajectory: the first trajectories do not depend on their number
+    split_seed, *seeds = np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories + 1)
+    trajectories = []
+    for number, seed in enumerate(seeds):
+        random = np.random.default_rng(seed)
+        start = np.concatenate([random.uniform(lowest, highest), np.zeros(lowest.size)])
+        tau = np.stack([random.choice(choices, size=t.size) for choices in torques], axis=1)
+        effect = tau if drives is None else tau @ drives.inputs.T
+        states = rollout(dynamics, start, t, effect)
+        q, qd = np.split(states, 2, axis=1)
+        trajectories.append(Trajectory(t, q, qd, tau, f"traj_{number:02d}"))
+        progress(number + 1, protocol.trajectories)
+    # at least one trajectory remains for training
+    count = protocol.trajectories
+    order = np.random.default_rng(split_seed).permutation(count)
+    tests = min(round(protocol.test_fraction * count), count - 1)
+    return SimulatedLogs(*set_aside(trajectories, order[:tests]))
+
 
 PROTOCOLS = {"random-inputs": random_inputs, "tracking": track, "prescribed": prescribed}
 
 
 def simulate(
-    arm: ConfiguredArm,
+    arm: Arm,
     *,
     trajectories: int | None = None,
     duration: float | None = None,
@@ -55,7 +109,7 @@ def simulate(
     }  # fmt: skip
     changes = {key: value for key, value in arguments.items() if value is not None}
     values = arm.settings.simulation.model_dump(exclude_unset=True) | changes
-    changed = validated(SimulationSettings, values, Document(Path("simulate"), None))
+    changed = validated(SimulationSettings, values, YamlDocument(Path("simulate"), None))
     settings = _controlled(arm.settings.model_copy(update={"simulation": changed}))
     drives = arm.actuation.drives()
     progress = progress or (lambda done, total: None)
@@ -65,9 +119,9 @@ def simulate(
                 "motions of an arm with position servos", element="input", expected="input: torque",
                 do="simulate without motions: commands are random",
             )  # fmt: skip
-        return prescribed(arm.arm, settings, drives, motions=motions, progress=progress)
+        return prescribed(arm.chain, settings, drives, motions=motions, progress=progress)
     run = servo_motions if settings.input == "position" else PROTOCOLS[settings.simulation.protocol]
-    return run(arm.arm, settings, drives, progress=progress)
+    return run(arm.chain, settings, drives, progress=progress)
 
 
 def _controlled(settings: Settings) -> Settings:

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spelgen.arm.actuation import Drives
-from spelgen.arm.arm import Arm
-from spelgen.dynamics.joint_friction import DriveFriction
+from spelgen.arm.arm import Chain
+from spelgen.dynamics.friction import DriveFriction
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import SettingsError
@@ -23,8 +23,7 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import TrackingSettings
 from spelgen.simulation.integration import rollout
-from spelgen.simulation.paths import paths
-from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction
+from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction, paths
 from spelgen.simulation.tuning import TUNING
 
 
@@ -52,7 +51,7 @@ class Recording:
 
 
 def track(
-    arm: Arm,
+    arm: Chain,
     settings: Settings,
     drives: Drives | None = None,
     *,

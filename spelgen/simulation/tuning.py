@@ -24,21 +24,18 @@ class SimulationTuning:
     # [Hz] Approximate rate of the controllers by default.
     control_rate: float = 125.0
 
-
-@dataclass(frozen=True)
-class ServoSimulationTuning:
-    """Motion of arms under position servos in `spelgen simulate`."""
+    # Arms under position servos.
 
     # [s] Largest step of the integration.
-    step: float = 1e-3
+    servo_step: float = 1e-3
     # [rad, m] Largest amplitude of a command about the middle of a joint's range.
-    widest: float = 0.6
+    command_amplitude: float = 0.6
     # [s] Time between jumps of the commands.
-    held_level: float = 2.0
+    command_interval: float = 2.0
     # [Hz] Lowest frequency of the commands' sines.
-    lowest_frequency: float = 0.05
+    min_command_frequency: float = 0.05
     # [Hz] Highest frequency of the commands' sines: servos of hobby arms track no faster motion.
-    highest_frequency: float = 1.2
+    max_command_frequency: float = 1.2
 
 
 @dataclass(frozen=True)
@@ -72,4 +69,4 @@ class AsBuiltTuning:
     sample_rate: float = 200.0
 
 
-TUNING, SERVOS, AS_BUILT = SimulationTuning(), ServoSimulationTuning(), AsBuiltTuning()
+TUNING, AS_BUILT = SimulationTuning(), AsBuiltTuning()

@@ -1,1 +1,1 @@
-"""An Arm to its Structure: what of M and V is zero, constant or varying, and the fewest outputs and inputs."""
+"""Arm -> Structure: zero, constant and varying entries of M and V, and a minimal set of functions for M."""

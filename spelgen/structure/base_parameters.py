@@ -1,9 +1,9 @@
-"""Derive the base inertial parameters of an arm, exactly: the fewest combinations that M and V are linear in.
+"""Base inertial parameters of an arm: the minimal set of combinations in which M and V are linear, exactly.
 
-Every value of M, and of V less its value elsewhere, is a row of coefficients over the ten parameters of each
-body. Rows at random rational configurations span all of them; the reduced echelon form of that span is the
-base (Gautier and Khalil, *Direct calculation of minimum set of inertial parameters of serial robots*, IEEE
-Trans. Robotics and Automation 6(3), 1990, find the same by rules).
+An entry of M(q), and V(q) - V(q0), is a row of coefficients of the ten parameters of each body. Rows at random
+rational configurations span the row space of the regressor; its reduced row echelon form defines the base parameters.
+Gautier and Khalil, *Direct calculation of minimum set of inertial parameters of serial robots*, IEEE Trans. Robotics
+and Automation 6(3), 1990, derive the same parameters by symbolic rules.
 """
 
 from __future__ import annotations
@@ -16,23 +16,25 @@ from functools import lru_cache
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.structure import field
 from spelgen.structure.recursion import PARAMETERS, Position, coefficients
 from spelgen.structure.sampling import regressor_rows
 
-# Parameters that stand for a group if they can; Iyy, hz and m of a turning body can always be regrouped.
+# Order of the columns: the first parameter of a group names the group. Iyy, hz and m come last, because those
+# parameters of a body with a revolute joint can always be regrouped into others.
 _PREFERRED = ("Izz", "Ixx", "Ixy", "Ixz", "Iyz", "hx", "hy", "m", "Iyy", "hz")
+# Random rational numbers have numerators and denominators below this bound.
 _GRID = 1000
 
 
 @dataclass(frozen=True)
 class BaseParameter:
-    """Hold a combination of inertial parameters that the motion depends on.
+    """A linear combination of inertial parameters that can be identified from the motion.
 
-    ``name`` is that of its first parameter, with an R where others are regrouped into it; ``weights`` are
-    (parameter, coefficient), parameters counted 10 body + i in the order of ``PARAMETERS``. ``value`` is the
-    URDF's, None where a body has no inertial.
+    ``index`` and ``name`` are the first parameter's, with the suffix R if others are regrouped into it. ``weights`` are
+    pairs (parameter, coefficient); parameter i of a body has the index 10 body + i, in the order of ``PARAMETERS``.
+    ``value`` follows from the URDF; it is None if a body has no inertial.
     """
 
     name: str
@@ -42,29 +44,26 @@ class BaseParameter:
 
 
 def parameter_name(index: int) -> str:
-    """Return its name: ``Izz2`` is the tensor component zz of the second body."""
+    """Return the name of an inertial parameter: ``Izz2`` is the tensor component zz of the second body."""
     return f"{PARAMETERS[index % 10]}{index // 10 + 1}"
 
 
 @lru_cache(maxsize=16)
-def base_parameter_count(arm: Arm) -> int:
-    """Return the rank of the inverse-dynamics regressor.
-
-    So many combinations of inertial parameters move the arm differently.
-    """
-    points = 7  # enough for all but few arms of up to seven joints
+def base_parameter_count(arm: Chain) -> int:
+    """Return the rank of the inverse-dynamics regressor, which is the number of base parameters."""
+    points = 7  # sufficient for most arms of up to seven joints
     while True:
         rows = regressor_rows(arm, points + 2)
-        found = field.rank(rows)
-        # the rows of the last points would have raised an unfinished rank, all but surely
-        if field.rank(rows[: len(rows) * points // (points + 2)]) == found:
-            return found
+        rank = field.rank(rows)
+        # The rank is complete if two more points do not raise it, except with negligible probability.
+        if field.rank(rows[: len(rows) * points // (points + 2)]) == rank:
+            return rank
         points *= 2
 
 
-@lru_cache(maxsize=16)  # of one arm they are asked for by least squares, logs and closed forms
-def base_parameters(arm: Arm) -> tuple[BaseParameter, ...]:
-    """Return the base parameters of ``arm``, by body from the root."""
+@lru_cache(maxsize=16)  # least squares, checks of logs and closed forms use the same arm
+def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
+    """Return the base parameters of ``arm``, in the order of the bodies from the root."""
     order: list[int] = []
     for body in range(len(arm.bodies)):
         order += [10 * body + PARAMETERS.index(name) for name in _PREFERRED]
@@ -74,7 +73,7 @@ def base_parameters(arm: Arm) -> tuple[BaseParameter, ...]:
         for index, coefficient in zip(order, row, strict=True):
             if coefficient:
                 weights.append((index, Fraction(int(coefficient.p), int(coefficient.q))))
-        # a row of an echelon form is 1 at its first parameter
+        # The pivot of a row of the reduced echelon form is 1.
         first, _ = weights[0]
         name = parameter_name(first)
         if len(weights) > 1:
@@ -83,7 +82,8 @@ def base_parameters(arm: Arm) -> tuple[BaseParameter, ...]:
     return tuple(result)
 
 
-def _value(arm: Arm, weights: list[tuple[int, Fraction]]) -> Fraction | None:
+def _value(arm: Chain, weights: list[tuple[int, Fraction]]) -> Fraction | None:
+    """Return the value of a base parameter from the URDF; None if a body has no inertial."""
     total = Fraction(0)
     for index, coefficient in weights:
         inertia = arm.bodies[index // 10].inertia
@@ -93,10 +93,10 @@ def _value(arm: Arm, weights: list[tuple[int, Fraction]]) -> Fraction | None:
     return total
 
 
-def _reduced_rows(arm: Arm, order: list[int]) -> list[list[fmpq]]:
-    """Return the reduced echelon form of all coefficients, its columns in this order."""
+def _reduced_rows(arm: Chain, order: list[int]) -> list[list[fmpq]]:
+    """Return the reduced row echelon form of the regressor, with its columns in this order."""
     generator = random.Random(0)
-    # a constant part of V moves nothing: V counts from where it is here
+    # A constant part of V has no effect on the motion: V is relative to its value at the first configuration.
     reference = _rows(arm, generator)[-1]
     basis: list[list[fmpq]] = []
     while len(basis) < base_parameter_count(arm):
@@ -107,19 +107,22 @@ def _reduced_rows(arm: Arm, order: list[int]) -> list[list[fmpq]]:
     return basis
 
 
-def _rows(arm: Arm, generator: random.Random) -> np.ndarray:
-    """Return coefficients of M's entries and of V at one random configuration, (n(n+1)/2 + 1, 10 bodies) of fmpq."""
+def _rows(arm: Chain, generator: random.Random) -> np.ndarray:
+    """Return the coefficients of the entries of M, and of V, at a random configuration, (m, 10 B) of fmpq.
+
+    m = n(n+1)/2 + 1 for n joints, B bodies.
+    """
     parameters = 10 * len(arm.bodies)
     positions = []
     for _ in arm.coordinates:
         t = fmpq(generator.randrange(1, _GRID), generator.randrange(1, _GRID))
         value = fmpq(generator.randrange(1, _GRID), generator.randrange(1, _GRID))
-        # t is the tangent of half the angle, so that cosine and sine are rational
+        # t is the tangent of half the angle: cosine and sine are rational.
         norm = 1 + t * t
         positions.append(Position((1 - t * t) / norm, 2 * t / norm, value))
     units = list(np.eye(parameters, dtype=int).astype(object))
     elements = coefficients(arm, positions, units, rational)
-    # where nothing moves an element is a plain 0
+    # an entry that is always zero is a plain 0
     return np.stack([np.broadcast_to(element, parameters) for element in elements])
 
 

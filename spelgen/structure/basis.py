@@ -1,9 +1,10 @@
-"""Find the smallest exact form M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, with each f_j on as few joints as possible.
+"""Minimal exact form M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, in which each f_j depends on a minimal set of joints.
 
-U is the span of all changes of M, W the span of M. A read-out is a weighting of M's entries; on the joints
-J only depends exactly that which vanishes on the changes made by every joint outside J. Read-outs are
-taken greedily, sets of joints nearest the tip first and small sets before large ones (the independent sets
-of a matroid, so no later choice could have done better), single entries of M before sums of them.
+U is the span of all changes of M, W the span of M. A linear functional of M is a weighted sum of the entries of M; it
+depends only on the joints in a set J if and only if it vanishes on all changes caused by joints outside J. The
+functionals f_j are selected greedily: sets of joints close to the tip first, small sets before large ones, single
+entries of M before sums of entries. Independent functionals are the independent sets of a matroid, for which the
+greedy selection is optimal.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ Weights = tuple[tuple[int, int, Fraction], ...]
 
 
 def row_of(weights: Weights, n: int) -> np.ndarray:
-    """Return weights of M's entries, of n joints, as a row (n(n+1)/2,) over its lower triangle."""
+    """Return the lower triangle of a sparse symmetric (n, n) matrix as a vector, row after row: n(n+1)/2 numbers."""
     row = np.zeros(n * (n + 1) // 2)
     for i, j, value in weights:
         row[i * (i + 1) // 2 + j] = float(value)
@@ -34,19 +35,20 @@ def row_of(weights: Weights, n: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Term:
-    """Hold one term of M: a function f(q) of ``joints`` that is left open, or a constant, of no joints.
+    """A term of M: an unknown function f(q) of ``joints``, or a constant if there are none.
 
-    It is the sum of ``reads`` x M, and ``basis`` takes it to M.
+    The value of the term is the sum of ``functional`` times M over the lower triangle; its contribution to M is the
+    value times ``basis``.
     """
 
     joints: tuple[int, ...]
-    reads: Weights
+    functional: Weights
     basis: Weights
 
 
 @dataclass(frozen=True)
-class _Reading:
-    """Hold a read-out: its exact weights in the field, and the same in double precision."""
+class _Functional:
+    """A linear functional of M, (n(n+1)/2,), in the prime field (``weights``) and in double precision (``values``)."""
 
     joints: tuple[int, ...]
     weights: np.ndarray
@@ -54,36 +56,38 @@ class _Reading:
 
 
 def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
-    """Return the outputs and constants of the smallest exact form."""
-    readings = list(_readings(spans))
+    """Return the outputs and constants of the minimal exact form of M."""
+    functionals = list(_functionals(spans))
     entries = len(spans.keys)
-    weights = np.array([r.weights for r in readings], dtype=np.uint64).reshape(-1, entries)
-    values = np.array([r.values for r in readings]).reshape(-1, entries)
-    # B is fixed by f_j = 1 and all other outputs 0: the inverse of what the read-outs see of U
+    weights = np.array([r.weights for r in functionals], dtype=np.uint64).reshape(-1, entries)
+    values = np.array([r.values for r in functionals]).reshape(-1, entries)
+    # With functionals R (m, entries) and a basis U (m, entries) of the changes of M, B = (U R^T)^-1 U: then R B^T = 1,
+    # that is, B_j is the change of M for f_j = 1 and all other f = 0.
     basis = field.product(field.inverse(field.product(spans.varying, weights.T)), spans.varying)
     changes = spans.float_changes(frozenset(range(spans.n)))
     basis_values = _solved(changes @ values.T, changes)
     outputs = []
-    for r, row, row_values in zip(readings, basis, basis_values, strict=True):
-        reads = _weights(spans, r.weights, r.values)
-        outputs.append(Term(r.joints, reads, _weights(spans, row, row_values)))
-    # what the outputs do not explain cannot vary, so its span is that of the constants
+    for r, row, row_values in zip(functionals, basis, basis_values, strict=True):
+        functional = _weights(spans, r.weights, r.values)
+        outputs.append(Term(r.joints, functional, _weights(spans, row, row_values)))
+    # M - sum_j f_j B_j does not vary: its span is the span of the constants.
     constant = field.difference(spans.mass, field.product(field.product(spans.mass, weights.T), basis))
-    rest_values = spans.floats[0] - spans.floats[0] @ values.T @ basis_values
-    return tuple(outputs), _constants(spans, readings, (constant, rest_values), (basis, basis_values))
+    constant_values = spans.floats[0] - spans.floats[0] @ values.T @ basis_values
+    return tuple(outputs), _constants(spans, functionals, (constant, constant_values), (basis, basis_values))
 
 
 def _constants(
     spans: Spans,
-    readings: list[_Reading],
+    functionals: list[_Functional],
     constant: tuple[np.ndarray, np.ndarray],
     basis: tuple[np.ndarray, np.ndarray],
 ) -> tuple[Term, ...]:
-    """Return a basis of what the outputs leave of W.
+    """Return the constant terms: a basis of M - sum_j f_j B_j.
 
-    Entries that are constant themselves are the first choice for a constant.
+    constant: samples of this difference, (S, entries), in the field and in double precision. basis: B, (m, entries), in
+    the field and in double precision.
     """
-    # pivots fall on the first columns, so entries that read least become the constants
+    # Pivots fall on the first columns: entries of M that are constant, or depend on few joints, define the constants.
     order = sorted(range(len(spans.keys)), key=lambda index: (len(spans.entry_joints[index]), -index))
     echelon = field.row_basis(constant[0][:, order])
     bound = [order[pivot] for pivot in field.pivots(echelon)]
@@ -92,48 +96,47 @@ def _constants(
     row_values = _solved(constant[1][:, bound], constant[1])
     constants = []
     for pivot, row, values in zip(bound, rows, row_values, strict=True):
-        # c is the entry at the pivot less what the outputs put there
-        reading, reading_values = _single(spans, pivot)
-        for j, output in enumerate(readings):
+        # The constant is the entry of M at the pivot minus the contribution of the outputs to this entry.
+        weights, weight_values = _single(spans, pivot)
+        for j, output in enumerate(functionals):
             coefficient = int(basis[0][j, pivot])
             if coefficient:
                 scaled = field.product(np.array([[coefficient]], dtype=np.uint64), output.weights[None])[0]
-                reading = field.difference(reading, scaled)
-                reading_values = reading_values - basis[1][j, pivot] * output.values
-        constants.append(Term((), _weights(spans, reading, reading_values), _weights(spans, row, values)))
+                weights = field.difference(weights, scaled)
+                weight_values = weight_values - basis[1][j, pivot] * output.values
+        constants.append(Term((), _weights(spans, weights, weight_values), _weights(spans, row, values)))
     return tuple(constants)
 
 
-def _readings(spans: Spans) -> Iterator[_Reading]:
-    """Yield independent read-outs that together fix every change of M."""
+def _functionals(spans: Spans) -> Iterator[_Functional]:
+    """Yield linearly independent functionals that together determine every change of M."""
     chosen = np.zeros((0, len(spans.varying)), dtype=np.uint64)
     tried: set[int] = set()
     for joints in _joint_sets(spans):
         outside = field.row_basis(spans.outside(joints))
         kernel = field.null_space(outside)
-        # rank of the union less what is chosen: how many outputs this set of joints still adds
+        # number of functionals of this set of joints that are independent of the chosen ones
         missing = 0
         if len(kernel):
             missing = field.rank(np.concatenate([chosen, kernel])) - len(chosen)
         candidates = _candidates(spans, joints, outside, tried)
         while missing:
-            readouts = next(candidates)
-            weights = np.array([w for w, _ in readouts], dtype=np.uint64).reshape(-1, len(spans.keys))
+            pairs = next(candidates)
+            weights = np.array([w for w, _ in pairs], dtype=np.uint64).reshape(-1, len(spans.keys))
             rows = np.concatenate([chosen, field.product(weights, spans.varying.T)])
-            # columns of an echelon form have their pivots where they do not depend on those before
+            # The pivot columns of the transposed matrix are the rows that do not depend on earlier rows.
             independent = field.pivots(field.row_basis(rows.T))
             for index in independent[len(chosen) :]:
-                yield _Reading(tuple(sorted(joints)), *readouts[index - len(chosen)])
+                yield _Functional(tuple(sorted(joints)), *pairs[index - len(chosen)])
             missing -= len(independent) - len(chosen)
             chosen = rows[independent]
 
 
 def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
-    """Yield sets of joints that M depends on, nearest the tip first, small before large."""
+    """Yield sets of joints that M depends on: sets close to the tip first, small sets before large ones."""
     active = [k for k in range(spans.n) if len(spans.change_bases[k])]
     for position in reversed(range(len(active))):
         first, later = active[position], active[position + 1 :]
-        # small sets first: a matroid lets the greedy choice be the best one
         for size in range(len(later) + 1):
             if spans.n <= TUNING.all_subsets_up_to:
                 for tail in combinations(later, size):
@@ -145,10 +148,13 @@ def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
 def _candidates(
     spans: Spans, joints: frozenset[int], outside: np.ndarray, tried: set[int]
 ) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
-    """Yield read-outs that depend on ``joints`` only: single entries of M, then the sparsest sums of entries.
+    """Yield functionals that depend on ``joints`` only: single entries of M, then the sparsest sums of entries.
 
-    ``outside`` is the basis of the changes made by all other joints, in the basis of U. Entries that were ``tried``
-    for fewer joints are chosen or depend on those that are: they are left out, and those of now are put in.
+    Args:
+        spans: samples of M and the spans of its changes.
+        joints: the only joints that the functionals may depend on.
+        outside: echelon basis of the changes caused by all other joints, (m, dim U), in the basis of U.
+        tried: entries that were candidates for smaller sets of joints, which are skipped; this function extends it.
     """
     singles = []
     for index in reversed(range(len(spans.keys))):
@@ -157,7 +163,7 @@ def _candidates(
             singles.append(_single(spans, index))
     yield singles
     order = spans.order
-    rows = spans.changes_of(outside)[:, order]  # an echelon form, as those of both are
+    rows = spans.changes_of(outside)[:, order]  # an echelon form, because both factors are echelon forms
     bound = [order[pivot] for pivot in field.pivots(rows)]
     reduced = field.null_space(rows)
     kernel = np.zeros_like(reduced)
@@ -167,7 +173,7 @@ def _candidates(
     coefficients = _solved(samples[:, bound], samples[:, free])
     sums = []
     for row in sorted(kernel, key=np.count_nonzero):
-        # each row of a null space is 1 at one free entry, and elsewhere nonzero at bound ones only
+        # A row of the null space is 1 at one free entry; all other nonzero elements are at pivots.
         (entry,) = set(np.flatnonzero(row).tolist()) - set(bound)
         values = np.zeros(len(row))
         values[entry] = 1.0
@@ -177,21 +183,23 @@ def _candidates(
 
 
 def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the functional that is one entry of M, (entries,), in the field and in double precision."""
     weights = np.zeros(len(spans.keys), dtype=np.uint64)
     weights[index] = 1
     return weights, weights.astype(float)
 
 
 def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the least-squares solution X of matrix X = right, both tall."""
+    """Return the least-squares solution X (k, p) of A X = B, with A = matrix (S, k) and B = right (S, p)."""
     width = matrix.shape[1]
-    # the triangular factor holds all there is to know, and is small
+    # The triangular factor of [A, B] has the same normal equations and far fewer rows.
     factor = np.asarray(np.linalg.qr(np.concatenate([matrix, right], axis=1), mode="r"))
     result: np.ndarray = np.linalg.lstsq(factor[:, :width], factor[:, width:], rcond=None)[0]
     return result
 
 
 def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:
+    """Return the nonzero elements of a vector over the lower triangle, (entries,), as fractions."""
     weights = []
     for index in np.flatnonzero(exact).tolist():
         weights.append((*spans.keys[index], _fraction(int(exact[index]), float(values[index]))))
@@ -199,11 +207,11 @@ def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:
 
 
 def _fraction(element: int, value: float) -> Fraction:
-    """Return the rational number behind a field element, near ``value``.
+    """Return the rational number that a field element represents; ``value`` is its approximation.
 
-    Rational reconstruction finds it when numerator and denominator are below 2^30 (von zur Gathen and
-    Gerhard, *Modern Computer Algebra*, section 5.10). Geometry with irrational sizes gives longer
-    fractions; there the double itself is as exact as the URDF.
+    Rational reconstruction succeeds if numerator and denominator are below 2^30 (von zur Gathen and Gerhard, *Modern
+    Computer Algebra*, section 5.10). Geometry with irrational lengths gives longer fractions; for these the float is as
+    accurate as the URDF.
     """
     bound = 2**30
     previous, current = (field.PRIME, 0), (element, 1)

@@ -1,8 +1,8 @@
-"""Expand entries of M, and V, to exact polynomials for one inertial parameter at a time, within a budget.
+"""Entries of M, and V, as exact polynomials, for one inertial parameter at a time and within a budget.
 
-The recursion is run once over operations that are only written down; what an entry needs is then carried
-out, for one parameter set to 1 and all others to 0. So nothing is expanded that was not asked for, memory
-stays that of one parameter's polynomials, and an expansion that would take too long stops before it does.
+The recursion runs once and records its operations (lazy evaluation). The operations of an entry are then executed with
+one inertial parameter set to 1 and all others to 0. Only requested entries are expanded, memory is limited to the
+polynomials of one parameter, and an expansion that is too expensive is refused before it starts.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from typing import TypeAlias
 
 from flint import Ordering, fmpq, fmpq_mpoly, fmpq_mpoly_ctx
 
-from spelgen.arm.arm import Arm
+from spelgen.arm.arm import Chain
 from spelgen.structure.base_parameters import rational
 from spelgen.structure.recursion import Position, energies
 
 Value: TypeAlias = fmpq_mpoly | fmpq | int
-"""A polynomial, or a number where nothing else is needed."""
+"""A polynomial, or a number."""
 
 
 class Deferred:
-    """Hold an operation of the recursion that waits to be carried out, or a leaf of it."""
+    """A recorded operation of the recursion, or a leaf of the expression."""
 
     __slots__ = ("action", "operands")
 
@@ -31,7 +31,7 @@ class Deferred:
         self.operands = operands
 
     def __add__(self, operand: Deferred | int) -> Deferred:
-        # zeros are common, and what is not written down need not be carried out
+        # Zeros are common: an operation that is not recorded costs nothing.
         if isinstance(operand, int) and operand == 0:
             return self
         return Deferred("add", self, operand)
@@ -58,26 +58,26 @@ class Deferred:
 
 
 class TooLarge(Exception):
-    """Tell that an expansion needs more multiplications of terms than its budget holds."""
+    """An expansion needs more multiplications of terms than its budget has."""
 
 
 class Budget:
-    """Count how many multiplications of terms are left."""
+    """Number of multiplications of terms that remain."""
 
-    def __init__(self, left: int):
-        self.left = left
+    def __init__(self, remaining: int):
+        self.remaining = remaining
 
     def spend(self, cost: int) -> None:
-        """Take ``cost`` away. Raises TooLarge, before anything is computed, where less is left."""
-        if cost > self.left:
+        """Subtract ``cost``. Raises TooLarge, before anything is computed, if it exceeds the budget."""
+        if cost > self.remaining:
             raise TooLarge
-        self.left -= cost
+        self.remaining -= cost
 
 
 class Expansion:
-    """Hold the recursion of ``arm``, written down over s1, c1, q1, s2, ... three variables a coordinate."""
+    """The recorded recursion of ``arm`` over the variables s1, c1, q1, s2, ..., three per coordinate."""
 
-    def __init__(self, arm: Arm):
+    def __init__(self, arm: Chain):
         n = len(arm.coordinates)
         names: list[str] = []
         for k in range(n):
@@ -89,14 +89,14 @@ class Expansion:
         inertias: list[Sequence[Deferred]] = []
         for body in range(len(arm.bodies)):
             inertias.append(self._parameters[10 * body : 10 * body + 10])
-        self.written = energies(arm, positions, inertias, _number)
+        self.energies = energies(arm, positions, inertias, _number)
 
     def polynomial(self, element: Deferred | int, parameter: int, budget: Budget) -> fmpq_mpoly:
-        """Return what ``parameter`` (10 body + i) is multiplied by in ``element``. Raises TooLarge."""
+        """Return the coefficient of ``parameter`` (10 body + i) in ``element``. Raises TooLarge."""
         values: dict[int, Value] = {}
         for index, leaf in enumerate(self._parameters):
             values[id(leaf)] = int(index == parameter)
-        # a stack and no recursion: the operations of a long arm are nested deeper than Python may call
+        # A stack replaces recursion: the operations of a long arm are nested deeper than the recursion limit of Python.
         stack = [element]
         while stack:
             node = stack[-1]
@@ -104,7 +104,7 @@ class Expansion:
             if isinstance(node, Deferred) and id(node) not in values:
                 missing = [x for x in node.operands if isinstance(x, Deferred) and id(x) not in values]
                 if not missing:
-                    values[id(node)] = _carried_out(node, values, budget)
+                    values[id(node)] = _executed(node, values, budget)
             if missing:
                 stack += missing
             else:
@@ -112,7 +112,7 @@ class Expansion:
         return _value(element, values) + self.context.from_dict({})
 
 
-def _carried_out(node: Deferred, values: dict[int, Value], budget: Budget) -> Value:
+def _executed(node: Deferred, values: dict[int, Value], budget: Budget) -> Value:
     if node.action == "constant":
         return _value(node.operands[0], values)
     x, y = (_value(operand, values) for operand in node.operands)

@@ -1,9 +1,8 @@
-"""Batches of numbers in the prime field of 2^61 - 1, and linear algebra over it.
+"""Batches of elements of the prime field GF(2^61 - 1), and linear algebra over it.
 
-A polynomial that is not zero vanishes at a random point of this field with probability at most degree /
-2^61 (Schwartz 1980, Zippel 1979), and a rank found here is never above the rank over the rationals. So
-what holds here at random points holds exactly, but for odds of about 1e-16 a question, without a tolerance
-and without writing a polynomial down.
+A nonzero polynomial vanishes at a random point of this field with probability at most degree / 2^61 (Schwartz 1980,
+Zippel 1979), and a rank over this field never exceeds the rank over the rationals. A rank or a zero at random points is
+therefore exact with an error probability of about 1e-16, without tolerances and without explicit polynomials.
 """
 
 from __future__ import annotations
@@ -13,24 +12,16 @@ from fractions import Fraction
 import numpy as np
 from flint import fmpz_mat, nmod_mat
 
-_EXPONENT = 61  # of a Mersenne prime: remainders are sums of shifted bits
-
-
-def _ones(count: int) -> int:
-    """Return the integer of so many binary ones."""
-    return (1 << count) - 1
-
-
-PRIME = _ones(_EXPONENT)
+# A Mersenne prime: 2^61 = 1, so a remainder is the sum of the low and the shifted high bits.
+PRIME = 2**61 - 1
 _P = np.uint64(PRIME)
-_LOWER = _EXPONENT // 2
-_UPPER = _EXPONENT - _LOWER  # bits of the halves whose products fit into 64 bits
-_BITS_61, _BITS_31, _BITS_30 = np.uint64(_EXPONENT), np.uint64(_UPPER), np.uint64(_LOWER)
-_LOW_31, _LOW_30 = np.uint64(_ones(_UPPER)), np.uint64(_ones(_LOWER))
+# Shifts and masks of halves of 31 and 30 bits, whose products fit into 64 bits.
+_BITS_61, _BITS_31, _BITS_30 = map(np.uint64, (61, 31, 30))
+_LOW_31, _LOW_30 = _P >> _BITS_30, _P >> _BITS_31
 
 
 class Residues:
-    """A batch of field elements with elementwise +, - and *, among themselves and with integers."""
+    """A batch of field elements, (...,), with elementwise +, - and * with other batches and with integers."""
 
     __slots__ = ("values",)
 
@@ -67,20 +58,20 @@ class Residues:
 
 
 def residue(number: Fraction) -> int:
-    """The field element of a rational number."""
+    """Return the field element of a rational number."""
     return number.numerator * pow(number.denominator, -1, PRIME) % PRIME
 
 
 def random_residues(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Uniform field elements."""
+    """Return uniform field elements; shape: of the result, such as (m, n)."""
     return rng.integers(0, PRIME, shape, dtype=np.uint64)
 
 
 def random_circle_points(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """``count`` random solutions (c, s) of c^2 + s^2 = 1, by the rational half-angle parameter."""
+    """Return random solutions c, s (count,) of c^2 + s^2 = 1 from the tangent of the half-angle."""
     cosines, sines = [], []
     for t in random_residues(rng, (count,)).tolist():
-        # 1 + t^2 is never 0: -1 has no square root modulo a prime of the form 4k + 3
+        # 1 + t^2 is never 0: -1 has no square root modulo a prime of the form 4k + 3.
         inverse = pow(1 + t * t, -1, PRIME)
         cosines.append((1 - t * t) * inverse % PRIME)
         sines.append(2 * t * inverse % PRIME)
@@ -88,13 +79,13 @@ def random_circle_points(rng: np.random.Generator, count: int) -> tuple[np.ndarr
 
 
 def difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a - b in the field, elementwise."""
+    """Return a - b, elementwise; a and b have the same shape (...,)."""
     return _folded(a + (_P - b))
 
 
 def row_basis(rows: np.ndarray) -> np.ndarray:
-    """The reduced row echelon form of (m, n) ``rows`` without its zero rows, (rank, n)."""
-    # FLINT refuses matrices without rows or columns
+    """Return the reduced row echelon form of ``rows`` (m, n) without zero rows, (rank, n)."""
+    # FLINT refuses matrices without rows or columns.
     if not rows.size:
         return rows[:0]
     reduced, rank = _matrix(rows).rref()
@@ -102,19 +93,19 @@ def row_basis(rows: np.ndarray) -> np.ndarray:
 
 
 def rank(rows: np.ndarray) -> int:
-    """Rank of the (m, n) matrix ``rows``."""
+    """Return the rank of the matrix ``rows`` (m, n)."""
     return int(_matrix(rows).rank()) if rows.size else 0
 
 
 def pivots(basis: np.ndarray) -> list[int]:
-    """First nonzero column of each row of an echelon form."""
+    """Return the first nonzero column of each row of an echelon form (m, n)."""
     return (basis != 0).argmax(axis=1).tolist() if basis.size else []
 
 
 def null_space(basis: np.ndarray) -> np.ndarray:
-    """Return rows that span {x : basis x = 0} of a ``row_basis``.
+    """Return a basis (n - rank, n) of {x : basis x = 0} for a result ``basis`` (rank, n) of ``row_basis``.
 
-    Each is 1 at one free column and elsewhere nonzero at pivots only.
+    A row of the result is 1 at one free column; all other nonzero elements are at pivots.
     """
     width = basis.shape[1]
     bound = pivots(basis)
@@ -127,40 +118,45 @@ def null_space(basis: np.ndarray) -> np.ndarray:
 
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The matrix product of (m, k) and (k, n) in the field."""
+    """Return the matrix product (m, n) of a (m, k) and b (k, n)."""
     if not a.size or not b.size:
         return np.zeros((a.shape[0], b.shape[1]), dtype=np.uint64)
     return _array(_matrix(a) * _matrix(b))
 
 
 def inverse(square: np.ndarray) -> np.ndarray:
-    """The inverse of a regular matrix in the field."""
+    """Return the inverse of a regular matrix (n, n)."""
     return _array(_matrix(square).inv()) if square.size else square
 
 
 def _matrix(rows: np.ndarray) -> nmod_mat:
-    # faster than to make a residue of every number by itself
+    """Return an array (m, n) as a matrix of FLINT."""
+    # The conversion of an integer matrix is faster than the conversion of every element.
     return nmod_mat(fmpz_mat(rows.shape[0], rows.shape[1], rows.ravel().tolist()), PRIME)
 
 
 def _array(matrix: nmod_mat, rows: int | None = None) -> np.ndarray:
-    """The first ``rows`` of ``matrix``, all of them by default."""
+    """Return the first ``rows`` rows of a matrix of FLINT, all by default, as an array (rows, n)."""
     height, width = matrix.nrows() if rows is None else rows, matrix.ncols()
     entries = map(int, matrix.entries()[: height * width])
     return np.fromiter(entries, dtype=np.uint64, count=height * width).reshape(height, width)
 
 
 def _values(operand: Residues | int) -> np.ndarray | np.uint64:
+    """Return the field elements of an operand, (...,) or a scalar."""
     return operand.values if isinstance(operand, Residues) else np.uint64(operand % PRIME)
 
 
 def _folded(values: np.ndarray) -> np.ndarray:
-    """Numbers below 2^62 brought below the prime."""
+    """Return numbers (...,) below 2^62 modulo the prime."""
     return np.where(values >= _P, values - _P, values)
 
 
 def _product(a: np.ndarray, b: np.ndarray | np.uint64) -> np.ndarray:
-    """Products modulo 2^61 - 1 in 64-bit arithmetic: halves of 30 and 31 bits, and 2^61 = 1."""
+    """Return a b modulo 2^61 - 1, elementwise, (...,), in 64-bit arithmetic.
+
+    With a = a1 2^31 + a0 and b = b1 2^31 + b0: a b = a1 b1 2^62 + (a1 b0 + a0 b1) 2^31 + a0 b0, with 2^61 = 1.
+    """
     a_high, a_low, b_high, b_low = a >> _BITS_31, a & _LOW_31, b >> _BITS_31, b & _LOW_31
     middle = a_high * b_low + a_low * b_high
     total = (

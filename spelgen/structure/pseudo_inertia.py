@@ -1,7 +1,7 @@
-"""Keep inertial parameters physically consistent, by the 4 x 4 pseudo-inertia of a body.
+"""Physical consistency of inertial parameters, from the 4 x 4 pseudo-inertia of a body.
 
-A body's ten parameters are those of some distribution of mass exactly where J = [[S, h], [h^T, m]] with
-S = tr(I)/2 1 - I is positive definite (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018).
+Ten parameters (m, h, I) are physically consistent, that is, belong to a distribution of mass, if and only if
+J = [[S, h], [h^T, m]] with S = tr(I)/2 1 - I is positive definite (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
     rows, columns = np.triu_indices(3)
     tensor[..., rows, columns] = tensor[..., columns, rows] = values[..., 4:]
     pseudo = np.zeros((*values.shape[:-1], 4, 4))
-    # second moments of mass from the tensor: I = tr(S) 1 - S
+    # The second moments of mass S from the inertia tensor I = tr(S) 1 - S.
     pseudo[..., :3, :3] = _trace(tensor) / 2 * np.eye(3) - tensor
     pseudo[..., :3, 3] = pseudo[..., 3, :3] = values[..., 1:4]
     pseudo[..., 3, 3] = values[..., 0]
@@ -40,15 +40,18 @@ def _trace(matrices: np.ndarray) -> np.ndarray:
 
 
 def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return C (4, 4) with C C^T = J of a body, and whether the body is a possible one.
+    """Return the Cholesky factor of a consistent pseudo-inertia, and whether the parameters are consistent.
 
-    For one that is not, J is the nearest that is, its least eigenvalues raised.
+    Args:
+        parameters: (m, h, I) of a body, (10,) [kg, kg m, kg m2].
+
+    Returns:
+        C (4, 4) with C C^T = J. If the parameters are inconsistent, the smallest eigenvalues of J are raised.
     """
     pseudo = pseudo_inertia(parameters)
-    # URDFs with impossible inertias still need a start: the nearest possible body
     values, vectors = np.linalg.eigh(pseudo)
-    least = TUNING.least_pseudo_eigenvalue * values[-1]
-    possible = bool(values[0] > least * TUNING.least_pseudo_eigenvalue)
-    if not possible:
-        pseudo = (vectors * np.maximum(values, least)) @ vectors.T
-    return np.linalg.cholesky(pseudo), possible
+    min_eigenvalue = TUNING.min_pseudo_eigenvalue * values[-1]
+    is_consistent = bool(values[0] > min_eigenvalue * TUNING.min_pseudo_eigenvalue)
+    if not is_consistent:
+        pseudo = (vectors * np.maximum(values, min_eigenvalue)) @ vectors.T
+    return np.linalg.cholesky(pseudo), is_consistent

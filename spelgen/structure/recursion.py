@@ -1,10 +1,9 @@
-"""M(q) and V(q) of an arm by one recursion, over any ring.
+"""M(q) and V(q) of an arm by the composite-rigid-body algorithm (CRBA), over any commutative ring.
 
-The composite-inertia recursion (Featherstone, *Rigid Body Dynamics Algorithms*, 2008, ch. 6) only adds,
-negates and multiplies, so the same lines serve floating-point numbers (nominal values), a prime field
-(``structure``) and polynomials (``expansion``). Each body carries ten inertial parameters (m, h = m c, I
-about its joint's origin), in which M and V are linear. A body turns about or slides along the z axis of
-its own joint frame.
+The recursion (Featherstone, *Rigid Body Dynamics Algorithms*, 2008, ch. 6) consists of additions, negations and
+multiplications. The same code therefore serves floating-point numbers (nominal values), a prime field (``structure``)
+and polynomials (``expansion``). Each body has ten inertial parameters (m, h = m c, I about the origin of its joint's
+frame), in which M and V are linear. A body rotates about, or translates along, the z axis of its joint's frame.
 """
 
 from __future__ import annotations
@@ -16,16 +15,16 @@ from itertools import combinations_with_replacement
 from math import cos, lcm, sin, tan
 from typing import Any
 
-from spelgen.arm.arm import Arm, Body
+from spelgen.arm.arm import Body, Chain
 
 Element = Any
-"""An element of the ring: anything with +, - and * among its own kind and with integers."""
+"""An element of the ring: an object with +, - and *, with other elements and with integers."""
 
 Vector = tuple[Element, Element, Element]
 Terms = tuple[tuple[int, Element], ...]
 
 PARAMETERS = ("m", "hx", "hy", "hz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
-"""Names of a body's ten inertial parameters, in their order."""
+"""Names of the ten inertial parameters of a body, in their order."""
 
 TENSOR = tuple(combinations_with_replacement(range(3), 2))
 """Order of the six tensor components of a ten-vector: Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
@@ -33,7 +32,7 @@ TENSOR = tuple(combinations_with_replacement(range(3), 2))
 
 @dataclass(frozen=True)
 class Position:
-    """Hold one coordinate's position: the cosine and sine of its base angle, and its value where something slides."""
+    """The position of a coordinate: cosine and sine of its base angle (see ``base_denominators``), and its value."""
 
     cos: Element
     sin: Element
@@ -41,8 +40,8 @@ class Position:
 
 
 @dataclass(frozen=True)
-class _Motion:
-    """Where one body's joint stands: the cosine and sine of its angle, or its displacement."""
+class _JointMotion:
+    """The motion of the joint of a body: cosine and sine of its angle, or its displacement."""
 
     cos: Element = 1
     sin: Element = 0
@@ -51,7 +50,7 @@ class _Motion:
 
 @dataclass(frozen=True)
 class Energies:
-    """Hold the lower triangle of the arm's mass matrix, {(row, column): element}, 0-based, and its potential energy."""
+    """The lower triangle of the mass matrix, {(row, column): element} from 0, and the potential energy."""
 
     mass: dict[tuple[int, int], Element]
     potential: Element
@@ -59,7 +58,7 @@ class Energies:
 
 @dataclass(frozen=True)
 class _Inertia:
-    """A composite inertia: mass, first moment, and tensor about the frame's origin."""
+    """A composite inertia: mass, first moment, and inertia tensor about the origin of the frame."""
 
     mass: Element
     moment: Vector
@@ -68,7 +67,7 @@ class _Inertia:
 
 @dataclass(frozen=True)
 class _Wrench:
-    """A force and its moment about the frame's origin."""
+    """A force and its moment about the origin of the frame."""
 
     force: Vector
     moment: Vector
@@ -76,27 +75,32 @@ class _Wrench:
 
 @dataclass(frozen=True)
 class _Pose:
-    """A body's constant pose in its parent, with zeros left out and +-1 kept as integers."""
+    """The constant pose of a body in its parent: sparse, with the elements 1 and -1 as integers."""
 
     rotation: tuple[Terms, Terms, Terms]
     translation: Terms
 
 
 def triangle(n: int) -> list[tuple[int, int]]:
-    """Positions of the lower triangle of an n x n matrix, row by row."""
+    """Return the indices (row, column) of the lower triangle of an n x n matrix, row after row."""
     return [(row, column) for row in range(n) for column in range(row + 1)]
 
 
 def energies(
-    arm: Arm,
+    arm: Chain,
     positions: Sequence[Position],
     inertias: Sequence[Sequence[Element]],
     number: Callable[[Fraction], Element],
 ) -> Energies:
-    """Mass matrix and potential energy of ``arm``.
+    """Return the mass matrix and the potential energy of ``arm``.
 
-    ``positions`` go by coordinate, ``inertias`` (ten elements each) by body; ``number`` takes the arm's exact
-    constants into the ring. V is zero for a body at the root's origin and grows against ``arm.gravity``.
+    Args:
+        arm: the arm.
+        positions: of each coordinate.
+        inertias: ten inertial parameters of each body.
+        number: converts the exact constants of the arm to elements of the ring.
+
+    V is zero for a mass at the origin of the root link and increases against ``arm.gravity``.
     """
     motions = _motions(arm, positions, number)
     poses = [_pose(body, number) for body in arm.bodies]
@@ -112,90 +116,89 @@ def energies(
             total = _sum(total, moved)
         else:
             composites[body.parent] = _sum(composites[body.parent], moved)
-    # V = -g . (m c) summed over all bodies: the composite at the root holds the sum
+    # V = -g . sum_b m_b c_b: the first moment of the composite inertia at the root is this sum.
     gravity = _terms(arm.gravity, number)
     return Energies(mass, -_dot(gravity, total.moment))
 
 
 def coefficients(
-    arm: Arm,
-    positions: Sequence[Position],
-    units: Sequence[Element],
-    number: Callable[[Fraction], Element],
+    arm: Chain, positions: Sequence[Position], units: Sequence[Element], number: Callable[[Fraction], Element]
 ) -> list[Element]:
-    """Return what inertial parameters are multiplied by in M's entries, row by row, and last in V.
+    """Return the coefficients of the inertial parameters in the entries of M, row after row, and then in V.
 
-    ``units`` are batches, one for each of the arm's parameters, that are 1 for this parameter and 0 for all others.
+    units: for each of the 10 B parameters of B bodies, a unit vector (10 B,) of the ring.
     """
     inertias = [units[10 * body : 10 * body + 10] for body in range(len(arm.bodies))]
     result = energies(arm, positions, inertias, number)
     return [*result.mass.values(), result.potential]
 
 
-def _motions(arm: Arm, positions: Sequence[Position], number: Callable[[Fraction], Element]) -> list[_Motion]:
-    """Return how every body's joint has moved when the coordinates stand at ``positions``."""
+def _motions(
+    arm: Chain, positions: Sequence[Position], number: Callable[[Fraction], Element]
+) -> list[_JointMotion]:
+    """Return the motion of the joint of each body at these positions of the coordinates."""
     bases = base_denominators(arm)
-    moved = []
+    motions = []
     for body in arm.bodies:
         position = positions[body.coordinate]
-        if body.kind == "prismatic":
+        if body.joint_type == "prismatic":
             slide = position.value
             if body.multiplier != 1:
                 slide = number(body.multiplier) * slide
             if body.offset:
                 slide = slide + number(Fraction(str(body.offset)))
-            moved.append(_Motion(slide=slide))
+            motions.append(_JointMotion(slide=slide))
         else:
-            turns = int(body.multiplier * bases[body.coordinate])
-            c, s = _multiple_angle(position.cos, position.sin, turns)
+            factor = int(body.multiplier * bases[body.coordinate])
+            c, s = _multiple_angle(position.cos, position.sin, factor)
             if body.offset:
                 c0, s0 = map(number, circle_point(body.offset))
                 c, s = c0 * c - s0 * s, s0 * c + c0 * s
-            moved.append(_Motion(c, s))
-    return moved
+            motions.append(_JointMotion(c, s))
+    return motions
 
 
 def circle_point(angle: float) -> tuple[Fraction, Fraction]:
-    """Return the cosine and sine of an angle [rad], as a rational point of the circle within 1e-13 of it."""
-    # tan(angle / 2) has a pole at pi, and right angles are meant exactly
+    """Return the cosine and sine of an angle [rad] as a rational point of the unit circle, with an error of 1e-13."""
+    # tan(angle / 2) has a pole at pi; multiples of right angles are exact.
     if abs(cos(angle)) < 1e-12 or abs(sin(angle)) < 1e-12:
         return Fraction(round(cos(angle))), Fraction(round(sin(angle)))
     t = Fraction(tan(angle / 2)).limit_denominator(10**7)
     return (1 - t * t) / (1 + t * t), 2 * t / (1 + t * t)
 
 
-def base_denominators(arm: Arm) -> list[int]:
-    """Return by coordinate the d for which every body's angle is a whole multiple of q / d."""
+def base_denominators(arm: Chain) -> list[int]:
+    """Return for each coordinate q the integer d for which the angle of every body is an integer multiple of q / d."""
     denominators = [1] * len(arm.coordinates)
     for body in arm.bodies:
-        if body.kind == "revolute":
+        if body.joint_type == "revolute":
             index = body.coordinate
             denominators[index] = lcm(denominators[index], body.multiplier.denominator)
     return denominators
 
 
-def _multiple_angle(c: Element, s: Element, turns: int) -> tuple[Element, Element]:
-    """Return cosine and sine of ``turns`` times an angle, by repeated doubling."""
+def _multiple_angle(c: Element, s: Element, factor: int) -> tuple[Element, Element]:
+    """Return cosine and sine of an integer multiple of an angle, by repeated doubling."""
     result: tuple[Element, Element] = (1, 0)
-    # cos and sin of multiples by squaring, as mimic joints may turn twenty times as far
-    for bit in bin(abs(turns))[2:]:
+    # Exponentiation by squaring: multipliers of mimic joints reach twenty.
+    for bit in bin(abs(factor))[2:]:
         x, y = result
         result = (x * x - y * y, 2 * (x * y))
         if bit == "1":
             x, y = result
             result = (x * c - y * s, y * c + x * s)
-    if turns < 0:
+    if factor < 0:
         return result[0], -result[1]
     return result
 
 
 def _column(
-    arm: Arm, poses: Sequence[_Pose], motions: Sequence[_Motion], index: int, inertia: _Inertia
+    arm: Chain, poses: Sequence[_Pose], motions: Sequence[_JointMotion], index: int, inertia: _Inertia
 ) -> list[tuple[int, Element]]:
-    """The body-level mass-matrix entries of joint ``index`` with itself and each of its ancestors."""
+    """Return the entries of the mass matrix of the bodies' joints: of joint ``index`` with itself and its ancestors."""
     body = arm.bodies[index]
     (hx, hy, _), tensor = inertia.moment, inertia.tensor
-    if body.kind == "revolute":
+    if body.joint_type == "revolute":
         wrench = _Wrench((-hy, hx, 0), (tensor[2], tensor[4], tensor[5]))
     else:
         wrench = _Wrench((0, 0, inertia.mass), (hy, -hx, 0))
@@ -209,7 +212,7 @@ def _column(
 
 
 def _along(body: Body, wrench: _Wrench) -> Element:
-    return wrench.moment[2] if body.kind == "revolute" else wrench.force[2]
+    return wrench.moment[2] if body.joint_type == "revolute" else wrench.force[2]
 
 
 def _add_entry(
@@ -219,12 +222,14 @@ def _add_entry(
     entry: Element,
     number: Callable[[Fraction], Element],
 ) -> None:
-    """Adds a body-level entry where its coordinates meet; a mimic joint moves at a multiple of its leader."""
+    """Add an entry of two bodies to the entry of their coordinates; the rate of a mimic joint is a multiple of its
+    leader's.
+    """
     multiplier = first.multiplier * second.multiplier
     if multiplier != 1:
         entry = number(multiplier) * entry
     row, column = max(first.coordinate, second.coordinate), min(first.coordinate, second.coordinate)
-    # two bodies of one coordinate meet twice on its diagonal: once as row, once as column
+    # Two bodies of one coordinate contribute twice to its diagonal entry, as (i, j) and as (j, i).
     twice = first is not second and row == column
     mass[row, column] = mass[row, column] + (entry + entry if twice else entry)
 
@@ -234,14 +239,14 @@ def _sum(a: _Inertia, b: _Inertia) -> _Inertia:
     return _Inertia(a.mass + b.mass, moment, tuple(x + y for x, y in zip(a.tensor, b.tensor, strict=True)))
 
 
-def _moved_inertia(body: Body, motion: _Motion, inertia: _Inertia) -> _Inertia:
-    """The inertia seen from the joint's frame at rest, after the joint has moved about or along z."""
-    if body.kind == "prismatic":
+def _moved_inertia(body: Body, motion: _JointMotion, inertia: _Inertia) -> _Inertia:
+    """Return the inertia in the joint's frame at q = 0 after the joint has moved about or along z."""
+    if body.joint_type == "prismatic":
         return _translated(((2, motion.slide),), inertia)
     c, s = motion.cos, motion.sin
     hx, hy, hz = inertia.moment
     xx, xy, xz, yy, yz, zz = inertia.tensor
-    # sin^2 is written as 1 - cos^2 from the start, so no product ever needs reducing
+    # sin^2 = 1 - cos^2 is substituted here, so that polynomials need no reduction.
     cc, cs, difference = c * c, c * s, xx - yy
     turned_xx = yy + cc * difference - 2 * (cs * xy)
     return _Inertia(
@@ -258,9 +263,9 @@ def _moved_inertia(body: Body, motion: _Motion, inertia: _Inertia) -> _Inertia:
     )
 
 
-def _moved_wrench(body: Body, motion: _Motion, wrench: _Wrench) -> _Wrench:
+def _moved_wrench(body: Body, motion: _JointMotion, wrench: _Wrench) -> _Wrench:
     (fx, fy, fz), (mx, my, mz) = wrench.force, wrench.moment
-    if body.kind == "prismatic":
+    if body.joint_type == "prismatic":
         return _Wrench(wrench.force, (mx - motion.slide * fy, my + motion.slide * fx, mz))
     c, s = motion.cos, motion.sin
     return _Wrench((c * fx - s * fy, s * fx + c * fy, fz), (c * mx - s * my, s * mx + c * my, mz))
@@ -293,21 +298,21 @@ def _turned(pose: _Pose, vector: Vector) -> Vector:
 
 
 def _translated(offset: Terms, inertia: _Inertia) -> _Inertia:
-    """The inertia about an origin that lies ``-offset`` away: h + m p and the parallel-axis terms of I."""
+    """Return the inertia about an origin at ``-offset``: h + m p, and I by the parallel-axis theorem."""
     if not offset:
         return inertia
     moment: list[Element] = list(inertia.moment)
     tensor = dict(zip(TENSOR, inertia.tensor, strict=True))
     for axis, length in offset:
-        # with k = h + (h + m p) the shift of I is (p.k) 1 - (p k^T + k p^T)/2, one term per component of p
+        # With k = h + (h + m p), I increases by (p.k) 1 - (p k^T + k p^T) / 2: one term per component of p.
         moment[axis] = moment[axis] + length * inertia.mass
     for axis, length in offset:
         double = length * (inertia.moment[axis] + moment[axis])
-        for other in range(3):
-            if other != axis:
-                tensor[other, other] = tensor[other, other] + double
-                pair = (min(axis, other), max(axis, other))
-                tensor[pair] = tensor[pair] - length * inertia.moment[other]
+        for k in range(3):
+            if k != axis:
+                tensor[k, k] = tensor[k, k] + double
+                pair = (min(axis, k), max(axis, k))
+                tensor[pair] = tensor[pair] - length * inertia.moment[k]
     lengths = dict(offset)
     for i, j in ((0, 1), (0, 2), (1, 2)):
         if i in lengths and j in lengths:

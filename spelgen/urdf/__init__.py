@@ -1,1 +1,1 @@
-"""A URDF's bytes to a Robot, exactly as written."""
+"""Bytes of a URDF -> Robot, with the values of the file."""

@@ -1,4 +1,4 @@
-"""Bytes -> XML tree of a URDF: what is unsafe or no URDF at all is refused here."""
+"""Bytes -> XML tree of a URDF; unsafe content and other formats are refused."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lxml import etree
 
 from spelgen.errors import UrdfError, collect
 from spelgen.files import read_bytes
-from spelgen.urdf.xacro_input import Expansion, expand, is_xacro
+from spelgen.urdf.xacro_input import XacroOutput, expand, is_xacro
 
 MAX_BYTES = 20_000_000
 _CONFLICT = re.compile(rb"^(?:<{7} |={7}\r?$|>{7} )", re.MULTILINE)
@@ -27,11 +27,11 @@ _OTHER_FORMATS = {
 
 
 @dataclass(frozen=True)
-class Document:
-    """A URDF's bytes, its ``<robot>`` element, and the lines of harmless xacro left in it.
+class UrdfDocument:
+    """The bytes of a URDF, its ``<robot>`` element, and the lines of ``<xacro:property>`` elements in it.
 
-    ``path`` is how errors name the file. Of a xacro file, the bytes and all lines are those of the document
-    that it expands to, ``path`` says so, and ``warnings`` are xacro's.
+    ``path`` is the name of the file in errors. For a xacro file, bytes and lines refer to the expanded document, and
+    ``warnings`` are the warnings of xacro.
     """
 
     path: Path
@@ -42,24 +42,24 @@ class Document:
 
 
 def urdf_bytes(path: Path) -> bytes:
-    """The URDF in a file, or the one that a file called ``*.xacro`` expands to. Raises ``UrdfError``."""
+    """Return the bytes of a URDF file, or of the URDF that a ``*.xacro`` file expands to. Raises UrdfError."""
     return _expanded(path).data
 
 
-def read_document(path: Path) -> Document:
-    """Return the parsed file; entities are never expanded and nothing else is opened.
+def read_document(path: Path) -> UrdfDocument:
+    """Return the parsed file; entities are never expanded and no other file is opened.
 
-    A file called ``*.xacro`` is run first, see ``xacro_input``, and may open what it likes.
+    A ``*.xacro`` file is a program, which is executed first and may open other files (see ``xacro_input``).
 
-    Raises ``UrdfError`` for a missing or oversized file, a document type declaration, anything but
-    well-formed XML, another root than ``<robot>``, and xacro that was not expanded.
+    Raises UrdfError for a missing or oversized file, a document type declaration, malformed XML, a root element other
+    than ``<robot>``, and xacro that is not expanded.
     """
     expansion = _expanded(path)
     data = expansion.data
     if is_xacro(path):
         path = path.with_name(f"{path.name} (expanded)")
         _refuse_damage(path, data)
-    # huge_tree=False keeps libxml2's own limits on depth (256) and text length
+    # huge_tree=False: the limits of libxml2 on depth (256) and text length apply
     parser = etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=False, load_dtd=False)
     try:
         root = etree.fromstring(data, parser)
@@ -70,13 +70,13 @@ def read_document(path: Path) -> Document:
     if root.getroottree().docinfo.internalDTD is not None:
         raise _doctype_error(path, None)
     _check_root(path, root)
-    return Document(path, data, root, _check_xacro(path, root), expansion.warnings)
+    return UrdfDocument(path, data, root, _check_xacro(path, root), expansion.warnings)
 
 
-def _expanded(path: Path) -> Expansion:
+def _expanded(path: Path) -> XacroOutput:
     data = read_bytes(path, UrdfError, "a URDF file", MAX_BYTES, "keep meshes in files of their own")
     _refuse_damage(path, data)
-    return expand(path, MAX_BYTES) if is_xacro(path) else Expansion(data, ())
+    return expand(path, MAX_BYTES) if is_xacro(path) else XacroOutput(data, ())
 
 
 def _line_of(data: bytes, position: int) -> int:
@@ -84,7 +84,7 @@ def _line_of(data: bytes, position: int) -> int:
 
 
 def _refuse_damage(path: Path, data: bytes) -> None:
-    """Refuses what an XML parser would misreport, or must not see."""
+    """Raise UrdfError for damage with unclear errors of the XML parser, and for unsafe declarations."""
     if not data.strip():
         raise UrdfError("an empty file", file=path, expected="a URDF document")
     conflict = _CONFLICT.search(data)
@@ -156,9 +156,9 @@ def _check_root(path: Path, root: etree._Element) -> None:
 
 
 def _check_xacro(path: Path, root: etree._Element) -> tuple[int, ...]:
-    """Refuses xacro that still holds structure; returns the lines of <xacro:property>, which holds none.
+    """Return the lines of <xacro:property> elements. Raises UrdfError for other xacro elements.
 
-    Expanders leave properties behind; a number that still refers to one is refused where it is read.
+    Output of expanders may contain properties; a number that refers to one is refused when it is read.
     """
     errors, leftovers = [], []
     for element in root.iter(etree.Element):

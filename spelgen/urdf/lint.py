@@ -1,4 +1,4 @@
-"""Warn about what is impossible or likely a mistake; nothing here stops the reading."""
+"""Warnings about physically inconsistent values and probable mistakes in a URDF."""
 
 from __future__ import annotations
 
@@ -7,35 +7,32 @@ from collections.abc import Iterator
 import numpy as np
 
 from spelgen.errors import Diagnostic
-from spelgen.urdf.robot import Inertial, Joint, Link, Robot, Tensor
+from spelgen.urdf.robot import Inertial, Robot, Tensor, UrdfJoint, UrdfLink
 
-# computed tensors are printed with rounding: what is violated by less than this share is not worth a word
+# Tensors are printed with rounding: violations below this fraction are not reported.
 _ROUNDING = 1e-6
 _UNIT_AXIS = 1e-3
 
 
 def lint(robot: Robot) -> list[Diagnostic]:
-    """Return the diagnostics of inertials, joints, rigid groups and limits, in no particular order."""
-    warnings = [
-        *_lint_inertials(robot),
-        *_lint_placeholders(robot),
-        *_lint_joints(robot),
-        *_lint_groups(robot),
-    ]
-    return [*warnings, *_unlimited(robot)]
+    """Return the diagnostics of inertials, joints, rigid groups and limits, which the reader sorts by line."""
+    diagnostics: list[Diagnostic] = []
+    for link in robot.links:
+        diagnostics += _lint_inertial(link)
+    diagnostics += _lint_placeholders(robot)
+    for joint in robot.joints:
+        diagnostics += _lint_joint(joint)
+    return [*diagnostics, *_lint_groups(robot), *_unlimited(robot)]
 
 
 def _warning(code: str, where: str, line: int, message: str) -> Diagnostic:
     return Diagnostic("warning", code, where, line, message)
 
 
-def _lint_inertials(robot: Robot) -> Iterator[Diagnostic]:
-    for link in robot.links:
-        if link.inertial is not None:
-            yield from _lint_inertial(link, link.inertial)
-
-
-def _lint_inertial(link: Link, inertial: Inertial) -> Iterator[Diagnostic]:
+def _lint_inertial(link: UrdfLink) -> Iterator[Diagnostic]:
+    inertial = link.inertial
+    if inertial is None:
+        return
     where, line, tensor = f"link {link.name!r} inertial", inertial.line, inertial.tensor
     if inertial.mass < 0:
         yield _warning("negative-mass", where, line, f"the mass is {inertial.mass:g} kg")
@@ -43,7 +40,7 @@ def _lint_inertial(link: Link, inertial: Inertial) -> Iterator[Diagnostic]:
         if inertial.mass > 0:
             yield _warning("zero-inertia", where, line, "the inertia tensor is zero: a point mass")
         return
-    # the unit matrix passes every test of a possible body, and is what templates begin with
+    # the identity matrix is physically consistent, and is the default of templates
     if tensor == (1.0, 0.0, 0.0, 1.0, 0.0, 1.0):
         yield _warning("placeholder-inertial", where, line, "the tensor is the unit matrix: a placeholder")
     smallest, middle, largest = _principal_moments(inertial)
@@ -52,7 +49,7 @@ def _lint_inertial(link: Link, inertial: Inertial) -> Iterator[Diagnostic]:
             f"the inertia tensor is not positive semidefinite: its least principal moment is {smallest:.3g}"
         )
         yield _warning("non-psd-inertia", where, line, message)
-    # each moment is a sum of two of three second moments, none of which is negative
+    # a principal moment is the sum of two of three nonnegative second moments of mass
     elif smallest + middle < largest * (1 - _ROUNDING):
         inequality = f"{smallest:.3g} + {middle:.3g} < {largest:.3g}"
         message = f"no mass distribution has these principal moments: {inequality}"
@@ -75,21 +72,17 @@ def _lint_placeholders(robot: Robot) -> Iterator[Diagnostic]:
             lines.setdefault(link.inertial.tensor, []).append(link.inertial.line)
             total += 1
     repeated = max(lines.values(), key=len, default=[])
-    # two links may well be alike, three of one tensor are copies
+    # two links may have equal shapes; three equal tensors are copies
     if len(repeated) > total / 2 and len(repeated) >= 3:
         message = f"{len(repeated)} of {total} links have the same inertia tensor: perhaps placeholders"
         yield _warning("placeholder-inertial", "robot", repeated[0], message)
 
 
-def _lint_joints(robot: Robot) -> Iterator[Diagnostic]:
-    for joint in robot.joints:
-        if joint.moves:
-            yield from _lint_joint(joint)
-
-
-def _lint_joint(joint: Joint) -> Iterator[Diagnostic]:
+def _lint_joint(joint: UrdfJoint) -> Iterator[Diagnostic]:
+    if not joint.moves:
+        return
     where = f"joint {joint.name!r}"
-    # negative friction would drive the arm: simulations with it diverge
+    # negative friction adds energy: simulations diverge
     for name, value in (("damping", joint.damping), ("friction", joint.friction)):
         if value < 0:
             message = f"{name} is {value:g}: it would add energy"
@@ -99,7 +92,7 @@ def _lint_joint(joint: Joint) -> Iterator[Diagnostic]:
         yield _warning(
             "non-unit-axis", f"{where} axis", joint.line, f"its length is {length:.6g}: normalised"
         )
-    # kept as written: which of the two is wrong nobody can tell
+    # not corrected, because either number may be wrong
     if joint.lower is not None and joint.upper is not None and joint.lower > joint.upper:
         message = f"lower {joint.lower:g} is above upper {joint.upper:g}: perhaps the two were swapped"
         yield _warning("lower-above-upper", f"{where} limit", joint.line, message)
@@ -127,7 +120,7 @@ def _unlimited(robot: Robot) -> Iterator[Diagnostic]:
 
 
 def _lint_groups(robot: Robot) -> Iterator[Diagnostic]:
-    """Warn where what a moving joint carries rigidly, its child link and all fixed to it, has no mass."""
+    """Warn about a moving joint whose rigid group, its child link and all links fixed to it, has no mass."""
     if all(link.inertial is None for link in robot.links):
         yield _warning(
             "missing-inertial", "robot", 1, "no link has an <inertial>: masses and inertias are unknown"
@@ -136,7 +129,7 @@ def _lint_groups(robot: Robot) -> Iterator[Diagnostic]:
     for joint in robot.joints:
         if not joint.moves:
             continue
-        # frames without mass are usual; a joint that moves no mass at all has a singular M
+        # single links without mass are common; M is singular if a whole rigid group has no mass
         inertials = [link.inertial for link in _rigid_group(robot, joint.child) if link.inertial is not None]
         line = robot.link[joint.child].line
         if not inertials:
@@ -149,7 +142,7 @@ def _lint_groups(robot: Robot) -> Iterator[Diagnostic]:
             yield _warning("massless-moving-link", f"link {joint.child!r}", line, message)
 
 
-def _rigid_group(robot: Robot, link: str) -> list[Link]:
+def _rigid_group(robot: Robot, link: str) -> list[UrdfLink]:
     group, pending = [], [link]
     while pending:
         name = pending.pop()

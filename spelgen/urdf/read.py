@@ -1,4 +1,4 @@
-"""URDF file -> Robot, exactly as written: everything is checked, nothing is repaired silently."""
+"""URDF file -> Robot, with the values of the file: all elements are checked, and no defect is repaired silently."""
 
 from __future__ import annotations
 
@@ -14,23 +14,21 @@ from spelgen.errors import Diagnostic, collect, suggestion
 from spelgen.urdf.document import read_document
 from spelgen.urdf.elements import read_joint, read_link, read_name, read_transmission
 from spelgen.urdf.lint import lint
-from spelgen.urdf.robot import Joint, Link, Robot
+from spelgen.urdf.robot import Robot, UrdfJoint, UrdfLink
 from spelgen.urdf.values import Notes
 
 MAX_LINKS = 2000
-Part = TypeVar("Part", Link, Joint)
+Part = TypeVar("Part", UrdfLink, UrdfJoint)
 
 
 def read_urdf(path: Path) -> Robot:
-    """Return the robot of a URDF file, with lint diagnostics by line; no other file is opened.
+    """Return the robot of a URDF file, with lint diagnostics in the order of lines; no other file is opened.
 
-    A file called ``*.xacro`` is a program, and is run: see ``xacro_input``. The lines are then those of the
-    document that it expands to.
+    A ``*.xacro`` file is a program, which is executed (see ``xacro_input``); lines then refer to the expanded document.
 
-    Raises ``UrdfError``, or ``SpelgenErrors`` with all that was found, where the file is missing or is not
-    one well-formed tree of links and joints.
+    Raises UrdfError, or SpelgenErrors with all errors, if the file is missing or is no well-formed tree of links and
+    joints.
     """
-    # bytes are read once: digest and tree then speak of the same file
     document = read_document(path)
     notes = Notes(document.path)
     if document.path != path:
@@ -44,25 +42,23 @@ def read_urdf(path: Path) -> Robot:
         message = f"{len(document.leftovers)} <xacro:property> elements were left behind by xacro: ignored"
         notes.warn(document.leftovers[0], "unexpanded-xacro", "robot", message)
     links = _read_links(notes, root)
-    # direct children alone: Gazebo and transmissions have elements of the same names deeper down
+    # direct children only: Gazebo and transmissions have nested elements of the same names
     joints = _unique(notes, [read_joint(notes, element) for element in root.findall("joint")])
     _check_ends(notes, links, joints)
     _check_mimics(notes, joints)
     joint_names = [joint.name for joint in joints]
-    # after the joints, whose names they must use
     transmissions = []
     for element in root.findall("transmission"):
         transmissions.append(read_transmission(notes, element, joint_names))
-    # a joint that could not be read leaves false roots behind, so these are sought in a sound file only
+    # only if all joints could be read, because links of unread joints appear as roots
     tops: list[str] = []
     if not notes.errors:
         tops = _check_tree(notes, root, links, joints)
-    # by line, so that a user mends the file from top to bottom
     collect(sorted(notes.errors, key=lambda error: error.line or 0))
     robot = Robot(
         name=name,
         path=path,
-        told_as=document.path,
+        source=document.path,
         digest=hashlib.sha256(document.data).hexdigest(),
         links=tuple(links),
         joints=tuple(joints),
@@ -74,7 +70,7 @@ def read_urdf(path: Path) -> Robot:
 
 
 def _diagnostics(notes: Notes, robot: Robot) -> tuple[Diagnostic, ...]:
-    """Return what reading and lint remarked, by line; that an absent tensor is a zero tensor is not said twice."""
+    """Return the diagnostics of reading and lint in the order of lines, without duplicates for absent tensors."""
     diagnostics = list(notes.diagnostics)
     absent = {remark.line for remark in notes.diagnostics if remark.code == "inertial-without-inertia"}
     for warning in lint(robot):
@@ -91,9 +87,9 @@ def _robot_name(notes: Notes, root: etree._Element) -> str:
     return notes.path.stem
 
 
-def _read_links(notes: Notes, root: etree._Element) -> list[Link]:
+def _read_links(notes: Notes, root: etree._Element) -> list[UrdfLink]:
     elements = root.findall("link")
-    # all that follows grows at least linearly with the links, and no arm has a tenth of these
+    # the cost of all later steps is at least linear in the links; arms have at most a tenth of this number
     if len(elements) > MAX_LINKS:
         notes.error(root.sourceline, "<robot>", f"{len(elements)} links", f"at most {MAX_LINKS}")
         collect(notes.errors)
@@ -108,23 +104,23 @@ def _read_links(notes: Notes, root: etree._Element) -> list[Link]:
 
 
 def _unique(notes: Notes, elements: Sequence[Part | None]) -> list[Part]:
-    """Return what could be read; a name used twice is an error (a link and a joint may share one)."""
+    """Return the elements that could be read; a name of two links, or of two joints, is an error."""
     by_name: dict[str, Part] = {}
     for element in elements:
         if element is None:
             continue
         first = by_name.setdefault(element.name, element)
         if first is not element:
-            kind = type(element).__name__.lower()
+            kind = "link" if isinstance(element, UrdfLink) else "joint"
             got = f"a second {kind} of that name (the first is in line {first.line})"
             notes.error(element.line, f"{kind} {element.name!r}", got, "unique names", "rename or remove one")
     return list(by_name.values())
 
 
-def _check_ends(notes: Notes, links: Sequence[Link], joints: Sequence[Joint]) -> None:
-    """Check that both links of a joint exist, and that no link hangs from two joints."""
+def _check_ends(notes: Notes, links: Sequence[UrdfLink], joints: Sequence[UrdfJoint]) -> None:
+    """Report joints with unknown links, and links that are the child of two joints."""
     names = {link.name: None for link in links}
-    above: dict[str, Joint] = {}
+    above: dict[str, UrdfJoint] = {}
     for joint in joints:
         where = f"joint {joint.name!r}"
         for role, link in (("parent", joint.parent), ("child", joint.child)):
@@ -139,8 +135,8 @@ def _check_ends(notes: Notes, links: Sequence[Link], joints: Sequence[Joint]) ->
         above.setdefault(joint.child, joint)
 
 
-def _check_mimics(notes: Notes, joints: Sequence[Joint]) -> None:
-    """Check that every leader exists, has one degree of freedom, and leads to no circle."""
+def _check_mimics(notes: Notes, joints: Sequence[UrdfJoint]) -> None:
+    """Report leaders that do not exist or do not move, and cycles of mimic joints."""
     by_name = {joint.name: joint for joint in joints}
     for joint in joints:
         if joint.mimic is None:
@@ -157,10 +153,10 @@ def _check_mimics(notes: Notes, joints: Sequence[Joint]) -> None:
             notes.error(joint.line, where, "a circle of mimic joints", "a leader that moves by itself")
 
 
-def _is_circle(joint: Joint, by_name: dict[str, Joint]) -> bool:
-    """Whether following leaders from ``joint`` comes back to it."""
+def _is_circle(joint: UrdfJoint, by_name: dict[str, UrdfJoint]) -> bool:
+    """Whether ``joint`` is part of a cycle of mimic joints."""
     seen: set[str] = set()
-    leader: Joint | None = joint
+    leader: UrdfJoint | None = joint
     while leader is not None and leader.mimic is not None and leader.name not in seen:
         seen.add(leader.name)
         leader = by_name.get(leader.mimic.joint)
@@ -168,9 +164,9 @@ def _is_circle(joint: Joint, by_name: dict[str, Joint]) -> bool:
 
 
 def _check_tree(
-    notes: Notes, root: etree._Element, links: Sequence[Link], joints: Sequence[Joint]
+    notes: Notes, root: etree._Element, links: Sequence[UrdfLink], joints: Sequence[UrdfJoint]
 ) -> list[str]:
-    """Return the names of the links that hang from no joint: exactly one, from which all others are reached."""
+    """Return the root link in a list; an empty list, with an error, unless the links form one tree."""
     children = {joint.child for joint in joints}
     tops = [link for link in links if link.name not in children]
     if len(tops) != 1:

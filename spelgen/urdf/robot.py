@@ -1,4 +1,4 @@
-"""A robot as its URDF says it: links, joints and transmissions, nothing computed."""
+"""A robot with the values of its URDF: links, joints and transmissions."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from spelgen.errors import Diagnostic, UrdfError
 Vector = tuple[float, float, float]
 Tensor = tuple[float, float, float, float, float, float]
 
+JointType = Literal["revolute", "prismatic"]
+
 Assume = Literal["kinematics", "inertials"]
-"""Values of the URDF that are trusted: the kinematics, or also the inertials' zeros and symmetries."""
+"""Values of the URDF that determine the structure: the kinematics, or also zeros and symmetries of inertials."""
 
 MOVING = ("revolute", "continuous", "prismatic")
-"""Joint types with one degree of freedom."""
+"""Types of joints with one degree of freedom."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +36,8 @@ class Inertial:
 
 
 @dataclass(frozen=True)
-class Link:
-    """A rigid body; ``inertial`` is None where the file gives none."""
+class UrdfLink:
+    """A link; ``inertial`` is None if absent."""
 
     name: str
     inertial: Inertial | None
@@ -52,11 +54,10 @@ class Mimic:
 
 
 @dataclass(frozen=True)
-class Joint:
-    """A joint; ``xyz`` [m] and ``rpy`` [rad] place it in the parent link's frame, ``axis`` is in its own.
+class UrdfJoint:
+    """A joint at ``xyz`` [m] and ``rpy`` [rad] in the frame of the parent link; ``axis`` is in the frame of the joint.
 
-    Limits are in rad or m, N m or N, and per second, None where absent; ``axis`` is as written, (1, 0, 0)
-    where absent.
+    Limits are in rad or m, N m or N, and per second, None if absent. ``axis`` is not normalised; (1, 0, 0) if absent.
     """
 
     name: str
@@ -83,9 +84,9 @@ class Joint:
 
 @dataclass(frozen=True)
 class Transmission:
-    """Which actuators (name, reduction) drive which joints (name, reduction, offset); None where absent.
+    """Actuators (name, reduction) that drive joints (name, reduction, offset); None for an absent number.
 
-    ``errors``: what cannot be read of it, for the step that needs it: most need none of the transmissions.
+    ``errors`` are raised by a step that needs the transmission.
     """
 
     name: str
@@ -97,55 +98,55 @@ class Transmission:
 
     @property
     def joint_names(self) -> list[str]:
-        """Names of the joints that it drives."""
+        """Names of the driven joints."""
         return [name for name, _, _ in self.joints]
 
 
 @dataclass(frozen=True)
 class Robot:
-    """A tree of links and joints in file order; ``digest`` is the SHA-256 of its bytes in hexadecimal.
+    """A tree of links and joints in the order of the file; ``digest`` is the SHA-256 of its bytes in hexadecimal.
 
-    ``told_as`` is how errors name the file: a xacro file's lines and digest are those of its expansion.
+    ``source`` is the name of the file in errors; for a xacro file, lines and digest refer to the expanded document.
     """
 
     name: str
     path: Path
-    told_as: Path
+    source: Path
     digest: str
-    links: tuple[Link, ...]
-    joints: tuple[Joint, ...]
+    links: tuple[UrdfLink, ...]
+    joints: tuple[UrdfJoint, ...]
     transmissions: tuple[Transmission, ...]
     root: str
     diagnostics: tuple[Diagnostic, ...]
 
     @cached_property
-    def link(self) -> dict[str, Link]:
+    def link(self) -> dict[str, UrdfLink]:
         """The links by name."""
         return {link.name: link for link in self.links}
 
     @cached_property
-    def joint(self) -> dict[str, Joint]:
+    def joint(self) -> dict[str, UrdfJoint]:
         """The joints by name."""
         return {joint.name: joint for joint in self.joints}
 
     @cached_property
-    def joint_above(self) -> dict[str, Joint]:
-        """The joint that carries a link, by the link's name; the root has none."""
+    def joint_above(self) -> dict[str, UrdfJoint]:
+        """The joint whose child is a link, by the name of the link; the root link has none."""
         return {joint.child: joint for joint in self.joints}
 
     @cached_property
-    def joints_below(self) -> dict[str, tuple[Joint, ...]]:
-        """The joints that leave a link, by the link's name, in file order."""
-        below: dict[str, list[Joint]] = {link.name: [] for link in self.links}
+    def joints_below(self) -> dict[str, tuple[UrdfJoint, ...]]:
+        """The joints whose parent is a link, by the name of the link, in the order of the file."""
+        below: dict[str, list[UrdfJoint]] = {link.name: [] for link in self.links}
         for joint in self.joints:
             below[joint.parent].append(joint)
         return {name: tuple(joints) for name, joints in below.items()}
 
     @cached_property
-    def joints_from_root(self) -> tuple[Joint, ...]:
-        """All joints, parents before their children, depth first in file order."""
-        ordered: list[Joint] = []
-        # a stack, since a hostile file may be nested deeper than Python recurses
+    def joints_from_root(self) -> tuple[UrdfJoint, ...]:
+        """All joints, parents before their children, depth first in the order of the file."""
+        ordered: list[UrdfJoint] = []
+        # A stack replaces recursion: the nesting in a file is not bounded.
         pending = list(reversed(self.joints_below[self.root]))
         while pending:
             joint = pending.pop()
@@ -153,10 +154,9 @@ class Robot:
             pending.extend(reversed(self.joints_below[joint.child]))
         return tuple(ordered)
 
-    def path_to(self, link: str) -> tuple[Joint, ...]:
-        """The joints from the root to ``link``, in that order."""
-        # from the link upwards: each link has one joint above it, but many below
-        path: list[Joint] = []
+    def path_to(self, link: str) -> tuple[UrdfJoint, ...]:
+        """Return the joints from the root to ``link``, in this order."""
+        path: list[UrdfJoint] = []
         while link in self.joint_above:
             path.append(self.joint_above[link])
             link = path[-1].parent

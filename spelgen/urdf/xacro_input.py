@@ -1,8 +1,8 @@
-"""What the package xacro makes of a xacro file.
+"""Expansion of xacro files by the package xacro.
 
-A xacro file is a program: it holds Python expressions, reads other files and the environment, and nothing
-contains it. So it is run only where its user says so by its name, ``*.xacro``, and never because of what a
-file holds. It gets a process of its own, which bounds its time and memory, not what it may do.
+A xacro file is a program: it contains Python expressions, reads other files and the environment, and is not sandboxed.
+It is therefore executed only if the name of the file is ``*.xacro``, never because of the content of a file. It runs in
+a separate process with limited time and memory, but with the permissions of the user.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from spelgen.urdf import xacro_child
 
 SUFFIX = ".xacro"
 MAX_SECONDS = 8
+MAX_MESSAGE = 400  # characters of xacro's message in an error
 _BY_HAND = "expand it where that works: xacro FILE name:=value ... > ROBOT.urdf"
-_TOLD_AT_MOST = 400
 
 
 @dataclass(frozen=True)
-class Expansion:
-    """The plain URDF, and what xacro warned of."""
+class XacroOutput:
+    """The expanded URDF, and the warnings of xacro."""
 
     data: bytes
     warnings: tuple[str, ...]
 
 
 def is_xacro(path: Path) -> bool:
-    """Whether a file is, by its name, to be run as a xacro file."""
+    """Whether the name of a file marks it as a xacro file."""
     return path.suffix.lower() == SUFFIX
 
 
-def expand(path: Path, max_bytes: int) -> Expansion:
-    """Run a xacro file, with the default values of its arguments.
+def expand(path: Path, max_bytes: int) -> XacroOutput:
+    """Execute a xacro file with the default values of its arguments.
 
-    Raises ``UrdfError`` where the package xacro is not installed or fails, runs for more than 8 s, or
-    writes more than ``max_bytes``.
+    Raises UrdfError if the package xacro is not installed or fails, runs for more than 8 s, or writes more than
+    ``max_bytes``.
     """
-    # -P: the folder in which spelgen is called must not stand in for the package
+    # -P: modules in the current folder must not shadow the package
     command = [sys.executable, "-P", "-X", "utf8", xacro_child.__file__, str(path)]
     with tempfile.TemporaryFile() as output:
         try:
@@ -63,7 +63,7 @@ def expand(path: Path, max_bytes: int) -> Expansion:
         if size > max_bytes:
             raise UrdfError(f"{size} bytes of URDF from xacro", file=path, expected=f"at most {max_bytes}")
         output.seek(0)
-        return Expansion(output.read(), warnings)
+        return XacroOutput(output.read(), warnings)
 
 
 def _failure(path: Path, code: int, lines: list[str]) -> UrdfError:
@@ -73,5 +73,5 @@ def _failure(path: Path, code: int, lines: list[str]) -> UrdfError:
             file=path,
             do=f"pip install 'spelgen[xacro]', or {_BY_HAND}",
         )
-    told = " ".join(" ".join(lines).split())[:_TOLD_AT_MOST] or f"it ended with code {code}"
-    return UrdfError(f"xacro cannot expand it ({told})", file=path, do=f"correct it, or {_BY_HAND}")
+    reason = " ".join(" ".join(lines).split())[:MAX_MESSAGE] or f"it ended with code {code}"
+    return UrdfError(f"xacro cannot expand it ({reason})", file=path, do=f"correct it, or {_BY_HAND}")

@@ -1,89 +1,103 @@
-"""Select which joints have a dead zone: those far more probable with it.
+"""Selection of the joints that have a dead zone, by the maximum posterior of each joint with and without one.
 
-Slopes of errors do not tell: a joint that gravity does not load is held off its command alike by a dead zone and by dry
-friction, and only how it starts, stops and turns round says which. Under the load and the delay of a fit each joint is
-one by itself: it is fitted from other starts, and keeps what is most probable, where a dead zone has to be worth more
-than luck.
+The derivatives of the errors do not distinguish a dead zone from dry friction at a joint without gravity load: both
+hold the joint off its command. The motion at starts, stops and reversals does. So each joint is fitted twice, from
+initial parameters with and without a dead zone, under the load and the delay of the last fit, which make joints
+independent. A dead zone is kept if it lowers the joint's negative log posterior by more than significance^2 / 2.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import torch
 
-from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo.parameters import COULOMB, DEAD_ZONE, ServoParameters
-from spelgen.fitting.servo.problem import LONGEST_STEP, ServoProblem
+from spelgen.fitting.servo.problem import MAX_STEP, ServoProblem
 from spelgen.fitting.servo.tuning import ServoLawTuning, ServoSolverTuning
+from spelgen.fitting.tuning import TUNING as DAMPING
+from spelgen.runtime.friction_laws import FrictionLaws
 
 TUNING, SOLVER = ServoLawTuning(), ServoSolverTuning()
 
 
 def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
-    """Return parameters with the dead zones that the joints turn out to have, which are fitted from then on."""
-    problem.weigh(problem.residual(x))
-    plain, plain_costs = _joint_minima(problem, x)
-    zoned, zoned_costs = _joint_minima(problem, divided(problem, x, TUNING.dead_zone_fraction))
-    better = zoned_costs + TUNING.significance**2 / 2 < plain_costs  # never where a rollout left all bounds
-    joints, active = torch.where(better, zoned.joints, plain.joints), x.active.clone()
-    active[problem.rows.row(DEAD_ZONE)] = better
-    return without_faint(problem, replace(x, joints=joints, active=active))
+    """Return the parameters with the selected dead zones, which further iterations fit."""
+    problem = problem.reweighted(x)
+    without, costs_without = _joint_minima(problem, x)
+    with_zones, costs_with = _joint_minima(problem, with_dead_zones(problem, x, TUNING.dead_zone_fraction))
+    better = costs_with + TUNING.significance**2 / 2 < costs_without  # false if a rollout diverged
+    joints, active = torch.where(better, with_zones.joints, without.joints), x.active.clone()
+    active[problem.parameters.row(DEAD_ZONE)] = better
+    return without_small_dead_zones(problem, replace(x, joints=joints, active=active))
 
 
-def without_faint(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
-    """Return the parameters without dead zones that are next to none."""
-    row, joints, active = problem.rows.row(DEAD_ZONE), x.joints.clone(), x.active.clone()
-    active[row] &= joints[row] > TUNING.least_dead_zone
+def without_small_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
+    """Return the parameters without dead zones below the resolution of encoders."""
+    row, joints, active = problem.parameters.row(DEAD_ZONE), x.joints.clone(), x.active.clone()
+    active[row] &= joints[row] > TUNING.min_dead_zone
     joints[row] *= active[row]
     return replace(x, joints=joints, active=active)
 
 
 def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, torch.Tensor]:
-    """Return where each joint's own parameters are most probable, under what all share, and what that costs, (n,).
+    """Minimize the cost of each joint over its own parameters; return the parameters and the costs, (n,).
 
-    Each joint has a damping of its own: one for all would follow the joint that is worst off, and others end early.
+    The n joints have independent Levenberg-Marquardt solvers in one batch, each with its own damping and termination:
+    with a common damping the joint with the worst initial guess would slow down all others.
     """
     errors = problem.residual(x)
     costs = problem.joint_costs(x, errors)
-    damping, active = torch.full_like(costs, DAMPING.initial), torch.ones_like(costs).bool()
+    damping, active = torch.full_like(costs, DAMPING.initial_damping), torch.ones_like(costs).bool()
     p, n = x.joints.shape
     for _ in range(TUNING.steps):
         normal = problem.normal_equations(x, errors)
+        # the block (p, p) of each joint: (n, p, p) and (n, p)
         blocks = normal.curvature[: p * n, : p * n].view(p, n, p, n).diagonal(dim1=1, dim2=3)
         joints = NormalEquations(blocks.permute(2, 0, 1), normal.descent[: p * n].view(p, n).mT)
-        steps = joints.step(damping).clamp(-LONGEST_STEP, LONGEST_STEP)
-        moved = replace(x, joints=x.joints + steps.mT * x.active)
-        moved_errors = problem.residual(moved)
-        moved_costs = problem.joint_costs(moved, moved_errors)
-        better = active & (moved_costs < costs)
-        active &= torch.where(better, costs - moved_costs >= SOLVER.gain, damping < 1.0)
-        x = replace(x, joints=torch.where(better, moved.joints, x.joints))
-        errors = torch.where(better, moved_errors, errors)
-        costs = torch.where(better, moved_costs, costs)
-        damping = torch.where(better, damping / DAMPING.factor, damping * DAMPING.factor / 2)
+        steps = joints.step(damping).clamp(-MAX_STEP, MAX_STEP)
+        candidate = replace(x, joints=x.joints + steps.mT * x.active)
+        candidate_errors = problem.residual(candidate)
+        candidate_costs = problem.joint_costs(candidate, candidate_errors)
+        better = active & (candidate_costs < costs)
+        # a joint ends after a small decrease, or if no step with a damping below one lowers its cost
+        active &= torch.where(better, costs - candidate_costs >= SOLVER.min_decrease, damping < 1.0)
+        x = replace(x, joints=torch.where(better, candidate.joints, x.joints))
+        errors = torch.where(better, candidate_errors, errors)
+        costs = torch.where(better, candidate_costs, costs)
+        damping = torch.where(better, damping / DAMPING.damping_factor, damping * DAMPING.damping_factor / 2)
         if not active.any():
             break
     return x, costs
 
 
-def divided(problem: ServoProblem, x: ServoParameters, fraction: float) -> ServoParameters:
-    """Return parameters where dead zones are this fraction of the static error, and dry friction the rest."""
-    problem.write(x)
+def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) -> ServoParameters:
+    """Return parameters in which all joints have a dead zone.
+
+    The half dead zone becomes `fraction` of the static error, which is dry friction / kp, and Coulomb friction is
+    reduced by this fraction.
+    """
+    rollouts, row, joints = problem.rollouts, problem.parameters.row, x.joints.clone()
+    model = rollouts.model
+    problem.parameters.write(x)
     with torch.no_grad():
-        dry = sliding_friction(problem.model.friction, problem.along.qd, problem.load.gravity)
-    row, joints = problem.rows.row, x.joints.clone()
-    joints[row(DEAD_ZONE)] = fraction * dry / problem.model.kp.detach()
-    # the parameter is a logarithm
+        dry = sliding_friction(model.friction, rollouts.motion.qd, rollouts.load.gravity)
+    joints[row(DEAD_ZONE)] = fraction * dry / model.servo.kp().detach()
+    # the parameter is the logarithm of Coulomb friction
     joints[row(COULOMB)] += torch.tensor(1 - fraction).log()
     return replace(x, joints=joints, active=torch.ones_like(x.active))
 
 
-def sliding_friction(friction: Any, qd: torch.Tensor, gravity: torch.Tensor) -> torch.Tensor:
-    """Return dry friction of each joint, (n,) [Nm, N], over what it slid; qd and gravity's torque: (..., n)."""
-    slid = qd.abs() + 1e-9  # so that joints which never move have friction
-    dry = friction.prepare().dry(qd, gravity) * slid
-    mean: torch.Tensor = dry.flatten(0, -2).sum(dim=0) / slid.flatten(0, -2).sum(dim=0)
+def sliding_friction(friction: FrictionLaws, qd: torch.Tensor, gravity: torch.Tensor) -> torch.Tensor:
+    """Return the mean dry friction of each joint over the distance that it moves, (n,) [Nm, N].
+
+    Args:
+        friction: friction model.
+        qd: velocities, (..., n) [rad/s, m/s].
+        gravity: gravity torques, (..., n) [Nm, N].
+    """
+    speed = qd.abs() + 1e-9  # so that the mean of joints at rest is defined
+    dry = friction.prepare().dry(qd, gravity) * speed
+    mean: torch.Tensor = dry.flatten(0, -2).sum(dim=0) / speed.flatten(0, -2).sum(dim=0)
     return mean

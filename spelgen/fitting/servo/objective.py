@@ -1,8 +1,8 @@
-"""The objective servo: fit position servos, friction and weight of an arm to what follows its commands.
+"""The objective servo: fit position servos, friction and gravity load of an arm to positions under its commands.
 
-First least squares on the command error (`start`), then predicted windows (`problem`), in rounds: each takes the
-bodies' load along what has been predicted, and the scale of errors, anew. After the first, joints get the dead zones
-that they turn out to have (`laws`); the last has all windows.
+The initial guess is the least-squares solution of the command error (`initial_guess`). Outer iterations then minimize
+the error of predicted windows (`problem`): each recomputes the load of the bodies along the predicted motion and the
+scale of the errors. Dead zones are selected after the first iteration (`laws`); the last one uses all windows.
 """
 
 from __future__ import annotations
@@ -20,33 +20,35 @@ import torch
 from spelgen.dynamics.bristles import encoder_step
 from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import digest
-from spelgen.fitting.levenberg_marquardt import TUNING as DAMPING
 from spelgen.fitting.levenberg_marquardt import SolverState, initial_state, levenberg_marquardt
 from spelgen.fitting.objective import FitRequest, Objective, PreparedLogs, Status
 from spelgen.fitting.run_record import Content
-from spelgen.fitting.servo.laws import select_dead_zones, without_faint
+from spelgen.fitting.servo.initial_guess import set_initial_guess
+from spelgen.fitting.servo.laws import select_dead_zones, without_small_dead_zones
 from spelgen.fitting.servo.linear_servos import fit_linear_servos
 from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
 from spelgen.fitting.servo.report import servo_record, solution
-from spelgen.fitting.servo.start import start_servos
+from spelgen.fitting.servo.rollouts import ServoRollouts
 from spelgen.fitting.servo.tuning import ServoSolverTuning
 from spelgen.fitting.servo.windows import servo_windows
+from spelgen.fitting.tuning import TUNING as DAMPING
 from spelgen.logs.checks import check
 from spelgen.logs.trajectory import require_commands, require_joints
 
 if TYPE_CHECKING:
-    from spelgen.fitting.progress import TrainingProgress
+    from spelgen.fitting.process import TrainingProgress
 
 TUNING = ServoSolverTuning()
-ROUNDS = 3  # on few windows with half the steps; on few, with dead zones; on all
+# On few windows with half the integration steps; on few windows with dead zones; on all windows.
+OUTER_ITERATIONS = 3
 
 
 class ServoObjective(Objective):
-    """Fit all logs, so that none is left to validate on; each round can be gone on with.
+    """A fit to all logs, without validation logs; it can be resumed at the start of each outer iteration.
 
-    What a round computes with, the bodies' load and the scale of errors, comes of the parameters where it and the
-    rounds before it began: these are all that a checkpoint keeps.
+    The load and the scale of the errors are functions of the parameters at the start of an iteration and of the
+    iterations before it: these parameters are all that a checkpoint contains.
     """
 
     name: ClassVar[str] = "servo"
@@ -54,7 +56,7 @@ class ServoObjective(Objective):
 
     def __init__(self, request: FitRequest) -> None:
         super().__init__(request)
-        self._rounds: list[ServoParameters] = []  # where they began
+        self._iterates: list[ServoParameters] = []  # at the start of each outer iteration
         self._steps = 0
 
     def prepare(self) -> PreparedLogs:
@@ -78,90 +80,90 @@ class ServoObjective(Objective):
         )
 
     def begin(self) -> list[Diagnostic]:
-        """Start servos by least squares."""
+        """Set the initial guess."""
         self._since = time.monotonic()
-        start_servos(self.model, self._windows)
+        set_initial_guess(self.model, self._windows)
         self._set_up(copy.deepcopy(self.model.state_dict()))
-        self._begin_round(self._problem.start)
+        self._begin_iteration(self._rollouts.parameters.prior_mean)
         return []
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Go on from the beginning of the last round."""
+        """Resume at the start of the last outer iteration."""
         self._since = time.monotonic() - checkpoint["seconds"]
         state = checkpoint["servo"]
         self.model.load_state_dict(state["start"])
         self._set_up(state["start"])
         self._steps = state["steps"]
         for parameters in state["rounds"]:
-            self._begin_round(ServoParameters(**parameters))
+            self._begin_iteration(ServoParameters(**parameters))
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
         """See `Objective`."""
-        problem = self._problem
-        while True:
-            number = len(self._rounds)
-            show = partial(_show_progress, progress, number)
-            x, damping = self._rounds[-1], DAMPING.initial
-            if number > 1:  # near the minimum from where the round before ended
-                damping = TUNING.later_damping
-            result = levenberg_marquardt(
-                problem,
-                initial_state(problem, x, damping, self._steps),
-                max_steps=TUNING.steps if number < ROUNDS else TUNING.last_steps,
-                min_decrease=TUNING.gain,
-                min_relative_decrease=TUNING.relative_gain,
-                callback=show,
-            )
-            show(result.state)
-            x, self._steps = result.state.x, result.state.steps
-            if number == ROUNDS:
-                break
-            # dead zones are chosen when gains are right: before, errors are those of the gains
-            choose = select_dead_zones if number == 1 else without_faint
-            x = choose(problem, x)
-            self._begin_round(x)
+        while len(self._iterates) < OUTER_ITERATIONS:
+            x = self._minimized(progress)
+            # dead zones are selected with fitted gains: before, wrong gains dominate the errors
+            select = select_dead_zones if len(self._iterates) == 1 else without_small_dead_zones
+            self._begin_iteration(select(self._problem, x))
             save()
-        self._finish(x)
+        self._finish(self._minimized(progress))
         save()
         return "finished"
 
+    def _minimized(self, progress: TrainingProgress) -> ServoParameters:
+        """Return the minimum of this outer iteration's cost."""
+        problem, number = self._problem, len(self._iterates)
+        show = partial(_show_progress, progress, number)
+        # later iterations start near the minimum
+        damping = DAMPING.initial_damping if number == 1 else TUNING.later_damping
+        result = levenberg_marquardt(
+            problem,
+            initial_state(problem, self._iterates[-1], damping, self._steps),
+            max_steps=TUNING.steps if number < OUTER_ITERATIONS else TUNING.last_steps,
+            min_decrease=TUNING.min_decrease,
+            min_relative_decrease=TUNING.min_relative_decrease,
+            callback=show,
+        )
+        show(result.state)
+        self._steps = result.state.steps
+        return result.state.x
+
     def _finish(self, x: ServoParameters) -> None:
-        """Take half as long steps, from which errors of the integration are known, and report the result."""
-        problem = self._problem
-        problem.windows = replace(self._windows, steps=2 * self._windows.steps)
-        problem.nudge = TUNING.last_nudge  # by shorter ones a joint that just slips looks known
+        """Take one step with half the integration step, which corrects the integration error, and record the result."""
+        problem = self._problem.refined(2 * self._windows.steps, TUNING.last_difference_step)
         end, solved = solution(problem, x)
-        problem.write(end)
+        problem.parameters.write(end)
         record = servo_record(problem, solved, end, self._steps)
-        linear = fit_linear_servos(self._windows.thinned(TUNING.sparse_windows))
+        linear = fit_linear_servos(self._windows.subsampled(TUNING.sparse_windows))
         self.results["servo"] = record | {"linear": asdict(linear)}
-        self._take_checkpoint(float(np.sqrt(np.square(record["rms"]).mean())))
+        self._update_checkpoint(float(np.sqrt(np.square(record["rms"]).mean())))
 
-    def _set_up(self, start: Content) -> None:
-        """Take the model as it is, with these weights, for where the fit starts."""
-        self._start = start
+    def _set_up(self, weights: Content) -> None:
+        """Prepare the rollouts of a model that has these weights: the prior mean."""
+        self._initial_weights = weights
         steps = np.max([encoder_step(log.q) for log in self._logs], axis=0)
-        # the standard deviation of an encoder's rounding, at the least of a hundredth of a milliradian
-        noise = torch.from_numpy(steps).clamp(min=1e-5) / 12**0.5
-        self._problem = ServoProblem(self.model, self._windows.thinned(TUNING.sparse_windows), noise)
+        # the standard deviation of an encoder's rounding error, of steps of at least 1e-5 rad
+        self._noise = torch.from_numpy(steps).clamp(min=1e-5) / 12**0.5
+        self._rollouts = ServoRollouts.of(self.model, self._windows.subsampled(TUNING.sparse_windows))
 
-    def _begin_round(self, x: ServoParameters) -> None:
-        problem = self._problem
-        if len(self._rounds) == ROUNDS - 1:
-            problem.windows = self._windows
-            problem.linearise(x, problem.windows.path())
-        elif self._rounds:  # the first was near enough with errors of the integration
-            problem.windows = replace(problem.windows, steps=self._windows.steps)
-        if self._rounds:
-            problem.linearise(x, problem.predicted_path(x))
-        errors = problem.residual(x)
-        problem.weigh(errors)
-        problem.write(x)  # for the checkpoint: an interrupted fit is usable
-        self._rounds.append(x)
+    def _begin_iteration(self, x: ServoParameters) -> None:
+        """Recompute the load and the likelihood at x for the next outer iteration."""
+        rollouts = self._rollouts
+        if len(self._iterates) == OUTER_ITERATIONS - 1:
+            rollouts = replace(rollouts, windows=self._windows)
+            rollouts = rollouts.linearized(x, self._windows.motion())
+        elif self._iterates:  # only the first iteration tolerates the integration error of half the steps
+            rollouts = replace(rollouts, windows=replace(rollouts.windows, steps=self._windows.steps))
+        if self._iterates:
+            rollouts = rollouts.linearized(x, rollouts.predicted_motion(x))
+        errors = rollouts.residual(x)
+        self._rollouts, self._problem = rollouts, ServoProblem.of(rollouts, self._noise, errors)
+        rollouts.parameters.write(x)  # for the checkpoint: the model of an interrupted fit is usable
+        self._iterates.append(x)
         self._first_steps = self._steps
-        self._take_checkpoint(float(errors.square().mean().sqrt()))
+        self._update_checkpoint(float(errors.square().mean().sqrt()))
 
-    def _take_checkpoint(self, rms: float) -> None:
+    def _update_checkpoint(self, rms: float) -> None:
+        """Set the content of checkpoint.pt; rms: of the position errors [rad, m]."""
         self._checkpoint = {
             "epoch": 0,
             "step": self._steps,
@@ -171,8 +173,8 @@ class ServoObjective(Objective):
             "seconds": time.monotonic() - self._since,
             "substeps": self._windows.steps,
             "servo": {
-                "start": self._start,
-                "rounds": [vars(x) for x in self._rounds],
+                "start": self._initial_weights,
+                "rounds": [vars(x) for x in self._iterates],
                 "steps": self._first_steps,
             },
         }
@@ -180,4 +182,4 @@ class ServoObjective(Objective):
 
 def _show_progress(progress: TrainingProgress, number: int, state: SolverState[ServoParameters]) -> None:
     rms = float(state.residual.square().mean().sqrt())
-    progress.round(number, ROUNDS, state.steps, rms)
+    progress.round(number, OUTER_ITERATIONS, state.steps, rms)

@@ -1,9 +1,8 @@
-"""Name the parameters that logs of commanded positions determine, with their Gaussian prior, and a point among them."""
+"""The parameters of a servo fit: a point, the map between points and a model, and their Gaussian prior."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING
 
@@ -23,14 +22,19 @@ TUNING = ServoPriorTuning()
 DEAD_ZONE = "servo.dead_zone"
 COULOMB = "friction.raw_coulomb"
 STRIBECK_VELOCITY = "friction.raw_stribeck_velocity"
-FIXED = 1e-9  # deviation of a parameter that is not fitted
+# Prior standard deviation of a parameter that is not fitted.
+FIXED = 1e-9
+# Smallest effect of a direction of the body parameters on gravity, relative to the largest effect.
+MIN_EFFECT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class ServoParameters:
-    """Hold parameters of joints (p, n), along directions of the bodies (r,), and the delay [s].
+    """Values of the fitted parameters, k = p n + r + 1 numbers.
 
-    active: (p, n) whether a joint's parameter is fitted: dead zones only where a joint has one.
+    joints: (p, n), p parameters of each joint. bodies: (r,), coordinates along directions of the body parameters, in
+    prior standard deviations. delay: of the commands [s]. active: mask (p, n) of the joint parameters that are fitted;
+    dead zones are fitted only at joints that have one.
     """
 
     joints: torch.Tensor
@@ -38,8 +42,8 @@ class ServoParameters:
     delay: float
     active: torch.Tensor
 
-    def moved(self, step: torch.Tensor) -> ServoParameters:
-        """Return the parameters one step (k,) further; no command acts early."""
+    def after(self, step: torch.Tensor) -> ServoParameters:
+        """Return the parameters after a step (k,); the delay is clamped at zero."""
         joints, bodies, delay = step.split([self.joints.numel(), len(self.bodies), 1])
         return replace(
             self,
@@ -50,89 +54,103 @@ class ServoParameters:
 
     @property
     def flat(self) -> torch.Tensor:
-        """Return all in one vector, (k,) with k = p n + r + 1."""
+        """All parameters as one vector, (k,)."""
         delay = torch.tensor([self.delay], dtype=torch.float64)
         return torch.cat([self.joints.flatten(), self.bodies, delay])
 
 
-class ParameterRows:
-    """Map the parameters of a model's joints to rows (p, n) and back.
+class ParameterMap:
+    """The map between `ServoParameters` and the tensors of a model, and the prior.
 
-    names: of the rows; a parameter of several numbers a joint has as many rows.
+    names: (p,) of the rows of `ServoParameters.joints`; a parameter with K numbers per joint has K rows. tensors: of
+    the model, by name. directions: (10 B, r) of the log-Cholesky parameters of B bodies. prior_mean: the parameters
+    that the model has when the map is made.
+
+    Args:
+        model: is updated by `write`.
+        q: (M, n) positions of the logs [rad, m], which determine the directions.
     """
 
-    def __init__(self, model: ArmModel) -> None:
-        self._n = model.n
+    def __init__(self, model: ArmModel, q: torch.Tensor) -> None:
+        self._model, self._n = model, model.n
         tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
-        # a drive's viscous friction and kd are one number: kd has it all
+        # without raw_viscous: logs of positions determine only the sum of viscous friction and kd, which is fitted as
+        # kd
         rows = [
-            *(parameters_of_kind(model, kind) for kind in ("stiffness", "damping", "armature", "offset")),
+            *(parameters_of_kind(model, group) for group in ("stiffness", "damping", "armature", "offset")),
             (COULOMB, "friction.raw_stribeck", STRIBECK_VELOCITY),
-            *(parameters_of_kind(model, kind) for kind in ("load_dependence", "fractions", "dead_zone")),
+            *(parameters_of_kind(model, group) for group in ("load_dependence", "fractions", "dead_zone")),
         ]
         self.tensors = {name: tensors[name] for name in chain(*rows)}
         self._widths = [x[:1].numel() for x in self.tensors.values()]
         self.names = np.repeat(list(self.tensors), self._widths).tolist()
+        self._deviations = torch.full((len(self.names), 1), TUNING.logarithm).double()
+        self._deviations[self.row(STRIBECK_VELOCITY)] = TUNING.stribeck_velocity
+        self._deviations[self.row(DEAD_ZONE)] = TUNING.dead_zone
+        (self._bodies,) = parameters_of_kind(model, "bodies")
+        self._mean_bodies = model.get_parameter(self._bodies).detach().clone()
+        self.directions = self._body_directions(q)
+        joints = torch.cat([x.detach().reshape(self._n, -1).mT for x in self.tensors.values()])
         always = torch.from_numpy(np.array(self.names) != DEAD_ZONE)
-        self.active = always.unsqueeze(-1).expand(-1, model.n)  # (p, n), at the start
-        deviations = torch.full((len(self.names), 1), TUNING.logarithm).double()
-        deviations[self.row(STRIBECK_VELOCITY)] = TUNING.stribeck_velocity
-        deviations[self.row(DEAD_ZONE)] = TUNING.dead_zone
-        self._deviations = deviations
+        bodies = torch.zeros(self.directions.shape[1]).double()
+        active = always.unsqueeze(-1).expand(-1, model.n)
+        self.prior_mean = ServoParameters(joints, bodies, float(model.servo.delay), active)
 
     def row(self, name: str) -> int:
-        """Return where the first row of a parameter is."""
+        """Return the index of the first row of a parameter."""
         return self.names.index(name)
 
-    def read(self) -> torch.Tensor:
-        """Return what the model has, (p, n)."""
-        columns = [x.detach().reshape(self._n, -1).mT for x in self.tensors.values()]
-        return torch.cat(columns)
-
     def named(self, joints: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Return (P, p, n) as the model's tensors by name, each (P, 1, n) or (P, 1, n, K)."""
-        parts = joints.unsqueeze(1).mT.split(self._widths, dim=-1)  # (P, 1, n, K)
+        """Return P sets of joint parameters (P, p, n) as tensors by name, each (P, 1, n) or (P, 1, n, K)."""
+        columns = joints.unsqueeze(1).mT.split(self._widths, dim=-1)  # (P, 1, n, K)
         named = {}
-        for (name, tensor), part in zip(self.tensors.items(), parts, strict=True):
-            named[name] = part.reshape(*part.shape[:2], *tensor.shape)
+        for (name, tensor), column in zip(self.tensors.items(), columns, strict=True):
+            named[name] = column.reshape(*column.shape[:2], *tensor.shape)
         return named
 
     def write(self, x: ServoParameters) -> None:
-        """Give the model the parameters of its joints."""
+        """Set the parameters of the model."""
         with torch.no_grad():
             for name, rows in self.named(x.joints.unsqueeze(0)).items():
                 self.tensors[name].copy_(rows[0, 0])
+            self._model.get_parameter(self._bodies).copy_(self._log_cholesky(x.bodies))
+            self._model.servo.delay.fill_(x.delay)
 
     def precision(self, x: ServoParameters) -> torch.Tensor:
-        """Return the prior's, (k,)."""
+        """Return the precision of the prior, (k,): inverse variances of independent parameters."""
         joints = torch.where(x.active, self._deviations, FIXED)
-        others = torch.tensor([1.0] * len(x.bodies) + [TUNING.delay]).double()
-        return torch.cat([joints.flatten(), others]) ** -2
+        shared = torch.tensor([1.0] * len(x.bodies) + [TUNING.delay]).double()
+        return torch.cat([joints.flatten(), shared]) ** -2
 
+    def inertial(self, bodies: torch.Tensor) -> torch.Tensor:
+        """Return the inertial parameters of all bodies, (10 B,), at coordinates (r,) along the directions."""
+        return self._inertial(self._log_cholesky(bodies)).flatten()
 
-def body_parameters(model: ArmModel) -> torch.nn.Parameter:
-    """Return what the bodies' inertial parameters are made of, (B, 10)."""
-    (name,) = parameters_of_kind(model, "bodies")
-    return model.get_parameter(name)
+    def _log_cholesky(self, bodies: torch.Tensor) -> torch.Tensor:
+        """Return the log-Cholesky parameters (B, 10) at coordinates (r,)."""
+        return self._mean_bodies + (self.directions @ bodies).view_as(self._mean_bodies)
 
+    def _inertial(self, log_cholesky: torch.Tensor) -> torch.Tensor:
+        """Return inertial parameters, (B, 10), for log-Cholesky parameters (B, 10)."""
+        parameters: torch.Tensor = evaluate_with(
+            self._model, {self._bodies: log_cholesky}, lambda model: model.inertial_parameters
+        )
+        return parameters
 
-def body_directions(model: ArmModel, q: torch.Tensor) -> torch.Tensor:
-    """Return directions of the bodies' parameters that change gravity at q (M, n) most, (10 B, r), each as long as its
-    standard deviation.
-    """
-    raw, zero = body_parameters(model).detach(), torch.zeros_like(q)
-    # torch.func's jacobians import a compiler for more than a second
-    slopes = jacobian(partial(inertial_parameters, model), raw)
-    with torch.no_grad():
-        gravity = regressor_of(model.chain, q, zero, zero) @ slopes.reshape(raw.numel(), -1)
-    _, sizes, directions = torch.linalg.svd(gravity.flatten(0, 1), full_matrices=False)
-    strong = sizes[: TUNING.body_directions] > 1e-3 * sizes[:1].clamp(min=1e-12)
-    result: torch.Tensor = TUNING.bodies * directions[: len(strong)][strong].mT
-    return result
+    def _body_directions(self, q: torch.Tensor) -> torch.Tensor:
+        """Return the directions (10 B, r) with the largest effect on gravity at q (M, n).
 
-
-def inertial_parameters(model: ArmModel, raw: torch.Tensor) -> torch.Tensor:
-    """Return the ten parameters of all bodies, (B, 10), made of trained ones (B, 10)."""
-    (name,) = parameters_of_kind(model, "bodies")
-    parameters: torch.Tensor = evaluate_with(model, {name: raw}, lambda x: x.inertial_parameters)
-    return parameters
+        They are right singular vectors of d gravity / d log-Cholesky parameters. The length of each is its prior
+        standard deviation.
+        """
+        zero = torch.zeros_like(q)
+        # not torch.func: its Jacobians import a compiler, which takes more than a second
+        slopes = jacobian(self._inertial, self._mean_bodies)
+        with torch.no_grad():
+            gravity = regressor_of(self._model.chain, q, zero, zero) @ slopes.reshape(
+                self._mean_bodies.numel(), -1
+            )
+        _, effects, directions = torch.linalg.svd(gravity.flatten(0, 1), full_matrices=False)
+        strong = effects[: TUNING.body_directions] > MIN_EFFECT * effects[:1].clamp(min=1e-12)
+        result: torch.Tensor = TUNING.bodies * directions[: len(strong)][strong].mT
+        return result

@@ -1,8 +1,8 @@
-"""Report what logs of commanded positions determine: ratios to kp with intervals, and what they leave open.
+"""Result of a servo fit: ratios to kp with confidence intervals, and the ratios that the logs do not determine.
 
-Errors of neighbouring samples are alike, and those of one motion are: what a model lacks shows otherwise in another. So
-what a log says is taken as one observation (the jackknife of a weighted least squares; one step without each log, see
-Cameron and Miller, J. Human Resources 50:317, 2015, CV3). What logs do not determine stays as unsure as the prior.
+Errors are correlated within a motion, and by the form of the model even over a whole log. So each log is one
+observation: a jackknife of the weighted least-squares solution, with one step without each log (Cameron and Miller,
+J. Human Resources 50:317, 2015, CV3). A parameter that the logs do not determine keeps the interval of its prior.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
 
 TUNING = ServoIntervalTuning()
-QUANTILE = 0.975  # of an interval of 95 %, of Student's t: windows are few
+# Of Student's t, since there are few blocks: a two-sided 95 % interval.
+QUANTILE = 0.975
 RATIOS = {
     "kd": ("kd/kp", "s"),
     "armature": ("armature/kp", "s^2"),
@@ -35,8 +36,9 @@ RATIOS = {
     "static_error": ("static error", "rad, m"),
     "dead_zone": ("half dead zone", "rad, m"),
 }
-"""The ratios to kp, with labels and units; dry: friction of a joint that slides, over what it slid; static_error: dry
-and half the dead zone, together."""
+"""Label and unit of each ratio to kp. dry: mean dry friction of a joint in motion. static_error: the sum of dry / kp
+and
+half the dead zone."""
 ABOUT = (
     "divided by kp, with half a 95 % interval. kp itself is scaled by the URDF's masses, unless it is known. kd is the "
     "sum of kd and viscous friction, which such logs do not distinguish. dry: dry friction; open where it cannot be "
@@ -46,9 +48,9 @@ ABOUT = (
 
 @dataclass(frozen=True)
 class FitSummary:
-    """Hold what a fit determined, for people.
+    """The result of a fit for people.
 
-    text: for a terminal. listing: parameters with their intervals. headline: the first figure, and what it is.
+    text: for a terminal. listing: parameters with intervals. headline: the first figure and its name.
     """
 
     text: str
@@ -58,114 +60,135 @@ class FitSummary:
 
 @dataclass(frozen=True, eq=False)
 class ServoSolution:
-    """Hold what windows determine where a fit ended: their normal equations by stretch of the logs, of dead
-    zones at all joints too, the precision (k,) of the prior, and the covariance (k, k) of the parameters.
+    """Normal equations and covariance at the end of a fit.
+
+    blocks: normal equations of the B blocks of the logs, (B, k, k) and (B, k); they contain the dead zones of all
+    joints. precision: of the prior, (k,). covariance: of the parameters, (k, k).
     """
 
-    windows: NormalEquations
+    blocks: NormalEquations
     precision: torch.Tensor
     covariance: torch.Tensor
 
     @property
     def quantile(self) -> float:
-        """Return how many standard deviations half an interval is."""
-        return float(stdtrit(max(1, len(self.windows.curvature) - 1), QUANTILE))
+        """Half the width of an interval, in standard deviations."""
+        return float(stdtrit(max(1, len(self.blocks.curvature) - 1), QUANTILE))
 
 
 def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, ServoSolution]:
-    """Return where one more step leads from x, of a fit with longer steps of the rollouts, and what windows determine
-    there; what the step changes is added to the covariance. Parameters stay at x where the step raises the cost.
+    """Return the parameters after one more step from x, and the solution there.
+
+    x: of a fit with longer integration steps than in `problem`. The step, the effect of the integration error, is
+    added to the covariance. The parameters remain x if the step raises the cost.
     """
-    # a dead zone that a joint does not have makes its dry friction no better known
+    # dead zones of all joints: fixed at zero, they would make dry friction seem better determined
     free, errors = replace(x, active=torch.ones_like(x.active)), problem.residual(x)
-    windows = problem.window_equations(free, errors)
-    windows = by_stretch(windows, problem.windows.stretches(TUNING.logs, TUNING.stretches))
-    precision = problem.rows.precision(free)
-    step = problem.with_prior(windows, x).step()
-    # where the fit ends, the slopes of all windows and of the prior add up to nothing
-    windows = windows._replace(descent=windows.descent - windows.curvature @ step)
-    end = x.moved(step)
-    # where joints just slip, errors are far from linear in the parameters
+    blocks = problem.window_equations(free, errors)
+    blocks = sum_by_block(blocks, problem.rollouts.windows.blocks(TUNING.min_logs, TUNING.min_blocks))
+    precision = problem.parameters.precision(free)
+    step = problem.with_prior(blocks, x).step()
+    # at the end of the fit the gradients of all windows and of the prior add up to zero
+    blocks = blocks._replace(descent=blocks.descent - blocks.curvature @ step)
+    end = x.after(step)
+    # a joint at the break-away torque: the errors are far from linear in the parameters
     if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
-    return end, ServoSolution(windows, precision, covariance(windows, precision, step))
+    return end, ServoSolution(blocks, precision, covariance(blocks, precision, step))
 
 
-def by_stretch(windows: NormalEquations, stretches: torch.Tensor) -> NormalEquations:
-    """Return the sums of windows' normal equations (W, ...) over the stretches that these are of, (W,)."""
+def sum_by_block(windows: NormalEquations, numbers: torch.Tensor) -> NormalEquations:
+    """Return sums of normal equations, (W, k, k) and (W, k), over the windows of each block, by number (W,)."""
 
     def summed(terms: torch.Tensor) -> torch.Tensor:
-        sums = terms.new_zeros(int(stretches.max()) + 1, *terms.shape[1:])
-        return sums.index_add(0, stretches, terms)
+        sums = terms.new_zeros(int(numbers.max()) + 1, *terms.shape[1:])
+        return sums.index_add(0, numbers, terms)
 
     return NormalEquations(*map(summed, windows))
 
 
-def covariance(windows: NormalEquations, precision: torch.Tensor, halved: torch.Tensor) -> torch.Tensor:
-    """Return that of the unknowns, (k, k): S^-1 (B + P) S^-1, of which the jackknife gives the first term, P is the
-    prior's; and as much as they changed when steps were halved (k,).
+def covariance(blocks: NormalEquations, precision: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
+    """Return the covariance of the parameters, (k, k): J + S^-1 P S^-1 + d d^T.
+
+    J is the jackknife covariance of the steps without each block, and S the Hessian of all blocks and the prior.
+
+    Args:
+        blocks: normal equations of B blocks, (B, k, k) and (B, k), with gradients that balance the gradient of the
+        prior. precision: P of the prior, (k,). change: d (k,), change of the parameters by half the integration step.
     """
-    count, prior = len(windows.curvature), torch.diag(precision)
-    total = windows.curvature.sum(dim=0) + prior
-    # where the fit ended, the slopes of all windows and of the prior add up to nothing
-    shifts = torch.linalg.solve(total - windows.curvature, -windows.descent.unsqueeze(-1)).squeeze(-1)
+    count, prior = len(blocks.curvature), torch.diag(precision)
+    hessian = blocks.curvature.sum(dim=0) + prior
+    # Newton steps without each block: its gradient is minus the sum of all others
+    shifts = torch.linalg.solve(hessian - blocks.curvature, -blocks.descent.unsqueeze(-1)).squeeze(-1)
     shifts = shifts - shifts.mean(dim=0)
-    inverse = torch.linalg.inv(total)
+    inverse = torch.linalg.inv(hessian)
     jackknife = (count - 1) / count * shifts.mT @ shifts
-    result: torch.Tensor = jackknife + inverse @ prior @ inverse + torch.outer(halved, halved)
+    result: torch.Tensor = jackknife + inverse @ prior @ inverse + torch.outer(change, change)
     return result
 
 
-def identifiable(windows: NormalEquations, precision: torch.Tensor, unknowns: torch.Tensor) -> torch.Tensor:
-    """Return whether windows tell these unknowns (m,) from all others, by their variance inflation factors, (m,).
+def identifiable(blocks: NormalEquations, precision: torch.Tensor, indices: torch.Tensor) -> torch.Tensor:
+    """Test by variance inflation factors if the logs distinguish parameters from all others; return (m,) booleans.
 
-    Of joints that gravity does not load the slopes of errors by a dead zone and by dry friction are the same but for a
-    factor, and what is linear in them says nothing of the one without the other.
+    Derivatives of the errors with respect to a dead zone and to dry friction are proportional at joints without gravity
+    load: a linear approximation cannot separate the two.
+
+    Args:
+        blocks: normal equations of B blocks, (B, k, k) and (B, k).
+        precision: of the prior, (k,).
+        indices: of the parameters in question, (m,).
     """
-    curvature = windows.curvature.sum(dim=0)
+    curvature = blocks.curvature.sum(dim=0)
     inverse = torch.linalg.inv(curvature + torch.diag(precision))
-    inflation: torch.Tensor = (curvature.diagonal() * inverse.diagonal())[unknowns]
+    inflation: torch.Tensor = (curvature.diagonal() * inverse.diagonal())[indices]
     return inflation < TUNING.variance_inflation
 
 
 def ratios(model: ArmModel, qd: torch.Tensor, gravity: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Return the ratios to kp, each (n,), of a model that moved at qd under gravity's torques, (..., n)."""
-    dead_zone = model.servo.dead_zone
-    dry = sliding_friction(model.friction, qd, gravity) / model.kp
+    """Return the ratios to kp by name, (n,) each.
+
+    Args:
+        model: with position servos.
+        qd: velocities, (..., n) [rad/s, m/s].
+        gravity: gravity torques, (..., n) [Nm, N].
+    """
+    servo, kp = model.servo, model.servo.kp()
+    dry = sliding_friction(model.friction, qd, gravity) / kp
     return {
-        "kd": model.kd / model.kp,
-        "armature": model.armature / model.kp,
+        "kd": servo.kd() / kp,
+        "armature": model.armature / kp,
         "dry": dry,
-        "static_error": dry + dead_zone,
-        "dead_zone": dead_zone,
+        "static_error": dry + servo.dead_zone,
+        "dead_zone": servo.dead_zone,
     }
 
 
 def ratios_with_deviations(
     problem: ServoProblem, solution: ServoSolution
 ) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
-    """Return the ratios to kp, and the standard deviations of their logarithms, each (n,)."""
-    tensors = {name: x.detach().clone().requires_grad_() for name, x in problem.rows.tensors.items()}
-    qd, gravity = problem.along.qd, problem.load.gravity
-    values = evaluate_with(problem.model, tensors, lambda model: ratios(model, qd, gravity))
-    p, n = problem.start.joints.shape
+    """Return the ratios to kp by name, and the standard deviations of their logarithms, (n,) each."""
+    rollouts, parameters = problem.rollouts, problem.parameters
+    tensors = {name: x.detach().clone().requires_grad_() for name, x in parameters.tensors.items()}
+    qd, gravity = rollouts.motion.qd, rollouts.load.gravity
+    values = evaluate_with(rollouts.model, tensors, lambda model: ratios(model, qd, gravity))
+    p, n = parameters.prior_mean.joints.shape
     blocks = solution.covariance[: p * n, : p * n].view(p, n, p, n).diagonal(dim1=1, dim2=3)  # (p, p, n)
     result = {}
     for name, value in values.items():
-        # the ratio of a joint depends on that joint's parameters alone
-        slopes = torch.autograd.grad(
+        # the ratio of a joint depends on the parameters of this joint only: the gradient of the sum has all derivatives
+        derivatives = torch.autograd.grad(
             value.sum(), list(tensors.values()), retain_graph=True, materialize_grads=True
         )
-        relative = torch.cat([x.reshape(n, -1).mT for x in slopes]) / value.detach()
+        relative = torch.cat([x.reshape(n, -1).mT for x in derivatives]) / value.detach()
         variance = torch.einsum("pn,pqn,qn->n", relative, blocks, relative)
         result[name] = value.detach(), variance.clamp(min=0).sqrt()
     return result
 
 
 def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Content:
-    """Return for config.json: delay [s], errors [rad, m], and by joint kp and the ratios to it with intervals of 95 %.
+    """Return the content for config.json: delay [s], RMS errors [rad, m], and per joint kp and the ratios to kp.
 
-    determined: whether an interval is narrow enough to be of use.
+    Intervals are of 95 %. determined: whether an interval is narrower than a factor of `ServoIntervalTuning`.
     """
     return {
         "delay": {"value": x.delay, "half": solution.quantile * float(solution.covariance[-1, -1].sqrt())},
@@ -176,23 +199,21 @@ def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParamet
 
 
 def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Content]:
-    model, records = problem.model, []
+    model, records = problem.rollouts.model, []
+    kp, trained = model.servo.kp().tolist(), model.servo.trained.tolist()
     values = ratios_with_deviations(problem, solution)
-    dead_zones = problem.rows.row(DEAD_ZONE) * model.n + torch.arange(model.n)
-    distinct = identifiable(solution.windows, solution.precision, dead_zones).tolist()
+    dead_zones = problem.parameters.row(DEAD_ZONE) * model.n + torch.arange(model.n)
+    distinct = identifiable(solution.blocks, solution.precision, dead_zones).tolist()
     for joint, name in enumerate(model.joint_names):
-        kp = {"value": float(model.kp[joint].detach()), "known": not float(model.servo.trained[joint])}
-        record: Content = {"joint": name, "kp": kp}
+        record: Content = {"joint": name, "kp": {"value": kp[joint], "known": not trained[joint]}}
         for ratio, (of_joints, deviations) in values.items():
             value = float(of_joints[joint])
-            if ratio == "dead_zone" and not value:  # a law that this joint has not
+            if ratio == "dead_zone" and not value:  # not selected
                 continue
-            half = solution.quantile * math.hypot(TUNING.law_deviation, float(deviations[joint]))
-            factor = math.exp(min(half, 50.0))  # which is open by far, and does not overflow
-            # dry friction and dead zone each by itself, while their sum, the static error, is determined anyway
-            determined = factor < TUNING.open_factor and (
-                distinct[joint] or ratio not in ("dry", "dead_zone")
-            )
+            half = solution.quantile * math.hypot(TUNING.model_deviation, float(deviations[joint]))
+            factor = math.exp(min(half, 50.0))  # bounded: exp must not overflow
+            # the sum of dry friction and dead zone, the static error, is determined even if its terms are not
+            determined = factor < TUNING.max_factor and (distinct[joint] or ratio not in ("dry", "dead_zone"))
             record[ratio] = {
                 "unit": RATIOS[ratio][1],
                 "value": value,
@@ -205,7 +226,7 @@ def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Conte
 
 
 def servo_summary(record: Content | None) -> FitSummary | None:
-    """Return what a fit determined, from `servo_record`; None of a fit that is not over, or of no servos."""
+    """Return the summary of a `servo_record`; None if the fit has not finished, or if the arm has no servos."""
     if record is None:
         return None
     listing = _listing(record)
@@ -218,18 +239,18 @@ def servo_summary(record: Content | None) -> FitSummary | None:
 
 
 def _listing(record: Content) -> Listing:
-    """Return by joint kp, and the ratios to it with intervals; half dead zones too, where a joint has one."""
+    """Return a table of kp and the ratios to kp per joint; half dead zones are a column if any joint has one."""
     columns = [ratio for ratio in RATIOS if any(ratio in joint for joint in record["joints"])]
     rows = []
     for joint in record["joints"]:
-        cells = [_shown(joint.get(column)) for column in columns]
+        cells = [_cell(joint.get(column)) for column in columns]
         rows.append((joint["joint"], number(joint["kp"]["value"]), *cells))
     head = ("joint", "kp [Nm/rad]", *("{} [{}]".format(*RATIOS[column]) for column in columns))
     return Listing("Servos", head, tuple(rows), f"All columns but kp are {ABOUT}.")
 
 
 def _undetermined(record: Content) -> str:
-    """Return what the logs leave open, dead zones apart."""
+    """Return a sentence that lists the ratios that the logs do not determine, except for dead zones."""
     names = []
     for joint in record["joints"]:
         for ratio, (label, _) in RATIOS.items():
@@ -240,7 +261,7 @@ def _undetermined(record: Content) -> str:
     return f"Not determined by these logs: {', '.join(names)}"
 
 
-def _shown(interval: Content | None) -> str:
+def _cell(interval: Content | None) -> str:
     if interval is None:
         return "none"
     if not interval["determined"]:

@@ -13,7 +13,7 @@ class ServoWindowTuning:
     # delay.
     length: float = 4.0
     # [s] Burn-in at the beginning of a window, during which the friction state forms; its errors do not count.
-    settling: float = 1.0
+    burn_in: float = 1.0
     # [1] Largest number of windows, evenly spread: ten minutes of motion.
     count: int = 200
 
@@ -44,7 +44,7 @@ class ServoCostTuning:
     # [s] Largest correlation time of the errors; most measured ones are above 0.2 s.
     correlation_time: float = 0.5
     # [1] Finite-difference step of the parameters: rollouts in double precision lose half of their digits.
-    nudge: float = 1e-4
+    difference_step: float = 1e-4
 
 
 @dataclass(frozen=True)
@@ -58,14 +58,14 @@ class ServoSolverTuning:
     # [1] Steps of the last outer iteration, on all windows: it starts near the minimum of few windows.
     last_steps: int = 2
     # [1] Decrease of the cost below which an outer iteration, or the fit of a joint with and without dead zone, ends.
-    gain: float = 0.01
+    min_decrease: float = 0.01
     # [1] The same, relative to the cost: costs are high if the form of the model is wrong.
-    relative_gain: float = 1e-4
+    min_relative_decrease: float = 1e-4
     # [1] Damping of the first step of all outer iterations but the first; with 1e-3 kd ends 0.3 % off.
     later_damping: float = 1e-5
     # [1] Finite-difference step of the last derivatives: with shorter steps a joint that is about to slip seems
     # determined.
-    last_nudge: float = 1e-3
+    last_difference_step: float = 1e-3
 
 
 @dataclass(frozen=True)
@@ -76,10 +76,10 @@ class ServoLawTuning:
     dead_zone_fraction: float = 0.25
     # [1] Steps of the fit of a single joint.
     steps: int = 6
-    # [1] Standard deviations by which a dead zone must be more probable; other forms of friction gain 3.
+    # [1] Standard deviations by which a dead zone must be more probable; other friction effects need 3.
     significance: float = 4.0
     # [rad, m] Smallest dead zone: the step of a 12-bit encoder is 1.5e-3 rad.
-    least_dead_zone: float = 1e-3
+    min_dead_zone: float = 1e-3
 
 
 @dataclass(frozen=True)
@@ -88,15 +88,15 @@ class ServoIntervalTuning:
 
     # [1] Smallest number of logs of which each is one block of the covariance: halves of one motion are not
     # independent.
-    logs: int = 3
+    min_logs: int = 3
     # [1] Smallest number of blocks into which fewer logs are divided.
-    stretches: int = 6
+    min_blocks: int = 6
     # [1] Variance inflation above which two effects are indistinguishable; on SO-101s it is below 30 or above 90.
     variance_inflation: float = 50.0
     # [1] Standard deviation of ratios due to the form of the friction model: `benchmarks/servo_recovery.py`.
-    law_deviation: float = 0.015
+    model_deviation: float = 0.015
     # [1] A value whose interval reaches beyond this factor is not determined.
-    open_factor: float = 1.25
+    max_factor: float = 1.25
 
 
 @dataclass(frozen=True)
@@ -109,4 +109,4 @@ class ServoStartTuning:
     kp_range: float = 20.0
     # [1] Smallest dry friction as a fraction of the nominal one; squared the smallest kd/kp, cubed the smallest
     # armature/kp, so that their logarithms exist.
-    least: float = 0.05
+    min_friction: float = 0.05

@@ -1,7 +1,7 @@
-"""Cut windows from logs of commanded positions, and compute what the arm's bodies are to its drives along them.
+"""Windows of logs of commanded positions, and the load of the drives by the arm's bodies along a motion.
 
-The bodies' load is taken along the measured motion, so that in a fit each joint is rolled out by itself: the predicted
-motion is a hundredth of a radian away, and as far off is what the arm weighs there.
+The load is evaluated along the measured motion, so that a fit integrates each joint by itself: measured and predicted
+positions differ by about 0.01 rad, which changes the load by about 1 %.
 """
 
 from __future__ import annotations
@@ -25,12 +25,14 @@ if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
 
 TUNING = ServoWindowTuning()
-SHORTEST = 8  # samples, of which half are judged
-BLOCK = 2**13  # samples at a time
+# Smallest number of samples of a window.
+MIN_SAMPLES = 8
+# Number of samples whose load is computed at once.
+BATCH = 2**13
 
 
-class Path(NamedTuple):
-    """Hold a motion along windows, between samples: means of q, qd and qdd, (W, K-1, n)."""
+class MidpointMotion(NamedTuple):
+    """q, qd and qdd (W, K-1, n) of windows, as means over the intervals between samples."""
 
     q: torch.Tensor
     qd: torch.Tensor
@@ -39,125 +41,129 @@ class Path(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ServoWindows:
-    """Hold q and, smoothed, qd (W, K, n), and dt (W, K-1) [s].
+    """W windows of K samples.
 
-    parts: the rows of logs. settling: samples at the start of each window that are not judged, in which friction's
-    state forms. steps: of the rollout between samples.
+    rows: of the logs, one entry per window. q, qd: (W, K, n) [rad, m, per second]; qd is smoothed. dt: (W, K-1) [s].
+    burn_in: number of samples at the start of each window, during which the friction state forms; their errors do not
+    count. steps: integration steps per sample interval.
     """
 
-    parts: tuple[LogRows, ...]
+    rows: tuple[LogRows, ...]
     q: torch.Tensor
     qd: torch.Tensor
     dt: torch.Tensor
-    settling: int
+    burn_in: int
     steps: int
 
     @property
     def rate(self) -> float:
-        """Return the sample rate [Hz]."""
+        """Mean sample rate [Hz]."""
         return float(1 / self.dt.mean())
 
-    def thinned(self, count: int) -> ServoWindows:
-        """Return at most so many of the windows, evenly spread, with half the steps."""
-        rows = slice(None, None, -(-len(self.q) // count))
-        return ServoWindows(
-            self.parts[rows], self.q[rows], self.qd[rows], self.dt[rows], self.settling, -(-self.steps // 2)
-        )
+    def subsampled(self, count: int) -> ServoWindows:
+        """Return at most `count` of the windows, evenly spread, with half the integration steps."""
+        selection = slice(None, None, -(-len(self.q) // count))
+        q, qd, dt = self.q[selection], self.qd[selection], self.dt[selection]
+        return ServoWindows(self.rows[selection], q, qd, dt, self.burn_in, -(-self.steps // 2))
 
-    def stretches(self, logs: int, count: int) -> torch.Tensor:
-        """Return the number (W,) of the stretch that each window is of: logs, or where there are fewer than so many,
-        equal parts of them, at least ``count``.
+    def blocks(self, min_logs: int, min_blocks: int) -> torch.Tensor:
+        """Return the number of the block of each window, (W,): errors are assumed independent between blocks.
+
+        Each log is one block if there are at least `min_logs`; fewer logs are divided into equal segments, at least
+        `min_blocks` in all.
         """
-        names, log_numbers = np.unique([log.name for log, _ in self.parts], return_inverse=True)
-        cuts = 1 if len(names) >= logs else -(-count // len(names))
-        stretches = log_numbers * cuts
+        names, log_numbers = np.unique([log.name for log, _ in self.rows], return_inverse=True)
+        segments = 1 if len(names) >= min_logs else -(-min_blocks // len(names))
+        blocks = log_numbers * segments
         for number in range(len(names)):
             windows = np.flatnonzero(log_numbers == number)
-            stretches[windows] += np.arange(len(windows)) * cuts // len(windows)
-        # of a log with fewer windows than cuts, some stretches have none
-        return torch.from_numpy(np.unique(stretches, return_inverse=True)[1])
+            blocks[windows] += np.arange(len(windows)) * segments // len(windows)
+        # consecutive numbers: some segments of a log with fewer windows than segments are empty
+        return torch.from_numpy(np.unique(blocks, return_inverse=True)[1])
 
-    def path(self, q: torch.Tensor | None = None, qd: torch.Tensor | None = None) -> Path:
-        """Return the measured motion.
+    def motion(self, q: torch.Tensor | None = None, qd: torch.Tensor | None = None) -> MidpointMotion:
+        """Return the measured motion between samples.
 
-        q, qd: predicted, of which only what they miss is smoothed: so fast motion stays.
+        The derivatives of a prediction q, qd (W, K, n), if there is one, are used, plus smoothed derivatives of
+        measured minus predicted positions: smoothing then does not attenuate fast motion that is predicted.
         """
         if q is None or qd is None:
             q = qd = torch.zeros_like(self.q)
-        missed = (self.q - q).numpy()
-        slow_qd, slow_qdd = (torch.from_numpy(derivative(missed, self.rate, order)) for order in (1, 2))
+        error = (self.q - q).numpy()
+        slow_qd, slow_qdd = (torch.from_numpy(derivative(error, self.rate, order)) for order in (1, 2))
         acceleration = qd.diff(dim=1) / self.dt.unsqueeze(-1)
-        return Path(
-            _midpoints(self.q), _midpoints(slow_qd) + _midpoints(qd), _midpoints(slow_qdd) + acceleration
-        )
+        velocity = _midpoints(slow_qd) + _midpoints(qd)
+        return MidpointMotion(_midpoints(self.q), velocity, _midpoints(slow_qdd) + acceleration)
 
     def commands(self, delay: float) -> torch.Tensor:
-        """Return those of ``delay`` [s] ago, over the steps between samples (W, K-1, S, n)."""
-        commands = [delayed_commands(log, rows, delay, self.steps) for log, rows in self.parts]
+        """Return the commands of ``delay`` [s] earlier, at the steps between samples, (W, K-1, S, n) [rad, m]."""
+        commands = [delayed_commands(log, rows, delay, self.steps) for log, rows in self.rows]
         return torch.from_numpy(np.stack(commands))
 
 
 def _midpoints(x: torch.Tensor) -> torch.Tensor:
+    """Return means of neighbouring samples, (W, K-1, n)."""
     return x[:, 1:] / 2 + x[:, :-1] / 2
 
 
 def servo_windows(
     logs: Sequence[Trajectory], preprocessing: Preprocessing, count: int = TUNING.count
 ) -> ServoWindows:
-    """Return at most so many windows, evenly spread; shorter ones where all logs are.
+    """Return at most `count` windows, evenly spread over the logs; they are shorter if all logs are.
 
-    Raises LogError for logs too short.
+    Raises LogError if all logs are too short.
     """
-    pieces: list[Trajectory] = []
+    segments: list[Trajectory] = []
     for log in logs:
-        pieces += split_at_gaps(log, preprocessing.gap)
-    rate = float(np.median([piece.sample_rate for piece in pieces]))
-    length = min(round(TUNING.length * rate), max(map(len, pieces)))
-    settling = min(round(TUNING.settling * rate), length // 2)
-    if length < SHORTEST:
+        segments += split_at_gaps(log, preprocessing.gap)
+    rate = float(np.median([segment.sample_rate for segment in segments]))
+    length = min(round(TUNING.length * rate), max(map(len, segments)))
+    burn_in = min(round(TUNING.burn_in * rate), length // 2)
+    if length < MIN_SAMPLES:
         raise LogError(f"at most {length} samples without a gap", expected="a second of motion or more")
-    parts: list[LogRows] = []
-    for piece in pieces:
-        starts = range(0, len(piece) - length + 1, max(1, length - settling))
-        parts += [(piece, slice(start, start + length)) for start in starts]
-    parts = parts[:: -(-len(parts) // count)]  # of all motions, rather than the first ones
-    smooth_velocities = {id(piece): velocities(piece) for piece in pieces if len(piece) >= length}
+    rows: list[LogRows] = []
+    for segment in segments:
+        starts = range(0, len(segment) - length + 1, max(1, length - burn_in))
+        rows += [(segment, slice(start, start + length)) for start in starts]
+    rows = rows[:: -(-len(rows) // count)]  # evenly spread: the first motions may not move all joints
+    smooth_velocities = {id(segment): velocities(segment) for segment in segments if len(segment) >= length}
     q, qd, dt, steps = [], [], [], 0
-    for log, rows in parts:
-        q.append(log.q[rows])
-        qd.append(smooth_velocities[id(log)][rows])
-        dt.append(np.diff(log.t[rows]))
+    for log, samples in rows:
+        q.append(log.q[samples])
+        qd.append(smooth_velocities[id(log)][samples])
+        dt.append(np.diff(log.t[samples]))
         steps = max(steps, steps_between(log))
     tensors = torch.from_numpy(np.stack(q)), torch.from_numpy(np.stack(qd)), torch.from_numpy(np.stack(dt))
-    return ServoWindows(tuple(parts), *tensors, settling, steps)
+    return ServoWindows(tuple(rows), *tensors, burn_in, steps)
 
 
 class BodyLoad(NamedTuple):
-    """Hold what the bodies are to the drives along windows.
+    """The load of the drives by the bodies, along the midpoints of windows.
 
-    inertia: (W, K-1, n) of each joint by itself, without the drives'. bias: the torque (W, K-1, n) that everything else
-    takes, gravity: its part of that. slopes: of the torque by the ten parameters of all bodies, (W, K-1, n, 10 B).
+    inertia: (W, K-1, n) diagonal of M without armature [kg m^2, kg]. bias: (W, K-1, n) [Nm, N], Coriolis, centrifugal
+    and gravity torque, plus the torque of M's other entries. gravity: (W, K-1, n) [Nm, N]. regressor: (W, K-1, n, 10
+    B), derivatives of the torque with respect to the inertial parameters of B bodies.
     """
 
     inertia: torch.Tensor
     bias: torch.Tensor
     gravity: torch.Tensor
-    slopes: torch.Tensor
+    regressor: torch.Tensor
 
 
-def body_load(model: ArmModel, path: Path) -> BodyLoad:
-    """Return that of the model as it is."""
-    blocks: list[BodyLoad] = []
+def body_load(model: ArmModel, motion: MidpointMotion) -> BodyLoad:
+    """Return the load of the model's bodies along a motion (W, K-1, n)."""
+    batches: list[BodyLoad] = []
     with torch.no_grad():
         prepared, armature = model.prepare(), model.armature
-        flat = [x.flatten(0, 1).split(BLOCK) for x in path]
+        flat = [x.flatten(0, 1).split(BATCH) for x in motion]
         for q, qd, qdd in zip(*flat, strict=True):
-            at = model.configuration(q, prepared)
-            mass = at.mass
+            configuration = model.configuration(q, prepared)
+            mass = configuration.mass
             inertia = mass.diagonal(dim1=-2, dim2=-1) - armature
             coupling = (mass @ qdd.unsqueeze(-1)).squeeze(-1) - (inertia + armature) * qdd
-            bias = model.nonlinear_effects(at, qd) + coupling
-            slopes = regressor_of(model.chain, q, qd, qdd)
-            blocks.append(BodyLoad(inertia, bias, model.gravity(at), slopes))
-    shape = path.q.shape[:2]
-    return BodyLoad(*(torch.cat(columns).unflatten(0, shape) for columns in zip(*blocks, strict=True)))
+            bias = model.nonlinear_effects(configuration, qd) + coupling
+            regressor = regressor_of(model.chain, q, qd, qdd)
+            batches.append(BodyLoad(inertia, bias, model.gravity(configuration), regressor))
+    shape = motion.q.shape[:2]
+    return BodyLoad(*(torch.cat(columns).unflatten(0, shape) for columns in zip(*batches, strict=True)))

@@ -9,26 +9,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from spelgen.dynamics.protocol import residual_terms
+from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.levenberg_marquardt import Termination
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import limit_friction
 from spelgen.fitting.torque.problem import TorqueEstimate, TorqueProblem, refine
-from spelgen.fitting.torque.residual_stage import fit_residual_terms
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.selection import SelectedTerm
-from spelgen.fitting.torque.stages import choose_friction_effects, choose_friction_state, initial_fit
+from spelgen.fitting.torque.stages import (
+    choose_friction_effects,
+    choose_friction_state,
+    fit_residual_terms,
+    initial_fit,
+)
 from spelgen.fitting.torque.tuning import TUNING
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import Adaptation, GaussianPrior
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 
 class FitStage(NamedTuple):

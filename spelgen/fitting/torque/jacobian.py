@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch.autograd import grad as gradient
 
 from spelgen.dynamics.body_regressor import regressor_of
+from spelgen.dynamics.parameters import friction_factor, residual_torque
 from spelgen.dynamics.protocol import motors_of
-from spelgen.dynamics.residuals import friction_factor, residual_torque
+from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.functional_model import NamedTensors, evaluate_with
 from spelgen.fitting.torque import linearization
 from spelgen.fitting.torque.linearization import (
@@ -25,9 +26,6 @@ from spelgen.fitting.torque.parameters import ParameterVector, joint_torque, ste
 from spelgen.fitting.torque.samples import SampleBlock, TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
 from spelgen.runtime.inputs import MotorInputs
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 LOGARITHMIC_GROUPS = ("armature", "sizes", "effects", "load_dependence")
 
@@ -254,7 +252,7 @@ class TorqueJacobian:
         """
         samples = block.samples
 
-        def torques(model: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        def torques(model: ArmModel) -> tuple[torch.Tensor, torch.Tensor]:
             constants, theta = model.friction.prepare(), model.inertial_parameters.flatten()
             gravity = block.load_regressor @ theta if load is None else load
             friction = constants.torque(block.speed, gravity, samples.z, samples.direction)

@@ -9,19 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 
 from spelgen.dynamics.protocol import motors_of
-from spelgen.fitting.torque.bayesian_ridge import BayesianRidge, append_target, bayesian_ridge
+from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.torque.jacobian import ResidualSamples
-from spelgen.fitting.torque.linearization import LinearTerms, RigidProjection
+from spelgen.fitting.torque.linearization import (
+    BayesianRidge,
+    LinearTerms,
+    RigidProjection,
+    append_target,
+    bayesian_ridge,
+)
 from spelgen.runtime.residual_terms import LARGEST, SPLINES, ResidualTerms
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 TermKey = tuple[str, int | None]
 """Parameter of a residual term, and its joint; None: all joints."""

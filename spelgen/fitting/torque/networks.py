@@ -1,18 +1,26 @@
-"""Fit of a model of networks to torques: L-BFGS on the error of its inverse dynamics, on all samples at once."""
+"""Networks fitted to torques by L-BFGS: models of networks, and the networks of residual terms, which are selected."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
 
 import torch
 
+from spelgen.dynamics.parameters import residual_torque
+from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.optimizers import minimise
+from spelgen.fitting.torque.jacobian import ResidualSamples
+from spelgen.fitting.torque.joint_functions import ALL, rms_per_joint
 from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.fitting.torque.selection import (
+    SelectedTerm,
+    block_squares,
+    significant_reduction,
+    split_halves,
+)
+from spelgen.fitting.torque.tuning import SELECTION
 from spelgen.settings.fits import DEFAULTS, Adaptation
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 ADAPTED_PARTS: dict[Adaptation, tuple[str, ...]] = {
     "load": ("mass.", "potential."),
@@ -83,3 +91,73 @@ def adapt_networks(
         return fit_networks(model, samples, 0.0, penalty, evaluations)
     finally:
         model.requires_grad_(True)
+
+
+def select_networks(
+    model: ArmModel, samples: ResidualSamples, correlation_length: float
+) -> Iterator[SelectedTerm]:
+    """Fit and select the network of the potential, then the network of the mass matrix.
+
+    Args:
+        model: model with residual terms, whose networks are set.
+        samples: torque residual of the model with its current terms.
+        correlation_length: number of samples per independent error.
+    """
+    step = -(-len(samples.q) // SELECTION.network_samples)
+    subset = ResidualSamples(*(column[::step] for column in samples))
+    # the target of all residual terms together, single-joint terms included
+    with torch.no_grad():
+        current = residual_torque(model, *subset[:3])
+    subset = subset._replace(torque_residual=subset.torque_residual + current)
+    terms = model.residuals
+    networks = {"residual_potential": list(terms.potential.parameters()) if terms.potential else []}
+    networks["residual_mass"] = [terms.raw_constants, *(terms.mass.parameters() if terms.mass else ())]
+    for name, weights in networks.items():
+        reduction = None
+        if weights:
+            network = torch.nn.ParameterList(weights)
+            reduction = _fit_network(model, network, subset, max(1.0, correlation_length / step))
+        if reduction is not None:
+            yield SelectedTerm(name, None, reduction)
+
+
+def _fit_network(
+    model: ArmModel, network: torch.nn.Module, samples: ResidualSamples, correlation_length: float
+) -> float | None:
+    """Fit one network if, fitted to the first half, it lowers the error on the last half; return the error reduction.
+
+    Otherwise the network keeps its weights. samples: as torque residual the target of all residual terms together.
+    """
+    initial, residual = copy.deepcopy(network.state_dict()), _remaining_residual(model, samples)
+    noise = rms_per_joint(residual)
+
+    def fit(rows: slice, evaluations: int) -> None:
+        selected = ResidualSamples(*(column[rows] for column in samples))
+
+        def cost() -> torch.Tensor:
+            error = selected.torque_residual - residual_torque(model, *selected[:3])
+            return 0.5 * (error / noise).square().sum() / correlation_length
+
+        network.load_state_dict(initial)
+        minimise(network, lambda: [cost()], evaluations, weight_decay=1.0)
+
+    first, last = split_halves(len(samples.q), correlation_length)
+    # most networks explain nothing, which a few evaluations show
+    for evaluations in (SELECTION.network_probe_evaluations, SELECTION.network_evaluations):
+        fit(first, evaluations)
+        error = _remaining_residual(model, samples)
+        before, after = block_squares((residual / noise)[last]), block_squares((error / noise)[last])
+        reduction = significant_reduction(before, after)
+        if after.sum() >= before.sum():
+            break
+    network.load_state_dict(initial)
+    if reduction is not None:
+        fit(ALL, SELECTION.network_evaluations)
+    model.zero_grad(set_to_none=True)
+    return reduction
+
+
+def _remaining_residual(model: ArmModel, samples: ResidualSamples) -> torch.Tensor:
+    """Return the residual (T, n) [Nm, N] after all residual terms of the model."""
+    with torch.no_grad():
+        return samples.torque_residual - residual_torque(model, *samples[:3])

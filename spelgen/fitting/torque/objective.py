@@ -7,14 +7,15 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.bristles import bristle_reach
+from spelgen.dynamics.parameters import without_idle_residuals
 from spelgen.dynamics.protocol import known_past, motors_of
-from spelgen.dynamics.residuals import without_idle_residuals
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import TrainingData, Validation
 from spelgen.fitting.objective import PreparedLogs, TorqueLogObjective
@@ -32,9 +33,6 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import thinned
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import TorqueFit
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 SAMPLES = 5  # per validation window
 FITTED = {

@@ -33,7 +33,7 @@ from spelgen.fitting.torque.linearization import (
     RigidProjection,
     least_squares_residual,
 )
-from spelgen.fitting.torque.prior import ParameterPrior, update_widths
+from spelgen.fitting.torque.parameters import ParameterPrior, update_widths
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
 from spelgen.settings.fits import Adaptation, GaussianPrior

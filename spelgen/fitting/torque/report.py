@@ -4,26 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import compress
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch.autograd.functional import jacobian
 
+from spelgen.dynamics.parameters import idle_residuals
 from spelgen.dynamics.protocol import residual_terms
-from spelgen.dynamics.residuals import idle_residuals
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic
 from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.torque.fit import TorqueSolution
 from spelgen.fitting.torque.parameters import ParameterVector
 from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.fitting.torque.tuning import TorqueReportTuning
+from spelgen.fitting.torque.tuning import TUNING
 from spelgen.runtime.inputs import MotorInputs
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-
-TUNING = TorqueReportTuning()
 
 TERM_NAMES = {
     "raw_torque_splines": "a torque by position (spring, cable)",
@@ -53,7 +48,7 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
         yield _compensation(model, solution, names)
     if residual_terms(model) is not None:
         yield Diagnostic("info", "residuals", "model", None, _selected_terms(solution, names))
-    subset = samples.subsampled(TUNING.positions).columns
+    subset = samples.subsampled(TUNING.report_positions).columns
     inertia, deviation = _inertia(model, subset.q, solution.covariance)
     undetermined = deviation > TUNING.undetermined
     if undetermined.any():

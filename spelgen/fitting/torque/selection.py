@@ -13,18 +13,14 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import torch
 
-from spelgen.fitting.torque.bayesian_ridge import append_target, bayesian_ridge
+from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.torque.jacobian import ResidualSamples
 from spelgen.fitting.torque.joint_functions import JointFunction, TermKey, joint_functions, rms_per_joint
-from spelgen.fitting.torque.linearization import RigidProjection
+from spelgen.fitting.torque.linearization import RigidProjection, append_target, bayesian_ridge
 from spelgen.fitting.torque.tuning import SELECTION
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
 
 
 @dataclass(frozen=True)

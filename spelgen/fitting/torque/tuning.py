@@ -89,6 +89,17 @@ class TorqueTuning:
     regressor_bytes: float = 4e8
     # [1] Largest step of a body, as a fraction of the distance to physically inconsistent parameters.
     body_step: float = 0.3
+    # [1] Relative standard deviation above which logs do not determine an inertia.
+    undetermined: float = 0.5
+    # [1] Relative standard deviation above which logs do not determine a motor gain: its 95 % interval then reaches
+    # 20 % to either side, as the difference of two datasheets does.
+    undetermined_gain: float = 0.1
+    # [1] Factor of the prior standard deviation of URDF masses above which the URDF is wrong.
+    wrong_urdf: float = 5.0
+    # [1] Torque residual divided by the inertial torque of a joint, above which the predicted motion is unreliable.
+    weak_acceleration: float = 2.0
+    # [1] Positions at which inertias are evaluated.
+    report_positions: int = 50
     # [1] Priors about the run that is adapted, by what is adapted. load: mass known to a factor of twenty (with 10 in
     # place of 3 half a second of motion has an error of 27 times the variance of the torque, UR10e). friction: warmth
     # changes the friction of all joints by tens of per cent, of a single joint less (Bittencourt and Gunnarsson, J.
@@ -129,23 +140,6 @@ class ResidualTuning:
     network_probe_evaluations: int = 20
     # [1] Evaluations of the loss of a network.
     network_evaluations: int = 100
-
-
-@dataclass(frozen=True)
-class TorqueReportTuning:
-    """Warnings of a torque fit (`fitting.torque.report`)."""
-
-    # [1] Relative standard deviation above which logs do not determine an inertia.
-    undetermined: float = 0.5
-    # [1] Relative standard deviation above which logs do not determine a motor gain: its 95 % interval then reaches
-    # 20 % to either side, as the difference of two datasheets does.
-    undetermined_gain: float = 0.1
-    # [1] Torque residual divided by the inertial torque of a joint, above which the predicted motion is unreliable.
-    weak_acceleration: float = 2.0
-    # [1] Factor of the prior standard deviation of URDF masses above which the URDF is wrong.
-    wrong_urdf: float = 5.0
-    # [1] Positions at which inertias are evaluated.
-    positions: int = 50
 
 
 TUNING = TorqueTuning()

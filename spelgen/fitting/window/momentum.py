@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 
 from spelgen.errors import Diagnostic
-from spelgen.fitting.dataset import Measured, Validation
+from spelgen.fitting.dataset import Validation
 from spelgen.fitting.objective import FitRequest, PreparedLogs, Status, TorqueLogObjective
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
+from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.rollout import momentum_loss
 from spelgen.fitting.run_record import Content
-from spelgen.fitting.tuning import WindowTuning
+from spelgen.fitting.tuning import TUNING
 from spelgen.logs.windows import Windows
 from spelgen.settings.fits import DEFAULTS, Solver, WindowConfig
-
-if TYPE_CHECKING:
-    from spelgen.fitting.progress import TrainingProgress
-
-TUNING = WindowTuning()
 
 
 class MomentumObjective(TorqueLogObjective):
@@ -35,7 +32,7 @@ class MomentumObjective(TorqueLogObjective):
 
     name: ClassVar[str] = "momentum"
     config: WindowConfig  # resolved by `prepare`
-    kept: ClassVar[tuple[str, ...]] = (
+    saved_attributes: ClassVar[tuple[str, ...]] = (
         "epoch", "step", "best_epoch", "best_loss", "best_weights", "seconds", "substeps", "momentum_done",
     )  # fmt: skip
     """Attributes that are saved in a checkpoint."""
@@ -78,7 +75,7 @@ class MomentumObjective(TorqueLogObjective):
 
     def checkpoint(self) -> Content:
         """See `Objective`."""
-        return {name: getattr(self, name) for name in self.kept}
+        return {name: vars(self)[name] for name in self.saved_attributes}
 
     def _set_up(self, solver: Solver = "rk4", substeps: int | None = None) -> None:
         """Validate the current model; solver, substeps: of the validation, see `Rollout`."""
@@ -95,18 +92,19 @@ class MomentumObjective(TorqueLogObjective):
         self.validation = Validation(
             self.model, self.data, device, batch=self.batch, solver=solver, substeps=substeps
         )
-        self._keep(self.validation.measure())
+        self._keep(*self.validation.measure())
         self.momentum_done = not self.config.momentum_steps
 
     def _restore(self, checkpoint: Content) -> None:
         """Restore the attributes of a checkpoint, and its best weights."""
-        for name in self.kept:
+        for name in self.saved_attributes:
             setattr(self, name, checkpoint[name])
         self.model.load_state_dict(self.best_weights)
 
-    def _keep(self, measured: Measured) -> None:
-        """Set a validated model as the best so far."""
-        self.substeps, self.best_loss, self.best_weights = measured.substeps, measured.loss, measured.weights
+    def _keep(self, substeps: int, loss: float) -> None:
+        """Set the current model, which was validated, as the best so far."""
+        self.substeps, self.best_loss = substeps, loss
+        self.best_weights = copy.deepcopy(self.model.state_dict())
 
     def _start_clock(self) -> None:
         self._since = time.monotonic() - self.seconds
@@ -167,9 +165,9 @@ class MomentumObjective(TorqueLogObjective):
             if optimizer.stalled or not math.isfinite(value):
                 break
             progress.momentum(min(start + call, steps), steps, value)
-        end = self.validation.measure()
-        if end.loss < self.best_loss:
-            self._keep(end)
+        substeps, validation = self.validation.measure()
+        if validation < self.best_loss:
+            self._keep(substeps, validation)
         else:
             model.load_state_dict(self.best_weights)
         self.momentum_done, self.seconds = True, self.seconds_now()

@@ -5,28 +5,24 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 
-from spelgen.dynamics.residuals import idle_residuals
+from spelgen.dynamics.parameters import idle_residuals
 from spelgen.errors import Diagnostic, RunError
+from spelgen.fitting.objective import Status
 from spelgen.fitting.optimizers import WindowOptimizer
+from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.rollout import rollout_loss
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.objective import fit_torques, torque_samples
-from spelgen.fitting.tuning import LoopTuning
+from spelgen.fitting.tuning import TUNING
 from spelgen.fitting.window.momentum import MomentumObjective
 from spelgen.logs.rates import SLOWEST
 from spelgen.logs.windows import Windows
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import Rollout, TorqueFit
-
-if TYPE_CHECKING:
-    from spelgen.fitting.objective import Status
-    from spelgen.fitting.progress import TrainingProgress
-
-TUNING = LoopTuning()
 
 
 class RolloutObjective(MomentumObjective):
@@ -40,8 +36,8 @@ class RolloutObjective(MomentumObjective):
 
     name: ClassVar[str] = "rollout"
     config: Rollout
-    kept: ClassVar[tuple[str, ...]] = (
-        *MomentumObjective.kept, "rollbacks", "learning_rate_factor", "fixed", "stage_from", "stage_epoch",
+    saved_attributes: ClassVar[tuple[str, ...]] = (
+        *MomentumObjective.saved_attributes, "rollbacks", "learning_rate_factor", "fixed", "stage_from", "stage_epoch",
     )  # fmt: skip
 
     def begin(self) -> list[Diagnostic]:
@@ -120,7 +116,7 @@ class RolloutObjective(MomentumObjective):
     def _run_epoch(self) -> Content:
         """Run one epoch; if its losses are not finite, repeat it at a lower learning rate."""
         while True:
-            before = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
+            state = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
             steps, start = self._steps_in_time(), self.seconds_now()
             # NaN if the loss or gradient of any step is not finite
             loss = self.optimizer.run(self._rollout_loss, self.training, steps, self._rate)
@@ -130,7 +126,7 @@ class RolloutObjective(MomentumObjective):
             self._validation_seconds = self.seconds_now() - trained
             if math.isfinite(validation):
                 break
-            self._roll_back(*before)
+            self._roll_back(*state)
         self.epoch += 1
         if validation < self.best_loss:
             self.best_loss, self.best_epoch = validation, self.epoch
@@ -186,12 +182,12 @@ class RolloutObjective(MomentumObjective):
         """Restore the state before a diverged epoch, and halve all further learning rates."""
         self.rollbacks += 1
         self.model.load_state_dict(weights)
-        if self.rollbacks > TUNING.rollbacks:
+        if self.rollbacks > TUNING.max_rollbacks:
             advice = "check units and signs of the logs"
             if self.request.folder is not None:
                 advice += "; the best model so far is kept in model.pt"
             raise RunError(
-                f"losses that are not finite, after {TUNING.rollbacks} attempts at half the learning rate each",
+                f"losses that are not finite, after {TUNING.max_rollbacks} attempts at half the learning rate each",
                 file=self.request.folder,
                 do=advice,
             )

@@ -1,0 +1,185 @@
+"""Commands about an arm: `inspect`, the exact structure of its dynamics, and `identify`, its base parameters."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
+
+import typer
+
+from spelgen.cli import options
+from spelgen.cli.console import FAILED, deliver, note, refuse_warnings
+from spelgen.cli.options import (
+    Accept,
+    AngleTolerance,
+    Assumption,
+    Data,
+    Entry,
+    Filter,
+    Joints,
+    MappingFile,
+    MoreData,
+    Output,
+    Robot,
+    Strict,
+    Tip,
+)
+
+if TYPE_CHECKING:
+    from spelgen.certificate.formulas import Formulas
+    from spelgen.certificate.inspection import Inspection
+    from spelgen.certificate.verification import Verification
+
+InspectionFormat = Literal["text", "json", "html", "latex", "sympy"]
+IdentificationFormat = Literal["text", "json", "html"]
+EFFECTS = ("stribeck", "polynomial", "memory")
+
+
+def inspect(
+    robot: Robot,
+    joints: Joints = None,
+    tip: Tip = None,
+    assume: Assumption = "kinematics",
+    angle_tolerance: AngleTolerance = 2e-3,
+    formulas: Annotated[
+        bool, typer.Option("--formulas", help="Write M and V as expressions in q and base parameters.")
+    ] = False,
+    entry: Entry = None,
+    format: Annotated[InspectionFormat | None, options.result_format()] = None,
+    output: Output = None,
+    strict: Strict = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Verify the structure by Pinocchio, SymPy and numeric samples.")
+    ] = False,
+) -> None:
+    """Show the exact structure of an arm's dynamics."""
+    chosen_entry = options.entry(entry)
+    chosen = options.choose_format(format, output, get_args(InspectionFormat))
+    from spelgen.certificate.inspection import inspect as inspect_arm
+
+    arm = options.load(robot, joints, tip, angle_tolerance)
+    inspection = inspect_arm(arm, assume=assume)
+    proof = None
+    if verify:
+        # imported here: Pinocchio and SymPy, which take seconds
+        from spelgen.certificate.verify import verify as verified
+
+        proof = verified(arm.robot, arm.chain, inspection.structure)
+    closed = None
+    if formulas or chosen_entry is not None or chosen in ("latex", "sympy"):
+        from spelgen.certificate.formulas import WRITABLE
+
+        longest = WRITABLE if chosen in ("json", "sympy") else None
+        closed = inspection.closed_forms(chosen_entry, longest=longest)
+    # the result comes first; --strict and a failed proof only decide the exit code
+    deliver(_text(chosen, inspection, closed, proof, arm.robot.path), output)
+    if strict:
+        refuse_warnings(f"{robot}: ", [x.severity for x in inspection.diagnostics].count("warning"))
+    if proof and not proof.agrees:
+        note(f"{robot}: the proof contradicts the derivation; please report this file")
+        raise typer.Exit(FAILED)
+
+
+def _text(
+    format: str, inspection: Inspection, closed: Formulas | None, proof: Verification | None, urdf: Path
+) -> str:
+    """Return the result in a format, with a line end; closed: closed forms of M and V."""
+    if closed and format in ("latex", "sympy"):
+        return _formula_file(format, closed, proof)
+    if format == "html":
+        from spelgen.render.arm_pages import inspection_page
+
+        return inspection_page(inspection, closed, proof, urdf)
+    if format == "json":
+        data = inspection.to_dict()
+        if closed:
+            from spelgen.certificate.formula_files import to_dict
+
+            data["formulas"] = to_dict(closed)
+        if proof:
+            data["verification"] = proof.to_dict()
+        return json.dumps(data, indent=2) + "\n"
+    if closed is None:
+        result = inspection.text()
+    else:
+        from spelgen.certificate import formula_files
+
+        result = formula_files.text(closed)
+    if proof:
+        result += f"\n\n{proof.text()}"
+    return result + "\n"
+
+
+def _formula_file(format: str, closed: Formulas, proof: Verification | None) -> str:
+    """Return a file of formulas. The proof and the names of omitted formulas are printed to stderr."""
+    from spelgen.certificate import formula_files
+
+    names = [formula.name for formula in closed.unwritten]
+    if names:
+        note(f"too long to be written: {', '.join(names)}")
+    if proof:
+        note(proof.text())
+    if format == "latex":
+        return formula_files.latex(closed)
+    return formula_files.sympy_source(closed)
+
+
+def identify(
+    robot: Robot,
+    extra_logs: MoreData = None,
+    data: Data = None,
+    mapping: MappingFile = None,
+    joints: Joints = None,
+    tip: Tip = None,
+    angle_tolerance: AngleTolerance = 2e-3,
+    filter: Filter = None,
+    weights: Annotated[
+        Literal["equal", "range", "noise"],
+        typer.Option(help="Weights of the joints: equal, by torque range, or by torque noise."),
+    ] = "noise",
+    friction: Annotated[
+        str | None,
+        typer.Option(
+            metavar="stribeck,polynomial,memory",
+            help="Friction terms in addition to viscous and Coulomb friction: Stribeck effect; qd |qd| and qd^3; "
+            "bristles (hysteresis).",
+        ),
+    ] = None,
+    accept: Accept = None,
+    format: Annotated[IdentificationFormat | None, options.result_format()] = None,
+    output: Output = None,
+) -> None:
+    """Identify base parameters and friction by least squares."""
+    paths = options.logs(data, extra_logs)
+    from spelgen.dynamics.friction import FrictionModel
+    from spelgen.identification.identification import LeastSquares
+    from spelgen.identification.identify import identify as identify_arm
+    from spelgen.log_checks.check_logs import require_sound_logs
+    from spelgen.logs.preprocessing import Preprocessing
+    from spelgen.logs.read import read_logs
+
+    effects = options.names(friction) or []
+    for name in effects:
+        if name not in EFFECTS:
+            raise typer.BadParameter(f"{name!r} is none of {', '.join(EFFECTS)}", param_hint="'--friction'")
+    method = LeastSquares(weights, FrictionModel(**dict.fromkeys(effects, True)))
+    arm = options.load(robot, joints, tip, angle_tolerance)
+    # codes on the command line are accepted in addition to those in the settings
+    log_mapping = options.log_mapping(arm, mapping, accept)
+    logs = read_logs(paths, arm, log_mapping, role="train")
+    # least squares would fit logs in wrong units without an error
+    for diagnostic in require_sound_logs(logs, arm, log_mapping):
+        note(diagnostic)
+    result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))
+    for diagnostic in result.diagnostics:
+        note(diagnostic)
+
+    def page() -> str:
+        # pages and charts are imported only for this format
+        from spelgen.render.arm_pages import identification_page
+
+        return identification_page(result, arm)
+
+    forms = {"text": result.text, "json": lambda: json.dumps(result.to_dict(), indent=2), "html": page}
+    options.write_result(format, output, forms)

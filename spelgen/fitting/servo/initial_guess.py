@@ -1,0 +1,80 @@
+"""Initial guess of a servo fit, by least squares on the command error.
+
+At a joint that a servo holds, kp (u - q) = kd qd + M qdd + gravity + friction. Divided by kp, the command error is
+linear in the unknown parameters, and its coefficient for the gravity torque of the URDF's masses is 1 / kp.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from spelgen.dynamics.bristles import bristle_reach, bristles_along
+from spelgen.fitting.servo.tuning import ServoStartTuning
+from spelgen.fitting.servo.windows import ServoWindows, body_load
+
+if TYPE_CHECKING:
+    from spelgen.emission.assemble import ArmModel
+
+TUNING = ServoStartTuning()
+# Logarithms of friction relative to its nominal value: negligible, and small.
+NEGLIGIBLE, SMALL = -6.0, -2.0
+
+
+def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
+    """Set kp, kd, armature, friction and offset of the model to the least-squares solution of the command error."""
+    delay = 1 / windows.rate
+    model.servo.delay.fill_(delay)
+    friction, servo = model.friction, model.servo
+    motion = windows.motion()
+    load = body_load(model, motion)
+    bristles = np.stack([bristles_along(q.numpy(), bristle_reach(model)) for q in windows.q])
+    direction = (torch.from_numpy(bristles) / friction.reach).mean(dim=-1)[:, :-1]
+    columns = torch.stack([motion.qd, motion.qdd, direction, load.bias, torch.ones_like(direction)], dim=-1)
+    error = windows.commands(delay).mean(dim=2) - windows.q[:, :-1]
+    coefficients, significance = _regression(columns[:, windows.burn_in :], error[:, windows.burn_in :])
+    damping, inertia, dry, compliance, offset = coefficients.unbind(-1)
+    with torch.no_grad():
+        is_known = servo.trained == 0
+        factor = 1 / (compliance * servo.nominal_kp).clamp(min=1e-12)
+        # gravity determines kp of the joints that it loads; the nominal kp of other joints gets the median factor
+        determined = ~is_known & (significance[:, 3] > TUNING.significance)
+        determined &= factor.log().abs() < np.log(TUNING.kp_range)
+        common = torch.ones(()).double()
+        if determined.any():
+            common = factor[determined].median()
+        factor = torch.where(determined, factor, common)
+        factor[is_known] = 1.0
+        kp, smallest = factor * servo.nominal_kp, TUNING.min_friction
+        servo.raw_kp.copy_(factor.log())
+        servo.raw_kd.copy_((kp * damping.clamp(min=smallest**2) / servo.nominal_kd).log())
+        armature = torch.maximum(kp * inertia - load.inertia.mean(dim=(0, 1)), smallest**3 * kp)
+        model.raw_armature.copy_((armature / model.nominal_armature).log())
+        friction.raw_coulomb.copy_((kp * dry / friction.nominal).clamp(min=smallest).log())
+        # such logs determine only the sum of viscous friction and kd: it is fitted as kd
+        friction.raw_viscous.fill_(NEGLIGIBLE)
+        friction.raw_saturation.fill_(NEGLIGIBLE)
+        friction.raw_stribeck.fill_(SMALL)
+        model.raw_offset.copy_((kp * offset / friction.nominal).clamp(-2.0, 2.0))
+
+
+def _regression(columns: torch.Tensor, errors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the least-squares coefficients of each joint, and their ratios to the standard deviations, (n, 5) each.
+
+    The K samples of a window count as one independent error.
+
+    Args:
+        columns: (W, K, n, 5), the regressors.
+        errors: (W, K, n) [rad, m].
+    """
+    matrix = columns.flatten(0, 1).transpose(0, 1)  # (n, M, 5)
+    target = errors.flatten(0, 1).mT.unsqueeze(-1)
+    # gelsd: the pivots of torch's default driver are not deterministic
+    solution = torch.linalg.lstsq(matrix, target, driver="gelsd").solution
+    residual = target - matrix @ solution
+    unscaled = torch.linalg.pinv(matrix.mT @ matrix).diagonal(dim1=-2, dim2=-1)
+    variance = residual.square().mean(dim=1) * unscaled * errors.shape[1]
+    coefficients = solution.squeeze(-1)
+    return coefficients, coefficients / variance.clamp(min=1e-300).sqrt()

@@ -1,0 +1,135 @@
+"""Predicted positions of windows as a function of the parameters, and their Jacobian by finite differences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+
+from spelgen.dynamics.servo_rollout import Load, ServoDrives, advanced, balanced, servo_drives
+from spelgen.fitting.functional_model import evaluate_with
+from spelgen.fitting.servo.parameters import ParameterMap, ServoParameters
+from spelgen.fitting.servo.tuning import ServoCostTuning
+from spelgen.fitting.servo.windows import BodyLoad, MidpointMotion, ServoWindows, body_load
+
+if TYPE_CHECKING:
+    from spelgen.emission.assemble import ArmModel
+
+# Number of samples for the directions of the body parameters.
+GRAVITY_SAMPLES = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class ServoRollouts:
+    """Rollouts of windows, in which each joint moves by itself under the load of the bodies along a fixed motion.
+
+    The load is computed once, for parameters x0: a change of the body parameters adds regressor (phi(x) - phi(x0)),
+    with the inertial parameters phi. Since joints are independent, one rollout in which a parameter is changed at all
+    joints gives the derivatives of all joints; parameters that joints share (body parameters, delay) need
+    one rollout each. All of them are one batch.
+
+    motion, load, inertial: the fixed motion, the load, and phi(x0) (10 B,). difference_step: of finite differences.
+    """
+
+    model: ArmModel
+    windows: ServoWindows
+    parameters: ParameterMap
+    motion: MidpointMotion
+    load: BodyLoad
+    inertial: torch.Tensor
+    difference_step: float = ServoCostTuning().difference_step
+
+    @classmethod
+    def of(cls, model: ArmModel, windows: ServoWindows) -> ServoRollouts:
+        """Return the rollouts under the load of the model along the measured motion."""
+        q = windows.q.flatten(0, 1)
+        parameters = ParameterMap(model, q[:: max(1, len(q) // GRAVITY_SAMPLES)])
+        motion = windows.motion()
+        inertial = parameters.inertial(parameters.prior_mean.bodies)
+        return cls(model, windows, parameters, motion, body_load(model, motion), inertial)
+
+    def linearized(self, x: ServoParameters, motion: MidpointMotion) -> ServoRollouts:
+        """Return the rollouts under the load at x along a motion; the model has the parameters x afterwards."""
+        self.parameters.write(x)
+        load, inertial = body_load(self.model, motion), self.parameters.inertial(x.bodies)
+        return replace(self, motion=motion, load=load, inertial=inertial)
+
+    def residual(self, x: ServoParameters) -> torch.Tensor:
+        """Return predicted minus measured positions after the burn-in, (W, K', n) [rad, m]."""
+        return self._errors(self._rollout_at(x)[0])[0]
+
+    def predicted_motion(self, x: ServoParameters) -> MidpointMotion:
+        """Return the measured motion, with the derivatives of the prediction; see `ServoWindows.motion`."""
+        q, qd = self._rollout_at(x)
+        return self.windows.motion(q[0], qd[0])
+
+    def jacobian(self, x: ServoParameters) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return derivatives of the residual with respect to joint and to shared parameters.
+
+        Returns:
+            (p, W, K', n), with respect to the parameters of the same joint, zero if no joint has the parameter;
+            (r + 1, W, K', n), with respect to the coordinates of the bodies and the delay.
+        """
+        rows = x.active.any(dim=1).nonzero().squeeze(-1)  # parameters that any joint has
+        p, r, step = len(rows), len(x.bodies), self.difference_step
+        # one batch: unchanged, each joint parameter, each coordinate of the bodies, the delay
+        joints = x.joints.expand(p + r + 2, -1, -1).clone()
+        joints[torch.arange(p) + 1, rows] += step
+        bodies = x.bodies.expand(p + r + 2, -1).clone()
+        bodies[torch.arange(r) + p + 1, torch.arange(r)] += step
+        commands = self.windows.commands(x.delay).expand(p + r + 1, -1, -1, -1, -1)
+        delayed = self.windows.commands(x.delay + step).unsqueeze(0)
+        q, _ = self._rollout(joints, bodies, torch.cat([commands, delayed]))
+        errors = self._errors(q)
+        derivatives = (errors[1:] - errors[0]) / step
+        of_joints = torch.zeros(len(x.joints), *derivatives.shape[1:]).double()
+        of_joints[rows] = derivatives[:p]
+        return of_joints, derivatives[p:]
+
+    def _errors(self, q: torch.Tensor) -> torch.Tensor:
+        """Return errors after the burn-in (P, W, K', n) for positions (P, W, K, n)."""
+        first = self.windows.burn_in + 1
+        return q[:, :, first:] - self.windows.q[:, first:]
+
+    def _rollout_at(self, x: ServoParameters) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return q and qd, (1, W, K, n)."""
+        commands = self.windows.commands(x.delay)
+        return self._rollout(x.joints.unsqueeze(0), x.bodies.unsqueeze(0), commands.unsqueeze(0))
+
+    def _rollout(
+        self, joints: torch.Tensor, bodies: torch.Tensor, commands: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return q and qd (P, W, K, n) for parameters (P, p, n), (P, r) under commands (P, W, K-1, S, n)."""
+        named = self.parameters.named(joints)
+        tensors = {name: tensor.detach() for name, tensor in named.items()}
+        # inference mode saves a tenth of the time of these many small operations
+        with torch.inference_mode():
+            drives, armature = evaluate_with(self.model, tensors, _drives)
+            changes = torch.stack([self.parameters.inertial(x) - self.inertial for x in bodies])
+            added = torch.einsum("wkni,pi->pwkn", self.load.regressor, changes)
+            return self._integrate(drives, armature, added, commands)
+
+    def _integrate(
+        self, drives: ServoDrives, armature: torch.Tensor, added: torch.Tensor, commands: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return q and qd (P, W, K, n); armature: (P, 1, n), added: load (P, W, K-1, n), commands as in `_rollout`."""
+        windows, load = self.windows, self.load
+        h = windows.dt.unsqueeze(-1) / commands.shape[3]
+        inertia, bias = load.inertia + armature.unsqueeze(-2), load.bias + added
+        shape = (len(added), *windows.q[:, 0].shape)
+        q, qd = windows.q[:, 0].expand(shape), windows.qd[:, 0].expand(shape)
+        positions, velocities, state = [q], [qd], None
+        for k in range(windows.q.shape[1] - 1):
+            current = Load(inertia[:, :, k], bias[:, :, k], load.gravity[:, k], coupled=False)
+            if state is None:  # the initial friction state is unknown; its effect decays during the burn-in
+                state = balanced(drives, q, qd, commands[:, :, k, 0], current)
+            for u in commands[:, :, k].unbind(2):
+                state = advanced(drives, state, u, current, h[:, k])
+            positions.append(state.q)
+            velocities.append(state.qd)
+        return torch.stack(positions, dim=2), torch.stack(velocities, dim=2)
+
+
+def _drives(model: ArmModel) -> tuple[ServoDrives, torch.Tensor]:
+    return servo_drives(model), model.armature

@@ -1,0 +1,183 @@
+"""The charts of a run's report, from the traces of its evaluation, its metrics and the coverage of its logs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from spelgen.baselines.names import LEAST_SQUARES, MODEL
+from spelgen.evaluation.drawn_motions import TorqueTrace
+from spelgen.evaluation.plain import array
+from spelgen.evaluation.traces import FrictionTrace, Traces
+from spelgen.evaluation.verdict import Limits
+from spelgen.fitting.run_record import Content
+from spelgen.labels import NamedJoint, named_joints, thousandths
+from spelgen.listing import number
+from spelgen.render.charts import Band, Chart, Dots, Line, Mark, line_chart
+from spelgen.render.plots import (
+    STYLES,
+    JointRow,
+    Panel,
+    growth_panels,
+    mass_panels,
+    stacks,
+    trajectory_panels,
+)
+from spelgen.render.tuning import TUNING
+from spelgen.spec import ModelSpec
+
+
+def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
+    """Return the charts of each section of the report; None, or no charts, for a section without traces."""
+    joints = named_joints(spec.joint_names, spec.joint_types)
+    drawn: dict[str, object] = dict.fromkeys(("growth", "mass", "friction", "energy"))
+    growth, mass = traces.growth, traces.mass
+    if growth is not None:
+        growths = {name: (growth, name) for name in growth.relative}
+        # the bands of all predictors would overlap
+        drawn["growth"] = growth_panels(growths, STYLES, (MODEL, LEAST_SQUARES))
+    if mass is not None and mass.by:
+        entries = {name: curves.entries for name, curves in mass.by.items()}
+        drawn["mass"] = mass_panels(mass.t, entries, STYLES, spec.joint_types)
+    if traces.friction is not None:
+        drawn["friction"] = friction_panels(traces.friction, traces.torques, joints)
+    if traces.torques:  # one trajectory shows the shares of the energy
+        drawn["energy"] = energy_chart(traces.torques[0])
+    torques = {}
+    for trace in traces.torques:
+        torques[f"{trace.which.capitalize()} trajectory: {trace.trajectory}"] = torque_panels(trace, joints)
+    trajectories = {}
+    for example in traces.trajectories:
+        which = example.which.capitalize()
+        if example.start is None:
+            distance = None if example.error is None else 1000 * example.error
+            off = f"{number(distance)} {thousandths(spec.joint_types)} off"
+            title = f"{which} log replayed: {example.trajectory}, {off}"
+        else:
+            title = f"{which} prediction: {example.trajectory}, {example.start:.3g} s into it, "
+            title += f"relative error {number(example.error)}"
+        motion, lines = f"prediction {example.which}", {"predicted": example}
+        trajectories[title] = trajectory_panels(lines, {"predicted": "predicted"}, joints, motion)
+    return drawn | {"torques": torques, "trajectories": trajectories}
+
+
+def loss_chart(metrics: Sequence[Content], best_epoch: int) -> Chart:
+    """Return training and validation loss over the epochs, with the epoch of the best model."""
+    columns = [(record["epoch"], record["loss"], record["validation"]) for record in metrics]
+    epochs, *losses = array(columns).T
+    ends = (np.nanmin(losses), np.nanmax(losses))
+    lines = [
+        Line("training loss", epochs, losses[0], "train"),
+        Line("validation loss", epochs, losses[1], "model"),
+        Line("epoch of the best model", (best_epoch, best_epoch), ends, "hold"),
+    ]
+    return line_chart(lines, "Loss by epoch", "epoch", "loss", log=True, width=560, height=240)
+
+
+def torque_panels(trace: TorqueTrace, joints: Sequence[NamedJoint]) -> list[Panel]:
+    """Return per joint measured and predicted torque, their difference, and the components of the prediction."""
+    measured, predicted = trace.measured, trace.predicted[MODEL]
+    curves = [("measured", measured, "truth"), ("predicted", predicted, "predicted")]
+    components = [(name, torque, name.lower()) for name, torque in trace.parts.items()]
+    rows = [
+        JointRow("Torque", "torque", "torque", curves, 160),
+        JointRow("Residual", "residual", "torque", [("residual", measured - predicted, "model")], 100),
+        JointRow("Components of the torque", "components", "torque", components, 162),
+    ]
+    return stacks(trace.t, rows, joints, f"torque {trace.which}")
+
+
+def friction_panels(
+    friction: FrictionTrace, torques: Sequence[TorqueTrace], joints: Sequence[NamedJoint]
+) -> list[Panel]:
+    """Return per joint friction over velocity: curves at constant velocity, and loops along measured motion.
+
+    Measured friction is the measured torque minus the model's rigid-body torque. The loops are caused by hysteresis,
+    and in a model without a friction state only by friction that depends on the load.
+    """
+    panels = []
+    for k, joint in enumerate(joints):
+        marks: list[Mark] = []
+        curve = friction.by[MODEL][k]
+        values = [curve]
+        for trace in torques:
+            qd, modelled = trace.qd[:, k], trace.parts["friction"][:, k]
+            # measured friction = measured torque - (model torque - model friction)
+            measured = modelled + trace.measured[:, k] - trace.predicted[MODEL][:, k]
+            values.append(measured)
+            marks.append(Dots("measured", qd, measured, "truth"))
+            # one trajectory only: the loops of two would overlap
+            if trace is torques[0]:
+                marks.append(Line("measured, over time", qd, measured, "loop"))
+                marks.append(Line("model, over time", qd, modelled, "loop model"))
+        for name, curves in friction.by.items():
+            marks.append(Line(name, friction.qd[k], curves[k], STYLES[name]))
+        chart = line_chart(
+            marks,
+            f"Friction of {joint.name}",
+            joint.axis("velocity"),
+            f"friction [{joint.units.torque}]",
+            limits=_friction_limits(np.concatenate(values), curve),
+            height=220,
+        )
+        panels.append(Panel(joint.name, (chart,)))
+    return panels
+
+
+def _friction_limits(values: np.ndarray, curve: np.ndarray) -> tuple[float, float] | None:
+    """Return a range for values (K,) without outliers, and for the model's curve (speeds,)."""
+    values = values[np.isfinite(values)]
+    if not values.size:
+        return None
+    # the outliers are samples at reversals, if a filter or a delay shifts the measured friction
+    low, high = np.quantile(values, [1 - TUNING.bulk, TUNING.bulk])
+    room = 0.15 * (high - low) or 1.0
+    return float(np.fmin(low, np.nanmin(curve)) - room), float(np.fmax(high, np.nanmax(curve)) + room)
+
+
+def coverage_panels(
+    traces: Traces, identified: Content | None, joints: Sequence[NamedJoint], limits: Limits
+) -> list[Panel]:
+    """Return per joint the histograms of position and velocity in training and test logs, with the position limits."""
+    logs: dict[str, Content | None] = {
+        "training": (identified or {}).get("coverage"),
+        "test": traces.coverage,
+    }
+    panels = []
+    for k, joint in enumerate(joints):
+        charts = []
+        for key, quantity in (("q", "position"), ("qd", "velocity")):
+            bands = [_histogram(name, covered[key][k]) for name, covered in logs.items() if covered]
+            if not bands:  # the logs of a run have a coverage for all joints or for none
+                return []
+            marks: list[Mark] = list(bands)
+            top = max(float(np.max(band.high)) for band in bands)
+            if key == "q":
+                for bound in limits[k] or ():
+                    marks.append(Line("joint limits", (bound, bound), (0.0, top), "hold"))
+            title, height = f"{quantity} of {joint.name}", 130
+            label = "fraction of samples"
+            charts.append(line_chart(marks, title, joint.axis(quantity), label, width=300, height=height))
+        panels.append(Panel(joint.name, tuple(charts)))
+    return panels
+
+
+def _histogram(name: str, histogram: Content) -> Band:
+    """Return the outline of a histogram; the heights of the bars sum to one."""
+    counts = array(histogram["counts"])
+    # two points per bar make the steps of the outline
+    edges = np.linspace(histogram["low"], histogram["high"], len(counts) + 1)
+    heights = np.repeat(counts / max(counts.sum(), 1.0), 2)
+    style = "train" if name == "training" else "model"
+    return Band(f"{name} logs", np.repeat(edges, 2)[1:-1], np.zeros_like(heights), heights, style)
+
+
+def energy_chart(trace: TorqueTrace) -> Chart:
+    """Return the terms of the energy balance along a trajectory."""
+    styles = ("truth", "urdf", "friction", "model")
+    lines = []
+    for (name, energy), color in zip(trace.energy.items(), styles, strict=True):
+        lines.append(Line(name, trace.t, energy, color))
+    motion = f"torque {trace.which}"
+    return line_chart(lines, "Energy", "t [s]", "energy [J]", motion=motion, width=560, height=250)
