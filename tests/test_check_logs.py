@@ -271,6 +271,26 @@ def test_logs_beyond_the_bound_of_memory_are_checked_by_segments(
     assert report["samples"] == 1000
 
 
+def test_the_line_for_velocities_of_the_opposite_sense_mends_them(robots, arm, log, tmp_path):
+    """A velocity that is only too large gets no line: its unit, or the times, may be wrong."""
+    path = tmp_path / "arm.urdf"
+    path.write_bytes((robots / "rpr.urdf").read_bytes())
+    write_logs(tmp_path / "log.csv", [replace(log, qd=-log.qd)], arm.joint_names)
+
+    def wrong_velocities(qd=None):
+        loaded = load_arm(path)
+        logs = read_logs([tmp_path / "log.csv"], loaded) if qd is None else [replace(log, qd=qd)]
+        report = check_logs(logs, loaded)
+        assert report.errors == ()
+        return [x.message for x in report.findings if x.code == "velocity-is-no-derivative"]
+
+    advised = wrong_velocities()
+    assert len(advised) == 3 and all("write 'velocity: differentiated'" in x for x in advised)
+    assert not any("write" in x for x in wrong_velocities(1.3 * log.qd))
+    path.with_suffix(".yaml").write_text("logs: {velocity: differentiated}\n")
+    assert wrong_velocities() == []
+
+
 @pytest.mark.parametrize("constant", [0.0, 0.1, 5.0])
 def test_a_torque_that_never_changes_is_told(loaded, log, constant):
     """0.1 is no binary number: what is left of it is rounding, not 0."""

@@ -239,6 +239,6 @@ def test_a_bag_that_unpacks_to_no_end_is_refused(tmp_path, monkeypatch):
     assert sum(path.stat().st_size for path in (tmp_path / "bag").iterdir()) < 1_000_000
     limits = resource.getrlimit(resource.RLIMIT_AS)
     monkeypatch.setattr(bags, "MEMORY", 200_000_000)
-    with pytest.raises(LogError, match="an unreadable ROS 2 bag"):
+    with pytest.raises(LogError, match="an unreadable ROS bag"):
         read_logs(tmp_path / "bag", JOINTS)
     assert resource.getrlimit(resource.RLIMIT_AS) == limits
