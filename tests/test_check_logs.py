@@ -142,7 +142,7 @@ def test_torques_beyond_all_drives_are_errors(loaded, arm, log):
     """Where gravity says nothing: of a joint with an effort limit and torques of noise."""
     random = np.random.default_rng(0)
     coordinates = tuple(replace(each, effort=10.0) for each in arm.coordinates)
-    weak = replace(loaded, arm=replace(arm, coordinates=coordinates))
+    weak = replace(loaded, chain=replace(arm, coordinates=coordinates))
     wrong = replace(log, tau=500 * random.standard_normal(log.tau.shape))
     with pytest.raises(
         SpelgenErrors, match=r"times what the drive can give, expected Nm or N at the joint; write 'un"
@@ -163,7 +163,7 @@ def test_limits_overrun_are_said(loaded, arm, log):
 def test_noise_at_the_velocity_limit_is_no_finding(loaded, arm, log, over, codes):
     first, *others = arm.coordinates
     first = replace(first, velocity=np.abs(log.qd[:, 0]).max() / over)
-    slower = replace(loaded, arm=replace(arm, coordinates=(first, *others)))
+    slower = replace(loaded, chain=replace(arm, coordinates=(first, *others)))
     assert {x.code for x in check_logs([log], slower).findings if "velocity" in x.code} == codes
 
 
