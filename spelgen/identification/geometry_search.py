@@ -123,12 +123,17 @@ def _scaled(base: Hypothesis, factors: Sequence[np.ndarray]) -> Iterator[Hypothe
 
 
 def reordered(problem: GeometryProblem, unchanged: Fit) -> list[Fit]:
-    """Return the best orders of all columns, and of the torques, by exchanging two joints at a time."""
+    """Return the best orders of all columns, and of the torques, by exchanging two joints at a time.
+
+    Long arms have local minima: the search starts at random orders, too.
+    """
     joints = problem.arm.joint_names
     starts = [np.arange(len(joints)), np.arange(len(joints))[::-1]]
     # a message in alphabetical order has the n-th name in column n
     starts.append(np.argsort(np.argsort(joints)))
-    fits = []
+    rng = np.random.default_rng(0)
+    starts += [rng.permutation(len(joints)) for _ in range(GEOMETRY.random_orders)]
+    fits = {}
     for code in ("joint-order", "torque-order"):
         for start in starts:
             order = {"torque_source": start}
@@ -141,8 +146,8 @@ def reordered(problem: GeometryProblem, unchanged: Fit) -> list[Fit]:
                 if best.cost > fit.cost - 1.0:
                     break
                 fit = best
-            fits.append(fit)
-    return [fit for fit in fits if not np.array_equal(fit.hypothesis.torque_source, starts[0])]
+            fits[code, fit.hypothesis.torque_source.tobytes()] = fit
+    return [fit for fit in fits.values() if not np.array_equal(fit.hypothesis.torque_source, starts[0])]
 
 
 def _with_offset(problem: GeometryProblem, base: Fit, joint: int, revolute: bool) -> list[Fit]:

@@ -106,6 +106,8 @@ class GeometryTuning:
     changes: int = 3
     # Readings that a message names at most.
     named: int = 3
+    # Random orders at which the search for the order of joints starts, in addition to three plausible ones.
+    random_orders: int = 6
     # Cost of a change that is rarer than a wrong sense or order.
     rare: float = 1.0
     # For comparing all hypotheses.
