@@ -138,10 +138,11 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
     except (LogError, GeneratorExit):
         raise
     except Exception as error:  # rosbags, its storages and their decompressors raise many kinds
-        reason, do = in_one_line(error).rstrip("."), None
-        if not isinstance(error, MemoryError):
-            do = "a recording that was not closed may be repaired by `ros2 bag reindex` or `rosbag reindex`"
-        raise LogError(f"an unreadable ROS bag ({reason})", file=path, do=do) from error
+        reason = in_one_line(error).rstrip(".")
+        do = "a recording that was not closed may be repaired by `ros2 bag reindex` or `rosbag reindex`"
+        raise LogError(
+            f"an unreadable ROS bag ({reason})", file=path, do=None if isinstance(error, MemoryError) else do
+        ) from error
 
 
 def _read_by(open_bag: Callable[[Path], Any], topic: str | None, path: Path) -> Iterator[tuple[int, bytes]]:
