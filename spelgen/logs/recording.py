@@ -76,6 +76,9 @@ def _without_repeats(
     data: np.ndarray, positions: int, mapping: LogMapping
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return rows (T, C) without repeats if every row is written several times or repeats are dropped; and a note."""
+    # too short to tell motion from rest, and an archive may have thousands of them
+    if len(data) < TUNING.jump_window:
+        return data, ()
     repeats, copies = repeated_rows(data[:, 1:], positions)
     count = int(np.count_nonzero(repeats))
     if count <= TUNING.repeats * len(data):
