@@ -163,10 +163,16 @@ class TestChain:
         with pytest.raises(ArmError, match="expected the order from the root to the tip; use a,b"):
             make_arm(robot(joint("a", "0", "1"), joint("b", "1", "2")), joints=["b", "a"])
 
-    def test_floating_joint_on_the_chain_is_refused_and_off_it_held(self, robot):
-        float_ = joint("f", "0", "1", "floating")
-        with pytest.raises(ArmError, match="got a floating joint on the way to the joint 'a'"):
-            make_arm(robot(float_, joint("a", "1", "2")))
+    @pytest.mark.parametrize("kind", ["floating", "planar"])
+    def test_a_free_joint_within_the_chain_is_refused_and_another_one_held(self, robot, kind):
+        free = joint("f", "1", "2", kind)
+        with pytest.raises(ArmError, match=f"got a {kind} joint on the way to the joint 'b'"):
+            make_arm(robot(joint("a", "0", "1"), free, joint("b", "2", "3")))
+        arm = make_arm(robot(joint("f", "0", "1", kind), joint("a", "1", "2")))
+        assert (arm.joint_names, arm.locked) == (("a",), ("f",))
+        assert [x.message for x in arm.diagnostics if x.code == "locked-joint"] == [
+            f"a {kind} joint that is not part of the chain: fixed at its origin"
+        ]
         arm = make_arm(robot(joint("a", "0", "2"), joint("f", "2", "1", "floating")))
         assert arm.locked == ("f",)
 

@@ -114,21 +114,22 @@ def test_a_torque_that_is_none_is_found(loaded, arm, log, code):
 
 
 IMPOSSIBLE = {
-    "sign": (-1.0, "torques that move against gravity, -"),
-    "unit": (1e-3, "torques that move with 0.000988 times the URDF's gravity torque"),
-    "drives": (1e4, "up to 1.622e+04, 811 times what the drive can give"),
+    "sign": (-1.0, "torques of the opposite sense", "{gain: -1}"),
+    "unit": (1e-3, "torques of another unit, 0.001 times as large", "{gain: 1000}"),
+    "drives": (1e4, "torques of another unit, 1e+04 times as large", "{gain: 0.0001}"),
 }
 
 
 @pytest.mark.parametrize("case", IMPOSSIBLE)
 def test_torques_of_another_sense_or_unit_are_errors_before_anything_is_fitted(loaded, arm, log, case):
-    factor, told = IMPOSSIBLE[case]
+    factor, told, line = IMPOSSIBLE[case]
     joint, tau = loaded_joint(loaded, log), log.tau.copy()
     tau[:, joint] *= factor
     wrong = [replace(log, tau=tau)]
-    where = f"joint {arm.coordinates[joint].name!r}, tau: got {told}"
+    name = arm.coordinates[joint].name
     (error,) = check_logs(wrong, loaded).errors
-    assert str(error).startswith(where)
+    assert str(error).startswith(f"joint {name!r}: got {told}")
+    assert f"write 'joints: {{{name}: {line}}}' under 'logs'" in str(error)
     with pytest.raises(LogError) as caught:
         require_sound_logs(wrong, loaded)
     assert str(caught.value) == str(error)
@@ -141,7 +142,7 @@ def test_torques_beyond_all_drives_are_errors(loaded, arm, log):
     """Where gravity says nothing: of a joint with an effort limit and torques of noise."""
     random = np.random.default_rng(0)
     coordinates = tuple(replace(each, effort=10.0) for each in arm.coordinates)
-    weak = replace(loaded, arm=replace(arm, coordinates=coordinates))
+    weak = replace(loaded, chain=replace(arm, coordinates=coordinates))
     wrong = replace(log, tau=500 * random.standard_normal(log.tau.shape))
     with pytest.raises(
         SpelgenErrors, match=r"times what the drive can give, expected Nm or N at the joint; write 'un"
@@ -162,7 +163,7 @@ def test_limits_overrun_are_said(loaded, arm, log):
 def test_noise_at_the_velocity_limit_is_no_finding(loaded, arm, log, over, codes):
     first, *others = arm.coordinates
     first = replace(first, velocity=np.abs(log.qd[:, 0]).max() / over)
-    slower = replace(loaded, arm=replace(arm, coordinates=(first, *others)))
+    slower = replace(loaded, chain=replace(arm, coordinates=(first, *others)))
     assert {x.code for x in check_logs([log], slower).findings if "velocity" in x.code} == codes
 
 
@@ -270,6 +271,26 @@ def test_logs_beyond_the_bound_of_memory_are_checked_by_segments(
     assert report["samples"] == 1000
 
 
+def test_the_line_for_velocities_of_the_opposite_sense_mends_them(robots, arm, log, tmp_path):
+    """A velocity that is only too large gets no line: its unit, or the times, may be wrong."""
+    path = tmp_path / "arm.urdf"
+    path.write_bytes((robots / "rpr.urdf").read_bytes())
+    write_logs(tmp_path / "log.csv", [replace(log, qd=-log.qd)], arm.joint_names)
+
+    def wrong_velocities(qd=None):
+        loaded = load_arm(path)
+        logs = read_logs([tmp_path / "log.csv"], loaded) if qd is None else [replace(log, qd=qd)]
+        report = check_logs(logs, loaded)
+        assert report.errors == ()
+        return [x.message for x in report.findings if x.code == "velocity-is-no-derivative"]
+
+    advised = wrong_velocities()
+    assert len(advised) == 3 and all("write 'velocity: differentiated'" in x for x in advised)
+    assert not any("write" in x for x in wrong_velocities(1.3 * log.qd))
+    path.with_suffix(".yaml").write_text("logs: {velocity: differentiated}\n")
+    assert wrong_velocities() == []
+
+
 @pytest.mark.parametrize("constant", [0.0, 0.1, 5.0])
 def test_a_torque_that_never_changes_is_told(loaded, log, constant):
     """0.1 is no binary number: what is left of it is rounding, not 0."""
@@ -366,22 +387,23 @@ def test_negated_torques_of_an_arm_without_gravity_are_refused(robots, rate):
     assert "No findings" not in refused.text()
     assert check_logs([right[:1]], flat).errors == ()  # no rate at all
     (error,) = refused.errors
-    assert "act against acceleration" in str(error) and "--accept torque-sense" in str(error)
+    assert "all joints: got torques of the opposite sense" in str(error)
+    assert "--accept torque-sense" in str(error)
 
 
 def test_times_in_milliseconds_are_refused(loaded, log):
     with pytest.raises(SpelgenError) as caught:
         require_sound_logs([replace(log, t=1000 * log.t)], loaded)
     assert str(caught.value) == (
-        "trajectory motion, joint 'joint1': got a sample every 9.99 s, expected times in seconds; write "
-        "'units: {t: ms}' (us, ns) under 'logs' in the robot's YAML; --accept time-unit if it is right"
+        "trajectory motion, joint 'joint1': got a sample every 9.99 s, 100.1 Hz if times are in ms, expected times in "
+        "seconds; write 'units: {t: ms}' under 'logs' in the robot's YAML; --accept time-unit if it is right"
     )
 
 
 def test_gravity_of_another_mounting_is_refused(robots, tmp_path, log):
     (tmp_path / "arm.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
     (tmp_path / "arm.yaml").write_text("gravity: [0, 0, 9.81]\n")
-    with pytest.raises(SpelgenError, match="the gravity of this mounting"):
+    with pytest.raises(SpelgenError, match=r"'gravity: \[0, 0, -9.81\]' in the robot's YAML"):
         require_sound_logs([log], load_arm(tmp_path / "arm.urdf"))
 
 

@@ -145,12 +145,12 @@ def test_joints_that_follow_keep_their_limits_too(tmp_path):
 def test_a_joint_without_room_is_refused(robots, tmp_path):
     text = (robots / "two_link.urdf").read_text()
     (tmp_path / "stuck.urdf").write_text(
-        text.replace("-3.141592653589793", "0").replace("3.141592653589793", "0")
+        text.replace("-3.141592653589793", "1").replace("3.141592653589793", "1")
     )
     with pytest.raises(SpelgenErrors) as caught:
         excite(load_arm(tmp_path / "stuck.urdf"), **CHOICE, trials=1)
     assert str(caught.value).splitlines()[0] == (
-        "joint 'joint1': got the limits 0 .. 0, expected room to move; "
+        "joint 'joint1': got the limits 1 .. 1, expected room to move; "
         "correct them, or omit the joint by --joints"
     )
 

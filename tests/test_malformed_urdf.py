@@ -31,7 +31,7 @@ REFUSED = {
 READ = {
     "koch_limit_without_effort": (
         "joint_1 joint_2 joint_3 joint_4 joint_5 joint_6",
-        {"incomplete-limit"},
+        set(),
         set(),
     ),
     "so100_link_joint_same_name": (
@@ -81,7 +81,7 @@ READ = {
         set(),
         set(),
     ),
-    "floating_joint_tip": ("part1 part2 part3 part4", {"incomplete-limit", "zero-inertia"}, set()),
+    "floating_joint_tip": ("part1 part2 part3 part4", {"zero-inertia"}, set()),
     "poppy_two_geometries": ("m1 m2 m3 m4 m5 m6", {"placeholder-inertial"}, set()),
     "mg400_opened_parallelogram": (
         "mg400_j1 mg400_j2_1 mg400_j3_1 mg400_j4_1 mg400_j5",

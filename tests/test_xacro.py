@@ -1,6 +1,7 @@
 """*.xacro files are expanded by the package xacro and read like the expanded text; other files are never run."""
 
 import importlib.util
+import shutil
 import subprocess
 import sys
 import time
@@ -114,6 +115,23 @@ class TestExpansion:
         assert check(module).fresh
         (arm.parent / "parts" / "segment.xacro").write_text(SEGMENT.replace("0.02", "0.03"))
         assert f"{arm} has changed since the module was built" in check(module).reasons
+
+    @pytest.mark.parametrize("place", ["above", "beside", "without-manifest"])
+    def test_packages_above_the_file_are_found_without_ros(self, arm, tmp_path, place):
+        package = tmp_path / "ws" / ("my_arm" if place != "above" else "checkout")
+        (package / "urdf").mkdir(parents=True)
+        if place != "without-manifest":
+            (package / "package.xml").write_text("<package><name> my_arm </name></package>")
+        shutil.copytree(arm.parent / "parts", package / "urdf" / "parts")
+        (package / "urdf" / "part.xacro").write_bytes(arm.read_bytes())
+        other = tmp_path / "ws" / "app" if place == "beside" else package
+        (other / "robots").mkdir(parents=True, exist_ok=True)
+        top = other / "robots" / "top.urdf.xacro"
+        top.write_text(
+            '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="top">'
+            '<xacro:include filename="$(find my_arm)/urdf/part.xacro"/></robot>'
+        )
+        assert load_arm(top).chain.joint_names == load_arm(arm).chain.joint_names
 
     def test_the_current_folder_does_not_replace_the_package(self, arm, monkeypatch):
         (arm.parent / "xacro.py").write_text("raise SystemExit('a foreign module')")

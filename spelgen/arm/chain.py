@@ -54,8 +54,7 @@ def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) ->
     if not chain.joints:
         expected = "a serial chain of joints"
         raise ArmError("no joint that moves by itself", file=robot.source, expected=expected)
-    # a floating base would add six coordinates
-    _refuse_free_joints(robot, chain.joints[-1])
+    _refuse_free_joints(robot, chain.joints)
     return chain
 
 
@@ -87,16 +86,18 @@ def _independent(joints: Iterable[UrdfJoint]) -> tuple[UrdfJoint, ...]:
     return tuple(filter(_moves_by_itself, joints))
 
 
-def _refuse_free_joints(robot: Robot, last: UrdfJoint) -> None:
-    for joint in robot.path_to(last.parent):
-        if joint.type in ("floating", "planar"):
+def _refuse_free_joints(robot: Robot, chain: Sequence[UrdfJoint]) -> None:
+    """Raise ArmError for a floating or planar joint between the chain's joints; one below the arm is held fixed."""
+    below = robot.path_to(chain[0].parent)
+    for joint in robot.path_to(chain[-1].parent):
+        if joint.type in ("floating", "planar") and joint not in below:
             raise ArmError(
-                f"a {joint.type} joint on the way to the joint {last.name!r}",
+                f"a {joint.type} joint on the way to the joint {chain[-1].name!r}",
                 file=robot.source,
                 line=joint.line,
                 element=f"joint {joint.name!r}",
                 expected="revolute, continuous, prismatic and fixed joints there",
-                do="an arm on a moving base is out of scope: make the joint fixed, or take it out",
+                do="make the joint fixed, or take it out",
             )
 
 
@@ -169,12 +170,10 @@ def _longest(robot: Robot) -> ChainChoice:
         jaws = ", ".join(repr(chain[-1].name) for chain in longest)
         message = f"{jaws} slide side by side at the end of the chain: taken as a gripper's and locked"
         return ChainChoice(longest[0][:-1], (_remark(longest[0][-1], "info", message),))
-    # an effort of 0 marks joints without a drive
-    driven = [chain for chain in longest if all(joint.effort != 0 for joint in chain)]
+    # nothing drives a joint without an effort limit, which is 0 in the file
+    driven = [chain for chain in longest if all(joint.effort is not None for joint in chain)]
     if len(driven) == 1:
-        message = (
-            f"{len(longest)} chains of {length} joints: the only one without a joint of effort 0 is taken"
-        )
+        message = f"{len(longest)} chains of {length} joints: the only one with effort limits of all joints is taken"
         return ChainChoice(driven[0], (_remark(driven[0][-1], "warning", message),))
     raise _ambiguous(robot, longest)
 

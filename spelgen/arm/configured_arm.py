@@ -36,6 +36,12 @@ class Arm:
         sources = (self.robot, self.chain, self.actuation, self.settings)
         return tuple(item for source in sources for item in source.diagnostics)
 
+    @property
+    def turning_joints(self) -> tuple[str, ...]:
+        """Names of the revolute joints without position limits."""
+        joints = self.chain.coordinates
+        return tuple(x.name for x in joints if x.joint_type == "revolute" and x.limits is None)
+
     def __repr__(self) -> str:
         joints = counted(len(self.chain.coordinates), "joint")
         return f"<Arm {self.chain.name!r}: {joints} of {self.robot.path.name}>"

@@ -131,7 +131,7 @@ def _locked_remarks(following: Mapping[str, Leader], locked: Sequence[UrdfJoint]
         if joint.mimic is not None:
             message = f"follows {followed.leader.name!r}: locked at {float(followed.offset):g}"
         else:
-            message = f"a {joint.type} joint off the chain: locked at its origin"
+            message = f"a {joint.type} joint that is not part of the chain: fixed at its origin"
         yield _info("locked-joint", joint, message)
 
 

@@ -189,7 +189,7 @@ def _suggested(paths: list[Path], arm: Arm, file: Path) -> Path:
 
     logs, errors = log_files(paths)
     collect(errors)
-    suggestion = suggest_mapping(logs[0], arm.chain.joint_names)
+    suggestion = suggest_mapping(logs[0], arm.chain.joint_names, commands=arm.settings.input == "position")
     say(f"wrote {write_text(file, suggestion.text)}; check it, then pass it by --mapping")
     if suggestion.missing:
         note(f"no column was found for {', '.join(suggestion.missing)}; write their names into {file}")

@@ -80,14 +80,14 @@ def train(
     """
     start_time = time.monotonic()  # max_minutes counts from here, reading of logs included
     # before anything is read: a misspelt key costs no time
-    request = Request(objective, read_assignments(assignments or []))
+    request, recorded = Request(objective, read_assignments(assignments or [])), None
     if source is not None:
         from spelgen.fitting.run_folder import RunFolder
 
         if module is not None:
             extra_logs = [module, *(extra_logs or [])]  # with --from, all arguments are logs
         run = RunFolder(source)
-        run.read_record()  # raises an error if there is no run
+        recorded = run.read_record().mapping  # raises an error if there is no run
         robot = robot or (run.urdf if run.urdf.exists() else None)
         request = _warm_start(request)
     elif "adapt" in request.values:
@@ -105,7 +105,7 @@ def train(
 
     # the mapping may contain all joints of a URDF, and logs are checked with the arm
     arm = None if urdf is None else arm_of_spec(spec, urdf)
-    log_mapping = options.log_mapping(arm or spec.joint_names, mapping or start.mapping, accept)
+    log_mapping = options.log_mapping(arm or spec.joint_names, mapping or start.mapping or recorded, accept)
     # torch is imported after the checks above, which therefore report errors without delay
     from spelgen.fitting.fit import RunOptions
     from spelgen.fitting.train import train as train_files

@@ -20,14 +20,14 @@ from spelgen.runtime.parts import Row
 from spelgen.runtime.port_hamiltonian import applied
 
 
-def body_chain(arm: Chain) -> BodyChain:
-    """Return the kinematics of the bodies of an arm."""
+def body_chain(arm: Chain, gravity: Row | None = None) -> BodyChain:
+    """Return the kinematics of the bodies of an arm; gravity [m/s^2]: by default the arm's."""
     rows: list[tuple[Any, ...]] = []
     for body in arm.bodies:
         placement = [(*_row(row), float(x)) for row, x in zip(body.rotation, body.translation, strict=True)]
         is_revolute, ratio = body.joint_type == "revolute", float(body.multiplier)
         rows.append((body.parent, body.coordinate, is_revolute, ratio, body.offset, placement))
-    return BodyChain(len(arm.coordinates), _row(arm.gravity), *zip(*rows, strict=True))
+    return BodyChain(len(arm.coordinates), gravity or _row(arm.gravity), *zip(*rows, strict=True))
 
 
 def regressor(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:

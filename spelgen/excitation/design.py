@@ -142,7 +142,7 @@ def excite(
         harmonics = max(TUNING.min_harmonics, round(TUNING.harmonics_per_second * duration))
     elif harmonics < 2:
         raise SettingsError(repr(harmonics), element="excite: harmonics", expected="2 or more")
-    bounds = motion_bounds(arm.chain, reach, speed, arm.robot.joint)
+    bounds = motion_bounds(arm.chain, reach, speed, arm.robot.joint, arm.settings.simulation.positions)
     trajectory = ExcitationTrajectory(duration, harmonics, bounds)
     criterion = Criterion(arm.chain, trajectory)
     starts = np.random.default_rng(seed).standard_normal((TUNING.starts, trajectory.size))

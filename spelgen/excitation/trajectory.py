@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import cos, pi
+from math import cos, nan, pi
 
 import numpy as np
 import torch
@@ -22,8 +22,6 @@ from spelgen.urdf.robot import UrdfJoint
 GRID_RATIO = cos(pi / TUNING.grid)
 # Speed limits of joints without a velocity limit [rad/s], [m/s].
 SPEEDS = {"revolute": TUNING.revolute_speed, "prismatic": TUNING.prismatic_speed}
-# Largest distance from 0 of joints without position limits [rad], [m].
-HALF_RANGES = {"revolute": pi, "prismatic": TUNING.prismatic_range}
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,17 +34,22 @@ class MotionBounds:
 
 
 def motion_bounds(
-    arm: Chain, range_fraction: float, speed_fraction: float, joints: Mapping[str, UrdfJoint] | None = None
+    arm: Chain,
+    range_fraction: float,
+    speed_fraction: float,
+    joints: Mapping[str, UrdfJoint] | None = None,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
 ) -> MotionBounds:
     """Return the central fraction of the position ranges, and a fraction of the velocity limits.
 
-    joints: of the URDF by name, so that <mimic> joints keep their own limits. Raises ArmError for a joint whose limits
-    are not increasing.
+    joints: of the URDF by name, so that <mimic> joints keep their own limits. ranges: of joints by name, in place of
+    their limits; continuous joints without a range move by half a turn to both sides. Raises ArmError for a joint
+    without a range, or whose limits are not increasing.
     """
     limits, speeds = np.zeros((len(arm.coordinates), 2)), np.zeros(len(arm.coordinates))
     for k, coordinate in enumerate(arm.coordinates):
-        half = HALF_RANGES[coordinate.joint_type]
-        limits[k] = sorted(coordinate.limits or (-half, half))
+        default = (-pi, pi) if coordinate.continuous else (nan, nan)
+        limits[k] = sorted((ranges or {}).get(coordinate.name) or coordinate.limits or default)
         speeds[k] = coordinate.velocity or SPEEDS[coordinate.joint_type]
     for body in arm.bodies:
         k, factor = body.coordinate, float(body.multiplier)
@@ -60,7 +63,13 @@ def motion_bounds(
             speeds[k] = min(speeds[k], mimic.velocity / abs(factor))
     errors: list[SpelgenError] = []
     for coordinate, (low, high) in zip(arm.coordinates, limits, strict=True):
-        if not low < high:
+        if np.isnan(low):
+            line = f"simulation: {{positions: {{{coordinate.name}: [LOWEST, HIGHEST]}}}}"
+            errors.append(ArmError(
+                "no position limits", element=f"joint {coordinate.name!r}", expected="a range to move in",
+                do=f"write '{line}' into the robot's YAML",
+            ))  # fmt: skip
+        elif not low < high:
             errors.append(ArmError(
                 f"the limits {low:g} .. {high:g}", element=f"joint {coordinate.name!r}",
                 expected="room to move", do="correct them, or omit the joint by --joints",

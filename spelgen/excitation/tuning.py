@@ -30,8 +30,6 @@ class ExcitationTuning:
     grid: int = 40
     # [m/s] Speed limit of prismatic joints without a velocity limit.
     prismatic_speed: float = 0.25
-    # [m] Largest distance from 0 of prismatic joints without position limits.
-    prismatic_range: float = 0.5
 
 
 TUNING = ExcitationTuning()

@@ -108,6 +108,9 @@ class _Fitting:
             self.notes += objective.begin()
             self.run.start(required_spec(request.model), request.urdf, force=request.options.force)
             self._save()
+            mapping = self.record.mapping.model_dump(mode="json", exclude_defaults=True)
+            if mapping:
+                write_json(self.run.mapping, mapping)
             write_json(self.run.config, self.record.to_dict())  # from now on it is a run and can be resumed
         status = self._run()
         model, checkpoint = request.model, Checkpoint.model_validate(objective.checkpoint())

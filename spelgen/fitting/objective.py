@@ -179,10 +179,7 @@ def new_record(request: FitRequest, prepared: PreparedLogs) -> Record:
     config, fraction = prepared.config, None
     if prepared.validation and isinstance(request.validation, float):
         fraction = request.validation
-    scales = {}
-    if prepared.scales is not None:
-        scales["scales"] = {name: x.tolist() for name, x in prepared.scales._asdict().items()}
-    return Record(
+    record = Record(
         schema=2,
         robot=spec.robot if spec else type(model).__name__,
         preset=spec.options.preset if spec else None,
@@ -200,5 +197,8 @@ def new_record(request: FitRequest, prepared: PreparedLogs) -> Record:
         mapping=request.options.mapping or LogMapping(input=input_of(model)),
         device=request.options.device,
         threads=request.options.threads,
-        **scales,
     )
+    if prepared.scales is None:
+        return record
+    scales = {name: x.tolist() for name, x in prepared.scales._asdict().items()}
+    return record.model_copy(update={"scales": scales})

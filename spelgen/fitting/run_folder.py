@@ -25,9 +25,10 @@ LARGEST_STATE = 2**29  # bytes of model.pt or checkpoint.pt, unpacked
 class RunFolder:
     """The files of one training run.
 
-    spec: specification of the model. urdf, settings: of its robot, where known. config: how it was trained. metrics:
-    a line per epoch. checkpoint: everything needed to resume. weights: the best state_dict so far. evaluation: what
-    `evaluate` found. baseline: baselines fitted to the training logs, and the coverage of these.
+    spec: specification of the model. urdf, settings: of its robot, where known. mapping: of logs with names and units
+    of their own, as --mapping takes it. config: how it was trained. metrics: a line per epoch. checkpoint: everything
+    needed to resume. weights: the best state_dict so far. evaluation: results of `evaluate`. baseline:
+    baselines fitted to the training logs, and the coverage of these.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -35,6 +36,7 @@ class RunFolder:
         self.spec = self.path / "spec.json"
         self.urdf = self.path / "robot.urdf"
         self.settings = self.path / "robot.yaml"
+        self.mapping = self.path / "mapping.yaml"
         self.config = self.path / "config.json"
         self.metrics = self.path / "metrics.jsonl"
         self.checkpoint = self.path / "checkpoint.pt"
@@ -62,8 +64,8 @@ class RunFolder:
         robot = self._robot_files(urdf)  # before anything is removed: they may be this very run's copies
         # first what makes it a run
         old_files = (
-            self.config, self.urdf, self.settings, self.metrics, self.checkpoint, self.weights, self.evaluation,
-            self.baseline,
+            self.config, self.urdf, self.settings, self.mapping, self.metrics, self.checkpoint, self.weights,
+            self.evaluation, self.baseline,
         )  # fmt: skip
         for old in old_files:
             remove(old)
@@ -161,6 +163,9 @@ class RunFolder:
         return assemble(self.read_spec())
 
 
+SERVO_LIMIT = "servo.limit"
+
+
 def _require_unpacked_size(path: Path) -> None:
     """Raise ValueError where tensors would fill the memory: torch itself takes what a file says of their sizes."""
     with ZipFile(path) as archive:
@@ -178,7 +183,8 @@ def _require_finite(weights: Content, path: Path) -> None:
         # a shape may repeat a few numbers to any size
         if tensor.numel() * tensor.element_size() > stored.nbytes():
             tensor = tensor.new_empty(0).set_(stored)
-        if not tensor.isfinite().all():
+        # a servo without an effort limit has an infinite one
+        if tensor.isnan().any() or (name != SERVO_LIMIT and tensor.isinf().any()):
             raise RunError(
                 "no finite numbers", file=path, element=name, expected="weights", do="start a new run"
             )

@@ -37,7 +37,7 @@ class Record(BaseModel):
     config: the options that apply to the model; its type is that of the objective. joints: names in the order of q.
     validation_fraction: None if validation logs were given. data_digest: SHA-256 of all numbers of the logs. training,
     validation: names of the logs. scales: of the validation loss. mapping: with which the logs were read. servo:
-    parameters of position servos with intervals, when such a fit is finished.
+    parameters of position servos with intervals, when such a fit is finished. notes: messages of a fit to torques.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -61,6 +61,7 @@ class Record(BaseModel):
     device: str = "cpu"
     threads: int = 1
     servo: Content | None = None
+    notes: list[str] = []
 
     @field_validator("config", mode="before")
     @classmethod

@@ -1,17 +1,16 @@
-"""Find what logs show of drives that no file says: motors that move several joints, and wrong torques.
+"""Find couplings of motors that no file states, by least squares with rate-only friction on a subset of all samples.
 
-Both are asked of least squares with friction without memory, on samples of all logs, thinned. The products of its
-columns are formed once; a candidate has other columns of one or two joints. The best candidate counts if it explains
-the torques better in blocks of time that the parameters were not fitted to.
+The products of the regressor's columns are formed once; a candidate has other columns of two joints. The best candidate
+counts if it explains the torques better in blocks of time that the parameters were not fitted to.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
-from itertools import combinations_with_replacement, permutations
+from itertools import permutations
 from typing import Literal
 
 import numpy as np
@@ -22,7 +21,7 @@ from spelgen.arm.actuation import Drives
 from spelgen.dynamics.body_regressor import chain_regressor
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.identification.drive_samples import DriveSamples
-from spelgen.identification.least_squares import block_products, normal_solution
+from spelgen.identification.least_squares import block_products, normal_solution, varying
 from spelgen.identification.tuning import HINTS, TUNING
 from spelgen.logs.tuning import SAMPLES
 from spelgen.runtime.body_chain import BodyChain
@@ -32,9 +31,9 @@ FRICTION = FrictionModel(coulomb_smoothing_velocity=SAMPLES.moving)
 
 @dataclass(frozen=True)
 class Coupling:
-    """The motor of `joint` turns `ratio` times as fast with `moved_by` beside its own joint.
+    """The motor of `joint` turns with its own joint and, `ratio` times as fast, with `moved_by`.
 
-    logged_at: whether the logged torques are those of the joints, or of the motors (in the joints' units).
+    logged_at: place of the logged torques: the joints, or the motors (in the joints' units).
     """
 
     joint: int
@@ -46,15 +45,6 @@ class Coupling:
     def pair(self) -> list[int]:
         """Return both joints."""
         return [self.joint, self.moved_by]
-
-
-@dataclass(frozen=True)
-class WrongTorque:
-    """Say why the torques of a joint cannot be right: `code` of what may be accepted, `got` in an error."""
-
-    joint: int
-    code: str
-    got: str
 
 
 def drive_rows(
@@ -78,7 +68,7 @@ def drive_problem(chain: BodyChain, drives: Drives, samples: DriveSamples) -> Dr
 
 @dataclass(frozen=True, eq=False)
 class DriveProblem:
-    """Hold least squares of the torques of n joints by K parameters, in B blocks of time.
+    """Least squares of the torques of n joints by K parameters, in B blocks of time.
 
     speeds: C, (n, n), of the motors, by the couplings that are known. rows: (S, n, K + 1), of each joint the columns of
     the parameters and the torque. products: (n, B, K + 1, K + 1), of these. size: (n,) of the squares of the torques.
@@ -103,33 +93,25 @@ class DriveProblem:
     @property
     def free(self) -> list[int]:
         """Return the joints that no known coupling joins and whose torques vary."""
-        joins, tau = self.speeds != 0, self.rows[..., -1]
-        # what is no more than a constant with rounding shows nothing
-        varies = tau.std(axis=0) > TUNING.negligible * np.abs(tau).max(axis=0)
-        return np.flatnonzero(varies & ((joins | joins.T).sum(axis=0) == 1)).tolist()
-
-    def with_rows(self, joints: list[int], rows: np.ndarray) -> DriveProblem:
-        """Return the same with other rows (S, k, K + 1) of k joints."""
-        products = self.products.copy()
-        products[joints] = block_products(rows, products.shape[1])
-        return replace(self, products=products)
+        joins = self.speeds != 0
+        return np.flatnonzero(varying(self.rows[..., -1]) & ((joins | joins.T).sum(axis=0) == 1)).tolist()
 
     def of_torques(self, tau: np.ndarray) -> DriveProblem:
-        """Return the same with other torques (S, n)."""
+        """Return the problem with other torques (S, n)."""
         rows = np.concatenate([self.rows[..., :-1], tau[..., None]], axis=2)
         return replace(self, rows=rows, products=block_products(rows, self.products.shape[1]))
 
     def in_one_block(self, stride: int) -> DriveProblem:
-        """Return the same on one of so many samples, in a single block: it judges by what it was fitted to."""
+        """Return the problem on every `stride`-th sample, in a single block: fitted to and tested on the same."""
         rows = self.rows[::stride]
         samples = self.samples.thinned(stride)
         return replace(self, samples=samples, rows=rows, products=block_products(rows, 1))
 
     @cached_property
     def errors(self) -> np.ndarray:
-        """Return squares (B, n) of what is left of each torque in each block, by the torque's squares.
+        """Return the squared residual (B, n) of each torque in each block, relative to the torque's square.
 
-        The parameters are those that fit all other blocks; of a single block, its own.
+        The parameters are fitted to all other blocks; for a single block, to this block.
         """
         products = self.products / np.where(self.size > 0, self.size, 1.0)[:, None, None, None]
         fitted = products.sum(axis=0)
@@ -138,19 +120,11 @@ class DriveProblem:
         solution = normal_solution(fitted, 1)
         left = np.append(solution, np.full_like(solution[:, :1], -1.0), axis=1)
         errors = left.swapaxes(1, 2) @ products @ left
-        # of torques that are explained exactly rounding is left
+        # the residual of an exact model is rounding
         return np.asarray(np.maximum(errors[..., 0, 0].T, TUNING.negligible))
 
-    def exchanged(self, joint: int, other: int) -> DriveProblem:
-        """Return the problem with the torques of two joints exchanged, of a joint and itself with the opposite sign."""
-        rows = self.rows[:, [joint, other]].copy()
-        rows[..., -1] = self.rows[:, [other, joint], -1] * (-1 if joint == other else 1)
-        size = self.size.copy()
-        size[[joint, other]] = size[[other, joint]]
-        return replace(self.with_rows([joint, other], rows), size=size)
-
     def cost(self, coupling: Coupling) -> float:
-        """Return what a coupling leaves of the errors of both joints."""
+        """Return the error ratio of both joints with a coupling."""
         errors = self.coupled(coupling).errors[:, coupling.pair].mean()
         return float(errors / self.errors[:, coupling.pair].mean())
 
@@ -167,31 +141,17 @@ class DriveProblem:
         rows[:, 1, of_motor] = ratio * columns
         if coupling.logged_at == "motors":
             rows[:, 1, -1] += ratio * rows[:, 0, -1]
-        return self.with_rows(coupling.pair, rows)
-
-
-def find_wrong_torques(problem: DriveProblem, joints: Sequence[str]) -> WrongTorque | None:
-    """Return what is surely wrong with the torques of joints: one of the other sign, or two exchanged."""
-    if problem.is_short:
-        return None
-    coarse = problem.in_one_block(HINTS.coarse)
-    candidates = list(combinations_with_replacement(range(len(joints)), 2))
-    k, other = min(candidates, key=lambda pair: float(coarse.exchanged(*pair).errors.mean()))
-    logged, changed = problem.errors.mean(axis=1), problem.exchanged(k, other).errors.mean(axis=1)
-    if not _is_sure(logged, changed, HINTS.wrong_gain, len(candidates)):
-        return None
-    if k == other:
-        return WrongTorque(k, "torque-sense", f"torques of the opposite sign (tau of {joints[k]!r})")
-    got = f"the torques of {joints[other]!r}, and that joint has those of {joints[k]!r}"
-    return WrongTorque(k, "torque-order", got)
+        products = self.products.copy()
+        products[coupling.pair] = block_products(rows, products.shape[1])
+        return replace(self, products=products)
 
 
 def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
-    """Return the coupling between two neighbours' motors that explains torques best, and what it leaves of the error.
+    """Return the coupling between two neighbours' motors that explains torques best, and the error ratio.
 
-    None: none is sure. Joints that known couplings join are left alone.
+    None: none is significant. Joints of known couplings are not searched.
     """
-    # all pairs on few samples: the ratio need not be exact to stand out
+    # all pairs on few samples: a coupling is visible with an approximate ratio
     coarse = problem.in_one_block(HINTS.coarse)
     candidates: list[Coupling] = []
     for joint, moved_by in permutations(problem.free, 2):
@@ -227,10 +187,10 @@ def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coup
 
 
 def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: int) -> bool:
-    """Whether errors by block (B,) fell to this part of what they were, and not as the luckiest of some candidates."""
+    """Whether errors per block (B,) fell below the fraction `gain`, significantly for the best of some candidates."""
     if mended.mean() >= gain * logged.mean():
         return False
-    # between -1 and 1: neither a block that is hard to tell nor one that all but vanishes counts more than others
+    # between -1 and 1, so that no single block dominates
     gains = (logged - mended) / (logged + mended)
     standard_error = gains.std(ddof=1) / np.sqrt(len(gains))
     # of hundreds of couplings one is always better by chance (Bonferroni's bound)

@@ -45,6 +45,11 @@ def reduce(blocks: Iterable[Columns]) -> Triangles:
     return Triangles(np.asarray(factors), count, deviation)
 
 
+def varying(tau: np.ndarray) -> np.ndarray:
+    """Whether torques (S, n) vary by more than the rounding of a constant, (n,)."""
+    return np.asarray(tau.std(axis=0) > TUNING.negligible * np.abs(tau).max(axis=0))
+
+
 def block_products(rows: np.ndarray, blocks: int) -> np.ndarray:
     """Return the Gram matrices (n, blocks, C, C) of the columns of rows (S, n, C), per joint and block of time.
 
@@ -95,7 +100,7 @@ class Solution:
 
 
 def solve(triangles: Triangles, weights: np.ndarray, columns: np.ndarray) -> Solution:
-    """Return the parameters that minimize the weighted squared residual; those of minimum norm if it is singular.
+    """Return the parameters that minimize the weighted squared residual; of minimum norm if it is singular.
 
     Args:
         triangles: of the samples.

@@ -15,7 +15,7 @@ from spelgen.dynamics.friction import FrictionModel
 from spelgen.errors import Diagnostic
 from spelgen.identification.drive_hints import Coupling, DriveProblem, drive_problem, find_coupling
 from spelgen.identification.drive_samples import SHIFTS, DriveLog
-from spelgen.identification.least_squares import block_products, normal_solution
+from spelgen.identification.least_squares import block_products, normal_solution, varying
 from spelgen.identification.tuning import HINTS, TUNING
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
@@ -85,7 +85,7 @@ def delay_of(problem: DriveProblem) -> TorqueDelay:
     late, coupling = _likely_delay(problem), find_coupling(problem)
     if coupling is None:
         return late
-    # torques that are late pass for a coupling, too, and no longer once they are moved
+    # delayed torques may be confounded with a coupling, until they are shifted
     moved = problem.of_torques(problem.samples.torques @ _spline(late.delay))
     if late.delay and find_coupling(moved) is None:
         return late
@@ -95,11 +95,11 @@ def delay_of(problem: DriveProblem) -> TorqueDelay:
 def _likely_delay(problem: DriveProblem) -> TorqueDelay:
     """Return the delay that least squares with and without friction's memory both show, where both fit.
 
-    The value is that of the form of friction that leaves less of the torque.
+    The value is from the form of friction with the smaller residual.
     """
     samples = problem.samples
     tau = samples.torques
-    if tau.std(axis=0).max() <= TUNING.negligible * np.abs(tau).max():  # a constant, with rounding
+    if not varying(problem.rows[..., -1]).any():
         return NO_DELAY
     estimates = []
     # dry friction with and without memory, through the filter of the torques: a delay that only one form shows is its
@@ -107,7 +107,7 @@ def _likely_delay(problem: DriveProblem) -> TorqueDelay:
     for dry in (samples.bent, samples.direction[..., None]):
         friction = FRICTION.columns(samples.qd, samples.qdd, dry, problem.speeds)
         estimates.append(_estimate(np.concatenate([problem.bodies, friction, tau], axis=2)))
-    # a lag of friction passes for one of torques with memory, not without: its errors are alike to both sides
+    # a lag of friction resembles a delay with memory, but not without: its errors are symmetric
     memory, direct = estimates
     likely = [direct]
     if memory.squares <= HINTS.unlikely_form * direct.squares:
@@ -123,7 +123,7 @@ def _likely_delay(problem: DriveProblem) -> TorqueDelay:
 def _estimate(rows: np.ndarray) -> _Estimate:
     """Return the delay of least squares by rows (S, n, K + D), the last of which are torques moved by `SHIFTS`.
 
-    The standard error is that of a jackknife over blocks of time, for what a model misses errs alike for long.
+    The standard error is from a jackknife over blocks of time: model errors are correlated over seconds.
     """
     products = block_products(rows, HINTS.blocks)
     deviation = rows[..., -len(SHIFTS) :].std(axis=(0, 2))
@@ -136,14 +136,14 @@ def _estimate(rows: np.ndarray) -> _Estimate:
         squares = unexplained @ products.sum(axis=1) @ unexplained
         noise = np.sqrt(np.maximum(squares / len(rows), np.square(TUNING.least_noise * least)))
     spread = np.var([_least(total - block)[0] for block in by_block]) * (HINTS.blocks - 1)
-    # nothing says that it ends at the last shift; where no error is left too few samples were fitted
+    # beyond the last shift the delay is unknown; without any residual there are too few samples
     unknown = abs(delay) > SHIFTS[-2] or spread == 0
     standard_error = np.inf if unknown else float(np.sqrt(spread))
     return _Estimate(delay, standard_error, float((squares / least**2).sum()))
 
 
 def _least(products: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the delay of the least squares by products (K + D, K + D), and what is unexplained then, (K + D,).
+    """Return the delay of the least squares by products (K + D, K + D), and the residual's coefficients, (K + D,).
 
     Between shifts a torque is a cubic in the shift: filtered torques are smooth over one step.
     """
@@ -166,5 +166,5 @@ _cardinal = CubicSpline(SHIFTS, np.eye(len(SHIFTS)))
 
 
 def _spline(delay: float) -> np.ndarray:
-    """Return what of each torque (D,) a torque moved by a delay is."""
+    """Return the weights (D,) of the shifted torques in a torque shifted by a delay."""
     return np.asarray(_cardinal(delay))

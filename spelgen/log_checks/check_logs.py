@@ -1,9 +1,9 @@
-"""Report all that logs show beside a robot, and what is odd about it."""
+"""Report the content of the logs of a robot, and findings about it."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,16 +11,22 @@ import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic, LogError, collect
-from spelgen.identification.drive_hints import Coupling, drive_problem, find_wrong_torques
-from spelgen.identification.drive_samples import DriveLog
+from spelgen.identification.drive_hints import Coupling, drive_problem
+from spelgen.identification.drive_samples import DriveLog, DriveSamples
+from spelgen.identification.geometry_search import compare_readings
+from spelgen.identification.least_squares import varying
+from spelgen.identification.log_geometry import Fit, GeometryProblem, MotionSamples
 from spelgen.identification.torque_delay import delay_of
+from spelgen.identification.tuning import HINTS
 from spelgen.listing import Listing, number
 from spelgen.log_checks.check_servo_logs import ServoLogs
-from spelgen.log_checks.gravity import find_opposed_inertia, fit_gravity, joined, state_samples
+from spelgen.log_checks.gravity import fit_gravity, joined, state_samples
+from spelgen.log_checks.remedies import GEOMETRY_CODES, Remedies, mapped_reading
 from spelgen.log_checks.report import JointReport, LogReport, joint_report, percent, signal_tables
-from spelgen.log_checks.robot_checks import CHECKS, SENSE, JointEvidence
+from spelgen.log_checks.robot_checks import CHECKS, WITHOUT_GRAVITY, JointEvidence, torque_factors
 from spelgen.log_checks.statistics import Statistics, statistics
 from spelgen.log_checks.tuning import TUNING
+from spelgen.logs.bags import BAG
 from spelgen.logs.checks import Findings, LogChecks, run_checks
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
@@ -30,27 +36,27 @@ if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
     from spelgen.settings.log_mapping import LogMapping
 
-ORDER = replace(
-    SENSE, code="torque-order", expected="its own", do="change the names of the columns under 'logs'"
-)
-COUPLED = "coupled-motors"
-WRONG_TORQUES = {"torque-sense": SENSE, "torque-order": ORDER}
-ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED}
+COUPLED, WRONG_VELOCITY, WRONG_LINK = "coupled-motors", "velocity-is-no-derivative", "urdf-inertials"
+ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED, WRONG_LINK, *GEOMETRY_CODES}
 
 
 def check_logs(logs: Iterable[Trajectory], arm: Arm, mapping: LogMapping | None = None) -> LogReport:
     """Report all about the logs of an arm, read once, one trajectory after another; nothing is repaired or raised.
 
-    The report's `errors` prevent training. mapping: that of the logs, by default from the arm's settings; units that
-    it declares and errors that it accepts are not checked. The arm's input matrix converts logged torques to those of
-    the joints. Raises LogError without any trajectory, or with one of another number of joints, and
-    where an arm's settings say 'input: position', without commands.
+    The report's `errors` prevent training. mapping: of the logs, by default from the arm's settings; units that
+    it declares and errors that it accepts are not checked. The arm's input matrix converts logged torques to joint
+    torques. Raises LogError without any trajectory, for another number of joints, and without commands if the
+    arm's settings have 'input: position'.
     """
     joints = arm.chain.joint_names
     checked: TorqueLogs | ServoLogs = TorqueLogs(arm, mapping or arm.settings.logs)
     if arm.settings.input == "position":
         checked = ServoLogs(arm)
-    log_checks = LogChecks(joints, arm.chain.joint_types)
+    types = [
+        "continuous" if x.joint_type == "revolute" and x.limits is None else x.joint_type
+        for x in arm.chain.coordinates
+    ]
+    log_checks = LogChecks(joints, types)
     measured: list[Statistics] = []
     examples: list[Trajectory] = []
     # one after another: a stream of logs may be larger than memory
@@ -82,22 +88,23 @@ def check_logs(logs: Iterable[Trajectory], arm: Arm, mapping: LogMapping | None 
 def require_sound_logs(
     logs: Sequence[Trajectory], arm: Arm, mapping: LogMapping | None = None
 ) -> list[Diagnostic]:
-    """Return what `check_logs` finds of logs beside their arm; raise LogError where they cannot be trained on."""
-    # the same checks as the command, so that a fit refuses what `spelgen logs` refuses
+    """Return the findings of `check_logs` about an arm and its logs; raise LogError where they cannot be trained on."""
+    # the same checks as the command: a fit and `spelgen logs` refuse the same logs
     report = check_logs(logs, arm, mapping)
     collect(report.errors)
-    # a fit itself tells what logs show without the arm, and finds the delay of torques
+    # a fit itself reports checks that need no arm, and finds the delay of torques
     return [note for note in report.findings if note.code in ABOUT_ARM]
 
 
 class TorqueLogs:
-    """Check logs of torques beside their arm, from samples that are kept while the logs go by."""
+    """Check logs of torques with the model of their arm, from samples that are kept while the logs go by."""
 
     def __init__(self, arm: Arm, mapping: LogMapping) -> None:
         self._arm, self._mapping, self._drives = arm, mapping, arm.actuation.drives()
         self._samples: list[np.ndarray] = []
         self._moving = DriveLog(arm.chain.joint_types, self._drives, Preprocessing())
         self._declared: list[set[str]] = []
+        self._seconds, self._is_bag = 0.0, False
 
     def add(self, trajectory: Trajectory) -> None:
         """Take in a trajectory. Raises LogError without torques."""
@@ -105,53 +112,93 @@ class TorqueLogs:
         self._samples.append(state_samples(trajectory, self._drives.inputs))
         self._moving.add(trajectory)
         self._declared.append(set(trajectory.accepted))
+        self._seconds += trajectory.duration
+        if trajectory.file is not None:
+            self._is_bag |= trajectory.file.suffix in BAG.suffixes or (trajectory.file / BAG.marker).exists()
 
     def check(
         self, reports: Sequence[JointReport], summary: Findings
     ) -> tuple[list[JointReport], tuple[Listing, ...]]:
-        """Return the reports with what gravity explains, and tables; add what is odd to the summary."""
-        # what files declare by themselves holds where all of them do
+        """Return the reports with gravity's part in the torques, and tables; add the findings to the summary."""
+        # a code that files declare holds if all of them declare it
         accepted = set(self._mapping.accept) | set.intersection(*self._declared)
         motion = joined(self._samples)
         completed = []
         fits = fit_gravity(self._arm.chain, motion)
-        for coordinate, report, gravity in zip(self._arm.chain.coordinates, reports, fits, strict=True):
+        for report, gravity in zip(reports, fits, strict=True):
             completed.append(replace(report, gravity=gravity))
-            passed = accepted
-            # a unit that somebody wrote down is taken as right
-            if self._mapping.unit("tau", coordinate.name) is not None:
-                passed = accepted.union(UNIT_CODES)
-            where = f"joint {coordinate.name!r}"
-            for check, message in run_checks(CHECKS, JointEvidence(coordinate, completed[-1]), passed):
+        evidence = list(map(JointEvidence, self._arm.chain.coordinates, completed))
+        # with wrong velocities friction is wrong too, and hints about drives would be wrong with wrong torques
+        has_errors = bool(summary.errors)
+        is_sound = not has_errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
+        moving = self._moving.samples()
+        is_right = not is_sound or self._is_read_right(moving, motion, evidence, accepted, summary)
+        if is_sound and is_right and moving is not None:
+            self._check_drives(moving, summary)
+        for joint in evidence:
+            passed = accepted | {code for code in UNIT_CODES if self._is_declared(joint.coordinate.name)}
+            if has_errors or not is_right:  # one cause, one message
+                passed |= {"torque-beyond-drive", WITHOUT_GRAVITY}
+            where = f"joint {joint.coordinate.name!r}"
+            for check, message in run_checks(CHECKS, joint, passed):
                 summary.add(check, message, f"{where}, tau" if check.severity == "error" else where)
-        # beside wrong velocities friction is wrong too, and of wrong torques hints about drives would be wrong
-        if not any(note.code == "velocity-is-no-derivative" for note in summary.notes):
-            self._check_together(motion, accepted, summary)
         return completed, (*signal_tables(completed, QUANTITIES), _physics_table(completed))
 
-    def _check_together(self, motion: np.ndarray, accepted: set[str], summary: Findings) -> None:
-        """Add what is wrong with the torques of all joints together, or else a coupling of motors, or else a delay.
+    def _is_declared(self, joint: str) -> bool:
+        """Whether the mapping states the unit of a joint's torque."""
+        return self._mapping.unit("tau", joint) is not None
 
-        motion: samples (4, S, n), see `state_samples`.
+    def _is_read_right(
+        self,
+        moving: DriveSamples | None,
+        motion: np.ndarray,
+        joints: Sequence[JointEvidence],
+        accepted: set[str],
+        summary: Findings,
+    ) -> bool:
+        """Whether no other reading of the columns explains the torques better; add the finding if one does.
+
+        moving: filtered samples; None: the logs are too slow for accelerations, and motion (4, S, n) is used.
         """
-        arm, joints, drives = self._arm.chain, self._arm.chain.joint_names, self._drives
-        if not summary.errors and SENSE.code not in accepted:
-            opposed = find_opposed_inertia(arm, motion, drives.speeds)
-            if opposed is not None:
-                summary.add(SENSE, opposed, "tau")
-        moving = self._moving.samples()
-        if moving is None or summary.errors:
-            return
-        problem = drive_problem(body_chain(arm), drives, moving)
-        wrong = find_wrong_torques(problem, joints)
-        if wrong is not None and wrong.code not in accepted:
-            summary.add(WRONG_TORQUES[wrong.code], wrong.got, f"joint {joints[wrong.joint]!r}, tau")
-            return
-        late = delay_of(problem)
+        arm = self._arm.chain
+        q, qd, qdd, tau = motion
+        samples = MotionSamples(q, qd, qdd, tau)
+        if moving is not None:
+            samples = MotionSamples(moving.q, moving.qd, moving.qdd, moving.tau)
+        if len(samples.q) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
+            return True
+        reading = mapped_reading(arm, self._mapping, self._drives)
+        problem = GeometryProblem(arm, samples, self._drives.speeds, self._seconds, reading)
+        undeclared = [not self._is_declared(name) for name in arm.joint_names]
+        comparison = compare_readings(problem, torque_factors(joints, undeclared))
+        if not comparison.better:
+            summary.notes.extend(_link_notes(problem, comparison.unchanged))
+        if not comparison.better or set(comparison.codes) <= accepted:
+            return True
+        finding = Remedies(problem.unchanged, arm, self._mapping, self._is_bag).finding(comparison)
+        if isinstance(finding, Diagnostic):
+            summary.notes.append(finding)
+        else:
+            summary.errors.append(finding)
+        return False
+
+    def _check_drives(self, moving: DriveSamples, summary: Findings) -> None:
+        """Add a coupling of motors that the logs show, or else a delay of the torques."""
+        late = delay_of(drive_problem(body_chain(self._arm.chain), self._drives, moving))
         if late.coupling is not None:
             summary.notes.append(_coupling_hint(self._arm, *late.coupling))
         else:
             summary.notes.extend(late.notes)
+
+
+def _link_notes(problem: GeometryProblem, fit: Fit) -> Iterator[Diagnostic]:
+    """Yield a warning for each link whose inertials in the URDF are far from the log's."""
+    for k, ratio, deviation in problem.wrong_links(fit):
+        message = (
+            f"its first moment (mass times centre of mass) is {ratio:.2f} +- {deviation:.2f} times the URDF's by "
+            "least squares: check its mass and centre of mass in the URDF"
+        )
+        yield Diagnostic("warning", WRONG_LINK, f"link {problem.arm.bodies[k].link!r}", None, message)
 
 
 def _coupling_hint(arm: Arm, coupling: Coupling, remaining: float) -> Diagnostic:
@@ -178,7 +225,7 @@ def _physics_table(joints: Sequence[JointReport]) -> Listing:
     rows = []
     for joint in joints:
         fit = joint.gravity
-        # beside a low correlation the factor means nothing
+        # with a low correlation the factor means nothing
         is_seen = abs(fit.correlation or 0) > TUNING.seen
         velocity = number(joint.velocity_factor), number(joint.velocity_correlation)
         rows.append((joint.name, *velocity, percent(fit.explained), number(fit.factor if is_seen else None)))

@@ -1,4 +1,4 @@
-"""Check logs of commanded positions beside a robot: what they hold, how joints follow, and what is odd about it."""
+"""Check logs of commanded positions: contents, tracking of the commands, and anomalies."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from spelgen.listing import Listing, number
 from spelgen.log_checks.report import JointFollowing, JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
 from spelgen.log_checks.tuning import SERVO_LOGS as TUNING
-from spelgen.logs.checks import DEGREES, Findings, is_factor, run_checks
+from spelgen.logs.checks import DEGREES, Findings, run_checks
 from spelgen.logs.commands import delayed_commands
 from spelgen.logs.filtering import derivative
+from spelgen.logs.joint_signals import is_factor
 from spelgen.logs.trajectory import Trajectory, require_commands, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, SIGNALS
 
@@ -30,11 +31,11 @@ FOLLOWS = SIGNALS.agreement
 
 
 class Following(NamedTuple):
-    """Hold how n joints follow their commands.
+    """Tracking of the commands of n joints.
 
     moves: (n,) whether the command moves. delay, correlation: (n, n) of the command of the row's joint with the
-    position of the column's, at the delay [s] at which the two are most alike. gain: (n,) how far a joint moves by its
-    own command. joints: by joint.
+    position of the column's, at the delay [s] of the largest correlation. gain: (n,) ratio of a joint's motion to its
+    own command's. joints: one per joint.
     """
 
     moves: np.ndarray
@@ -79,7 +80,7 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
 
 
 def _steady_state_errors(pieces: Sequence[Trajectory]) -> list[float | None]:
-    """Return by joint nine tenths of the distances from the command while both rest; None where they never do."""
+    """Return the 90th percentile, per joint, of the distances from the command at rest; None if it never rests."""
     distances, rests = [], []
     for piece in pieces:
         u = require_commands(piece)[:-1]
@@ -102,7 +103,7 @@ def _midpoints(x: np.ndarray) -> np.ndarray:
 
 
 class ServoLogs:
-    """Check logs of commanded positions beside their arm."""
+    """Check logs of commanded positions against their arm."""
 
     def __init__(self, arm: Arm) -> None:
         self._arm = arm
@@ -116,7 +117,7 @@ class ServoLogs:
     def check(
         self, reports: Sequence[JointReport], summary: Findings
     ) -> tuple[list[JointReport], tuple[Listing, ...]]:
-        """Return the reports with how joints follow their commands, and tables; add what is odd to the summary."""
+        """Return the reports with the tracking of commands, and tables; add the findings to the summary."""
         names = self._arm.chain.joint_names
         saturation = np.full(len(names), np.inf)
         for k, coordinate in enumerate(self._arm.chain.coordinates):
@@ -149,26 +150,26 @@ class ServoLogs:
                     f"{log.sample_rate:.3g} Hz: delays and friction need {TUNING.sparse_rate:g} Hz or more"
                 )
                 summary.notes.append(Diagnostic("warning", "sparse", f"trajectory {log.name}", None, message))
-                break  # said once: logs of one robot have one rate
+                break  # reported once: logs of one robot have one rate
         return completed, (*signal_tables(completed, ("q", "u")), _following_table(completed))
 
 
 def _odd_command(
     k: int, joints: Sequence[str], report: JointReport, following: Following, is_copy: bool
 ) -> LogError | Diagnostic | None:
-    """Return what is odd about a joint's command: an error where it cannot be that of this joint.
+    """Return the finding about a joint's command: an error if it cannot be this joint's command; None without one.
 
-    is_copy: it is the position itself.
+    is_copy: the command is the position itself.
     """
     where = f"joint {joints[k]!r}"
-    # judged at the delay at which the two are most alike: a slow servo is no wrong one
+    # at the delay of the largest correlation: a slow servo is not wrong
     correlation, gain = following.correlation[k, k], following.gain[k]
     if is_copy:
         code, message = (
             "commands-are-positions",
             "u is q, to the last bit: are the commands those that were sent?",
         )
-    # what does not move follows nothing, and proves nothing wrong
+    # a constant command is evidence of nothing
     elif not following.moves[k]:
         width = report.high["u"] - report.low["u"]
         code, message = "idle-command", f"its command moves by {width:.3g} alone: its servo is not determined"

@@ -1,4 +1,4 @@
-"""Tell whether logged torques move with gravity, joint by joint, and whether all together act against inertia."""
+"""Fit the gravity of the URDF to logged torques, each joint separately."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 from scipy.linalg import orth
 
 from spelgen.arm.arm import Chain
-from spelgen.dynamics.regressor_dynamics import body_chain, regressor, urdf_parameters
-from spelgen.identification.drive_hints import drive_rows
+from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.log_checks.tuning import TUNING
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SAMPLES
@@ -20,13 +19,13 @@ MOVING = SAMPLES.moving
 
 @dataclass(frozen=True)
 class GravityFit:
-    """What gravity has to do with the torque of one joint.
+    """Gravity in the torque of one joint.
 
-    explained: part of the torque's variance, beside friction and the joint's own acceleration, that some
-    inertial values explain as gravity (0..1); None where gravity never loads the joint, where the torque never
-    changes, or where there is too little to tell. factor: by what the URDF's gravity torque must be multiplied to
-    fit best, correlation: of both, beside the same. relative_deviation: the standard deviation of the URDF's,
-    relative to that of the torque.
+    explained: part of the torque's variance, in addition to friction and the joint's own acceleration, that some
+    inertial values explain as gravity (0..1); None if gravity never loads the joint, if the torque never changes,
+    or with too few samples. factor: ratio to the URDF's gravity torque by least squares, correlation: with the URDF's
+    gravity torque, both after projection. relative_deviation: standard deviation of the URDF's gravity torque,
+    relative to the torque's.
     """
 
     explained: float | None = None
@@ -58,15 +57,15 @@ def joined(samples: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def fit_gravity(arm: Chain, motion: np.ndarray) -> list[GravityFit]:
-    """Return by joint what gravity explains of the torques of these samples, (4, S, n)."""
+    """Return the fit of gravity per joint. motion: samples (4, S, n)."""
     q, qd, qdd, tau = motion
-    # fewer cannot tell gravity from friction
+    # with fewer, gravity and friction are confounded
     if len(q) < TUNING.gravity_samples / 4:
         return [GravityFit()] * q.shape[1]
     still = np.zeros_like(q)
     rows = regressor(arm, q, still, still)  # (S, n, 10 B)
     load = rows @ urdf_parameters(arm)
-    # beside friction and the joint's own inertia, which move with gravity in a slow swing
+    # with friction and the joint's own inertia, which move with gravity in a slow swing
     friction = np.stack([np.ones_like(q), qd, np.tanh(qd / MOVING), qdd], axis=2)
     fits = []
     for joint in range(q.shape[1]):
@@ -75,35 +74,11 @@ def fit_gravity(arm: Chain, motion: np.ndarray) -> list[GravityFit]:
     return fits
 
 
-def find_opposed_inertia(arm: Chain, motion: np.ndarray, speeds: np.ndarray) -> str | None:
-    """Find torques that all have the opposite sign: by least squares the mass matrix then is negative.
-
-    motion: samples, (4, S, n). speeds: C, (n, n), of the motors. Friction does not tell: a drive may compensate it
-    after its torque was measured.
-    """
-    q, qd, qdd, tau = motion
-    if len(q) < TUNING.gravity_samples / 4 or not np.ptp(tau, axis=0).all():
-        return None
-    unit = tau.std(axis=0)
-    chain = body_chain(arm)
-    moving = drive_rows(chain, q, qd, qdd, speeds)
-    steady = drive_rows(chain, q, qd, np.zeros_like(qdd), speeds)
-    flat = (moving / unit[:, None]).reshape(tau.size, -1)
-    parameters = np.linalg.lstsq(flat, (tau / unit).ravel(), rcond=TUNING.dependent)[0]
-    inertia = (moving - steady) @ parameters
-    if not (inertia.std(axis=0) > TUNING.loaded * unit).any():
-        return None
-    product = (inertia * qdd).sum(axis=1)  # qdd^T M qdd
-    if product.sum() >= -TUNING.opposed * np.abs(product).sum():
-        return None
-    return "torques of all joints that act against acceleration"
-
-
 def _fit(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
-    """Fit a torque beside columns of friction. signals: (S, 2 + K), it, the URDF's gravity torque, and its columns."""
+    """Fit a torque with columns of friction. signals: (S, 2 + K), it, the URDF's gravity torque, and its columns."""
     remainders = _without(friction, signals)
     lengths = np.linalg.norm(remainders, axis=0)
-    # what is left of a constant torque, say, is no more than rounding
+    # the residual of a constant torque is rounding
     is_rounding = lengths <= TUNING.dependent * np.linalg.norm(signals, axis=0)
     largest = max(1.0, float(np.abs(signals[:, 2:]).max(initial=0.0)))
     is_seen = lengths[2:] > TUNING.dependent * largest * np.sqrt(len(signals))
@@ -125,6 +100,6 @@ def _fit(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
 
 
 def _without(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return what of the values (S,) or (S, K) no combination of the columns (S, C) explains."""
+    """Return the residual of the values (S,) or (S, K) after projection onto the columns (S, C)."""
     basis = orth(columns, rcond=TUNING.dependent)
     return np.asarray(values - basis @ (basis.T @ values))

@@ -1,4 +1,4 @@
-"""Tell what `check_logs` found: for a terminal, a notebook, a page or a program."""
+"""Report of `check_logs`: for a terminal, a notebook, a page or a program."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MEASURES = {"q": "position", "qd": "velocity", "tau": "torque", "u": "position"}
 
 @dataclass(frozen=True)
 class JointFollowing:
-    """Say how a joint follows its command; None where it cannot be said.
+    """Tracking of a joint's command; None if it is unknown.
 
     lag: by which positions come after commands [s]. tracking_rms: root mean square of u, delayed by the lag, less q
     [rad, m]. steady_state_error: nine tenths of the distances u - q are smaller while both rest. saturated: fraction of
@@ -40,10 +40,10 @@ class JointFollowing:
 
 @dataclass(frozen=True)
 class JointReport:
-    """One joint over all trajectories; [rad, m], [rad/s, m/s], [Nm, N]; None where it cannot be told.
+    """One joint over all trajectories; [rad, m], [rad/s, m/s], [Nm, N]; None if it is unknown.
 
     low, high, noise, steps: of q, qd and tau, or of q, qd and commands u. range_fraction: of the joint's range that was
-    visited. noise: standard deviation of what changes from sample to sample; None of sparse logs. steps: of signals
+    visited. noise: standard deviation of white noise; None for sparse logs. steps: of signals
     that are quantised in most trajectories. velocity_factor, velocity_correlation: both 1 where qd is dq/dt.
     following: of a joint under a position servo.
     """
@@ -67,7 +67,7 @@ class JointReport:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LogReport:
-    """What `check_logs` found. errors: why the logs cannot be trained on. examples: trajectories to be drawn.
+    """Findings of `check_logs`. errors: reasons why the logs cannot be trained on. examples: trajectories to be drawn.
 
     tables: about the joints.
     """
@@ -156,7 +156,7 @@ class LogReport:
 def joint_report(
     index: int, coordinate: Coordinate, measured: Sequence[Statistics], products: np.ndarray
 ) -> JointReport:
-    """Put together what all trajectories show of one joint. products: see `velocity_products`."""
+    """Return the report of one joint over all trajectories. products: see `velocity_products`."""
     low, high, noise, steps = {}, {}, {}, {}
     for name in measured[0].signals:
         lows, highs, noises, quanta = np.array([x.signals[name][:, index] for x in measured]).T
@@ -183,7 +183,7 @@ def joint_report(
 
 
 def _median(values: np.ndarray, share: float) -> float | None:
-    """Return the median of what is finite; None where that is no more than this share of all."""
+    """Return the median of the finite values; None if their fraction is at most `share`."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) > share * len(values) else None
 
@@ -204,7 +204,7 @@ def _clock_table(trajectories: Sequence[Clock], limit: int | None) -> Listing:
 
 
 def signal_tables(joints: Sequence[JointReport], quantities: Sequence[str]) -> tuple[Listing, Listing]:
-    """Return the ranges of these quantities, q and others, and what of them is noise or quantised."""
+    """Return the tables of ranges, and of noise and quantisation steps, of these quantities, q first."""
     ranges, signals = [], []
     for joint in joints:
         spans = [f"{number(joint.low[name])} .. {number(joint.high[name])}" for name in quantities]

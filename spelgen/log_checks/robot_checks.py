@@ -1,10 +1,13 @@
-"""Check logs against the robot: limits, and torques that must move with gravity."""
+"""Check logs against the robot: limits of its joints, and the size of torques relative to the URDF's gravity."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from math import inf, nan
 from typing import NamedTuple
+
+import numpy as np
 
 from spelgen.arm.arm import Coordinate
 from spelgen.labels import UNITS
@@ -14,12 +17,12 @@ from spelgen.logs.checks import Check
 from spelgen.logs.trajectory import QUANTITIES
 from spelgen.logs.tuning import SIGNALS
 
+WITHOUT_GRAVITY = "torque-without-gravity"
 SAY_UNIT = "write 'units: {tau: ...}' or a 'gain' under 'logs' in the robot's YAML; 'Nm' confirms the unit"
-TORQUE_ERRORS = ("torque-sense", "torque-unit", "torque-beyond-drive")
 
 
 class JointEvidence(NamedTuple):
-    """Hold a joint, and what all trajectories show of it: the subject of the checks against the robot."""
+    """A joint and its report over all trajectories: the subject of the checks against the robot."""
 
     coordinate: Coordinate
     report: JointReport
@@ -36,7 +39,7 @@ class JointEvidence(NamedTuple):
         fit = self.report.gravity
         # of a joint that gravity hardly loads the factor is chance
         if fit.factor is None or fit.correlation is None or (fit.relative_deviation or 0.0) < TUNING.loaded:
-            return nan, nan  # which no comparison takes for odd
+            return nan, nan  # every comparison with NaN is false
         return fit.factor, fit.correlation
 
 
@@ -64,21 +67,34 @@ def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
     return f"{limit} up to {largest:.4g} {unit}, the limit is {bound:.4g}"
 
 
-def find_opposed(seen: float, message: str, joint: JointEvidence) -> str | None:
-    """Find torques that move against gravity, beyond a correlation; message: with the factor."""
-    factor, correlation = joint.gravity_in_torque()
-    return message.format(factor) if correlation < -seen else None
+def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) -> list[np.ndarray]:
+    """Return factors (n,) that give the torques the size of the URDF's gravity: candidates for another unit.
 
-
-def find_scaled(seen: float, largest: float, message: str, joint: JointEvidence) -> str | None:
-    """Find torques that move with gravity, beyond a correlation, by too large or too small a factor.
-
-    message: with the factor and its inverse.
+    One for each joint with torques at least `TUNING.unusual_factor` times too large or too small, and one for all
+    joints together. undeclared: joints whose unit no mapping states.
     """
-    factor, correlation = joint.gravity_in_torque()
-    if correlation > seen and not 1 / largest < factor < largest:
-        return message.format(factor, 1 / factor)
-    return None
+    seen: list[float] = []
+    factors = []
+    for k, joint in enumerate(joints):
+        factor, correlation = joint.report.gravity.factor, joint.report.gravity.correlation or 0.0
+        # the factor of a joint that gravity hardly loads is chance, unless its torque is only gravity
+        is_known = joint.gravity_in_torque()[1] > TUNING.seen or correlation > SIGNALS.agreement
+        if factor is None or not (is_known and undeclared[k]):
+            continue
+        seen.append(factor)
+        if not 1 / TUNING.unusual_factor < factor < TUNING.unusual_factor:
+            single = np.ones(len(joints))
+            single[k] = _rounded(1 / factor)
+            factors.append(single)
+    if factors and all(undeclared):
+        factors.append(np.full(len(joints), _rounded(1 / float(np.median(seen)))))
+    return factors
+
+
+def _rounded(factor: float) -> float:
+    """Return one significant digit where it is within a tenth, else two: gravity shows a factor no better."""
+    one = float(f"{factor:.1g}")
+    return one if abs(one - factor) < 0.1 * factor else float(f"{factor:.2g}")
 
 
 def find_beyond_drive(joint: JointEvidence) -> str | None:
@@ -93,7 +109,7 @@ def find_beyond_drive(joint: JointEvidence) -> str | None:
 def find_coarse(joint: JointEvidence) -> str | None:
     """Find signals that are quantised to steps of their own size."""
     for name in QUANTITIES:
-        # a step alone says little: 0.01 Nm is fine for a shoulder and all there is for a wrist
+        # a step has to be compared with the range: 0.01 Nm is fine for a shoulder and all there is for a wrist
         step, width = joint.report.steps[name], joint.report.high[name] - joint.report.low[name]
         if step is not None and width < TUNING.levels * step:
             return (
@@ -112,9 +128,10 @@ def find_stop(joint: JointEvidence) -> str | None:
 
 
 def find_one_way(joint: JointEvidence) -> str | None:
-    """Find joints that move one way only: by it dry friction is one number with what loads the joint."""
+    """Find joints that move one way only: dry friction is then one number with the load of the joint."""
     slower, faster = sorted((-joint.report.low["qd"], joint.report.high["qd"]))
-    if slower >= TUNING.one_way * faster:
+    # of a velocity that is not dq/dt nothing follows for the motion
+    if slower >= TUNING.one_way * faster or not (joint.report.velocity_correlation or 0.0) > TUNING.seen:
         return None
     unit = UNITS[joint.coordinate.joint_type].velocity
     return (
@@ -130,31 +147,15 @@ def find_no_gravity(joint: JointEvidence) -> str | None:
         return None
     return (
         f"tau does not move with gravity: their correlation is {correlation:.2g}, while the URDF's gravity torque "
-        f"varies {joint.report.gravity.relative_deviation:.2g} times as much as tau; is it compensated in the log?"
+        f"varies {joint.report.gravity.relative_deviation:.2g} times as much as tau"
     )
 
 
 # these need no torques: of arms under position servos, too
 POSITION_CHECKS = [Check("beyond-position-limit", "warning", find_beyond_limits)]
-SENSE = Check(
-    "torque-sense", "error",
-    partial(find_opposed, SIGNALS.agreement, "torques that move against gravity, {:.3g} times the URDF's"),
-    expected="the URDF's sense",
-    do="write 'sign: -1' or a negative 'gain' of the joint under 'logs', or the gravity of this mounting",
-)  # fmt: skip
 CHECKS: list[Check[JointEvidence]] = [
-    SENSE,
-    # by a factor that only another unit has
     Check(
-        "torque-unit", "error",
-        partial(
-            find_scaled, SIGNALS.agreement, TUNING.impossible_factor,
-            "torques that move with {:.3g} times the URDF's gravity torque",
-        ),
-        expected="Nm or N at the joint", do=SAY_UNIT,
-    ),
-    Check(
-        "torque-beyond-drive", "error", find_beyond_drive, unless=("torque-sense", "torque-unit"),
+        "torque-beyond-drive", "error", find_beyond_drive,
         expected="Nm or N at the joint", do=SAY_UNIT,
     ),
     *POSITION_CHECKS,
@@ -163,23 +164,5 @@ CHECKS: list[Check[JointEvidence]] = [
     Check("at-a-stop", "warning", find_stop),
     Check("coarse", "warning", find_coarse),
     Check("one-way", "warning", find_one_way),
-    Check("torque-without-gravity", "warning", find_no_gravity, unless=TORQUE_ERRORS),
-    Check(
-        "torque-against-gravity", "warning",
-        partial(
-            find_opposed, TUNING.seen,
-            "tau moves against gravity: {:.3g} times the URDF's; a sign of tau or q is wrong",
-        ),
-        unless=TORQUE_ERRORS,
-    ),
-    # by a factor that errors of inertials do not explain
-    Check(
-        "torque-scale", "warning",
-        partial(
-            find_scaled, TUNING.seen, TUNING.unusual_factor,
-            "tau moves with {:.3g} times the URDF's gravity torque; check its unit and gain, or let the "
-            "gain be found: 'torque: motor', and 'gear: {:.3g}' with 'gain: trained' of this joint",
-        ),
-        unless=TORQUE_ERRORS,
-    ),
+    Check(WITHOUT_GRAVITY, "warning", find_no_gravity),
 ]  # fmt: skip

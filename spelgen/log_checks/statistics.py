@@ -35,8 +35,7 @@ class Statistics(NamedTuple):
     """One trajectory of n joints.
 
     signals: of its quantities (see `Trajectory`), (4, n): the lowest and the highest value; the standard deviation of
-    what changes from sample to sample, NaN where the log is too sparse to tell; the step of a quantised signal, NaN of
-    others.
+    white noise, NaN for sparse logs; the step of a quantised signal, NaN for others.
     """
 
     clock: Clock
@@ -71,8 +70,8 @@ def statistics(trajectory: Trajectory) -> Statistics:
 def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the standard deviation (n,) of white noise on smooth signals (T, n) at jittered times (T,).
 
-    From third divided differences, scaled so that white noise keeps its size: of smooth motion they are small,
-    and the median leaves out the moments at which they are not.
+    From third divided differences, scaled so that white noise keeps its standard deviation: they are small for smooth
+    motion, and the median ignores short exceptions.
     """
     times = sliding_window_view(t, 4)  # (T - 3, 4)
     distances = times[:, :, None] - times[:, None, :] + np.eye(4)
@@ -86,12 +85,12 @@ def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 def quantisation_step(values: np.ndarray) -> float:
     """Return the step of a quantised signal (T,); NaN where it is not quantised, or never changes."""
     differences = np.diff(np.unique(values))
-    # two levels more or less say nothing of a grid
+    # two or three levels are no grid
     if len(differences) < 3:
         return float("nan")
     smallest = np.quantile(differences, TUNING.step_tolerance)
     step = float(np.median(differences[differences <= 1.5 * smallest]))
-    # over a hundred steps rounding adds up to what whole steps are told by
+    # over a hundred steps the error of the step adds up to a fraction of a step
     near = differences[differences < 100 * step] / step
     is_whole = np.abs(near - np.round(near)) < TUNING.step_tolerance
     is_grid = len(near) > 2 and is_whole.mean() > 1 - TUNING.step_tolerance

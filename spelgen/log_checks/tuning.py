@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class LogCheckTuning:
-    """Thresholds of notes and errors about logs beside their robot."""
+    """Thresholds of notes and errors about logs and their robot."""
 
     # [rad, m] A position limit may be exceeded by this much: rounding.
     limit_rounding: float = 1e-3
@@ -18,9 +18,6 @@ class LogCheckTuning:
     # [1] Standard deviation of the gravity torque, as a fraction of the measured torque's, from which on gravity must
     # be visible (UR10e).
     loaded: float = 0.2
-    # [1] Negative net inertial power, divided by the sum of its magnitudes, from which on torques have the wrong
-    # sense; recorded arms have +0.3 to +1.
-    opposed: float = 0.25
     # [1] Correlation from which on gravity is part of the torque; with a correlation below 1 - seen it is not.
     seen: float = 0.7
     # [1] Multiple of the URDF's gravity torque that wrong inertials do not explain.

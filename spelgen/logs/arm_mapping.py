@@ -18,7 +18,7 @@ GivenMapping = LogMapping | Mapping[str, object] | Path | str | None
 
 @runtime_checkable
 class JointNames(Protocol):
-    """Hold the joints whose logs are read, as an arm and a module do. joint_types: "revolute" or "prismatic"."""
+    """Joints whose logs are read: an arm or a module. joint_types: "revolute" or "prismatic"."""
 
     @property
     def joint_names(self) -> Sequence[str]: ...
@@ -28,10 +28,12 @@ class JointNames(Protocol):
 
 @runtime_checkable
 class DescribedArm(Protocol):
-    """Hold what of a loaded arm says how its logs are named."""
+    """Loaded arm with the settings that describe its logs. turning_joints: revolute, without position limits."""
 
     @property
     def chain(self) -> JointNames: ...
+    @property
+    def turning_joints(self) -> Sequence[str]: ...
     @property
     def robot(self) -> Robot: ...
     @property
@@ -50,7 +52,7 @@ LoggedArm = DescribedArm | JointNames | Sequence[str]
 
 
 class LogSource(NamedTuple):
-    """Say whose logs they are. joint_types: "revolute" or "prismatic", None where they are not known."""
+    """Joints of logs and their mapping. joint_types: "revolute" or "prismatic", None if unknown."""
 
     joints: tuple[str, ...]
     joint_types: tuple[str, ...] | None
@@ -58,10 +60,17 @@ class LogSource(NamedTuple):
 
 
 def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
-    """Return what `read_logs` was given. Raises LogError for what is no arm, SettingsError for a wrong mapping."""
+    """Return the joints and the mapping of an argument of `read_logs`.
+
+    Raises LogError for other arguments, SettingsError for a wrong mapping.
+    """
     if isinstance(arm, DescribedArm):
-        mapping = arm.settings.logs if mapping is None else mapping
-        log_mapping = _mapping(mapping, list(arm.robot.joint))
+        stated = arm.settings.logs
+        log_mapping = stated if mapping is None else _mapping(mapping, list(arm.robot.joint), stated)
+        if arm.settings.input == "position":
+            log_mapping = log_mapping.model_copy(update={"input": "position"})
+        # an angle without limits may be logged in any interval of one turn
+        log_mapping = log_mapping.with_turns(arm.turning_joints)
         return LogSource(tuple(arm.chain.joint_names), tuple(arm.chain.joint_types), log_mapping)
     if isinstance(arm, JointNames):
         joints = tuple(arm.joint_names)
@@ -75,9 +84,23 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
     raise LogError(repr(arm), element="read_logs", expected=expected)
 
 
-def _mapping(mapping: GivenMapping, joints: Sequence[str]) -> LogMapping:
+def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | None = None) -> LogMapping:
+    """Return a mapping as an object; keys that a file or a dict lacks come from the settings, `stated`."""
     if isinstance(mapping, LogMapping):
         return mapping
     if isinstance(mapping, str | Path):
-        return load_mapping(mapping, joints)
-    return validated(LogMapping, dict(mapping or {}), YamlDocument(Path("mapping"), None))
+        given = load_mapping(mapping, joints)
+    else:
+        given = validated(LogMapping, dict(mapping or {}), YamlDocument(Path("mapping"), None))
+    if stated is None:
+        return given
+    return LogMapping.model_validate(
+        _merged(stated.model_dump(exclude_unset=True), given.model_dump(exclude_unset=True))
+    )
+
+
+def _merged(stated: object, given: object) -> object:
+    """Return the keys of two groups, and of the groups in them; a key of both has the value of the second."""
+    if isinstance(stated, Mapping) and isinstance(given, Mapping):
+        return {**stated, **{key: _merged(stated.get(key), value) for key, value in given.items()}}
+    return given

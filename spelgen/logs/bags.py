@@ -1,48 +1,71 @@
-"""Read ROS 2 bags (MCAP, sqlite3) by the package `rosbags`: no ROS is needed."""
+"""Read bags of ROS 2 (MCAP, sqlite3) and ROS 1 by the package `rosbags`: no ROS is needed."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError, in_one_line
 from spelgen.files import limited_memory, require_regular_file
+from spelgen.labels import counted
+from spelgen.logs.mcap import MAGIC, mcap_messages
 from spelgen.logs.tables import LogFormat, LogTable, table_layout
 from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
 
-if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
-    from rosbags.rosbag2 import Reader
-
+ROS1 = ".bag"
 MESSAGE = "sensor_msgs/msg/JointState"
-MEMORY = 2**29  # bytes beside what the messages of a bag take
+MEMORY = 2**29  # bytes in addition to the messages of a bag
 FIELDS = {"q": "position", "qd": "velocity", "tau": "effort"}
+
+
+class StampedState(NamedTuple):
+    """A joint state with the times [ns] of its header, 0 if it has none, and of the recorder."""
+
+    stamp: int
+    recorded: int
+    state: Any
 
 
 def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
     """Return the joint states of a bag, or of a file of its storage, as one table.
 
-    t [s] counts from the first message: by the header's stamps, or by the recorder's clock where the first
-    stamp is 0. A message with none of the joints is another device's and passed over. Raises LogError, also where
+    t [s] counts from the first message: by the header's stamps, or by the recorder's clock if no message has a stamp.
+    A message without any of the joints is another device's and left out. Raises LogError, also if
     `rosbags` is not installed.
     """
-    table = _joint_states(path, list(map(mapping.log_name, joints)), mapping.topic)
-    # the messages' own fields, in SI units by definition: the mapping says no columns
+    remarks: list[str] = []
+    messages = _stamped(list(_messages(path, mapping.topic, remarks)), remarks)
+    table = _joint_states(path, messages, list(map(mapping.log_name, joints)))
+    # the messages' own fields, in SI units by definition: columns and units of the mapping do not apply
     mapping = mapping.with_joint_columns(dict.fromkeys(joints, dict.fromkeys(FIELDS)))
     mapping = mapping.model_copy(update={"columns": LogColumns()})
-    return [(table_layout(table.schema, joints, mapping, path), table)]
+    layout = table_layout(table.schema, joints, mapping, path)
+    return [(replace(layout, remarks=tuple(remarks)), table)]
 
 
-def _joint_states(path: Path, names: Sequence[str], topic: str | None) -> pa.Table:
+def _stamped(messages: Sequence[StampedState], remarks: list[str]) -> list[tuple[int, Any]]:
+    """Return times [ns] and states by one clock for all: headers and recorder may be hours apart."""
+    without = sum(not message.stamp for message in messages)
+    if messages and without == len(messages):
+        remarks.append("no message has a stamp: times are those at which the recorder received them")
+        return [(message.recorded, message.state) for message in messages]
+    if without:
+        remarks.append(f"{counted(without, 'message')} without a stamp left out")
+    return [(message.stamp, message.state) for message in messages if message.stamp]
+
+
+def _joint_states(path: Path, messages: Sequence[tuple[int, Any]], names: Sequence[str]) -> pa.Table:
     """Return the columns `t`, `q_<name>`, `qd_<name>`, `tau_<name>`; none of a field that no message fills."""
     times: list[int] = []
     rows: list[np.ndarray] = []
     other_names: dict[str, None] = {}
-    for stamp, state in _messages(path, topic):
+    for stamp, state in messages:
         missing = set(names) - set(state.name)
         if len(missing) == len(names):
             other_names |= dict.fromkeys(state.name)
@@ -53,7 +76,7 @@ def _joint_states(path: Path, names: Sequence[str], topic: str | None) -> pa.Tab
                 f"a message with the joints {', '.join(state.name)}", file=path, element=f"message {number}",
                 expected=f"{', '.join(sorted(missing, key=names.index))} in it too",
             )  # fmt: skip
-        values = np.full((len(FIELDS), len(state.name)), np.nan)  # where the message leaves a field empty
+        values = np.full((len(FIELDS), len(state.name)), np.nan)  # for empty fields of the message
         for k, field in enumerate(FIELDS.values()):
             logged = np.asarray(getattr(state, field), dtype=float)
             if len(logged) not in (0, len(state.name)):
@@ -78,59 +101,109 @@ def _joint_states(path: Path, names: Sequence[str], topic: str | None) -> pa.Tab
     return pa.table(columns)
 
 
-def _messages(path: Path, topic: str | None) -> Iterator[tuple[int, Any]]:
-    """Yield times [ns] and joint states of one topic.
+def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[StampedState]:
+    """Yield the joint states of one topic.
 
-    Messages are decoded by the published definition of the standard type alone: definitions that come with a
+    Messages are decoded by the published definition of the standard type only: definitions that come with a
     bag are not looked at.
     """
     try:
-        from rosbags.rosbag2 import Reader
+        from rosbags.rosbag1 import Reader as Ros1Reader
+        from rosbags.rosbag2 import Reader as Ros2Reader
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError as error:
         expected, do = "the package rosbags to read it", "pip install 'spelgen[ros]'"
-        raise LogError("a ROS 2 bag", file=path, expected=expected, do=do) from error
+        raise LogError("a ROS bag", file=path, expected=expected, do=do) from error
     size = path.stat().st_size
     for file in path.rglob("*"):
         if not file.is_dir():
-            # rosbags opens whatever the folder holds
+            # rosbags opens all files of the folder
             require_regular_file(file, LogError, "files in the folder of a ROS 2 bag")
             size += file.stat().st_size
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    is_ros1 = path.suffix == ROS1
+    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
     try:
         # rosbags unpacks a chunk whole, however large it gets; messages as arrays take ten times their bytes
-        with limited_memory(MEMORY + 20 * size), Reader(path) as reader:
-            by_header = None
-            for _, recorded, raw in reader.messages(_connections(reader, topic, path)):
-                state: Any = store.deserialize_cdr(raw, MESSAGE)
+        with limited_memory(MEMORY + 20 * size):
+            unfinished = [] if is_ros1 else _unfinished(path)
+            if unfinished:
+                messages = _without_end(unfinished, topic, path, remarks)
+            else:
+                messages = _read_by(Ros1Reader if is_ros1 else Ros2Reader, topic, path)
+            for recorded, raw in messages:
+                state: Any = decode(raw, MESSAGE)
                 clock = state.header.stamp
-                stamp = clock.sec * 1_000_000_000 + clock.nanosec
-                # one clock for all messages: the two may be hours apart
-                if by_header is None:
-                    by_header = stamp != 0
-                yield stamp if by_header else recorded, state
+                yield StampedState(clock.sec * 1_000_000_000 + clock.nanosec, recorded, state)
     except (LogError, GeneratorExit):
         raise
     except Exception as error:  # rosbags, its storages and their decompressors raise many kinds
         reason = in_one_line(error).rstrip(".")
-        raise LogError(f"an unreadable ROS 2 bag ({reason})", file=path) from error
+        do = "a recording that was not closed may be repaired by `ros2 bag reindex` or `rosbag reindex`"
+        raise LogError(
+            f"an unreadable ROS bag ({reason})", file=path, do=None if isinstance(error, MemoryError) else do
+        ) from error
 
 
-def _connections(reader: Reader, topic: str | None, path: Path) -> list[Connection]:
-    """Return the connections that carry joint states of the topic, or of the only topic that has them."""
-    connections = [x for x in reader.connections if x.msgtype == MESSAGE]
-    topics = sorted({x.topic for x in connections})
+def _read_by(open_bag: Callable[[Path], Any], topic: str | None, path: Path) -> Iterator[tuple[int, bytes]]:
+    """Yield times [ns] and contents of the joint states of one topic."""
+    with open_bag(path) as reader:
+        topics = {x.topic for x in reader.connections if x.msgtype == MESSAGE}
+        others = {f"{x.topic} ({x.msgtype})" for x in reader.connections}
+        chosen = _chosen_topic(topics, others, topic, path)
+        connections = [x for x in reader.connections if x.msgtype == MESSAGE and x.topic == chosen]
+        for _, recorded, raw in reader.messages(connections):
+            yield recorded, raw
+
+
+def _unfinished(path: Path) -> list[Path]:
+    """Return the MCAP files of a bag if one of them has no end, else none."""
+    files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+    for file in files:
+        with file.open("rb") as source:
+            if source.read(len(MAGIC)) == MAGIC:
+                source.seek(-len(MAGIC), 2)
+                if source.read() != MAGIC:
+                    return files
+    return []
+
+
+def _without_end(
+    files: Sequence[Path], topic: str | None, path: Path, remarks: list[str]
+) -> Iterator[tuple[int, bytes]]:
+    """Yield times [ns] and contents of the joint states of one topic, in files of which one has no end."""
+    messages = list(chain(*(mcap_messages(file, MESSAGE) for file in files)))
+    if not messages:
+        raise LogError(
+            "a recording that was not closed, without a complete message of joint states", file=path,
+            expected="an MCAP file with an end", do="try `mcap recover FILE`",
+        )  # fmt: skip
+    chosen = _chosen_topic({topic for topic, _, _ in messages}, set(), topic, path)
+    remarks.append("the recording was not closed: all complete messages were read")
+    for name, recorded, raw in messages:
+        if name == chosen:
+            yield recorded, raw
+
+
+def _chosen_topic(topics: set[str], present: set[str], topic: str | None, path: Path) -> str:
+    """Return the topic of joint states that was asked for, or the only one."""
+    if topic in topics:
+        return topic
+    if topic is None and len(topics) == 1:
+        return topics.pop()
+    names, do = ", ".join(sorted(topics)), None
     if not topics:
-        present = sorted({f"{x.topic} ({x.msgtype})" for x in reader.connections})
-        got, expected, do = f"only the topics {', '.join(present) or '(none)'}", f"one of {MESSAGE}", None
-    elif topic is None and len(topics) > 1:
-        got, expected = f"joint states on the topics {', '.join(topics)}", "one of them"
-        do = "name it by 'topic' under 'logs'"
-    elif topic not in (None, *topics):
-        got, expected, do = f"no joint states on {topic}", f"one of {', '.join(topics)}", None
+        listed = ", ".join(sorted(present)) or "(none)"
+        got, expected = f"only the topics {listed}", f"one of {MESSAGE}"
+    elif topic is None:
+        got, expected, do = (
+            f"joint states on the topics {names}",
+            "one of them",
+            "name it by 'topic' under 'logs'",
+        )
     else:
-        return [x for x in connections if topic in (None, x.topic)]
+        got, expected = f"no joint states on {topic}", f"one of {names}"
     raise LogError(got, file=path, expected=expected, do=do)
 
 
-BAG = LogFormat(read_bag, suffixes=(".mcap", ".db3"), marker="metadata.yaml", folder="a ROS 2 bag")
+BAG = LogFormat(read_bag, suffixes=(".mcap", ".db3", ROS1), marker="metadata.yaml", folder="a ROS 2 bag")

@@ -1,4 +1,4 @@
-"""Check logs alone: frozen columns, velocities that are no derivative, degrees, gaps. Nothing is repaired.
+"""Check logs without the robot: frozen columns, velocities that are no derivative, degrees, gaps. Nothing is repaired.
 
 A check is a code, a severity and a function of a subject, registered in CHECKS. Each trajectory is checked by itself,
 so that logs need not lie in memory together. `log_checks` has the checks that take the robot.
@@ -7,38 +7,45 @@ so that logs need not lie in memory together. `log_checks` has the checks that t
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Generic, Literal, NamedTuple, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.labels import counted
+from spelgen.logs.joint_signals import Advice, JointSignals
+from spelgen.logs.jump_checks import (
+    find_dropouts,
+    find_held,
+    find_jumps,
+    find_too_rare,
+    find_unsigned_velocity,
+)
 from spelgen.logs.rates import SLOWEST, is_dense, shows_accelerations
-from spelgen.logs.recording import is_dropout
 from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
 from spelgen.logs.tuning import SIGNALS
 from spelgen.settings.log_mapping import TIMES
 
 DEGREES = 180.0 / np.pi
-TURNS = 4 * np.pi  # [rad] no revolute joint turns further, so what does is in degrees
+TURNS = 4 * np.pi  # [rad] A joint with limits turns less: larger positions are in degrees.
 
 Subject = TypeVar("Subject")
 
 
 @dataclass(frozen=True)
 class Check(Generic[Subject]):
-    """Look for one thing that may be odd about logs.
+    """Search for one fault of logs.
 
-    find: from the subject to the message; None where nothing is odd. severity: logs with an error cannot be trained on.
-    unless: codes of checks, earlier in the list, whose findings explain this one. everywhere: it is odd only where
+    find: from the subject to the message; None without a finding. severity: logs with an error cannot be trained on.
+    unless: codes of checks, earlier in the list, whose findings explain this one. everywhere: it is a fault only if
     all trajectories show it. expected, do: of an error.
     """
 
     code: str
     severity: Literal["info", "warning", "error"]
-    find: Callable[[Subject], str | None]
+    find: Callable[[Subject], str | Advice | None]
     unless: tuple[str, ...] = ()
     everywhere: bool = False
     expected: str | None = None
@@ -47,13 +54,13 @@ class Check(Generic[Subject]):
 
 @dataclass(frozen=True)
 class Findings:
-    """Gather what checks find: notes, and errors, which prevent training."""
+    """Results of checks: notes, and errors, which prevent training."""
 
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
 
     def add(self, check: Check[Any], message: str, where: str, file: Path | None = None) -> None:
-        """Add what a check says; of an error, how to have it accepted."""
+        """Add the message of a check; to an error, how to accept it."""
         if check.severity == "error":
             do = f"{check.do}; --accept {check.code} if it is right"
             error = LogError(message, file=file, element=where, expected=check.expected, do=do)
@@ -65,15 +72,17 @@ class Findings:
 def run_checks(
     checks: Iterable[Check[Subject]], subject: Subject, accepted: Collection[str] = ()
 ) -> list[tuple[Check[Subject], str]]:
-    """Return the checks that find something odd, with their messages; accepted: codes that are passed over."""
+    """Return the checks with a finding, and their messages; accepted: codes that are not checked."""
     results: dict[str, tuple[Check[Subject], str]] = {}
     for check in checks:
         # one cause, one message: degrees are no derivatives either
         if check.code in accepted or not results.keys().isdisjoint(check.unless):
             continue
-        message = check.find(subject)
-        if message is not None:
-            results[check.code] = check, message
+        found = check.find(subject)
+        if isinstance(found, Advice):
+            results[check.code] = replace(check, do=found.do), found.message
+        elif found is not None:
+            results[check.code] = check, found
     return list(results.values())
 
 
@@ -96,7 +105,7 @@ def velocity_products(trajectory: Trajectory) -> np.ndarray:
 def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return factors (n,) by which qd must be multiplied to be dq/dt, and correlations (n, n).
 
-    These are 1 where qd of the row's joint is dq/dt of the column's, but for a factor. Both are NaN where one rests.
+    Correlations are 1 if qd of the row's joint is proportional to dq/dt of the column's; NaN if a joint is at rest.
     products: see `velocity_products`.
     """
     n = len(products) // 2
@@ -106,46 +115,15 @@ def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return products[:n, n:].diagonal() / np.where(qd_squares > 0, qd_squares, np.nan), correlations
 
 
-class JointSignals(NamedTuple):
-    """Hold what one trajectory shows of one joint: the subject of the checks of logs alone.
-
-    q, qd: (T,). factor: by what qd must be multiplied to be dq/dt; NaN where it rests. correlations: of qd with dq/dt
-    of every joint; NaN where one rests.
-    """
-
-    trajectory: Trajectory
-    number: int
-    kind: str
-    joints: Sequence[str]
-    q: np.ndarray
-    qd: np.ndarray
-    factor: float
-    correlations: Sequence[float]
-
-    @property
-    def correlation(self) -> float:
-        """Of qd and dq/dt."""
-        return self.correlations[self.number]
-
-    def changes_by(self, unit: float) -> bool:
-        """Whether q changes that many times as fast as qd says, as beside a wrong unit."""
-        return self.correlation > SIGNALS.agreement and is_factor(self.factor, unit)
-
-
-def is_factor(value: float, unit: float) -> bool:
-    """Whether a factor is near enough to that of a unit to be it."""
-    return 1 / SIGNALS.unit_factor < value / unit < SIGNALS.unit_factor
-
-
 def find_degrees(signals: JointSignals) -> str | None:
     """Find revolute joints that look recorded in degrees."""
-    if signals.kind != "revolute":
+    if signals.kind == "prismatic":
         return None
     if signals.changes_by(DEGREES):
         return f"q that changes {signals.factor:.3g} times as fast as qd says (180/pi is 57.3)"
     if signals.changes_by(1 / DEGREES):
         return f"qd that is {1 / signals.factor:.3g} times as large as q changes (180/pi is 57.3)"
-    if np.ptp(signals.q) > TURNS:
+    if np.ptp(signals.q) > TURNS and not signals.turns:
         return f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
     return None
 
@@ -164,52 +142,60 @@ def find_frozen(signals: JointSignals) -> str | None:
     return None
 
 
-def find_time_unit(signals: JointSignals) -> str | None:
+def find_time_unit(signals: JointSignals) -> str | Advice | None:
     """Find times that are not in seconds: no arm is sampled more slowly than at 2 Hz, and q changes as fast as qd."""
-    steps = np.diff(signals.trajectory.t)
-    if steps.size and np.median(steps) > SIGNALS.slowest_step:
-        # told once, and not of each joint
-        return None if signals.number else f"a sample every {np.median(steps):.3g} s"
+    step = signals.step
+    if step > SIGNALS.slowest_step:
+        # reported once, and not for each joint
+        if signals.number:
+            return None
+        unit = time_unit(step)
+        message = f"a sample every {step:.3g} s"
+        if unit is None or signals.trajectory.mapping.units.t != "s":
+            return message
+        message += f", {1 / (step * TIMES[unit]):.4g} Hz if times are in {unit}"
+        return Advice(message, f"write 'units: {{t: {unit}}}' under 'logs' in the robot's YAML")
     for unit in ("ms", "us", "ns"):
         if signals.changes_by(TIMES[unit]):
-            return f"q that changes {signals.factor:.3g} times as fast as qd says: times in {unit}"
+            message = f"q that changes {signals.factor:.3g} times as fast as qd says: times in {unit}"
+            return Advice(message, f"write 'units: {{t: {unit}}}' under 'logs' in the robot's YAML")
     return None
 
 
-def find_dropouts(signals: JointSignals) -> str | None:
-    """Find moments at which the position or the torque falls to 0 and comes back."""
-    trajectory = signals.trajectory
-    for name, values in (("q", trajectory.q), ("tau", trajectory.tau)):
-        if values.size:
-            rows = np.flatnonzero(is_dropout(values[:, signals.number]))
-            if rows.size:
-                t = trajectory.t[rows[0]]
-                return f"{name} that falls to 0 for a moment at t = {t:.4g} s ({rows.size} such samples)"
+def time_unit(step: float) -> str | None:
+    """Return the unit in which the step between two samples is one of a robot's log; None if it is none."""
+    for unit, size in TIMES.items():
+        if SIGNALS.fastest_step <= step * size <= SIGNALS.slowest_step:
+            return unit
     return None
 
 
 def find_no_torques(signals: JointSignals) -> str | None:
     """Find recordings in which every joint's torque is 0 all the time."""
     trajectory = signals.trajectory
-    # told once, and not of each joint
+    # reported once, and not for each joint
     if signals.number or not trajectory.tau.size or trajectory.tau.any() or not np.ptp(trajectory.q):
         return None
     return "torques that are all 0 while the arm moves"
 
 
 def find_wrong_velocity(signals: JointSignals) -> str | None:
-    """Find velocities that are not the positions' derivative, and say what else they may be."""
+    """Find velocities that are not the derivative of the positions, and a joint or a sign that fits better."""
     factor, correlation, tolerance = signals.factor, signals.correlation, 1 - SIGNALS.agreement
+    # times in another unit have been found at the first joint
+    if signals.step > SIGNALS.slowest_step:
+        return None
     if np.isnan(correlation) or (correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance):
         return None
-    advice = "check units, signs and the order of the joints"
-    if abs(factor + 1) <= tolerance:
-        advice = "its sign is the opposite of that of q"
+    advice = ""
+    if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
+        # the velocity is right up to its sense, so that q differentiated has no more errors than q
+        advice = "; its sense is opposite: write 'velocity: differentiated' under 'logs' in the robot's YAML"
     for joint, fit in zip(signals.joints, signals.correlations, strict=True):
         if fit > max(SIGNALS.agreement, correlation):
-            advice = f"it fits q of joint {joint!r}"
+            advice = f"; it is the derivative of q of joint {joint!r}: check the names of the columns"
             break
-    return f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}; {advice}"
+    return f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}{advice}"
 
 
 def find_constant_torque(signals: JointSignals) -> str | None:
@@ -249,12 +235,25 @@ def find_low_rate(trajectory: Trajectory) -> str | None:
     )
 
 
-CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", find_low_rate)]
-# said when a log is read: each repair is a message of its own
+CLOCK_CHECKS = [
+    Check("gap", "info", find_gaps),
+    Check("low-rate", "warning", find_low_rate),
+]
+# reported when a log is read: each repair is a message of its own
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
+REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
     Check(
-        "degrees", "error", find_degrees, expected="radians and rad/s",
+        "jumps", "error", find_jumps, expected="signals without jumps",
+        do="split recordings that were joined by a column 'trajectory', or check the encoder",
+    ),
+    Check(
+        "dropouts", "error", find_dropouts,
+        unless=("jumps",), expected="signals without holes and outliers",
+        do="write 'dropouts: dropped' under 'logs' in the robot's YAML to drop those rows",
+    ),
+    Check(
+        "degrees", "error", find_degrees, unless=("jumps",), expected="radians and rad/s",
         do="convert degrees, by 'units' under 'logs' in the robot's YAML; if the units are right, declare them there, "
         "or in the Parquet schema's metadata 'units'",
     ),
@@ -267,15 +266,23 @@ CHECKS: list[Check[JointSignals]] = [
         do="write 'units: {t: ms}' (us, ns) under 'logs' in the robot's YAML",
     ),
     Check(
-        "dropouts", "error", find_dropouts, expected="signals without holes",
-        do="write 'dropouts: dropped' under 'logs' in the robot's YAML to drop those rows",
+        "held-samples", "error", find_too_rare, unless=("time-unit",),
+        expected=f"values that change {SLOWEST:g} times a second",
+        do="log the measurements when they are new, and not the last ones again",
+    ),
+    Check("held-values", "warning", find_held, unless=("held-samples", "time-unit")),
+    Check(
+        "velocity-without-sign", "error", find_unsigned_velocity, unless=("degrees", "time-unit", "frozen"),
+        expected="dq/dt", do="write 'velocity: differentiated' under 'logs' in the robot's YAML: velocities are then "
+        "those of q",
     ),
     Check(
         "no-torques", "error", find_no_torques, everywhere=True, expected="the torques that moved it",
         do="check the names of the columns and the logger",
     ),
     Check(
-        "velocity-is-no-derivative", "warning", find_wrong_velocity, unless=("degrees", "time-unit", "dropouts"),
+        "velocity-is-no-derivative", "warning", find_wrong_velocity,
+        unless=("degrees", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign"),
     ),
     Check("constant-torque", "warning", find_constant_torque, unless=("no-torques",), everywhere=True),
     Check("joint-at-rest", "info", find_rest, unless=("frozen",), everywhere=True),
@@ -298,12 +305,11 @@ class LogChecks:
         """Take in a trajectory."""
         self._count += 1
         where = f"trajectory {trajectory.name}"
-        for clock_check in CLOCK_CHECKS:
-            message = clock_check.find(trajectory)
-            if message is not None:
-                self._add(message, clock_check, message, where, trajectory)
-        for repair in trajectory.repairs:
-            self._add(repair, REPAIRED, repair, where, trajectory)
+        for clock_check, message in run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted):
+            self._add(message, clock_check, message, where, trajectory)
+        for result, messages in ((REPAIRED, trajectory.repairs), (REMARKED, trajectory.remarks)):
+            for message in messages:
+                self._add(message, result, message, where, trajectory)
         products = velocity_products(trajectory)
         self.products += products
         factors, correlations = map(np.ndarray.tolist, velocity_agreement(products))
@@ -317,7 +323,7 @@ class LogChecks:
         self._results.setdefault((group, result), []).append((message, where, trajectory.file))
 
     def findings(self) -> Findings:
-        """Return what is odd: a sentence for each joint and check, of clocks for each message."""
+        """Return the findings: one for each joint and check; for clocks, one for each message."""
         summary = Findings()
         for (_, result), occurrences in self._results.items():
             # a joint that rests in one motion and moves in another is no oddity
@@ -333,7 +339,7 @@ class LogChecks:
 def check(
     trajectories: Iterable[Trajectory], joints: Sequence[str], joint_types: Sequence[str]
 ) -> list[Diagnostic]:
-    """Return what is odd about the logs, nothing repaired.
+    """Return the findings of the checks of logs; nothing is repaired.
 
     Raises LogError when revolute joints look recorded in degrees, unless units are declared, and when a
     position or a velocity never changes while the other one does.

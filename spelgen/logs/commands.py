@@ -22,7 +22,7 @@ def steps_between(trajectory: Trajectory, longest: float = SERVO_ROLLOUT.step) -
 def delayed_commands(trajectory: Trajectory, rows: slice, delay: float, steps: int) -> np.ndarray:
     """Return means (K, steps, n) of the command of ``delay`` [s] ago over the steps between the samples of ``rows``.
 
-    Means, not values: so what follows from them is smooth in the delay.
+    Means, not values: motions are then smooth in the delay.
     """
     samples = trajectory.t[rows]
     earliest, latest = np.searchsorted(trajectory.t, samples[[0, -1]] - delay)

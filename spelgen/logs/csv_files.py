@@ -27,9 +27,9 @@ def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 
 def csv_columns(file: Path) -> pa.Table:
-    """Return a table of commas, semicolons or tabs, with decimal commas beside the latter two.
+    """Return a table of commas, semicolons or tabs, with decimal commas if separated by the latter two.
 
-    Text may be UTF-8, UTF-16 or Latin-1. What `ros2 topic echo --csv` wrote of joint states has no header.
+    Text may be UTF-8, UTF-16 or Latin-1. Joint states written by `ros2 topic echo --csv` have no header.
     """
     encoding, head = _decoded_head(file)
     first_line, _, rows = head.partition("\n")

@@ -22,7 +22,7 @@ AUTOMATIC = Preprocessing()
 
 @dataclass(frozen=True, eq=False)
 class DynamicsSamples:
-    """Hold samples (T, n) of one trajectory: q, qd, qdd [rad, s; m, s] and tau [Nm, N] as logged.
+    """Samples (T, n) of one trajectory: q, qd, qdd [rad, s; m, s] and tau [Nm, N] as logged.
 
     z: (T, n, K) [rad, m], states of friction's bristles from the motion before; None: not known.
     direction: (T, n) of dry friction without memory, through the same filter as tau; None: not known. rate: [Hz].
@@ -57,7 +57,7 @@ def dynamics_samples(
     At 100 Hz (logs from 24 Hz on are interpolated, see `resampled`), through the zero-phase low-pass of
     ``preprocessing``, by default of 8 Hz, on q, qd and tau (before the change of rate where the log is denser, after
     it where not), qdd by central differences of the filtered qd, only samples with some |qd| > 0.02 rad/s; pieces
-    between gaps separately, without what the filter makes up at both ends. ``pauses``: all samples from the first that
+    between gaps separately, without the filter's transient at both ends. ``pauses``: all samples from the first that
     moves to the last, standstill between them included. ``reach``: of the bristles whose states z are wanted, through
     the same filter; see ``bristles_along``.
     """
@@ -75,22 +75,22 @@ def dynamics_samples(
 
 
 def long_pieces(trajectory: Trajectory, gap: float) -> list[Trajectory]:
-    """Return the pieces between holes of which a filter leaves something."""
+    """Return the pieces between holes that are longer than the transients of a filter."""
     return [piece for piece in split_at_gaps(trajectory, gap, HOLE) if piece.duration >= SHORTEST]
 
 
 def _columns(
     piece: Trajectory, pauses: bool, cutoff: float | None, reach: BristleReach | None
 ) -> list[np.ndarray]:
-    """Return q, qd, qdd, tau, and z where a reach is given, of the selected samples of a piece."""
+    """Return q, qd, qdd, tau (T, n), and z (T, n, K) if a reach is given, of the selected samples of a piece."""
     rate, times, t = piece.sample_rate, piece.t, regular_times(piece.t, FREQUENCY)
     is_denser = rate > 1.5 * FREQUENCY
 
     def sampled(signals: np.ndarray) -> np.ndarray:
-        """Return signals at the piece's own times at regular times, through the filter."""
+        """Return signals (T, ...) of the piece's own times at the regular times, filtered."""
         if cutoff is None:
             return resampled(times, signals, t, rate)
-        # filtered at the higher of the two rates: what the lower one would fold back is gone by then
+        # filtered at the higher of the two rates: frequencies above half the lower rate are removed by then
         if is_denser:
             return resampled(times, low_passed(times, signals, cutoff), t, rate)
         return low_passed(t, resampled(times, signals, t, rate), cutoff)
@@ -99,7 +99,7 @@ def _columns(
         require_cutoff(piece, rate if is_denser else FREQUENCY, cutoff)
     q, qd, tau = sampled(piece.q), sampled(piece.qd), sampled(piece.tau)
     selected = is_moving(qd)
-    if cutoff is not None:  # a filter that begins or ends within a motion makes up what it does not see
+    if cutoff is not None:  # a filter that begins or ends within a motion has a transient
         unsettled = round(SAMPLES.unsettled * FREQUENCY / cutoff)
         selected[:unsettled] = selected[len(selected) - unsettled :] = False
     if pauses and selected.any():
@@ -107,8 +107,8 @@ def _columns(
         selected[moving[0] : moving[-1]] = True
     columns = [q, qd, np.gradient(qd, t, axis=0), tau]
     if reach is not None and reach.elements:
-        # the torque steps where joints turn around, at the log's own times, and then went through filter and change of
-        # rate: so must these, else a step is wrong by up to a sample's time, and passes for inertia
+        # the torque steps where joints reverse, at the log's own times, and then went through filter and change of
+        # rate: so must these, else a step is wrong by up to a sample's time, and is confounded with inertia
         path, speed = piece.q, piece.qd
         if cutoff is not None:
             path, speed = interpolated(t, q, times), interpolated(t, qd, times)

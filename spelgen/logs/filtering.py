@@ -1,4 +1,4 @@
-"""Filter signals with zero phase, bring them to other times, and differentiate recordings of positions alone."""
+"""Filter signals with zero phase, bring them to other times, and differentiate recorded positions."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def low_passed(t: np.ndarray, signals: np.ndarray, cutoff: float) -> np.ndarray:
 
 
 def interpolated(t: np.ndarray, signals: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Return signals (T, ...) at times t at other times, on a cubic; as they are where these are the same times."""
+    """Return signals (T, ...) at times t at other times, on a cubic; unchanged if the times are the same."""
     if len(t) == len(times) and np.abs(t - times).max() < 1e-6 / _mean_rate(t):
         return signals
     from scipy.interpolate import CubicSpline
@@ -67,14 +67,14 @@ def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndar
 
 @lru_cache(maxsize=8)  # logs of a robot have few rates
 def _sections(rate: float, cutoff: float) -> np.ndarray:
-    """Return the filter's second-order sections: to design them takes as long as to filter a minute of a joint."""
+    """Return the filter's second-order sections (S, 6), whose design takes as long as filtering a minute of a joint."""
     from scipy.signal import butter
 
     return np.asarray(butter(TUNING.filter_order, cutoff, fs=rate, output="sos"))
 
 
 def regular_times(t: np.ndarray, frequency: float) -> np.ndarray:
-    """Return the times of a regular rate [Hz] within the times t."""
+    """Return the times of a regular rate [Hz] within the times t (T,)."""
     return np.arange(t[0], t[-1], 1.0 / frequency)
 
 
@@ -102,6 +102,6 @@ def derivative(q: np.ndarray, rate: float, order: int) -> np.ndarray:
 
     samples = q.shape[-2]
     width = 2 * round(TUNING.derivative_span * rate / 2) + 1
-    # the filter takes odd widths alone: above a cubic's four samples, and no more than there are
+    # an uneven width above the four samples of a cubic, at most the number of samples
     width = min(max(5, width), samples - 1 + samples % 2)
     return np.asarray(savgol_filter(q, width, 3, deriv=order, delta=1 / rate, axis=-2))

@@ -1,4 +1,4 @@
-"""Hold the formats of logs, and find the logs that paths name.
+"""Formats of logs, and the logs at given paths.
 
 A new format is a file like `csv_files.py`, and its name in FORMATS.
 """
@@ -18,11 +18,12 @@ from spelgen.logs.parquet_files import LEROBOT, PARQUET
 from spelgen.logs.tables import LogFormat, LogTable, reading
 from spelgen.settings.log_mapping import LogMapping
 
+UNPACK = {".zstd": "zstd -d", ".zst": "zstd -d", ".gz": "gunzip", ".xz": "unxz", ".bz2": "bunzip2"}
 FORMATS: list[LogFormat] = [PARQUET, CSV, NPZ, BAG, LEROBOT]
 
 
 def format_of(path: Path) -> LogFormat | None:
-    """Return the format of a file or folder; None of what is no log, such as a pipe that might never end."""
+    """Return the format of a file or folder; None of other files, such as a pipe that might never end."""
     for log_format in FORMATS:
         is_folder = log_format.marker and (path / log_format.marker).is_file()
         if is_folder or (path.suffix in log_format.suffixes and path.is_file()):
@@ -41,7 +42,7 @@ def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[
 def log_files(
     paths: Path | str | Iterable[Path | str], role: str | None = None
 ) -> tuple[list[Path], list[SpelgenError]]:
-    """Return the logs that these paths name, each once, and errors about those that cannot be one.
+    """Return the logs that these paths name, each once, and errors of the others.
 
     role: "train" or "test": of a folder that holds train.* or test.* files, only those with this stem.
     """
@@ -58,6 +59,12 @@ def log_files(
     return list(files), errors
 
 
+def _unpacking(path: Path) -> str | None:
+    """Return the remedy for a packed file, None for other files."""
+    command = UNPACK.get(path.suffix)
+    return None if command is None else f"unpack it: {command} {path.name}"
+
+
 def _logs_at(path: Path, role: str | None) -> list[Path]:
     if format_of(path) is not None:
         return [path]
@@ -66,11 +73,12 @@ def _logs_at(path: Path, role: str | None) -> list[Path]:
     formats = f"{suffixes}, the folder of {folders}"
     if not path.is_dir():
         require_regular_file(path, LogError, f"a file: {formats}")
-        raise LogError(f"a file of kind {path.suffix!r}", file=path, expected=formats)
-    # hidden files are not recordings: macOS puts "._log.csv" beside log.csv on other file systems
+        raise LogError(f"a file of kind {path.suffix!r}", file=path, expected=formats, do=_unpacking(path))
+    # hidden files are not recordings: macOS adds "._log.csv" to log.csv on other file systems
     logs = sorted(x for x in path.iterdir() if format_of(x) is not None and not x.name.startswith("."))
     if not logs:
-        raise LogError("a folder without logs", file=path, expected=formats)
+        packed = [unpacking for unpacking in map(_unpacking, sorted(path.iterdir())) if unpacking]
+        raise LogError("a folder without logs", file=path, expected=formats, do="; ".join(packed[:1]) or None)
     if role is None or not any(log.stem in ("train", "test") for log in logs):
         return logs
     selected = [log for log in logs if log.stem == role]

@@ -20,7 +20,7 @@ TRAJECTORY = "{trajectory}"
 
 
 class NpzArrays:
-    """Hold the arrays of an NPZ archive, each read when it is first asked for, and never unpickled."""
+    """Arrays of an NPZ archive, each read when it is first used, and never unpickled."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -33,7 +33,7 @@ class NpzArrays:
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._arrays:
             member = self._members[name]
-            # zipfile itself reads no more of a member than this size says
+            # zipfile itself reads at most this size of a member
             self._bytes += member.file_size
             if self._bytes > TUNING.npz_bytes:
                 raise LogError(
@@ -83,7 +83,7 @@ def npz_columns(file: Path) -> pa.Table:
 
 
 def _trajectory_text(pattern: str, name: str) -> str | None:
-    """Return what stands for `{trajectory}` in a name, everywhere the same; None where the pattern does not fit.
+    """Return the text in place of `{trajectory}` in a name, everywhere the same; None where the pattern does not fit.
 
     By lengths: a regular expression with several open ends takes exponential time on a long name.
     """
@@ -97,13 +97,21 @@ def _trajectory_text(pattern: str, name: str) -> str | None:
 def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapping: LogMapping) -> LogTable:
     """Return the table of one recording of the archive, or of the only one."""
     for quantity in mapping.quantities:
-        # a joint's column may be that of a matrix `q` (T, n)
-        matrix = getattr(mapping.columns, quantity).replace("{joint}", "").rstrip("_")
+        # a joint's column may belong to a matrix `q` (T, n)
+        pattern: str = getattr(mapping.columns, quantity)
+        matrix = pattern.replace("{joint}", "").rstrip("_")
         if matrix in arrays.names and arrays[matrix].ndim == 2:
-            indices = _matrix_columns(arrays, matrix, [mapping.log_name(joint) for joint in joints])
-            for joint, index in zip(joints, indices, strict=True):
-                mapping = mapping.with_joint_columns({joint: {quantity: f"{matrix}[{index}]"}})
-    # names alone: to learn an array's type is to read it
+            names = [mapping.log_name(joint) for joint in joints]
+            places = dict(zip(names, _matrix_columns(arrays, matrix, names), strict=True))
+            columns_of: dict[str, str] = {}
+            for joint, name in zip(joints, names, strict=True):
+                columns_of[joint] = mapping.column(quantity, joint)
+                # a joint may have the column of another one
+                for owner in (name, *names):
+                    if pattern.replace("{joint}", owner) == columns_of[joint]:
+                        columns_of[joint] = f"{matrix}[{places[owner]}]"
+            mapping = mapping.with_joint_columns({joint: {quantity: x} for joint, x in columns_of.items()})
+    # only names: the type of an array is known once it is read
     schema = pa.schema([(name, pa.null()) for name in arrays.names])
     layout = table_layout(schema, joints, mapping, arrays.file)
     if recording is not None:
@@ -122,7 +130,7 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
 
 
 def _matrix_columns(arrays: NpzArrays, matrix: str, joints: Sequence[str]) -> list[int]:
-    """Return the joints' columns of a matrix: as the array `joints` says, else in the order of the arm's joints."""
+    """Return the joints' columns of a matrix: by the array `joints`, else in the order of the arm's joints."""
     width = arrays[matrix].shape[1]
     if JOINT_NAMES not in arrays.names:
         if width != len(joints):

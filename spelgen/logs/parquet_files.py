@@ -6,34 +6,42 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 
-from spelgen.errors import LogError
+from spelgen.errors import LogError, collect
 from spelgen.files import read_json, require_regular_file
 from spelgen.logs.tables import LogFormat, LogTable, reading, stored_columns, table_layout
-from spelgen.settings.log_mapping import LogMapping
+from spelgen.settings.log_mapping import LogMapping, MotorCalibration
+from spelgen.settings.messages import validated
+from spelgen.settings.yaml_document import YamlDocument
 
 INFO = "meta/info.json"  # of a data set of LeRobot
-STATE, ACTION = "observation.state", "action"
+STATE, ACTION, TIMESTAMP = "observation.state", "action", "timestamp"
+ENDING = ".pos"
+LARGEST_NORMALISED = 100.001  # single precision
 
 
 def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the one table of a file. A file that spelgen wrote is read as such, whatever the mapping says."""
+    """Return the one table of a file. The mapping does not apply to files that spelgen wrote."""
     schema = pa.parquet.read_schema(file)
     layout = table_layout(schema, joints, mapping, file)
     columns = stored_columns(layout, schema.names)
-    # pre-buffering would hold the compressed file in memory beside the table
+    # pre-buffering would hold the compressed file in memory in addition to the table
     return [(layout, pa.parquet.read_table(file, columns=columns, pre_buffer=False))]
 
 
 def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the tables of all files, with columns by the data set's names of motors; units stay the mapping's.
+    """Return the tables of all files, with columns by the data set's names of motors.
 
-    Raises LogError where there are no files, or a joint is not among the motors.
+    Raises LogError if there are no files, a joint is not among the motors, or positions are normalised and no
+    calibration states their scale.
     """
-    states, actions = _motor_names(folder, STATE), _motor_names(folder, ACTION)
+    info = read_json(folder / INFO, LogError)
+    states, actions = _motor_names(folder, info, STATE), _motor_names(folder, info, ACTION)
     for joint in joints:
         name = mapping.log_name(joint)
         for names in (states, actions):
@@ -44,27 +52,92 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
                 )  # fmt: skip
         motors = {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
         mapping = mapping.with_joint_columns({joint: motors})
-    common = mapping.columns.model_copy(update={"t": "timestamp", "trajectory": "episode_index"})
+    common = mapping.columns.model_copy(update={"t": TIMESTAMP, "trajectory": "episode_index"})
     mapping = mapping.model_copy(update={"columns": common})
-    tables: list[LogTable] = []
-    for file in sorted((folder / "data").rglob("*.parquet")):
+    files = sorted((folder / "data").rglob("*.parquet"))
+    for file in files:
         require_regular_file(file, LogError, "files of episodes")
-        with reading(file):
-            for layout, table in read_parquet(file, joints, mapping):
-                tables.append((replace(layout, file=folder), table))
-    if not tables:
+    if not files:
         expected = "data/chunk-000/file-000.parquet"
         raise LogError("a data set without Parquet files", file=folder, expected=expected)
+    mapping, remarks = _with_scale(folder, files, joints, mapping)
+    # LeRobot 2 had degrees, and no ending in the names
+    if ENDING not in str(info["features"][STATE]["names"]):
+        remarks = ()
+    fps = info.get("fps")
+    if isinstance(fps, int | float) and not mapping.sample_rate:
+        remarks += (
+            f"times are frame numbers at {fps:g} frames per second and not measured: delays, damping and armatures are "
+            "as right as this rate; 'sample_rate: HZ' under 'logs' states another one",
+        )
+    tables: list[LogTable] = []
+    for file in files:
+        with reading(file):
+            for layout, table in read_parquet(file, joints, mapping):
+                tables.append((replace(layout, file=folder, remarks=remarks), table))
     return tables
 
 
-def _motor_names(folder: Path, feature: str) -> list[str]:
+def _with_scale(
+    folder: Path, files: Sequence[Path], joints: Sequence[str], mapping: LogMapping
+) -> tuple[LogMapping, tuple[str, ...]]:
+    """Return the mapping with the unit of positions, and remarks on it.
+
+    LeRobot stores -100..100 of each motor's calibrated range by default, and degrees or radians on request; the data
+    set does not state which. Raises LogError if values are in the former range, and no calibration states their scale.
+    """
+    largest = 0.0
+    for file in files:
+        with reading(file):
+            states = pa.parquet.read_table(file, columns=[STATE])[STATE].combine_chunks()
+            values = np.abs(states.flatten().to_numpy(zero_copy_only=False))
+            largest = max(largest, float(values.max(initial=0.0)))
+    if not 2 * np.pi < largest <= LARGEST_NORMALISED:
+        return mapping, ()
+    unstated = [joint for joint in joints if mapping.unit("q", joint) is None]
+    if not unstated:
+        unit = mapping.unit("q", joints[0])
+        doubt = (
+            f"positions within -100..100: right as {unit}, unless they are LeRobot's normalised values, which "
+            "'units: {q: normalised}' and 'calibration' under 'logs' convert"
+        )
+        return mapping, (doubt,) if unit == "deg" else ()
+    found = mapping.calibration or _calibration(folder)
+    if not all(mapping.log_name(joint) in found for joint in unstated):
+        raise LogError(
+            f"positions up to {largest:.4g} without a unit, within LeRobot's normalised range of -100..100",
+            file=folder, expected="degrees, or the calibration of the motors",
+            do="write 'units: {q: deg}' under 'logs' in the robot's YAML if they are degrees (use_degrees); "
+            "else 'units: {q: normalised}' and 'calibration:' with the content of LeRobot's calibration file, or put "
+            "that file into the folder of the data set as calibration.json",
+        )  # fmt: skip
+    units = mapping.units.model_copy(update={"q": "normalised"})
+    mapping = mapping.model_copy(update={"units": units, "calibration": found})
+    collect(mapping.misfits(joints))
+    return mapping, ("normalised positions were converted by the ranges of the motors' calibration",)
+
+
+def _calibration(folder: Path) -> dict[str, MotorCalibration]:
+    """Return the calibration of the motors that lies in a data set, empty without one."""
+    for file in (folder / "calibration.json", folder / "meta" / "calibration.json"):
+        if file.is_file():
+            document = YamlDocument(file, None)
+            return validated(LogMapping, {"calibration": read_json(file, LogError)}, document).calibration
+    return {}
+
+
+def dataset_motors(folder: Path) -> list[str]:
+    """Return the names of the motors of a data set."""
+    return _motor_names(folder, read_json(folder / INFO, LogError), STATE)
+
+
+def _motor_names(folder: Path, info: Any, feature: str) -> list[str]:
     """Return the motors' names of a feature, without LeRobot's ending."""
     try:
-        names = read_json(folder / INFO, LogError)["features"][feature]["names"] or []
+        names = info["features"][feature]["names"] or []
         if isinstance(names, dict):  # LeRobot writes a list, or a group of lists
             names = chain(*names.values())
-        return [str(name).removesuffix(".pos") for name in names]
+        return [str(name).removesuffix(ENDING) for name in names]
     except (KeyError, TypeError, AttributeError) as error:
         raise LogError(
             f"no names of {feature} ({type(error).__name__})", file=folder / INFO,

@@ -1,4 +1,4 @@
-"""Decide what is done to logs before anything is computed from them, in training, identification and evaluation."""
+"""Preprocessing of logs in training, identification and evaluation."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Preprocessing:
 
     cutoff: of the zero-phase low-pass on q, qd and tau [Hz]; 0: none; None: 8 Hz, and none for windows of logs of
     which one is sampled at 50 Hz or less.
-    decimation: samples from one sample of a window to the next; None: as many as filtered logs can spare.
-    gap: a step longer than so many median steps is a hole in the recording, at which it is cut.
+    decimation: samples from one sample of a window to the next; None: as filtered logs allow.
+    gap: a step longer than this multiple of the median step is a hole in the recording, at which it is cut.
     torque_delay: how much later than positions the logs show torques [s]; None: found where torques are fitted.
     """
 
@@ -41,9 +41,9 @@ class Preprocessing:
                 raise SettingsError(repr(getattr(self, name)), element=name, expected=expected)
 
     def resolved(self, rates: Iterable[float]) -> Preprocessing:
-        """Return the same with all decided for windows of logs with these sample rates [Hz], as it is kept with a run.
+        """Return the options resolved for windows of logs with these sample rates [Hz], as a run keeps them.
 
-        A cutoff that stays None is that of logs too slow to be filtered unasked.
+        The cutoff remains None for logs that are too slow to be filtered by default.
         """
         rates = list(rates)
         cutoff, decimation = self.cutoff, self.decimation or 1
@@ -63,7 +63,7 @@ class Preprocessing:
 
     @property
     def filtered(self) -> bool:
-        """Return whether windows are cut from filtered logs; needs a ``resolved`` one."""
+        """True if windows are cut from filtered logs; needs a ``resolved`` one."""
         return bool(self.cutoff)
 
     @property
@@ -75,7 +75,7 @@ class Preprocessing:
         return [Diagnostic("info", "filter", "logs", None, message)]
 
     def pieces(self, trajectories: Sequence[Trajectory], *, shortest: int) -> list[Trajectory]:
-        """Return gap-free pieces (see `gap_ends`) of at least so many samples, filtered; of a ``resolved`` one.
+        """Return gap-free pieces (see `gap_ends`) of at least `shortest` samples, filtered; of a ``resolved`` one.
 
         Raises LogError where a trajectory has no piece that long.
         """
@@ -96,6 +96,6 @@ class Preprocessing:
     def moved(self, trajectories: Sequence[Trajectory]) -> Sequence[Trajectory]:
         """Return trajectories with torques at the times at which they act."""
         delay = self.torque_delay
-        if not delay:  # most logs have none, and a copy is checked anew
+        if not delay:  # most logs have none, and a copy is checked again
             return trajectories
         return [replace(x, tau=earlier(x.t, x.tau, delay)) for x in trajectories]

@@ -1,4 +1,4 @@
-"""Decide what the sample rates of logs allow. No logger's clock is exact, so every bound has a tolerance."""
+"""Limits of the sample rates of logs. No logger's clock is exact, so every bound has a tolerance."""
 
 from __future__ import annotations
 
@@ -14,5 +14,5 @@ def shows_accelerations(rate: float) -> bool:
 
 
 def is_dense(rate: float) -> bool:
-    """Whether the motion between two samples is nearly a line, so that what is left of one is noise."""
+    """Whether the motion between two samples is nearly a line, so that differences from a line are noise."""
     return rate * FAST >= TUNING.dense_rate

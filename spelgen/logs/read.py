@@ -32,11 +32,11 @@ def read_logs(
     """Return all trajectories of the given files and folders, in sorted order of their files.
 
     arm: one loaded from a URDF, a model, or the names of joints as the URDF has them; without a mapping, joint j
-    has the columns `q_<j>`, `qd_<j>`, `tau_<j>`, beside the time `t` [s]. A column `trajectory` splits one file
+    has the columns `q_<j>`, `qd_<j>`, `tau_<j>`, and the time `t` [s]. A column `trajectory` splits one file
     into several. mapping: how the logs are named and measured, as a LogMapping, its keys in a dict, or a YAML file
-    of them; by default what the settings beside the arm's URDF say under `logs`. role "train" or "test": of a folder
-    that contains train.* or test.* files, only those with this stem are read. joint_types: what the mapping's units are
-    checked against, where `arm` is names alone.
+    of them; by default the group `logs` of the settings of the arm's URDF. role "train" or "test": of a folder
+    that contains train.* or test.* files, only those with this stem are read. joint_types: with which the
+    mapping's units are checked if `arm` is a list of names.
     Raises LogError (or one error with several) naming file, row and column, and SettingsError where
     the mapping does not fit the joints.
     """
@@ -59,8 +59,8 @@ def read_bounded_logs(
     """Return the logs as `read_logs` does; of logs of more than `LogTuning.kept_bytes` evenly spread segments.
 
     Each file is read and reduced by itself, so that memory is bounded by the largest file and the kept samples. A
-    reduced recording has gaps between its segments. The same files give the same samples. Raises what `read_logs`
-    raises, for rows that are kept.
+    reduced recording has gaps between its segments. The same files give the same samples. Raises the errors of
+    `read_logs` for rows that are kept.
     """
     segments = LogSegments(TUNING.kept_bytes)
     trajectories = _read(paths, log_source(arm, mapping), role, segments)
@@ -121,7 +121,7 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
     for quantity in trajectories[0].quantities:
         values = joined_column(trajectories, quantity)
         columns |= {f"{quantity}_{joint}": column for joint, column in zip(joints, values.T, strict=True)}
-    # the file says that it is in SI units, so that no mapping is applied when it is read back
+    # the file states that it is in SI units, so that no mapping is applied when it is read back
     table = pa.table(columns).replace_schema_metadata({UNITS_KEY: UNITS})
     with replacing(path) as unfinished:
         if path.suffix == ".csv":
@@ -132,7 +132,7 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
 
 
 def _with_unique_names(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-    """Return the trajectories under the shortest names that tell all of them apart."""
+    """Return the trajectories with the shortest names that are unique."""
     names: list[str] = []
     for form in ("{0.name}", "{0.file.stem}/{0.name}", "{0.file}/{0.name}"):
         names = list(map(form.format, trajectories))

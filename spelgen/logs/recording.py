@@ -1,26 +1,37 @@
-"""Make trajectories of rows in SI units: put in order, holes left out, velocities differentiated, torques moved."""
+"""Make trajectories of rows in SI units: in order, without wraps and lost rows, with velocities, torques in time."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
+from math import pi
 
 import numpy as np
 
 from spelgen.errors import LogError
+from spelgen.labels import counted
+from spelgen.logs.jumps import centred, is_outlier, jump_count, repeated_rows, unwrapped
 from spelgen.logs.tables import Layout
 from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.logs.tuning import TUNING
+from spelgen.logs.values import foreign_rows
+from spelgen.settings.log_mapping import LogMapping
 
 
 def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[str, ...] = ()) -> Trajectory:
-    """Return a trajectory of these rows (T, C) in SI units, velocities differentiated where there are none."""
-    mapping = layout.mapping
+    """Return a trajectory of these rows (T, C) in SI units, velocities differentiated if none were logged.
+
+    Wrapped angles and overflowed registers are unwrapped, and rows that are written several times are read once,
+    before anything is differentiated; with 'dropouts: dropped' lost rows and outliers are removed, too.
+    """
+    mapping, remarks = layout.mapping, layout.remarks
+    data, wraps = _without_wraps(data, mapping.signals(layout.joints), mapping)
+    data, dropped = _without_repeats(data, len(layout.joints), mapping)
+    repairs += dropped
     if mapping.dropouts == "dropped":
-        holes = np.any([is_dropout(column) for column in data[:, 1:].T], axis=0)
-        if holes.any():
-            data = data[~holes]
-            repairs += (f"{holes.sum()} rows in which a signal fell to 0 were left out",)
+        data, dropped = _without_outliers(data, mapping.signals(layout.joints))
+        repairs += dropped
     t, columns = data[:, 0], np.split(data[:, 1:], len(mapping.quantities), axis=1)
     signals = dict(zip(mapping.quantities, columns, strict=True))
     q, tau = signals["q"], signals.get("tau", np.zeros((len(t), 0)))
@@ -29,17 +40,105 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
         for rows in _pieces(t):
             qd[rows] = np.gradient(q[rows], t[rows], axis=0)  # central differences
     tau = earlier(t, tau, mapping.torque_delay)
-    return Trajectory(t, q, qd, tau, name, layout.file, layout.accepted, signals.get("u"), repairs)
+    trajectory = Trajectory(t, q, qd, tau, name, layout.file, layout.accepted, signals.get("u"), repairs)
+    return replace(trajectory, remarks=remarks + wraps, mapping=mapping)
+
+
+def _without_wraps(
+    data: np.ndarray, signals: Sequence[tuple[str, str]], mapping: LogMapping
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return rows (T, C) in which signals with a period do not jump by it, and remarks on them."""
+    remarks: list[str] = []
+    values = dict(zip(signals, data[:, 1:].T, strict=True))
+    for (quantity, joint), logged in values.items():
+        period = abs(mapping.scale(quantity, joint)) * (mapping.word("period", quantity, joint) or 0.0)
+        if not period:
+            continue
+        count = jump_count(logged, period)
+        result = unwrapped(logged, period)
+        if quantity == "u":
+            # a command is close to the position, although the two registers may count from different revolutions
+            result = result - period * np.round(np.median(result - values["q", joint]) / period)
+        # without a jump, an angle beyond half a turn is as good as one within it
+        elif count or abs(period - 2 * pi) > TUNING.limit_of_turn:
+            offset = mapping.offset(quantity, joint)
+            result = centred(result - offset, period) + offset
+        if count:
+            remarks.append(f"{quantity} of {joint!r} wraps at {period:.4g}: {counted(count, 'jump')} removed")
+        if result is not logged:
+            values[quantity, joint] = result
+    if all(column is logged for column, logged in zip(values.values(), data[:, 1:].T, strict=True)):
+        return data, ()
+    return np.column_stack([data[:, 0], *values.values()]), tuple(remarks)
+
+
+def _without_repeats(
+    data: np.ndarray, positions: int, mapping: LogMapping
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return rows (T, C) without repeats if every row is written several times or repeats are dropped; and a note."""
+    # too short to tell motion from rest, and an archive may have thousands of them
+    if len(data) < TUNING.jump_window:
+        return data, ()
+    repeats, copies = repeated_rows(data[:, 1:], positions)
+    count = int(np.count_nonzero(repeats))
+    if count <= TUNING.repeats * len(data):
+        return data, ()
+    rate = (len(data) - 1 - count) / (data[-1, 0] - data[0, 0])
+    message = f"every row is written {copies} times"
+    if copies == 1:
+        message = f"{count} rows repeat the row before in motion"
+        if mapping.dropouts == "kept":
+            return data, (f"{message}: 'dropouts: dropped' under 'logs' removes them, {rate:.3g} Hz remain",)
+    return data[~repeats], (f"{message}: repeats were left out, {rate:.3g} Hz remain",)
+
+
+def _without_outliers(
+    data: np.ndarray, signals: Sequence[tuple[str, str]]
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return rows (T, C) without lost samples and outliers, and a message that lists them."""
+    outliers = np.zeros(len(data), bool)
+    found = []
+    for (quantity, joint), values in zip(signals, data[:, 1:].T, strict=True):
+        if quantity != "u":
+            rows = outlier_rows(quantity, values)
+            outliers |= rows
+            if rows.any():
+                found.append(f"{quantity} of {joint!r} at t = {listed_times(data[rows, 0])}")
+    if not found:
+        return data, ()
+    message = f"{counted(int(outliers.sum()), 'row')} left out as dropouts: {'; '.join(found)}"
+    return data[~outliers], (message,)
+
+
+def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
+    """Return a mask (T,) of lost samples and outliers of "q", "qd" or "tau"; a velocity may be 0 for a moment."""
+    rows = is_outlier(values, smooth=quantity == "q")
+    return np.asarray(rows & (values != 0)) if quantity == "qd" else rows
+
+
+def listed_times(t: np.ndarray) -> str:
+    """Return the first times (T,) [s] of a list as text, and the number of the others."""
+    shown = ", ".join(f"{x:.4g}" for x in t[: TUNING.listed].tolist())
+    more = len(t) - TUNING.listed
+    return f"{shown} s" + (f" and {more} more" if more > 0 else "")
 
 
 def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return values (T, C) of these rows of a file with increasing times, and what was mended for that.
+    """Return values (T, C) of these rows of a file with increasing times, and messages on repairs.
 
-    Rows are sorted where positions become smoother by it, and of rows of one time the first is taken. Raises LogError
-    for a clock that begins anew, or that is too coarse.
+    Rows are sorted if positions become smoother by it, and of equal rows of one time the first is kept. Times of a
+    coarse clock are reconstructed. Raises LogError for a clock that starts again, or that is too coarse.
     """
-    t = data[:, 0]
     repairs: tuple[str, ...] = ()
+    foreign = foreign_rows(data, len(layout.joints))
+    if foreign.any():
+        data, rows = data[~foreign], np.asarray(rows)[~foreign]
+        count, message = counted(int(foreign.sum()), "row"), "of another topic or publisher left out"
+        repairs += (f"{count} {message}: without values, or with positions only",)
+    if layout.mapping.sample_rate:
+        data = np.column_stack([np.arange(len(data)) / layout.mapping.sample_rate, data[:, 1:]])
+        return data, repairs
+    t = data[:, 0]
     late = np.count_nonzero(np.diff(t) < 0)
     if late:
         ordered = data[np.argsort(t, kind="stable")]
@@ -50,22 +149,48 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[n
         data = ordered
         repairs += (f"{late} times before that of the row above: the rows were sorted",)
     is_repeat = np.diff(data[:, 0], prepend=-np.inf) == 0
+    differs = is_repeat & np.append(False, (np.diff(data[:, 1:], axis=0) != 0).any(axis=1))
+    # different states of one time: the clock is too coarse for the rows
+    if np.count_nonzero(differs) > max(TUNING.few_repeats, TUNING.coarse_clock * len(data)):
+        t, message = _reconstructed(data[:, 0], layout)
+        return np.column_stack([t, data[:, 1:]]), (*repairs, message)
     repeats = np.count_nonzero(is_repeat)
-    if 2 * repeats > len(data):
-        raise LogError(
-            f"{repeats} of {len(data)} rows with the time of another row", file=layout.file,
-            element=f"column {layout.columns[0]}",
-            expected="a time for each row",
-            do="log times with more digits, or split recordings by a column 'trajectory'",
-        )  # fmt: skip
     if repeats:
         data = data[~is_repeat]
         repairs += (f"{repeats} rows with the time of the row before were left out",)
     return data, repairs
 
 
+def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:
+    """Return evenly spaced times (T,) of a clock with few digits, and a message on them.
+
+    Raises LogError unless every time is its own evenly spaced one, rounded to a tick of the clock.
+    """
+    steps = np.diff(t)
+    tick = float(steps[steps > 0].min(initial=np.inf))
+    # a step that is longer than the clock's rounding allows is a hole in the recording
+    holes = np.flatnonzero(steps > TUNING.gap * max(tick, float(steps.mean()))) + 1
+    times, rates = t.copy(), []
+    for start, stop in pairwise([0, *holes.tolist(), len(t)]):
+        numbers = np.arange(stop - start)
+        slope, first = np.polyfit(numbers, t[start:stop], 1) if len(numbers) > 2 else (0.0, t[start])
+        times[start:stop] = first + slope * numbers
+        rates.append(slope)
+    if np.abs(times - t).max() > tick or not min(rates) > 0:
+        count = np.count_nonzero(steps == 0)
+        raise LogError(
+            f"{count} of {len(t)} rows with the time of another row, but another state", file=layout.file,
+            element=f"column {layout.columns[0]}", expected="a time for each row",
+            do="log times with more digits, split recordings by a column 'trajectory', or write "
+            "'sample_rate: HZ' under 'logs' if the rows are evenly spaced",
+        )  # fmt: skip
+    rate = 1 / float(np.median(rates))
+    message = f"the clock has ticks of {tick:.3g} s, too coarse for the rows: times were reconstructed, {rate:.4g} Hz"
+    return times, message
+
+
 def _roughness(positions: np.ndarray) -> float:
-    """Return the way that joints go from row to row, each relative to its range."""
+    """Return the sum of the distances between rows (T, n), each joint relative to its range."""
     ranges = np.ptp(positions, axis=0)
     length = np.abs(np.diff(positions, axis=0)).sum(axis=0)
     return float((length / np.where(ranges > 0, ranges, 1.0)).sum())
@@ -81,29 +206,15 @@ def require_increasing_times(t: np.ndarray, rows: Sequence[int] | np.ndarray, la
         raise layout.row_error(got, rows[k + 1], layout.columns[0], "increasing times", do)
 
 
-def is_dropout(values: np.ndarray) -> np.ndarray:
-    """Whether each sample (T,) is exactly 0 between samples that are far from 0: what loggers write for no value."""
-    is_lost = np.zeros(len(values), bool)
-    logged = np.flatnonzero(values)
-    if not logged.size or logged[-1] - logged[0] == len(logged) - 1:
-        return is_lost  # zeros at either end have nothing beside them
-    steps = np.abs(np.diff(values[logged]))
-    usual = np.median(steps[steps > 0]) if steps.any() else np.inf
-    # a signal that passes through 0 comes near it first
-    nearest = np.minimum(np.abs(values[logged[:-1]]), np.abs(values[logged[1:]]))
-    is_lost[logged[0] : logged[-1]] = np.repeat(nearest > TUNING.dropout * usual, np.diff(logged))
-    return np.asarray(is_lost & (values == 0))
-
-
 def _pieces(t: np.ndarray) -> Iterator[slice]:
-    """Yield the gap-free pieces of two samples or more; of a lone sample no window is cut."""
+    """Yield the gap-free pieces of two samples or more of times (T,); of a lone sample no window is cut."""
     for start, stop in pairwise(gap_ends(t)):
         if stop - start > 1:
             yield slice(start, stop)
 
 
 def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
-    """Return what is logged so much later [s], (T, n), held at the ends of each gap-free piece."""
+    """Return values (T, n) without their delay [s], constant at the ends of each gap-free piece."""
     if not delay:
         return values
     from scipy.interpolate import CubicSpline  # takes long to import, as in `low_pass`

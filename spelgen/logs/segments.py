@@ -102,13 +102,13 @@ class LogSegments:
 
 
 def _taken(table: pa.Table, rows: np.ndarray) -> pa.Table:
-    """Return these rows of a table; without a copy if they lie together."""
+    """Return these rows (T,) of a table; without a copy if they lie together."""
     first, count = int(rows[0]), len(rows)
     return table.slice(first, count) if int(rows[-1]) - first + 1 == count else table.take(rows)
 
 
 def _recordings(layout: Layout, table: pa.Table) -> list[tuple[str, np.ndarray]]:
-    """Return name and rows of each recording of a table, in order of their first rows."""
+    """Return name and rows (T,) of each recording of a table, in order of their first rows."""
     if layout.labels is None:
         return [(layout.recording or layout.file.stem, np.arange(table.num_rows))]
     # each label once: a name of a megabyte on a million rows is a small file

@@ -1,109 +1,215 @@
-"""Draft the mapping of a log that nobody has described, by the names of its columns.
+"""Draft the mapping of a log that nobody has described, by the names and the first values of its columns.
 
-Units that names do not say stay SI: the checks of logs find degrees and milliseconds, and say what to write.
+Units that neither names nor times state remain SI: the checks of logs find degrees, and state the lines to write.
 """
 
 from __future__ import annotations
 
+import difflib
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
+from spelgen.logs.checks import time_unit
 from spelgen.logs.formats import FORMATS, format_of
+from spelgen.logs.parquet_files import LEROBOT, dataset_motors
 from spelgen.logs.tables import names_joint, reading
 from spelgen.logs.tuning import TUNING
 
 WORDS = {
-    "t": {"t", "time", "times", "timestamp", "stamp", "clock", "ms", "us", "ns", "sec", "secs", "seconds", "millis"},
+    "t": {"t", "time", "times", "timestamp", "stamp", "clock", "secs", "seconds", "millis"},
     "q": {"q", "pos", "position", "positions", "angle", "angles", "theta"},
     "qd": {"qd", "dq", "vel", "velocity", "velocities", "speed", "speeds", "omega"},
-    "tau": {"tau", "torque", "torques", "effort", "efforts", "current", "currents", "amps", "curr", "moment"},
+    "tau": {"tau", "torque", "torques", "effort", "efforts", "current", "currents", "curr", "cur", "moment", "load"},
 }  # fmt: skip
-# set points have the names of what they are set points of
-NOT_MEASURED = {"target", "desired", "command", "cmd", "reference", "ref", "setpoint", "goal", "error", "std"}
-UNITS = {"ms": "ms", "millis": "ms", "us": "us", "ns": "ns", "mnm": "mNm", "ma": "mA"}
-UNITS |= dict.fromkeys(("amps", "current", "currents", "curr"), "A")
+# set points have the names of the measurements that they prescribe
+COMMANDED = {
+    "target", "desired", "des", "d", "command", "commanded", "cmd", "reference", "ref", "setpoint", "goal", "action",
+    "demand",
+}  # fmt: skip
+NOT_MEASURED = COMMANDED | {"error", "std"}
+# units in names, with their word in a mapping, per quantity that they imply
+UNITS = {
+    "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "ns": "ns"},
+    "q": {"deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad",
+          "counts": "counts", "ticks": "counts", "turns": "turns", "mm": "mm", "m": "m"},
+    "qd": {"deg/s": "deg/s", "degps": "deg/s", "dps": "deg/s", "rad/s": "rad/s", "rpm": "rpm", "mm/s": "mm/s"},
+    "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA"},
+}  # fmt: skip
+BARE = {"s", "n", "a", "m"}  # letters that are units in brackets only
+CURRENT = {"current", "currents", "curr", "cur"}
 
 
 class Suggestion(NamedTuple):
-    """Hold a mapping as YAML text, with comments on what was assumed. missing: what no column was found for."""
+    """A mapping as YAML text, with comments on assumptions. missing: quantities that no column was found for."""
 
     text: str
     missing: tuple[str, ...]
 
 
-def suggest_mapping(file: Path, joints: Sequence[str]) -> Suggestion:
-    """Return how a file may be read. Raises LogError where it cannot be opened, or has no column of times."""
+class ColumnName(NamedTuple):
+    """A column's name, with the words and the unit in it."""
+
+    name: str
+    words: set[str]
+    unit: str
+
+
+def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False) -> Suggestion:
+    """Return a draft of the mapping of a file. commands: positions are commanded, and no velocities or torques read.
+
+    Raises LogError if the file cannot be opened, or has no column of times.
+    """
     log_format = format_of(file)
+    if log_format is LEROBOT:
+        return _dataset_mapping(file, joints)
     if log_format is None or log_format.columns is None:
         suffixes = [x.suffixes[0] for x in FORMATS if x.columns is not None]
         raise LogError(f"a file of kind {file.suffix!r}", file=file, expected=" or ".join(suffixes))
     with reading(file):
-        names = _names(log_format.columns(file))
-    measured: dict[str, list[str]] = {quantity: [] for quantity in WORDS}
-    for name in names:
-        name_words = _words(name)
-        for quantity, words in WORDS.items():
-            if name_words & words and not name_words & NOT_MEASURED:
-                measured[quantity].append(name)
-                break
-    if not measured["t"]:
-        got = f"only the columns {shortened(names, TUNING.listed)}"
+        table = log_format.columns(file)
+    columns = [_column_name(name) for name in _names(table)]
+    found = _by_quantity(columns, commands, joints)
+    if not found["t"]:
+        got = f"only the columns {shortened([x.name for x in columns], TUNING.listed)}"
         raise LogError(got, file=file, expected="one of times, called t or time")
-    # `time` before `timestamp_of_receipt`: what has the fewest words is the plain clock
-    clock = min(measured.pop("t"), key=lambda name: len(_words(name)))
-    by_joint = {quantity: _by_joint(columns, joints) for quantity, columns in measured.items()}
-    units = {"t": _unit([clock]) or "s"}
-    torque_unit = _unit(by_joint["tau"].values())
-    if torque_unit:
-        units["tau"] = torque_unit
+    # the stamp of the measurement before the time of its receipt; else the fewest words, as the plain clock has
+    clock = min(found.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))
+    order = _order_in_cells(table, joints)
+    by_joint = {quantity: _by_joint(named, joints, order) for quantity, named in found.items()}
+    if not commands and len(by_joint["qd"]) < len(joints):
+        del by_joint["qd"]
+    units = _units(clock, by_joint, table)
     lines = [
         f"# Drafted from the column names of {json.dumps(file.name)}: check it, and the order of the joints.",
-        f"columns: {{t: {json.dumps(clock)}}}",
+        f"columns: {{t: {json.dumps(clock.name)}}}",
         f"units: {json.dumps(units)}",
     ]
-    if len(by_joint["qd"]) < len(joints):
+    if not commands and "qd" not in by_joint:
         lines.append("velocity: differentiated")
-        del by_joint["qd"]
     lines.append("joints:")
     missing = []
     for joint in joints:
-        entries = {quantity: named[joint] for quantity, named in by_joint.items() if joint in named}
+        entries = {quantity: named[joint].name for quantity, named in by_joint.items() if joint in named}
         missing += [f"{quantity} of {joint}" for quantity in by_joint if quantity not in entries]
         lines += [f"  {json.dumps(joint)}:", f"    columns: {json.dumps(entries)}"]
-        if torque_unit in ("A", "mA"):
+        if units.get("tau") in ("A", "mA"):
             at_joint = "at the joint, the gear included: write its value"
-            lines.append(f"    gain: 1.0 # Nm per {torque_unit} {at_joint}")
+            lines.append(f"    gain: 1.0 # Nm per {units['tau']} {at_joint}")
+        if units.get("q") == "counts":
+            lines.append("    counts_per_turn: 4096 # of the joint, the gear included: write its value")
     lines += [f"# no column was found for {column}" for column in missing]
     return Suggestion("\n".join(lines) + "\n", tuple(missing))
 
 
-def _unit(names: Iterable[str]) -> str | None:
-    """Return the unit that columns' names say, the last of several."""
-    unit = None
-    for name in names:
-        for word in reversed(UNITS):
-            if word in _words(name):
-                unit = UNITS[word]
-    return unit
+def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
+    """Return the mapping of a data set of LeRobot: the names of its motors."""
+    motors = dataset_motors(folder)
+    lines = [
+        f"# Drafted from the motors of {json.dumps(folder.name)}: check it.",
+        "# LeRobot stores degrees, 'units: {q: deg}', or -100..100 of the calibrated range:",
+        "# 'units: {q: normalised}' and 'calibration:' with the content of the robot's calibration file.",
+        "joints:",
+    ]
+    missing = []
+    for joint in joints:
+        close = [joint] if joint in motors else difflib.get_close_matches(joint, motors, n=1)
+        if close:
+            lines.append(f"  {json.dumps(joint)}: {{name: {json.dumps(close[0])}}}")
+        else:
+            missing.append(f"q of {joint}")
+    lines += [f"# no motor was found for {column}" for column in missing]
+    return Suggestion("\n".join(lines) + "\n", tuple(missing))
 
 
-def _words(name: str) -> set[str]:
-    """Return the words of a name: jointPos0 -> joint, pos."""
-    separated = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
-    return set(re.findall(r"[a-z]+", separated.lower()))
+def _column_name(name: str) -> ColumnName:
+    """Return a name with its words and its unit, which is in brackets or the last word."""
+    bracketed = re.fullmatch(r"(.*?)\s*[\[(]([^\])\d]+)[\])]", name)
+    base, unit = bracketed.groups() if bracketed else (name, "")
+    known = set().union(*UNITS.values())
+    last = re.fullmatch(r"(.*?)[\s_.]*?([^\W\d_]+(?:/s)?)", name)
+    if not unit and last and last[2].lower() in known - BARE and last[2] != name[:1]:
+        base, unit = last[1], last[2]
+    separated = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", base)
+    return ColumnName(name, set(re.findall(r"[a-z]+", separated.lower())), unit.strip().lower())
+
+
+def _by_quantity(
+    columns: Sequence[ColumnName], commands: bool, joints: Sequence[str]
+) -> dict[str, list[ColumnName]]:
+    """Return the columns of each quantity: by the words of their names, else by their units."""
+    found: dict[str, list[ColumnName]] = {x: [] for x in (("t", "q", "u") if commands else WORDS)}
+    names = {joint.lower() for joint in joints}
+    for column in columns:
+        quantity = next((x for x, words in WORDS.items() if column.words & words), None)
+        if quantity is None:
+            quantity = next((x for x, units in UNITS.items() if column.unit in units), None)
+        if commands and column.words & COMMANDED and quantity in ("q", None):
+            quantity = "u"
+        elif column.words & (NOT_MEASURED - names):
+            continue
+        if quantity in found:
+            found[quantity].append(column)
+    return found
+
+
+def _units(
+    clock: ColumnName, by_joint: Mapping[str, Mapping[str, ColumnName]], table: pa.Table
+) -> dict[str, str]:
+    """Return the units of times and quantities that names state, else the unit that fits the steps of times."""
+    units = {"t": UNITS["t"].get(clock.unit) or _unit_of_times(clock.name, table) or "s"}
+    for quantity, named in by_joint.items():
+        for column in named.values():
+            stated = UNITS["q" if quantity == "u" else quantity].get(column.unit)
+            if stated is None and quantity == "qd":
+                stated = {"deg": "deg/s", "rad": "rad/s"}.get(units.get("q", ""))
+            if stated is None and quantity == "tau" and column.words & CURRENT:
+                stated = "A"
+            if stated is not None and quantity != "u":
+                units[quantity] = stated
+    return units
+
+
+def _unit_of_times(name: str, table: pa.Table) -> str | None:
+    """Return the unit in which the median step of a column of times is one of a log."""
+    if name not in table.schema.names:
+        return None
+    times = table[name].drop_null()
+    if len(times) < 3 or not (pa.types.is_integer(times.type) or pa.types.is_floating(times.type)):
+        return None
+    steps = np.diff(times.to_numpy())
+    return time_unit(float(np.median(steps[steps > 0]))) if (steps > 0).any() else None
+
+
+def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
+    """Return the places of the joints that cells name: `name0` is elbow, or a list of names in each row."""
+    order: dict[str, int] = {}
+    for number, name in enumerate(table.schema.names):
+        kind = table.schema.field(number).type
+        numbers = re.findall(r"\d+", name)
+        if not len(table):
+            continue
+        first = table.column(number)[0].as_py()
+        if pa.types.is_nested(kind) and isinstance(first, list):
+            order |= {text: place for place, text in enumerate(first) if text in joints}
+        elif numbers and first in joints:
+            order[first] = int(numbers[-1])
+    return order
 
 
 def _names(table: pa.Table) -> list[str]:
-    """Return the names of all columns, and of columns of lists those of their elements."""
+    """Return the names of all columns, for columns of lists the names of their elements; no name that occurs twice."""
     names: list[str] = []
-    for name in table.column_names:
-        values = table[name].drop_null()
+    for number, name in enumerate(table.column_names):
+        if table.column_names.count(name) > 1:
+            continue
+        values = table.column(number).drop_null()
         if pa.types.is_nested(values.type) and len(values):
             names += [f"{name}[{index}]" for index in range(len(values[0]))]
         else:
@@ -111,14 +217,18 @@ def _names(table: pa.Table) -> list[str]:
     return names
 
 
-def _by_joint(names: Sequence[str], joints: Sequence[str]) -> dict[str, str]:
-    """Return the column of each joint: by its name, else by the last number, in the URDF's order."""
-    named = {joint: name for joint in joints for name in names if names_joint(name, joint)}
-    numbered: dict[int, str] = {}
-    for name in names:
-        numbers = re.findall(r"\d+", name)
+def _by_joint(
+    columns: Sequence[ColumnName], joints: Sequence[str], order: Mapping[str, int]
+) -> dict[str, ColumnName]:
+    """Return the column of each joint: by its name, else by the last number, in the URDF's order or the cells'."""
+    named = {joint: column for joint in joints for column in columns if names_joint(column.name, joint)}
+    numbered: dict[int, ColumnName] = {}
+    for column in columns:
+        numbers = re.findall(r"\d+", column.name)
         if numbers:
-            numbered[int(numbers[-1])] = name
+            numbered[int(numbers[-1])] = column
     if named or len(numbered) < len(joints):
         return named
+    if set(order) == set(joints):
+        return {joint: numbered[order[joint]] for joint in joints if order[joint] in numbered}
     return dict(zip(joints, map(numbered.__getitem__, sorted(numbered)), strict=False))

@@ -1,4 +1,4 @@
-"""Describe what every reader of logs gives: a table, and where in it an arm's quantities stand."""
+"""Results of every reader of logs: a table, and the columns of an arm's quantities in it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from spelgen.settings.log_mapping import LogMapping
 
 UNITS_KEY = b"units"  # in a Parquet file's metadata: the file declares its units
 UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")  # that a declared unit answers
-UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # what spelgen itself declares
+UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # declared in files of spelgen
 
 # Arrow, NumPy and zipfile raise all of these for damaged files
 UNREADABLE = (
@@ -30,11 +30,11 @@ UNREADABLE = (
 
 @dataclass(frozen=True)
 class Layout:
-    """Say where the quantities of an arm stand in a log, and how they are measured.
+    """Columns of the quantities of an arm in a log, and their units.
 
-    file: what errors and trajectories name. columns: of t, then of q, qd and tau by joint; without qd where velocities
-    are to be differentiated. labels: the column that splits the log into recordings, None without. accepted: see
-    `Trajectory`. recording: its name, where the format keeps recordings apart.
+    file: named by errors and trajectories. columns: of t, then of q, qd and tau per joint; without qd if velocities
+    are differentiated. labels: the column that splits the log into recordings, None without. accepted: see
+    `Trajectory`. recording: its name, if the format separates recordings. remarks: facts about the file.
     """
 
     file: Path
@@ -44,6 +44,7 @@ class Layout:
     mapping: LogMapping
     accepted: tuple[str, ...]
     recording: str | None = None
+    remarks: tuple[str, ...] = ()
 
     def row_error(self, got: str, row: int, column: str, expected: str, do: str | None = None) -> LogError:
         """Return an error about a column in a 0-based data row, with the line of a CSV, whose first is its header."""
@@ -57,11 +58,11 @@ LogTable = tuple[Layout, pa.Table]
 
 @dataclass(frozen=True)
 class LogFormat:
-    """Describe one format of logs: what belongs to it, and how that is read.
+    """One format of logs: its files and its reader.
 
     read: from a path, the joints and the mapping to tables; raises LogError. suffixes: of its files. columns: from a
-    file to all its columns, of which `suggest` drafts a mapping; None where the format itself says what they are.
-    marker: a file in each folder that is a log of this format; folder: what such a folder is called.
+    file to all its columns, of which `suggest` drafts a mapping; None if the format itself defines them.
+    marker: a file in each folder that is a log of this format; folder: name of such a folder.
     """
 
     read: Callable[[Path, Sequence[str], LogMapping], list[LogTable]]
@@ -72,14 +73,14 @@ class LogFormat:
 
 
 def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, file: Path) -> Layout:
-    """Return where a table's columns are. Raises LogError where one is missing, or there twice.
+    """Return the layout of a table. Raises LogError if a column is missing, or occurs twice.
 
-    What spelgen itself wrote is read as such, whatever the mapping says.
+    The mapping does not apply to files that spelgen wrote.
     """
     metadata = schema.metadata or {}
     # simulated logs of an arm whose settings describe its real logger
     if metadata.get(UNITS_KEY) == UNITS:
-        mapping = LogMapping(input=mapping.input)
+        mapping = mapping.in_si()
     columns = [mapping.columns.t, *starmap(mapping.column, mapping.signals(joints))]
     missing = []
     for name in columns:
@@ -87,7 +88,11 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
             got, expected = "one column for several joints", "'{joint}' in its name under 'logs'"
             raise LogError(got, file=file, element=f"column {name}", expected=expected)
         if schema.names.count(name) > 1:
-            raise LogError("the same column twice", file=file, element=f"column {name}", expected="it once")
+            places = ", ".join(str(k) for k, other in enumerate(schema.names, start=1) if other == name)
+            got = f"the same name for the columns {places}"
+            raise LogError(
+                got, file=file, element=f"column {name}", expected="it once", do="rename one of them"
+            )
         if name not in schema.names and not list_element(name, schema.names):
             missing.append(name)
     if missing:
@@ -127,7 +132,7 @@ def stored_columns(layout: Layout, columns: Collection[str]) -> list[str]:
 def missing_columns(
     missing: Sequence[str], columns: Collection[str], file: Path, mapping: LogMapping, joints: Sequence[str]
 ) -> LogError:
-    """Return the error about columns that are not there, with what to do."""
+    """Return the error of missing columns, with its remedy."""
     quantities, expected = mapping.quantities, [mapping.columns.t]
     for quantity in quantities:
         expected.append(getattr(mapping.columns, quantity).replace("{joint}", "<joint>"))
@@ -137,13 +142,14 @@ def missing_columns(
         if set(names) <= set(missing):
             unlogged.append(joint)
     if unlogged and len(unlogged) < len(joints):
+        logged = ", ".join(joint for joint in joints if joint not in unlogged)
         do = (
-            f"nothing was logged of {', '.join(unlogged)}: say which joints are the arm's, by --tip, --joints, or "
-            "'tip' or 'moving_joints' in the robot's YAML, or map its columns under 'logs'"
+            f"nothing was logged of {', '.join(unlogged)}: write 'moving_joints: [{logged}]' into the robot's YAML if "
+            "the others do not move, or map its columns under 'logs'"
         )
     elif mapping.input == "torque" and _are_commands(columns, mapping, joints):
         do = "write 'input: position' into the YAML beside the URDF if these are commands of position servos"
-    # the usual gap of loggers, and the only one with a remedy of its own
+    # the most frequent gap of loggers, and the only one with a remedy of its own
     elif set(missing) <= set(of_quantity.get("qd", ())):
         do = "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
     else:
@@ -188,7 +194,7 @@ def names_joint(column: str, joint: str) -> bool:
 
 @contextmanager
 def reading(file: Path) -> Iterator[None]:
-    """Turn what libraries raise for a damaged file into a LogError that names it."""
+    """Convert exceptions of libraries for a damaged file to a LogError that names it."""
     try:
         yield
     except UNREADABLE as error:

@@ -1,4 +1,4 @@
-"""Hold one recording of an arm: what every step from log files to training samples works on."""
+"""One recording of an arm, for every step from log files to training samples."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from spelgen.errors import LogError
 from spelgen.labels import counted
 from spelgen.listing import Listing
 from spelgen.logs.tuning import TUNING
+from spelgen.settings.log_mapping import LogMapping
 
 T = TypeVar("T")
 
 QUANTITIES = ("q", "qd", "tau")
 GAP = TUNING.gap
+IN_SI = LogMapping()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -28,12 +30,12 @@ class Trajectory:
     t: (T,) sample times [s], strictly increasing, not necessarily regular.
     q, qd: (T, n) joint positions and velocities [rad, rad/s; m, m/s for prismatic joints].
     tau: (T, n) joint torques or forces [Nm; N]. In a simulated log tau[k] is constant from t[k] to t[k+1]; in a
-        measured one it is the torque measured at t[k]. (T, 0) where none was logged, beside commands u.
+        measured one it is the torque measured at t[k]. (T, 0) if none was logged, with commands u.
     u: (T, n) commanded positions [rad; m] of joints with servos, u[k] constant from t[k] to t[k+1]; None of others.
     name: unique among the trajectories that are used together.
     file: where it was read from, None if it was not.
-    accepted: codes of checks (see `spelgen.logs.checks`) that are not made of it: what they would find is right.
-    repairs: what was mended when it was read.
+    accepted: codes of checks (see `spelgen.logs.checks`) that are not applied: their findings would be wrong.
+    repairs: changes of its rows when it was read; remarks: facts about them. mapping: how it was logged.
     Raises LogError where shapes do not fit, a number is not finite or larger than any arm has, or times do not
     increase.
     """
@@ -47,6 +49,8 @@ class Trajectory:
     accepted: tuple[str, ...] = ()
     u: np.ndarray | None = None
     repairs: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    mapping: LogMapping = IN_SI
 
     def __post_init__(self) -> None:
         for column in ("t", *self.quantities):
@@ -86,7 +90,7 @@ class Trajectory:
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """Names of its columns beside times: q, qd, and tau or u."""
+        """Names of its columns except times: q, qd, and tau or u."""
         return QUANTITIES if self.u is None else ("q", "qd", "u")
 
     @property
@@ -102,7 +106,7 @@ class Trajectory:
 
     @property
     def regular_steps(self) -> np.ndarray:
-        """Times between samples [s], but gaps: a pause of a minute would halve the rate."""
+        """Times (T,) [s] between samples, but gaps: a pause of a minute would halve the rate."""
         steps = np.diff(self.t)
         return steps[steps <= GAP * np.median(steps)] if steps.size else steps
 
@@ -117,7 +121,7 @@ class Trajectory:
     def _as_array(self, column: str) -> np.ndarray:
         values: object = getattr(self, column)
         try:
-            if hasattr(values, "detach"):  # a tensor, wherever it is and whatever gradient it has
+            if hasattr(values, "detach"):  # a tensor, on any device and with any gradient
                 values = values.detach().cpu()
             return np.asarray(values, dtype=float)
         except (TypeError, ValueError) as error:
@@ -166,7 +170,7 @@ def require_joints(trajectory: Trajectory, joints: Sequence[str]) -> None:
 
 
 def gap_ends(t: np.ndarray, gap: float = GAP, hole: float = 0.0) -> list[int]:
-    """Return where the gap-free pieces of these times (T,) begin, and T. gap: in median steps; hole: least one [s]."""
+    """Return the first rows of the gap-free pieces of times (T,), and T. gap: in median steps; hole: shortest [s]."""
     steps = np.diff(t)
     # of ten thousand recordings hardly one has a gap, and a median takes longer than all else here
     if not steps.size or steps.max() <= gap * steps.min():
@@ -177,7 +181,7 @@ def gap_ends(t: np.ndarray, gap: float = GAP, hole: float = 0.0) -> list[int]:
 def split_at_gaps(
     trajectory: Trajectory, gap: float = GAP, hole: float = 0.0, *, shortest: int = 1
 ) -> list[Trajectory]:
-    """Return the gap-free pieces of at least so many samples, in order, all under the trajectory's name."""
+    """Return the gap-free pieces of at least `shortest` samples, in order, all under the trajectory's name."""
     ends = gap_ends(trajectory.t, gap, hole)
     pieces = [trajectory]
     if len(ends) > 2:
@@ -186,12 +190,12 @@ def split_at_gaps(
 
 
 def joined_column(trajectories: Sequence[Trajectory], name: str) -> np.ndarray:
-    """Return a column of all trajectories, one after the other, by its name: t, q, qd, tau or u."""
+    """Return a column of all trajectories joined, (T,) or (T, n), by its name: t, q, qd, tau or u."""
     return np.concatenate([getattr(x, name) for x in trajectories])
 
 
 def set_aside(items: Sequence[T], numbers: np.ndarray) -> tuple[list[T], list[T]]:
-    """Return the items that do not have these numbers, and those that have, in their order."""
+    """Return the items without these numbers (k,), and the items with them, in their order."""
     remaining: list[T] = []
     chosen: list[T] = []
     chosen_numbers = set(numbers.tolist())
@@ -204,7 +208,7 @@ def set_aside(items: Sequence[T], numbers: np.ndarray) -> tuple[list[T], list[T]
 
 
 def coverage(logs: Sequence[Trajectory]) -> dict[str, object]:
-    """Return `seconds` of all logs; by joint `q` and `qd`: their range, and the samples in equal bins of it."""
+    """Return `seconds` of all logs; per joint `q` and `qd`: their range, and the samples in equal bins of it."""
     result: dict[str, object] = {"seconds": _rounded(sum(log.duration for log in logs))}
     for name in ("q", "qd"):
         joints = []

@@ -10,7 +10,7 @@ class LogTuning:
     """Reading, cutting, filtering and differentiation of logs."""
 
     # [B] Numbers that a fit keeps of all logs together: 25 minutes of seven joints at 1 kHz, or 76,000 samples of a
-    # torque fit, about as many as its last iterations use. Windows of five samples take five times the memory.
+    # torque fit, about the number that its last iterations use. Windows of five samples take five times the memory.
     kept_bytes: int = 2**28
     # [1] Largest number of samples of a segment of logs that exceed `kept_bytes`: 16 s at 1 kHz, long compared with
     # filter transients.
@@ -21,9 +21,36 @@ class LogTuning:
     npz_bytes: int = 2**30
     # [rad, rad/s, Nm; m, m/s, N] Largest magnitude of a signal; larger ones have a wrong unit.
     largest_value: float = 1e9
-    # [1] A 0 between samples whose magnitude exceeds this multiple of the typical step is a dropout: continuous
-    # signals approach 0 gradually.
-    dropout: float = 20.0
+    # [1] A step that exceeds this multiple of the typical step is a jump, and a 0 between samples whose magnitudes
+    # exceed it is a missing value: continuous signals approach 0 gradually.
+    jump: float = 20.0
+    # [1] An outlier's two steps exceed this multiple of the steps of its neighbours: a fast motion has large steps
+    # before and after, too.
+    local_jump: float = 4.0
+    # [1] Samples on each side of an outlier that are its neighbours.
+    jump_window: int = 8
+    # [1] Samples within which a signal that has left returns, if they are outliers; later it has jumped.
+    excursion: int = 5
+    # [1] Fraction of steps that are jumps; a signal with more is noise.
+    most_jumps: float = 0.05
+    # [1] Fraction of steps at which a signal around 0, and so the sign bit of its words, changes its sign at most.
+    most_words: float = 0.5
+    # [1] Smallest step of words relative to the range of a signal: words of 18 bits.
+    finest_word: float = 4e-6
+    # [1] Rounding of values on a grid, relative to its step.
+    word_rounding: float = 0.02
+    # [1] Noise of a wrapped angle beyond its period, relative to the period.
+    word_margin: float = 0.01
+    # [rad/s, m/s] Largest velocity of an arm: a faster step is a jump.
+    fastest: float = 40.0
+    # [rad] Difference from one revolution within which a period is one revolution.
+    limit_of_turn: float = 1e-6
+    # [1] Fraction of repeated rows that has no effect on a fit.
+    repeats: float = 0.02
+    # [1] Rows of one time but different states that are an accident of a logger.
+    few_repeats: int = 10
+    # [1] Fraction of such rows from which on the clock is too coarse.
+    coarse_clock: float = 0.02
     # [1] A step longer than this multiple of the median step is a gap; jitter of USB loggers stays below 3.
     gap: float = 4.0
     # [Hz] Cutoff of the low-pass filter by default: rigid-body motion lies below, ripple and quantisation above
@@ -66,8 +93,15 @@ class SignalCheckTuning:
     agreement: float = 0.9
     # [1] A factor within this ratio of the factor of a unit is the factor of the unit.
     unit_factor: float = 1.25
-    # [s] Largest median time between samples: no arm is sampled at less than 2 Hz.
+    # [s] Smallest and largest median time between samples: no arm is sampled above 10 kHz or below 2 Hz.
+    fastest_step: float = 1e-4
     slowest_step: float = 0.5
+    # [1] Velocity of the rarer sign relative to the fastest one, below which it may be the magnitude of a velocity.
+    unsigned: float = 0.05
+    # [1] Correlation from which on a signal is the magnitude of dq/dt.
+    unsigned_agreement: float = 0.9
+    # [1] Remaining distance of commands from positions, relative to the former one, if words are decoded correctly.
+    near_position: float = 0.3
 
 
 @dataclass(frozen=True)

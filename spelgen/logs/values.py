@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.compute
 
 from spelgen.errors import LogError
+from spelgen.logs.jumps import signed
 from spelgen.logs.tables import Layout, list_element
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import TIMES
@@ -22,7 +23,8 @@ Column: TypeAlias = "pa.ChunkedArray | pa.Array"
 def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows: Rows) -> np.ndarray:
     """Return the columns of a layout (T, C) in SI units, times from `start` on. rows: of the table in its file.
 
-    Raises LogError naming row and column where a value is no number, or none that an arm can have.
+    Rows of another topic or publisher (see `foreign_rows`) contain NaN. Raises LogError naming row and column if a
+    value is no number, or none that an arm can have.
     """
     times, unit = _clock(table, layout)
     if start is not None:
@@ -32,14 +34,21 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
     for name in layout.columns[1:]:
         logged.append(_floats(_column(table, name), name, layout, rows))
     mapping, signals = layout.mapping, layout.mapping.signals(layout.joints)
+    for k, (quantity, joint) in enumerate(signals, start=1):
+        sign_bit = mapping.word("sign_bit", quantity, joint)
+        if sign_bit:
+            logged[k] = signed(logged[k], sign_bit)
     factors = np.array([unit, *starmap(mapping.scale, signals)])
     offsets = np.array([0.0, *starmap(mapping.offset, signals)])
-    # what overflows is told below, with its row
+    # an overflow is reported below, with its row
     with np.errstate(over="ignore", invalid="ignore"):
         data: np.ndarray = np.stack(logged, axis=1) * factors + offsets
     largest = np.full(data.shape[1], TUNING.largest_value)
     largest[0] = TUNING.latest
     bad = ~(np.abs(data) < largest)  # NaN included
+    foreign = foreign_rows(data, len(layout.joints))
+    if not foreign.all():
+        bad &= ~foreign[:, None]
     if bad.any():
         first, k = np.argwhere(bad)[0]
         value, count = data[first, k], f"{bad.any(axis=1).sum()} of {len(data)} rows have such a"
@@ -48,9 +57,17 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
         if not np.isfinite(value):
             got, expected = f"no finite number ({count} gap", "a number"
             do = "remove those rows; a gap in t is understood"
+            if foreign.all():
+                do = "no row has all quantities: log them together, or resample them to the same times"
         got += ", this is the first)"
         raise layout.row_error(got, rows[first], layout.columns[k], expected, do)
     return data
+
+
+def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
+    """Return a mask (T,) of rows (T, C) of another topic or publisher: without values, or with positions only."""
+    empty = np.isnan(data[:, 1 + joints :])
+    return np.asarray(empty.all(axis=1))
 
 
 def clock_start(table: pa.Table, layout: Layout) -> pa.Scalar | None:
@@ -60,14 +77,14 @@ def clock_start(table: pa.Table, layout: Layout) -> pa.Scalar | None:
     is_stamp = pa.types.is_temporal(_column(first_row, layout.columns[0]).type)
     if pa.types.is_integer(times.type) or pa.types.is_floating(times.type):
         first = times[0].as_py()
-        # seconds since 1970 leave floating-point numbers no digits for what follows
+        # floating-point seconds since 1970 have too few digits
         if first is not None and (is_stamp or TUNING.longest_clock < abs(first) < np.inf):
             return times[0]
     return None
 
 
 def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
-    """Return the times as plain numbers, and their unit [s]. Raises LogError for dates beyond what Arrow counts."""
+    """Return the times as plain numbers, and their unit [s]. Raises LogError for dates beyond the range of Arrow."""
     name = layout.columns[0]
     times = _column(table, name)
     if pa.types.is_duration(times.type):
@@ -97,7 +114,7 @@ def _column(table: pa.Table, name: str) -> Column:
     if is_text:
         bare = pa.compute.replace_substring_regex(lists.cast(pa.string()), r"^.*[\[(]\s*|\s*[\])].*$", "")
         lists = pa.compute.split_pattern_regex(bare, r"[,;\s]+")
-    # Arrow raises for an index beyond a list, where a missing number is what it means
+    # Arrow raises for an index beyond a list, although a number is only missing
     long_enough = pa.compute.greater(pa.compute.list_value_length(lists), index)
     lists = pa.compute.if_else(long_enough, lists, pa.scalar(None, lists.type))
     elements = pa.compute.list_element(lists, index)
@@ -111,7 +128,7 @@ def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray
         floats = values.cast(pa.float64(), safe=not pa.types.is_integer(values.type))
         return np.asarray(floats.to_numpy(zero_copy_only=False))
     except (pa.ArrowException, ValueError) as error:
-        # Arrow does not say which row
+        # Arrow does not state the row
         texts = values.to_pylist() if pa.types.is_string(values.type) else []
         for index, text in enumerate(texts):
             if text and not is_number(text):

@@ -85,7 +85,7 @@ def cut_windows(
             tau = piece.tau[:-1]
             if measured:
                 tau = (tau + piece.tau[1:]) / 2
-            # sums of impulses: steps of a jittered clock are not alike
+            # sums of impulses: steps of a jittered clock differ
             impulses = tau * np.diff(piece.t)[:, None]
             impulse = sliding_window_view(impulses, decimation, axis=0).sum(axis=-1)  # (T - decimation, n)
             dt = (piece.t[decimation:] - piece.t[:-decimation])[:, None]
@@ -108,7 +108,7 @@ def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> tor
 
 
 class Split(NamedTuple):
-    """Hold training and validation pieces, which share no sample, and how they were chosen."""
+    """Training and validation pieces, which share no sample, and a note on their choice."""
 
     training: tuple[Trajectory, ...]
     validation: tuple[Trajectory, ...]
@@ -132,7 +132,7 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
         note = Diagnostic("info", "validation-split", "logs", None, message)
         last = replace(trajectory[cut:], name=f"{trajectory.name} (last part)")
         return Split((trajectory[:cut],), (last,), note)
-    # whole trajectories: neighbouring windows share samples, and would tell the answer
+    # whole trajectories: neighbouring windows share samples, and would validate on training data
     count = min(max(1, round(fraction * total)), total - 1)
     training, validation = set_aside(trajectories, np.random.default_rng(seed).permutation(total)[:count])
     names = ", ".join(x.name for x in validation) if count <= 3 else f"{count} of {total} trajectories"

@@ -90,6 +90,8 @@ def training_facts(
         facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"
         if record.options.get("solver", "rk4") == "rk4":
             facts["integrator"] = f"rk4, {counted(last['substeps'], 'step')} between samples"
+    if record.notes:
+        facts["notes"] = "; ".join(record.notes)
     if record.options.get("momentum_steps"):
         facts["start"] = f"{record.options['momentum_steps']:,} steps on the momentum along the logs"
     return facts
@@ -138,6 +140,8 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str
         options |= record.options | asdict(record.preprocessing)
         for key, value in _changed(options, defaults).items():
             train += f" --set {shlex.quote(f'{key}={value}')}"
+        if run.mapping.exists():
+            train += f" --mapping RUN/{run.mapping.name}"
         lines.append(train)
     return [*lines, "spelgen evaluate RUN2 --data LOGS", "spelgen report RUN2"]
 

@@ -1,7 +1,8 @@
 """Names, units and signs of logged columns: the group `logs` of a settings file, or a separate mapping file.
 
 q = sign * unit * value + offset, and so is u, a commanded position; qd = sign * unit * value,
-tau = sign * gain * unit * value + torque_offset.
+tau = sign * gain * unit * value + torque_offset. Before that, words of a register become values by `sign_bit` and
+`period`.
 """
 
 from __future__ import annotations
@@ -24,28 +25,25 @@ SPEEDS = {f"{name}/s": scale for name, scale in LENGTHS.items()} | {"rpm": 2 * p
 SCALES = {**LENGTHS, **SPEEDS, "mNm": _MILLI, "mA": _MILLI}
 CURRENTS = ("A", "mA")
 COUNTS = ("counts", "counts/s")
+# -100..100 of the calibrated range of a motor, as LeRobot stores positions by default
+NORMALISED = "normalised"
+SERVO_TURN = 4096  # counts in a revolution of the servos that LeRobot calibrates
 ONLY = {  # units that a joint of this type cannot have
     "revolute": ("m", "mm", "m/s", "mm/s", "N"),
-    "prismatic": ("rad", "deg", "turns", "rad/s", "deg/s", "turns/s", "rpm", "Nm", "mNm"),
+    "prismatic": ("normalised", "rad", "deg", "turns", "rad/s", "deg/s", "turns/s", "rpm", "Nm", "mNm"),
 }
 
 LONGEST_DELAY = 1.0  # s
 
 Accepted = Literal[
-    "degrees",
-    "frozen",
-    "time-unit",
-    "dropouts",
-    "no-torques",
-    "torque-sense",
-    "torque-unit",
-    "torque-beyond-drive",
-    "torque-order",
-]
-"""Codes of the errors of `spelgen logs` that a user can accept."""
+    "degrees", "frozen", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign", "no-torques",
+    "torque-sense", "torque-unit", "torque-beyond-drive", "torque-order", "joint-sense", "joint-order", "joint-zero",
+    "gravity", "gravity-compensated",
+]  # fmt: skip
+"""Codes of errors of `spelgen logs` that a user can accept."""
 
 Time = Literal["s", "ms", "us", "ns"]
-Position = Literal["rad", "deg", "turns", "counts", "m", "mm"]
+Position = Literal["rad", "deg", "turns", "counts", "normalised", "m", "mm"]
 Velocity = Literal["rad/s", "deg/s", "turns/s", "rpm", "counts/s", "m/s", "mm/s"]
 Effort = Literal["Nm", "mNm", "N", "A", "mA"]
 
@@ -116,6 +114,31 @@ class LogUnits(JointUnits):
     t: Time = "s"
 
 
+class JointWords(Group):
+    """Sizes of one joint's words, in logged units; None: its values are no words."""
+
+    q: Positive | None = None
+    qd: Positive | None = None
+    tau: Positive | None = None
+    u: Positive | None = None
+
+
+class MotorCalibration(Group):
+    """Calibration of one motor, as LeRobot writes it: the range of motion [counts], and whether it is mirrored."""
+
+    range_min: Number
+    range_max: Number
+    drive_mode: Literal[0, 1] = 0
+    homing_offset: Number = 0.0
+    id: int = 0
+
+    @model_validator(mode="after")
+    def _has_range(self) -> MotorCalibration:
+        if not self.range_min < self.range_max:
+            raise ValueError("a range_max above range_min")
+        return self
+
+
 class JointLog(Group):
     """Columns of one joint.
 
@@ -130,6 +153,9 @@ class JointLog(Group):
         gain: Torque per logged unit, e.g. gear times motor constant; negative if current and velocity have opposite
             senses [Nm/A].
         torque_offset: Torque at the logged value 0 [Nm, N].
+        period: Interval after which logged values start again, e.g. 65536 counts of a 16-bit register or 360 degrees;
+            default: one turn for the positions of joints without limits.
+        sign_bit: Logged value from which on values are negative: 32768 + x of a servo is -x.
     """
 
     name: str | None = None
@@ -141,6 +167,8 @@ class JointLog(Group):
     offset: Number = 0.0
     gain: Number | None = None
     torque_offset: Number = 0.0
+    period: JointWords = JointWords()
+    sign_bit: JointWords = JointWords()
 
     @model_validator(mode="after")
     def _moves(self) -> JointLog:
@@ -155,7 +183,7 @@ class LogMapping(Group):
     It does not apply to files that spelgen has written.
 
     Attributes:
-        topic: Topic of a ROS 2 bag that has joint states in several topics.
+        topic: Topic of a ROS bag that has joint states in several topics.
         columns: Names of the columns.
         units: Units of the columns.
         input: "position" for position servos: u is read instead of qd and tau.
@@ -163,7 +191,11 @@ class LogMapping(Group):
         torque_delay: Delay of the logged torques relative to the positions; `spelgen logs` suggests a value [s].
         joints: Columns of single joints, by the joint's name in the URDF.
         accept: Codes of errors of `spelgen logs` to ignore.
-        dropouts: "dropped" removes rows in which a signal falls to 0 for a moment.
+        dropouts: "dropped" removes rows in which a signal falls to 0 or deviates from its neighbours for a moment, and
+            rows that repeat the row before.
+        sample_rate: Rate of evenly spaced rows, whose times are ignored [Hz].
+        calibration: Calibration of the motors by their names in the log, the content of LeRobot's calibration file, for
+            the unit "normalised".
     """
 
     topic: str | None = None
@@ -175,6 +207,8 @@ class LogMapping(Group):
     joints: dict[str, JointLog] = Field(default={})
     accept: tuple[Accepted, ...] = ()
     dropouts: Literal["kept", "dropped"] = "kept"
+    sample_rate: Positive | None = None
+    calibration: dict[str, MotorCalibration] = Field(default={})
 
     @property
     def quantities(self) -> tuple[str, ...]:
@@ -216,6 +250,27 @@ class LogMapping(Group):
             joints[joint] = logged.model_copy(update={"columns": logged.columns.model_copy(update=names)})
         return self.model_copy(update={"joints": joints})
 
+    def with_turns(self, joints: Sequence[str]) -> LogMapping:
+        """Return the mapping with a period of one turn for positions of these joints, unless they have one."""
+        changed = dict(self.joints)
+        for joint in joints:
+            logged = self.joint(joint)
+            unstated = [x for x in ("q", "u") if not self.word("period", x, joint)]
+            turns = {x: 2 * pi / abs(self.scale(x, joint)) for x in unstated}
+            period = logged.period.model_copy(update=turns)
+            changed[joint] = logged.model_copy(update={"period": period})
+        return self.model_copy(update={"joints": changed})
+
+    def in_si(self) -> LogMapping:
+        """Return the mapping of a file in SI units with plain names: of this one only input and turns remain."""
+        turning = [name for name in self.joints if self.word("period", "q", name)]
+        return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
+
+    def word(self, key: Literal["period", "sign_bit"], quantity: str, joint: str) -> float | None:
+        """Return the period or the sign bit of a joint's quantity in logged units, None if it has none."""
+        size: float | None = getattr(getattr(self.joint(joint), key), quantity)
+        return size
+
     def unit(self, quantity: str, joint: str) -> str | None:
         """Return the unit of "q", "qd", "tau" or "u" of a joint, None without a setting; u has the unit of q."""
         unit: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
@@ -229,6 +284,10 @@ class LogMapping(Group):
         factor = SCALES.get(unit or "", 1.0)
         if quantity == "tau" and logged.gain is not None:
             factor *= logged.gain
+        elif unit == NORMALISED:
+            motor = self.calibration[self.log_name(joint)]
+            counts = (motor.range_max - motor.range_min) / 200
+            factor = (1 - 2 * motor.drive_mode) * counts * 2 * pi / (logged.counts_per_turn or SERVO_TURN)
         elif unit in COUNTS:
             turn = logged.counts_per_turn
             factor = 2 * pi / turn if turn else 1.0 / (logged.counts_per_metre or 1.0)
@@ -248,15 +307,17 @@ class LogMapping(Group):
         for joint, kind in zip(joints, kinds, strict=True):
             for quantity in self.quantities:
                 unit = self.unit(quantity, joint)
-                expected = self._missing(unit, self.joint(joint), kind)
+                expected = self._missing(unit, self.log_name(joint), self.joint(joint), kind)
                 if expected:
                     where = f"logs: joint {joint!r}, {quantity}"
                     errors.append(SettingsError(f"the unit {unit}", element=where, expected=expected))
         return errors
 
-    def _missing(self, unit: str | None, logged: JointLog, kind: str | None) -> str | None:
+    def _missing(self, unit: str | None, joint: str, logged: JointLog, kind: str | None) -> str | None:
         if unit in CURRENTS and logged.gain is None:
             return "a gain beside it"
+        if unit == NORMALISED and joint not in self.calibration:
+            return f"the content of LeRobot's calibration file as 'calibration', with {joint!r} in it"
         if unit in COUNTS:
             # for an unknown joint type, either key is accepted
             in_turns = logged.counts_per_turn if kind != "prismatic" else None

@@ -13,6 +13,7 @@ from spelgen.urdf.values import (
     Notes,
     first_child,
     note_unexpanded,
+    read_limit,
     read_number,
     read_text_number,
     read_triple,
@@ -164,23 +165,17 @@ def _read_axis(notes: Notes, element: etree._Element, kind: str | None, where: s
 def _read_limit(notes: Notes, element: etree._Element, kind: str | None, where: str) -> Limits:
     limit = first_child(notes, element, "limit", where)
     if limit is None:
-        # continuous and fixed joints need no limit
-        if kind in ("revolute", "prismatic"):
-            notes.warn(element.sourceline, "incomplete-limit", where, "no <limit>: read as unlimited")
         return _NO_LIMITS
-    keys = ["lower", "upper", "effort", "velocity"]
+    where = f"{where} limit"
+    # exporters write 0 for an effort or a velocity that nobody stated
+    effort, velocity = (read_limit(notes, limit, key, where) or None for key in ("effort", "velocity"))
     if kind == "continuous":
         # lower and upper of a continuous joint have no meaning
-        keys = ["effort", "velocity"]
-    missing = [key for key in keys if key not in limit.attrib]
-    if missing and kind in MOVING:
-        message = f"<limit> lacks {', '.join(missing)}: read as unlimited"
-        notes.warn(limit.sourceline, "incomplete-limit", where, message)
-    values: dict[str, float | None] = {}
-    for key in keys:
-        # exporters write numbers such as 1e38 for "no limit"
-        values[key] = read_number(notes, limit, key, f"{where} limit", bounded=False)
-    return values.get("lower"), values.get("upper"), values["effort"], values["velocity"]
+        return None, None, effort, velocity
+    lower, upper = (read_limit(notes, limit, key, where) for key in ("lower", "upper"))
+    if lower == upper == 0:
+        lower = upper = None
+    return lower, upper, effort, velocity
 
 
 def _read_dynamics(notes: Notes, element: etree._Element, where: str) -> tuple[float, float]:

@@ -15,14 +15,14 @@ _UNIT_AXIS = 1e-3
 
 
 def lint(robot: Robot) -> list[Diagnostic]:
-    """Return the warnings on inertials, joints and rigid groups, which the reader sorts by line."""
-    warnings: list[Diagnostic] = []
+    """Return the diagnostics of inertials, joints, rigid groups and limits, which the reader sorts by line."""
+    diagnostics: list[Diagnostic] = []
     for link in robot.links:
-        warnings += _lint_inertial(link)
-    warnings += _lint_placeholders(robot)
+        diagnostics += _lint_inertial(link)
+    diagnostics += _lint_placeholders(robot)
     for joint in robot.joints:
-        warnings += _lint_joint(joint)
-    return [*warnings, *_lint_groups(robot)]
+        diagnostics += _lint_joint(joint)
+    return [*diagnostics, *_lint_groups(robot), *_unlimited(robot)]
 
 
 def _warning(code: str, where: str, line: int, message: str) -> Diagnostic:
@@ -96,6 +96,27 @@ def _lint_joint(joint: UrdfJoint) -> Iterator[Diagnostic]:
     if joint.lower is not None and joint.upper is not None and joint.lower > joint.upper:
         message = f"lower {joint.lower:g} is above upper {joint.upper:g}: perhaps the two were swapped"
         yield _warning("lower-above-upper", f"{where} limit", joint.line, message)
+
+
+def _unlimited(robot: Robot) -> Iterator[Diagnostic]:
+    """Name all limits that moving joints do not have, once: every later step treats them as unlimited."""
+    lacking: dict[str, list[str]] = {"position": [], "velocity": [], "effort": []}
+    joints = [joint for joint in robot.joints if joint.moves and joint.mimic is None]
+    for joint in joints:
+        if joint.type != "continuous" and (joint.lower is None or joint.upper is None):
+            lacking["position"].append(joint.name)
+        if joint.velocity is None:
+            lacking["velocity"].append(joint.name)
+        if joint.effort is None:
+            lacking["effort"].append(joint.name)
+    texts = []
+    for limit, names in lacking.items():
+        which = "all joints" if len(names) == len(joints) else ", ".join(names)
+        if names:
+            texts.append(f"{limit} of {which}")
+    if texts:
+        message = f"no limits of {'; '.join(texts)}: absent, 0, inf, nan and huge limits mean unlimited"
+        yield Diagnostic("info", "unlimited", "robot", joints[0].line, message)
 
 
 def _lint_groups(robot: Robot) -> Iterator[Diagnostic]:

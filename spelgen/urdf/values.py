@@ -19,6 +19,8 @@ from spelgen.urdf.robot import Vector
 # Largest magnitude of a number of exact geometry: products of a few such numbers are in the range of a float.
 MAX_MAGNITUDE = 1e12
 MAX_NUMBER_TEXT = 64
+# [rad, m; Nm, N; per second] From these on a limit states that there is none: exporters write 1e9, 1e16 or DBL_MAX.
+UNLIMITED = {"lower": 1e3, "upper": 1e3, "effort": 1e5, "velocity": 1e3}
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _COUNTS = {1: "one number", 3: "three numbers"}
 
@@ -71,6 +73,15 @@ def read_number(
     text = element.get(key)
     values = None if text is None else _parsed(notes, element, text, 1, f"{where} {key}", bounded)
     return None if values is None else values[0]
+
+
+def read_limit(notes: Notes, element: etree._Element, key: str, where: str) -> float | None:
+    """Read a limit; None if it states none: absent, inf, nan, or beyond what joints have."""
+    text = (element.get(key) or "").strip().lower()
+    if text.lstrip("+-") in ("inf", "infinity", "nan"):
+        return None
+    value = read_number(notes, element, key, where, bounded=False)
+    return None if value is None or abs(value) >= UNLIMITED[key] else value
 
 
 def read_text_number(notes: Notes, element: etree._Element, tag: str, where: str) -> float | None:

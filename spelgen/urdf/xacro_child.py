@@ -1,11 +1,33 @@
 """Expansion of a xacro file in the process that ``xacro_input`` starts: FILE -> stdout, messages -> stderr."""
 
+import re
 import sys
+from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 
 MISSING = 3
 """Exit code where the package xacro is not installed."""
 MEMORY = 2**30  # bytes
+
+
+def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path) -> None:
+    """Let $(find PACKAGE) find a package above the file, or next to a folder above it, without ROS."""
+    installed = functions["_eval_find"]
+
+    def find(package: str) -> str:
+        for folder in path.parents:
+            for candidate in (folder, folder / package):
+                manifest = candidate / "package.xml"
+                if manifest.is_file():
+                    name = re.search(r"<name>\s*(.*?)\s*</name>", manifest.read_text(errors="replace"))
+                    if name and name[1] == package:
+                        return str(candidate)
+        # a package without its manifest has its name
+        named = [folder for folder in path.parents if folder.name == package]
+        return str(named[0]) if named else installed(package)
+
+    functions["_eval_find"] = find
 
 
 def main(path: str) -> None:
@@ -16,8 +38,10 @@ def main(path: str) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     try:
         import xacro
+        from xacro import substitution_args
     except ModuleNotFoundError:
         sys.exit(MISSING)
+    _find_packages_above(vars(substitution_args), Path(path).resolve())
     try:
         document = xacro.process_file(path)
         for comment in document.childNodes:

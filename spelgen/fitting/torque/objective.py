@@ -75,7 +75,9 @@ class TorqueObjective(TorqueLogObjective):
         regularizer = None
         if not isinstance(model, RigidBodyDynamics):  # rigid bodies have a prior of their own at the URDF
             regularizer = self._regularizer(self.data, self.config.urdf_weight, notes)
-        notes += fit_torques(model, samples, self.config, regularizer)
+        fit_notes = fit_torques(model, samples, self.config, regularizer)
+        self.results = {"notes": [note.message for note in fit_notes]}
+        notes += fit_notes
         # residual terms that were not selected are zero, and take time
         subset = replace(self.data, validation=thinned(self.data.validation, TUNING.validation_windows))
         validation = Validation(without_idle_residuals(model), subset, self.request.options.device)

@@ -18,6 +18,7 @@ from spelgen.fitting.torque.fit import TorqueSolution
 from spelgen.fitting.torque.parameters import ParameterVector
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
+from spelgen.runtime.inputs import MotorInputs
 
 TERM_NAMES = {
     "raw_torque_splines": "a torque by position (spring, cable)",
@@ -34,7 +35,15 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
     # the log-Cholesky parameters of a body are logarithms of its mass and radii
     factor = float(np.exp(solution.prior.bodies))
     message = f"prior standard deviation of URDF masses: factor {factor:.2g}"
-    yield Diagnostic("info", "urdf-prior", "bodies", None, message)
+    if factor > TUNING.wrong_urdf:
+        message += (
+            "; check the masses and centres of mass of the URDF, `spelgen logs` names links that are far off"
+        )
+        yield Diagnostic("warning", "urdf-prior", "bodies", None, message)
+    else:
+        yield Diagnostic("info", "urdf-prior", "bodies", None, message)
+    if isinstance(model.inputs, MotorInputs) and len(model.inputs.gain_rows):
+        yield _trained_gains(model, model.inputs, solution, names)
     if solution.compensated.any():
         yield _compensation(model, solution, names)
     if residual_terms(model) is not None:
@@ -53,6 +62,29 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
             "than constant velocity; record faster motion"
         )
         yield Diagnostic("warning", "acceleration-unseen", "logs", None, message)
+
+
+def _trained_gains(
+    model: ArmModel, inputs: MotorInputs, solution: TorqueSolution, names: np.ndarray
+) -> Diagnostic:
+    """Return the trained motor gains with 95 % intervals, as a warning if the logs do not determine one of them."""
+    trained = ParameterVector(model).mask("gains")
+    # of the logarithm of a gain
+    deviation = solution.covariance.diagonal()[trained].clamp(min=0).sqrt().numpy()
+    rows = inputs.gain_rows.numpy()
+    parts = []
+    for name, gain, factor in zip(
+        names[rows], inputs.gains().detach().numpy()[rows].sum(axis=1), np.exp(1.96 * deviation), strict=True
+    ):
+        parts.append(f"{name} {gain:.4g} ({gain / factor:.4g} to {gain * factor:.4g})")
+    message = f"joint torque per logged torque, with 95 % intervals: {', '.join(parts)}"
+    undetermined = names[rows][deviation > TUNING.undetermined_gain]
+    if not undetermined.size:
+        return Diagnostic("info", "trained-gains", "motors", None, message)
+    message += (
+        f"; the gain of {', '.join(undetermined)} is not determined: friction and inertia scale with it"
+    )
+    return Diagnostic("warning", "trained-gains", "motors", None, message)
 
 
 def _compensation(model: ArmModel, solution: TorqueSolution, names: np.ndarray) -> Diagnostic:

@@ -91,6 +91,11 @@ class TorqueTuning:
     body_step: float = 0.3
     # [1] Relative standard deviation above which logs do not determine an inertia.
     undetermined: float = 0.5
+    # [1] Relative standard deviation above which logs do not determine a motor gain: its 95 % interval then reaches
+    # 20 % to either side, as the difference of two datasheets does.
+    undetermined_gain: float = 0.1
+    # [1] Factor of the prior standard deviation of URDF masses above which the URDF is wrong.
+    wrong_urdf: float = 5.0
     # [1] Torque residual divided by the inertial torque of a joint, above which the predicted motion is unreliable.
     weak_acceleration: float = 2.0
     # [1] Positions at which inertias are evaluated.

@@ -1,0 +1,255 @@
+"""Evidence for hypotheses about the geometry of a log: senses and order of joints, zero offsets, gravity, units.
+
+A hypothesis changes the signals of a log, or the gravity of the arm, as lines of the settings would. Its cost is the
+negative log posterior of the torques, minimised over inertial parameters, friction and the noise of each joint. The
+prior at the URDF, and penalties for negative rotor inertia and for friction that drives, decide between hypotheses that
+explain the torques equally well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from copy import copy
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from spelgen.arm.arm import Chain
+from spelgen.dynamics.regressor_dynamics import body_chain
+from spelgen.identification.drive_hints import drive_rows
+from spelgen.identification.inertial_prior import InertialPrior, inertial_prior
+from spelgen.identification.least_squares import block_products, varying
+from spelgen.identification.tuning import GEOMETRY
+
+ARMATURE, VISCOUS, COULOMB = range(3)  # order of the friction effects of `drive_rows`
+Vector3 = tuple[float, float, float]
+
+
+class MotionSamples(NamedTuple):
+    """Samples of motion and joint torques, (S, n) each: q, qd, qdd [rad, s; m, s], tau [Nm; N]."""
+
+    q: np.ndarray
+    qd: np.ndarray
+    qdd: np.ndarray
+    tau: np.ndarray
+
+    def thinned(self, count: int) -> MotionSamples:
+        """Return at most `count` samples, evenly spaced."""
+        stride = -(-len(self.q) // count) or 1
+        return MotionSamples(*(column[::stride] for column in self))
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A reading of the columns of n joints, and a gravity.
+
+    codes: of the changes, as findings have them; none: the unchanged log. q of joint k is motion_scale[k] times the
+    column of joint motion_source[k], plus offset[k] [rad, m]; its torque is torque_scale[k] times the column of joint
+    torque_source[k]. gravity: in the frame of the root link [m/s^2].
+    """
+
+    codes: tuple[str, ...]
+    motion_source: np.ndarray
+    torque_source: np.ndarray
+    motion_scale: np.ndarray
+    torque_scale: np.ndarray
+    offset: np.ndarray
+    gravity: Vector3
+
+    @classmethod
+    def unchanged(cls, arm: Chain) -> Hypothesis:
+        """Return the hypothesis of the unchanged log, in SI units and without offsets."""
+        joints = len(arm.coordinates)
+        order, ones = np.arange(joints), np.ones(joints)
+        x, y, z = map(float, arm.gravity)
+        return cls((), order, order, ones, ones, np.zeros(joints), gravity=(x, y, z))
+
+    @property
+    def motion_key(self) -> tuple[bytes, Vector3]:
+        """Key of the regressor: motion and gravity."""
+        arrays = (self.motion_source, self.motion_scale, self.offset)
+        return b"".join(x.tobytes() for x in arrays), self.gravity
+
+    def signals(self, samples: MotionSamples) -> MotionSamples:
+        """Return the samples as this hypothesis reads them."""
+        q, qd, qdd = (x[:, self.motion_source] * self.motion_scale for x in samples[:3])
+        return MotionSamples(q + self.offset, qd, qdd, samples.tau[:, self.torque_source] * self.torque_scale)
+
+    def logged(self, samples: MotionSamples) -> MotionSamples:
+        """Return the columns of the log that this hypothesis reads as `samples`."""
+        motion, torque = np.argsort(self.motion_source), np.argsort(self.torque_source)
+        q = (samples.q - self.offset) / self.motion_scale
+        qd, qdd = samples.qd / self.motion_scale, samples.qdd / self.motion_scale
+        tau = samples.tau / self.torque_scale
+        return MotionSamples(q[:, motion], qd[:, motion], qdd[:, motion], tau[:, torque])
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Least squares with the prior under a hypothesis.
+
+    cost: negative log posterior up to a constant. misfit: its part from the torque residual. parameters: (K,), inertial
+    parameters first. covariance: (K, K), posterior. errors: (n,) mean squared residual of each joint, relative to the
+    variance of its torque.
+    """
+
+    hypothesis: Hypothesis
+    cost: float
+    misfit: float
+    parameters: np.ndarray
+    covariance: np.ndarray
+    errors: np.ndarray
+
+
+class GeometryProblem:
+    """Least squares of the torques of a log under hypotheses about its geometry."""
+
+    def __init__(
+        self,
+        arm: Chain,
+        samples: MotionSamples,
+        speeds: np.ndarray,
+        seconds: float,
+        unchanged: Hypothesis | None = None,
+    ) -> None:
+        """Prepare the problem of an arm with n joints.
+
+        Args:
+            arm: with its gravity and the inertial parameters of its URDF.
+            samples: of its motion, with torques at the joints.
+            speeds: C (n, n) of the motors, see `Drives`.
+            seconds: duration of the logs [s], which limits the number of independent errors.
+            unchanged: scales and offsets of the mapping of the logs; None: SI units and no offsets.
+        """
+        self.arm, self.speeds = arm, speeds
+        self.unchanged = unchanged or Hypothesis.unchanged(arm)
+        self.samples = self.unchanged.logged(samples)
+        self._prior: InertialPrior = inertial_prior(arm)
+        self._count = float(np.clip(seconds / GEOMETRY.correlation_time, 1.0, GEOMETRY.max_errors))
+        self._equations: dict[tuple[bytes, Vector3], tuple[np.ndarray, np.ndarray]] = {}
+
+    def thinned(self, count: int) -> GeometryProblem:
+        """Return the problem on at most `count` samples."""
+        fewer = copy(self)
+        fewer.samples, fewer._equations = self.samples.thinned(count), {}
+        return fewer
+
+    def torque(self, hypothesis: Hypothesis, parameters: np.ndarray) -> np.ndarray:
+        """Return the torques (S, n) of parameters (K,) under a hypothesis."""
+        return np.asarray(self.equations(hypothesis)[0] @ parameters)
+
+    def equations(self, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
+        """Return the regressor Y (S, n, K) under a hypothesis, and Y^T Y per joint, (n, K, K); the last ones are kept.
+
+        The columns are the inertial parameters of the bodies, then friction and rotor inertias.
+        """
+        key = hypothesis.motion_key
+        if key not in self._equations:
+            q, qd, qdd, _ = hypothesis.signals(self.samples)
+            rows = drive_rows(body_chain(self.arm, hypothesis.gravity), q, qd, qdd, self.speeds)
+            if len(self._equations) >= GEOMETRY.kept:
+                self._equations.pop(next(iter(self._equations)))
+            self._equations[key] = rows, block_products(rows, 1)[:, 0]
+        return self._equations[key]
+
+    def fit(self, hypothesis: Hypothesis) -> Fit:
+        """Return the fit that minimises the cost.
+
+        The noise of a joint is marginalised: its log likelihood is -N / 2 log(residual sum of squares), minimised by
+        reweighting. The prior is a Student t: `scale` is its weight of iteratively reweighted least squares.
+        """
+        rows, normal = self.equations(hypothesis)
+        tau = hypothesis.signals(self.samples).tau
+        right, total = np.einsum("snk,sn->nk", rows, tau), np.square(tau).sum(axis=0)
+        variance = len(tau) * _variance(tau)
+        prior, bodies = self._prior, len(self._prior.mean)
+        precision, mean = np.zeros(normal.shape[1:]), np.zeros(normal.shape[-1])
+        precision[:bodies, :bodies], mean[:bodies] = prior.precision, prior.mean
+        errors, scale = np.full(len(normal), GEOMETRY.initial_error), GEOMETRY.initial_scale
+        for _ in range(GEOMETRY.iterations):
+            weights = self._count / ((errors + GEOMETRY.error_floor) * variance)
+            matrix = np.tensordot(weights, normal, 1)
+            # the friction of a joint at rest is not identifiable
+            ridge = 1e-9 * np.diag(matrix) + 1e-9
+            ridge[:bodies] = 0.0
+            covariance = inverse(matrix + scale * precision + np.diag(ridge))
+            x = covariance @ (weights @ right + scale * precision @ mean)
+            squares = total - 2 * right @ x + np.einsum("k,jkl,l->j", x, normal, x)
+            errors = np.maximum(squares / variance, 0.0)
+            distance = float((x - mean) @ precision @ (x - mean))
+            scale = 2 * prior.freedom / (prior.freedom + distance)
+        misfit = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
+        cost = misfit + prior.freedom * float(np.log1p(distance / prior.freedom))
+        cost += self._implausible(x, covariance, normal)
+        return Fit(hypothesis, cost, misfit, x, covariance, errors)
+
+    def step(self, fit: Fit, columns: np.ndarray) -> np.ndarray:
+        """Return the Gauss-Newton step (D,) of parameters with the torque Jacobian `columns` (S, n, D)."""
+        rows, _ = self.equations(fit.hypothesis)
+        tau = fit.hypothesis.signals(self.samples).tau
+        weights = 1.0 / ((fit.errors + GEOMETRY.error_floor) * _variance(tau))
+        joined = np.concatenate([rows, columns], axis=2) * np.sqrt(weights)[:, None]
+        flat = joined.reshape(-1, joined.shape[2])
+        matrix = flat.T @ flat * (self._count / len(tau))
+        bodies = len(self._prior.mean)
+        matrix[:bodies, :bodies] += self._prior.precision
+        residual = (tau - rows @ fit.parameters) * np.sqrt(weights)
+        vector = flat.T @ residual.ravel() * (self._count / len(tau))
+        vector[:bodies] += self._prior.precision @ (self._prior.mean - fit.parameters[:bodies])
+        return np.asarray((inverse(matrix) @ vector)[-columns.shape[2] :])
+
+    def wrong_links(self, fit: Fit) -> Iterator[tuple[int, float, float]]:
+        """Yield bodies whose first moment is far from the URDF's, its ratio to the URDF's, and standard deviations.
+
+        The ratio is along the direction of the URDF's first moment. A body counts only if the difference is visible in
+        the torques: small and distant bodies compensate for each other.
+        """
+        visible = GEOMETRY.visible * float(self.samples.tau.std(axis=0).max())
+        gravity = float(np.linalg.norm(fit.hypothesis.gravity))
+        for k in range(len(self.arm.bodies)):
+            block = slice(10 * k + 1, 10 * k + 4)
+            stated, moment = self._prior.mean[block], fit.parameters[block]
+            length = float(np.linalg.norm(stated))
+            torque = float(np.linalg.norm(moment - stated)) * gravity
+            if not length or torque < visible:
+                continue
+            axis = stated / length
+            ratio = float(axis @ moment) / length
+            deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis)) / length
+            is_far = not 1 / GEOMETRY.wrong_moment < ratio < GEOMETRY.wrong_moment
+            if is_far and abs(ratio - 1) > GEOMETRY.certain * deviation:
+                yield k, ratio, deviation
+
+    def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
+        """Return the cost of rotor inertias below 0 and of friction that drives its joint, on average of the log.
+
+        Each costs the square of its standard score / 2, at most `implausible_inertia` and `implausible_friction`: a
+        drive may compensate friction, and the errors of a friction model may resemble inertia.
+        """
+        drives, n = np.arange(len(normal)), len(normal)
+        first = len(self._prior.mean)
+        viscous, coulomb = first + n * VISCOUS + drives, first + n * COULOMB + drives
+        functionals = np.zeros((2 * n, len(x)))
+        functionals[drives, first + n * ARMATURE + drives] = 1.0
+        # friction power: qd (viscous qd + Coulomb sign qd), summed over the samples
+        functionals[n + drives, viscous] = normal[drives, viscous, viscous]
+        functionals[n + drives, coulomb] = normal[drives, viscous, coulomb]
+        negative = np.minimum(functionals @ x, 0.0)
+        variance = np.einsum("ik,kl,il->i", functionals, covariance, functionals)
+        odds = 0.5 * np.square(negative) / np.maximum(variance, 1e-30)
+        bounds = np.repeat([GEOMETRY.implausible_inertia, GEOMETRY.implausible_friction], n)
+        return float(np.minimum(odds, bounds).sum())
+
+
+def _variance(tau: np.ndarray) -> np.ndarray:
+    """Return the variance (n,) of torques (S, n); infinite of a constant, which does not depend on the dynamics."""
+    return np.asarray(np.where(varying(tau), tau.var(axis=0), np.inf))
+
+
+def inverse(matrix: np.ndarray) -> np.ndarray:
+    """Return the inverse of a symmetric positive matrix, scaled to a unit diagonal."""
+    length = np.sqrt(np.diag(matrix))
+    length = np.where(length > 0, length, 1.0)
+    scaled = matrix / np.outer(length, length) + 1e-12 * np.eye(len(matrix))
+    return np.asarray(np.linalg.inv(scaled) / np.outer(length, length))

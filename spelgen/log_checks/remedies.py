@@ -1,0 +1,178 @@
+"""Lines of the settings for a better reading of a log, and the finding in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import yaml
+
+from spelgen.arm.actuation import Drives
+from spelgen.arm.arm import Chain
+from spelgen.errors import Diagnostic, LogError
+from spelgen.identification.geometry_search import Comparison
+from spelgen.identification.log_geometry import Fit, Hypothesis
+from spelgen.identification.tuning import GEOMETRY
+from spelgen.log_checks.tuning import TUNING
+from spelgen.settings.log_mapping import LogMapping
+
+GRAVITY = ("gravity", "gravity-compensated")
+GEOMETRY_CODES = (
+    "joint-order", "torque-order", "joint-sense", "torque-sense", "joint-zero", "torque-unit", "torque-scale", *GRAVITY
+)  # fmt: skip
+RIGHT = "joints, zeros, units and gravity as the URDF and the settings state them"
+
+
+def mapped_reading(arm: Chain, mapping: LogMapping, drives: Drives) -> Hypothesis:
+    """Return the unchanged reading of a log: scales and offsets of its mapping, and gears of single joints."""
+    joints = arm.joint_names
+    gears = np.diag(drives.inputs) if np.count_nonzero(drives.inputs) == len(joints) else np.ones(len(joints))
+    return replace(
+        Hypothesis.unchanged(arm),
+        motion_scale=np.array([mapping.scale("q", joint) for joint in joints]),
+        torque_scale=np.array([mapping.scale("tau", joint) for joint in joints])
+        * np.where(gears, gears, 1.0),
+        offset=np.array([mapping.offset("q", joint) for joint in joints]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Remedies:
+    """Lines of the settings, and findings, for better readings of a log.
+
+    by_name: the log consists of messages of joints by their names, as bags do, and has no columns.
+    """
+
+    unchanged: Hypothesis
+    arm: Chain
+    mapping: LogMapping
+    by_name: bool
+
+    def finding(self, comparison: Comparison) -> LogError | Diagnostic:
+        """Return the finding of a better reading: an error, or a warning about small angles and moderate factors."""
+        best, codes = comparison.better[0], comparison.codes
+        changes = [self._change(code, best.hypothesis) for code in codes]
+        where = " and ".join(dict.fromkeys(self._place(joints) for joints, _ in changes))
+        got = f"{' and '.join(text for _, text in changes)} ({_evidence(best, comparison.unchanged)})"
+        lines = [self.lines(fit.hypothesis) for fit in comparison.better]
+        do = f"write {'; or '.join(dict.fromkeys(lines))}"
+        if self._is_minor(best.hypothesis):
+            code = "torque-scale" if codes[0] == "torque-unit" else codes[0]
+            return Diagnostic("warning", code, where, None, f"{got}; {do}")
+        do += f"; {' '.join(f'--accept {code}' for code in codes)} if it is right"
+        return LogError(got, element=where, expected=RIGHT, do=do)
+
+    def lines(self, reading: Hypothesis) -> str:
+        """Return the lines to write for a reading, and their places."""
+        texts = []
+        keys = {name: self._joint_keys(k, reading) for k, name in enumerate(self.arm.joint_names)}
+        changed = {name: changes for name, changes in keys.items() if changes}
+        if changed:
+            texts.append(f"'joints: {_flow(changed)}' under 'logs' in the robot's YAML")
+        if reading.gravity != self.unchanged.gravity:
+            gravity = _flow({"gravity": list(map(_number, reading.gravity))})[1:-1]
+            texts.append(f"'{gravity}' in the robot's YAML (then build the model again)")
+        return " and ".join(texts)
+
+    def _joint_keys(self, k: int, reading: Hypothesis) -> dict[str, object]:
+        """Return the keys of joint k in a mapping that differ from its present ones."""
+        joints, mapping, unchanged = self.arm.joint_names, self.mapping, self.unchanged
+        present = mapping.joint(joints[k])
+        keys: dict[str, object] = {}
+        columns: dict[str, str] = {}
+        motion, torque = joints[reading.motion_source[k]], joints[reading.torque_source[k]]
+        for quantity in mapping.quantities:
+            source = torque if quantity == "tau" else motion
+            if source != joints[k]:
+                columns[quantity] = mapping.column(quantity, source)
+        if self.by_name and motion == torque != joints[k]:
+            keys["name"] = mapping.log_name(motion)
+        elif columns:
+            keys["columns"] = columns
+        sign = float(reading.motion_scale[k] / unchanged.motion_scale[k])
+        if sign < 0:
+            keys["sign"] = -present.sign
+        gain = float(reading.torque_scale[k] / unchanged.torque_scale[k]) / sign
+        if gain != 1.0:
+            keys["gain"] = _number((present.gain or 1.0) * gain)
+            if present.torque_offset:
+                keys["torque_offset"] = present.torque_offset * gain * sign
+        if reading.offset[k] != unchanged.offset[k]:
+            keys["offset"] = _number(reading.offset[k])
+        return keys
+
+    def _change(self, code: str, reading: Hypothesis) -> tuple[np.ndarray, str]:
+        """Return the joints (n,) that a change of a reading affects, and the content of the log instead."""
+        unchanged, order = self.unchanged, np.arange(len(reading.offset))
+        reversed_motion = reading.motion_scale * unchanged.motion_scale < 0
+        factors = reading.torque_scale / unchanged.torque_scale
+        if code == "joint-order":
+            return reading.motion_source != order, "the columns of other joints"
+        if code == "torque-order":
+            return reading.torque_source != order, "the torques of other joints"
+        if code == "joint-sense":
+            text = "positions and velocities of the opposite sense, and torques of the right one"
+            if (factors[reversed_motion] < 0).all():
+                text = "positions, velocities and torques of the opposite sense"
+            return reversed_motion, text
+        if code == "torque-sense":
+            return (factors < 0) & ~reversed_motion, "torques of the opposite sense"
+        if code == "torque-unit":
+            largest = factors[np.abs(np.log(np.abs(factors))).argmax()]
+            return np.abs(factors) != 1, f"torques of another unit, {1 / largest:.3g} times as large"
+        if code == "joint-zero":
+            shifts = np.where(reversed_motion, 0.0, reading.offset - unchanged.offset)
+            k = int(np.abs(shifts).argmax())
+            shift = f"{np.rad2deg(shifts[k]):.3g} degrees"
+            if self.arm.coordinates[k].joint_type == "prismatic":
+                shift = f"{shifts[k]:.3g} m"
+            return shifts != 0, f"positions with another zero, by {shift}"
+        return order >= 0, self._gravity_text(code, reading)
+
+    def _place(self, joints: np.ndarray) -> str:
+        """Return the place of joints (n,) in a finding."""
+        if joints.all() and len(joints) > 1:
+            return "all joints"
+        return f"joint {', '.join(map(repr, np.array(self.arm.joint_names)[joints].tolist()))}"
+
+    def _gravity_text(self, code: str, reading: Hypothesis) -> str:
+        present, new = np.array(self.unchanged.gravity), np.array(reading.gravity)
+        if code == "gravity-compensated":
+            part = float(new @ present / (present @ present))
+            return f"torques in which gravity is compensated: {part:.2g} times the URDF's gravity remains in all joints"
+        cosine = float(new @ present / max(np.linalg.norm(new) * np.linalg.norm(present), 1e-9))
+        angle = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
+        return f"torques of a gravity that is {angle:.3g} degrees from its direction in the settings"
+
+    def _is_minor(self, best: Hypothesis) -> bool:
+        """Whether errors of a URDF or a mounting, and no error of a log, may be the reason."""
+        if best.codes == ("torque-unit",):
+            factor = np.abs(np.log(best.torque_scale / self.unchanged.torque_scale)).max()
+            return bool(factor < np.log(TUNING.impossible_factor))
+        if best.codes == ("joint-zero",):
+            return bool(np.abs(best.offset - self.unchanged.offset).max() < GEOMETRY.serious_angle)
+        present = np.array(self.unchanged.gravity)
+        turned = float(np.linalg.norm(present - np.array(best.gravity)))
+        return best.codes == ("gravity",) and turned < GEOMETRY.serious_angle * float(np.linalg.norm(present))
+
+
+def _flow(value: object) -> str:
+    """Return a value as YAML in one line."""
+    text: str = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=float("inf"))
+    return text.strip()
+
+
+def _number(value: float) -> float:
+    """Return a number with five digits; an integer if it is one."""
+    rounded = float(f"{value:.5g}")
+    return int(rounded) if rounded.is_integer() else rounded
+
+
+def _evidence(best: Fit, unchanged: Fit) -> str:
+    """Return the error reduction of a reading: mean over joints of the squared error."""
+    if best.hypothesis.codes == ("torque-unit",):
+        return "by the URDF's gravity"
+    before, after = unchanged.errors.mean(), best.errors.mean()
+    if after < 0.9 * before:
+        return f"the squared torque error of least squares falls from {before:.2%} to {after:.2%} of the variance"
+    return "the torque error of least squares remains the same, with plausible masses, rotor inertias and friction"

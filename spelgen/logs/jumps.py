@@ -1,0 +1,209 @@
+"""Detect jumps of logged signals: lost samples, outliers, wrapped angles, register words, repeated rows.
+
+Every function takes one signal (T,) or the columns of a log (T, C). Nothing here depends on the format of the log or on
+the robot. A step is the difference between neighbouring samples, the typical step the median
+of the steps that are not 0.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from spelgen.logs.tuning import TUNING
+
+
+def jump_count(values: np.ndarray, period: float) -> int:
+    """Return the number of steps of a signal (T,) that are longer than half a period."""
+    return int(np.count_nonzero(np.abs(np.diff(values)) > period / 2))
+
+
+def unwrapped(values: np.ndarray, period: float) -> np.ndarray:
+    """Return the signal (T,) without jumps of whole periods."""
+    if not jump_count(values, period):
+        return values
+    steps = np.diff(values, prepend=values[:1])
+    return np.asarray(values - period * np.cumsum(np.round(steps / period)))
+
+
+def centred(values: np.ndarray, period: float) -> np.ndarray:
+    """Return the signal (T,) shifted by whole periods, so that its median is at most half a period from 0."""
+    return np.asarray(values - period * np.round(np.median(values) / period))
+
+
+def signed(words: np.ndarray, sign_bit: float) -> np.ndarray:
+    """Return the numbers that sign-magnitude words (T,) represent: from `sign_bit` on, minus the excess."""
+    return np.where(words >= sign_bit, sign_bit - words, words)
+
+
+def is_lost(values: np.ndarray) -> np.ndarray:
+    """Return a mask (T,) of samples that are exactly 0 between samples far from 0: missing values of loggers."""
+    lost = np.zeros(len(values), bool)
+    logged = np.flatnonzero(values)
+    if not logged.size or logged[-1] - logged[0] == len(logged) - 1:
+        return lost  # zeros at either end have no neighbours on both sides
+    steps = np.abs(np.diff(values[logged]))
+    # a signal that passes through 0 has samples close to 0 first
+    nearest = np.minimum(np.abs(values[logged[:-1]]), np.abs(values[logged[1:]]))
+    lost[logged[0] : logged[-1]] = np.repeat(nearest > TUNING.jump * _usual(steps), np.diff(logged))
+    return np.asarray(lost & (values == 0))
+
+
+def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
+    """Return a mask (T,) of lost samples and of outliers.
+
+    smooth: True for positions, whose steps change gradually; torques and velocities may step, so that
+    their outliers must also exceed all other samples by half their range.
+    """
+    outliers = is_lost(values)
+    if len(values) < TUNING.jump_window:
+        return outliers
+    steps = np.diff(values)
+    sizes = np.abs(steps)
+    is_jump = sizes > TUNING.jump * _usual(sizes)
+    # a signal of which many steps are large has no outliers, but noise
+    if not is_jump.any() or is_jump.mean() > TUNING.most_jumps:
+        return outliers
+    for first, second in pairwise(np.flatnonzero(is_jump)):
+        out, back = steps[first], steps[second]
+        is_excursion = out * back < 0 and 0.5 < abs(out / back) < 2 and second - first <= TUNING.excursion
+        if not is_excursion:
+            continue
+        low, high = max(0, first - TUNING.jump_window), second + 1 + TUNING.jump_window
+        # steps of the neighbours: a fast motion has large steps on both sides; the largest two may be another outlier's
+        around = np.sort(np.concatenate([sizes[low:first], sizes[second + 1 : high]]))[:-2]
+        if min(abs(out), abs(back)) > TUNING.local_jump * around.max(initial=0.0):
+            outliers[first + 1 : second + 1] = True
+    if smooth or not outliers.any():
+        return outliers
+    others = values[~outliers]
+    margin = np.ptp(others) / 2
+    is_beyond = (values > others.max() + margin) | (values < others.min() - margin) | is_lost(values)
+    return np.asarray(outliers & is_beyond)
+
+
+def jumps(t: np.ndarray, q: np.ndarray, limit: float = TUNING.fastest) -> np.ndarray:
+    """Return the rows after which a position (T,) jumps: faster than `limit` [rad/s, m/s] and typical steps.
+
+    Steps across gaps in time are no jumps: an arm may be moved meanwhile.
+    """
+    if len(q) < TUNING.jump_window:
+        return np.zeros(0, int)
+    sizes, dt = np.abs(np.diff(q)), np.diff(t)
+    median = float(np.median(dt))
+    is_jump = (sizes > TUNING.jump * _usual(sizes)) & (dt <= TUNING.gap * median)
+    # stamps may come in bursts: a step is at least as long as most
+    return np.flatnonzero(is_jump & (sizes > limit * np.maximum(dt, median)))
+
+
+def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]:
+    """Return a mask (T,) of rows of a log (T, C) that repeat the row before in a motion, and the copies of each row.
+
+    positions: the number of first columns that are positions. A row is a repeat if the position then makes up for it:
+    the step that follows k equal rows is as large as k steps of the motion after it. Rows of an arm at rest are kept,
+    one of n if rows of the motion are written n times.
+    """
+    starts = np.flatnonzero(np.append(True, (np.diff(columns, axis=0) != 0).any(axis=1)))
+    lengths = np.diff(np.append(starts, len(columns)))
+    is_held = np.zeros(len(starts), bool)
+    index = np.arange(len(columns)) - np.repeat(starts, lengths)
+    if len(starts) < 4 or not index.any():
+        return np.repeat(is_held, lengths), 1
+    steps = np.abs(np.diff(columns[starts, :positions], axis=0))  # at the end of each block but the last
+    speeds = steps[1:] / lengths[1:-1, None]
+    quantum = np.min(np.where(steps > 0, steps, np.inf), axis=0)
+    makes_up = (steps[:-1] > 2.5 * quantum) & (steps[:-1] > 0.6 * lengths[:-2, None] * speeds)
+    is_held[:-2] = makes_up.any(axis=1)
+    often = int(np.median(lengths[is_held])) if is_held.any() else 1
+    repeats = np.repeat(is_held, lengths) & (index > 0)
+    return repeats | (index % often != 0), often
+
+
+def held_samples(values: np.ndarray) -> int:
+    """Return the number of samples that a value of a quickly changing signal (T,) lasts: 1 of a sound signal."""
+    changes = np.flatnonzero(np.diff(values))
+    if len(changes) < TUNING.jump_window:
+        return 1
+    sizes = np.abs(np.diff(values)[changes])
+    # steps of a quantised signal last long without being held
+    large = sizes[1:] > 2.5 * sizes.min()
+    if large.sum() < TUNING.jump_window:
+        return 1
+    return int(np.median(np.diff(changes)[large]))
+
+
+class Word(NamedTuple):
+    """A reading of a signal as words of a register.
+
+    mapping key, its value in logged units, the number of jumps, the decoded signal.
+    """
+
+    key: str
+    value: float
+    jumps: int
+    values: np.ndarray
+
+
+def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
+    """Return the reading of a signal (T,) in logged units that removes its jumps; None if there is none.
+
+    Hypotheses: sign-magnitude words and overflowing words of 2^k steps of the signal's grid; turns (`turn` in logged
+    units, None for joints that do not turn) and powers of two of them. Each one is applied, and the best has fewest
+    jumps left, then the smoothest signal.
+    """
+    steps = np.diff(values)
+    limit = 0.4 * float(np.ptp(values))
+    rows = np.flatnonzero(np.abs(steps) > limit)
+    if not len(rows) or len(rows) > TUNING.most_words * len(values):
+        return None
+    jump, usual = float(np.median(np.abs(steps[rows]))), _usual(np.abs(steps))
+    # torques reverse, too: if values below 0 occur, only an overflow of the whole range is one
+    is_signed = values.min() < -TUNING.finest_word * np.ptp(values)
+    if is_signed and jump < max(0.9 * np.ptp(values), TUNING.jump * usual):
+        return None
+    sizes = [x for x in _word_sizes(values, turn) if 0.75 < x / jump < 1.35]
+    around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
+    best, best_score = None, (len(rows) / 2, np.inf)
+    for size in sizes:
+        # words of a register lie within its period, words with a sign bit on both sides of the bit
+        readings = []
+        if np.ptp(values) < size * (1 + TUNING.word_margin):
+            readings.append(Word("period", size, len(rows), centred(unwrapped(values, size), size)))
+        if not is_signed and values.max() >= size:
+            readings.append(Word("sign_bit", size, len(rows), signed(values, size)))
+        for reading in readings:
+            left = np.abs(np.diff(reading.values))
+            # a fast motion, or one across a gap, only becomes smaller by a period
+            if np.median(left[rows]) > TUNING.jump * usual:
+                continue
+            bends = np.abs(np.diff(reading.values, 2))
+            score = (
+                float(np.count_nonzero(left > limit)),
+                float(bends[np.clip(around, 0, len(bends) - 1)].sum()),
+            )
+            if score < best_score:
+                best, best_score = reading, score
+    return best
+
+
+def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
+    """Return sizes of registers of a signal (T,) in logged units: 2^k turns, and 2^k steps if the signal has a grid."""
+    sizes = [] if turn is None else [turn * 2.0**k for k in range(9)]
+    levels = np.unique(values)
+    differences = np.diff(levels)
+    # values in SI units were converted back: equal ones differ by rounding
+    differences = differences[differences > TUNING.finest_word * np.ptp(values)]
+    if differences.size:
+        step = float(differences.min())
+        numbers = values / step
+        if np.abs(numbers - np.round(numbers)).max() < TUNING.word_rounding:
+            sizes += [step * 2.0**k for k in range(10, 18)]
+    return sizes
+
+
+def _usual(sizes: np.ndarray) -> float:
+    """Return the median of the sizes (T,) that are not 0; infinite if there is none."""
+    moving = sizes[sizes > 0]
+    return float(np.median(moving)) if moving.size else np.inf

@@ -1,0 +1,351 @@
+"""Logs as loggers write them are read: unfinished and ROS 1 bags, rows of others, coarse clocks, LeRobot's values."""
+
+import bz2
+import json
+import re
+import struct
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+import torch
+
+from spelgen.arm.configured_arm import load_arm
+from spelgen.errors import LogError, RunError, SpelgenError
+from spelgen.excitation.design import excite
+from spelgen.fitting.run_folder import _require_finite
+from spelgen.log_checks.check_logs import check_logs
+from spelgen.logs.checks import check
+from spelgen.logs.mcap import mcap_messages
+from spelgen.logs.read import read_logs
+from spelgen.logs.suggest import suggest_mapping
+from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.log_mapping import LogMapping
+
+STATE = "sensor_msgs/msg/JointState"
+JOINTS = ("shoulder", "elbow")
+T = 0.01 * np.arange(400)
+Q = np.stack([np.sin(T), 0.5 * np.cos(2 * T)], axis=1)
+QD = np.stack([np.cos(T), -np.sin(2 * T)], axis=1)
+TAU = np.stack([5 * np.sin(T), np.cos(T)], axis=1)
+START = 1_700_000_000_000_000_000
+
+
+def joint_state(store, stamp: int, names, *arrays):
+    """A message with the time [ns] in its header."""
+    header, clock = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
+    stamps = {"stamp": clock(sec=stamp // 10**9, nanosec=stamp % 10**9), "frame_id": ""}
+    if "seq" in header.__dataclass_fields__:  # ROS 1
+        stamps["seq"] = 0
+    values = [np.array(x, dtype=float) for x in arrays]
+    return store.types[STATE](header(**stamps), list(names), *values)
+
+
+def bag_of(messages, folder, ros: int = 2):
+    """A bag of (stamp, names, position, velocity, effort), received 10 ms apart."""
+    pytest.importorskip("rosbags", reason="reading bags needs the extra 'ros'")
+    from rosbags.rosbag1 import Writer as Ros1Writer
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Ros2Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
+    writer = (
+        Ros1Writer(folder) if ros == 1 else Ros2Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
+    )
+    with writer:
+        connection = writer.add_connection("/joint_states", STATE, typestore=store)
+        for k, message in enumerate(messages):
+            encode = store.serialize_ros1 if ros == 1 else store.serialize_cdr
+            writer.write(
+                connection, START + 10_000_000 * k + 777, encode(joint_state(store, *message), STATE)
+            )
+    return folder
+
+
+def states(stamped=True):
+    return [
+        (START + 10_000_000 * k if stamped else 0, JOINTS[::-1], q[::-1], qd[::-1], tau[::-1])
+        for k, (q, qd, tau) in enumerate(zip(Q, QD, TAU, strict=True))
+    ]
+
+
+def check_read(log, rows=slice(None)):
+    np.testing.assert_allclose(log.q, Q[rows], rtol=1e-12)
+    np.testing.assert_allclose(log.tau, TAU[rows], rtol=1e-12)
+    np.testing.assert_allclose(log.t - log.t[0], T[rows] - T[rows][0], atol=1e-9)
+
+
+def test_a_bag_of_ros_1_is_read(tmp_path):
+    (log,) = read_logs(bag_of(states(), tmp_path / "run.bag", ros=1), JOINTS)
+    check_read(log)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_all_complete_messages_of_an_unfinished_recording_are_read(tmp_path, share):
+    folder = bag_of(states(), tmp_path / "rec")
+    (file,) = folder.glob("*.mcap")
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    (log,) = read_logs(cut, JOINTS)
+    assert 0.25 * share * len(T) < len(log) <= len(T)
+    check_read(log, slice(len(log)))
+    assert log.remarks == ("the recording was not closed: all complete messages were read",)
+    (folder / "metadata.yaml").unlink()
+    (whole,) = read_logs(folder, JOINTS)
+    assert len(whole) == len(T)
+
+
+@pytest.mark.parametrize("packed", ["lz4", "zstd"])
+def test_packed_chunks_of_an_unfinished_recording_are_read(tmp_path, packed):
+    """A file of the format's specification, by its records."""
+    lz4, zstd = pytest.importorskip("lz4.frame"), pytest.importorskip("backports.zstd")
+
+    def record(code, body):
+        return struct.pack("<BQ", code, len(body)) + body
+
+    def text(value):
+        return struct.pack("<I", len(value)) + value.encode()
+
+    schema = record(3, struct.pack("<H", 1) + text(STATE) + text("ros2msg") + text(""))
+    channel = record(4, struct.pack("<HH", 7, 1) + text("/joint_states") + text("cdr") + struct.pack("<I", 0))
+    messages = [
+        record(5, struct.pack("<HIQQ", 7, k, 1000 + k, 0) + b"content" + bytes([k])) for k in range(5)
+    ]
+    inside = b"".join([schema, channel, *messages])
+    small = (lz4 if packed == "lz4" else zstd).compress(inside)
+    head = struct.pack("<QQQI", 0, 0, len(inside), 0) + text(packed) + struct.pack("<Q", len(small))
+    path = tmp_path / "x.mcap"
+    whole = b"\x89MCAP0\r\n" + record(1, text("ros2") + text("")) + record(6, head + small)
+    path.write_bytes(whole + record(6, head + small)[:30])
+    found = list(mcap_messages(path, STATE))
+    assert found == [("/joint_states", 1000 + k, b"content" + bytes([k])) for k in range(5)]
+    assert list(mcap_messages(path, "other/msg/Type")) == []
+
+
+def test_messages_of_a_second_publisher_are_left_out_with_one_note(tmp_path):
+    messages = states()
+    zeros = [(x[0], JOINTS, [0.0, 0.0], [], []) for x in messages[::5]]
+    mixed = sorted([*messages, *zeros], key=lambda x: x[0])
+    (log,) = read_logs(bag_of(mixed, tmp_path / "bag"), JOINTS)
+    check_read(log)
+    assert log.repairs == (
+        f"{len(zeros)} rows of another topic or publisher left out: without values, or with positions only",
+    )
+
+
+def test_messages_without_stamps_are_left_out_or_all_have_the_time_of_the_recorder(tmp_path):
+    messages = states()
+    some = [(0 if k in (0, 1, 2, 200) else x[0], *x[1:]) for k, x in enumerate(messages)]
+    (log,) = read_logs(bag_of(some, tmp_path / "some"), JOINTS)
+    rows = [k for k in range(len(T)) if k not in (0, 1, 2, 200)]
+    check_read(log, rows)
+    assert log.remarks == ("4 messages without a stamp left out",)
+    (log,) = read_logs(bag_of(states(stamped=False), tmp_path / "none"), JOINTS)
+    check_read(log)
+    assert log.remarks == ("no message has a stamp: times are those at which the recorder received them",)
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+def test_rows_of_another_topic_are_left_out_and_a_cell_without_a_number_is_an_error(tmp_path, form):
+    columns = {"t": T} | {
+        f"{name}_{joint}": values[:, k]
+        for name, values in (("q", Q), ("qd", QD), ("tau", TAU))
+        for k, joint in enumerate(JOINTS)
+    }
+    rows = np.sort(np.r_[np.arange(len(T)), np.arange(0, len(T), 2)])
+    other = np.r_[False, np.diff(rows) == 0]
+    mixed = {name: pa.array(x[rows], mask=None if name == "t" else other) for name, x in columns.items()}
+    mixed["t"] = pa.array(T[rows] + 0.003 * other)
+
+    def write(table, path):
+        (pa.csv.write_csv if form == "csv" else pa.parquet.write_table)(pa.table(table), path)
+        return path
+
+    (log,) = read_logs(write(mixed, tmp_path / f"log.{form}"), JOINTS)
+    check_read(log)
+    assert log.repairs[0].startswith(f"{other.sum()} rows of another topic or publisher left out")
+    mixed["tau_elbow"] = pa.array(columns["tau_elbow"][rows], mask=other | (np.arange(len(rows)) == 6))
+    with pytest.raises(LogError, match="row 7, column tau_elbow: got no finite number"):
+        read_logs(write(mixed, tmp_path / f"log.{form}"), JOINTS)
+
+
+@pytest.mark.parametrize("suffix", [".zstd", ".zst", ".gz"])
+def test_a_packed_file_is_refused_with_the_command_that_unpacks_it(tmp_path, suffix):
+    (tmp_path / f"x.mcap{suffix}").write_bytes(bz2.compress(b"x"))
+    for path in (tmp_path, tmp_path / f"x.mcap{suffix}"):
+        with pytest.raises(LogError, match=f"unpack it: (zstd -d|gunzip) x.mcap{suffix}"):
+            read_logs(path, JOINTS)
+
+
+def columns_of(t):
+    names = (("q", Q), ("qd", QD), ("tau", TAU))
+    table = {f"{name}_{joint}": values[:, k] for name, values in names for k, joint in enumerate(JOINTS)}
+    return pa.table({"t": t} | table)
+
+
+@pytest.mark.parametrize("ticks", [2, 3.3, 10])
+def test_times_of_a_coarse_clock_are_reconstructed_where_rows_are_evenly_spaced(tmp_path, ticks):
+    tick = 0.01 * ticks
+    path = tmp_path / "log.csv"
+    pa.csv.write_csv(columns_of(1203 + np.floor(T / tick) * tick), path)
+    (log,) = read_logs(path, JOINTS)
+    assert len(log) == len(T)
+    assert log.sample_rate == pytest.approx(100, rel=0.01)
+    assert np.abs(log.t - log.t[0] - T).max() < tick
+    assert "too coarse for the rows: times were reconstructed" in log.repairs[0]
+    # the rate of the mapping replaces the times
+    (log,) = read_logs(path, JOINTS, {"sample_rate": 100})
+    check_read(log)
+
+
+def test_times_of_a_coarse_clock_are_an_error_where_rows_are_not_evenly_spaced(tmp_path):
+    uneven = np.cumsum(np.where(np.sin(5 * T) > 0, 0.002, 0.02))
+    pa.csv.write_csv(columns_of(np.floor(uneven / 0.02) * 0.02), tmp_path / "log.csv")
+    with pytest.raises(LogError, match=r"rows with the time of another row, but another state.*sample_rate"):
+        read_logs(tmp_path / "log.csv", JOINTS)
+
+
+@pytest.mark.parametrize(("unit", "size"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_times_in_another_unit_are_named_with_the_line_to_write(tmp_path, unit, size):
+    path = tmp_path / "log.csv"
+    pa.csv.write_csv(columns_of(np.round((1.7e9 + T) * size).astype(np.int64)), path)
+    (log,) = read_logs(path, JOINTS)
+    with pytest.raises(SpelgenError) as caught:
+        check([log], JOINTS, ["revolute"] * 2)
+    assert f"write 'units: {{t: {unit}}}' under 'logs'" in str(caught.value)
+    assert f"100 Hz if times are in {unit}" in str(caught.value)
+    (log,) = read_logs(path, JOINTS, {"units": {"t": unit}})
+    assert check([log], JOINTS, ["revolute"] * 2) == []
+    assert f'"t": "{unit}"' in suggest_mapping(path, JOINTS).text
+
+
+def dataset(folder, values, fps=30):
+    """A data set of LeRobot 3 with these positions and commands (T, n) of motors named like the joints."""
+    (folder / "meta").mkdir(parents=True)
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    names = [f"{joint}.pos" for joint in JOINTS]
+    features = {name: {"dtype": "float32", "names": names} for name in ("observation.state", "action")}
+    (folder / "meta" / "info.json").write_text(json.dumps({"fps": fps, "features": features}))
+    lists = pa.array(values.tolist(), pa.list_(pa.float32(), 2))
+    times = pa.array(np.arange(len(values)) / fps, pa.float32())
+    table = {
+        "observation.state": lists,
+        "action": lists,
+        "timestamp": times,
+        "episode_index": np.zeros(len(values)),
+    }
+    pa.parquet.write_table(pa.table(table), folder / "data" / "chunk-000" / "file-000.parquet")
+    return folder
+
+
+POSITION = LogMapping(input="position").model_dump(exclude_defaults=True)
+CALIBRATION = {
+    "shoulder": {"id": 1, "drive_mode": 0, "homing_offset": -12, "range_min": 800, "range_max": 3300},
+    "elbow": {"id": 2, "drive_mode": 1, "homing_offset": 5, "range_min": 1000, "range_max": 3000},
+}
+
+
+def test_normalised_positions_of_lerobot_are_converted_by_the_calibration_or_refused(tmp_path):
+    counts = 2048 + Q * 4096 / (2 * np.pi)
+    low, high = (np.array([CALIBRATION[x][key] for x in JOINTS]) for key in ("range_min", "range_max"))
+    normalised = ((counts - low) / (high - low) * 200 - 100) * [1, -1]
+    folder = dataset(tmp_path / "set", normalised)
+    with pytest.raises(LogError, match=r"within LeRobot's normalised range.*units: \{q: deg\}.*calibration"):
+        read_logs(folder, JOINTS, POSITION)
+    expected = Q + (2048 - (low + high) / 2) * 2 * np.pi / 4096  # 0 is the middle of the range
+    stated = POSITION | {"units": {"q": "normalised"}, "calibration": CALIBRATION}
+    (log,) = read_logs(folder, JOINTS, stated)
+    np.testing.assert_allclose(log.q, expected, atol=1e-5)
+    np.testing.assert_allclose(log.u, expected, atol=1e-5)
+    (folder / "calibration.json").write_text(json.dumps(CALIBRATION))
+    (log,) = read_logs(folder, JOINTS, POSITION)
+    np.testing.assert_allclose(log.q, expected, atol=1e-5)
+    assert "normalised positions were converted by the ranges of the motors' calibration" in log.remarks
+    (folder / "calibration.json").write_text(json.dumps({"shoulder": CALIBRATION["shoulder"]}))
+    with pytest.raises(LogError, match="normalised range"):
+        read_logs(folder, JOINTS, POSITION)
+
+
+def test_times_of_lerobot_are_reported_as_frame_numbers_until_a_rate_is_stated(tmp_path):
+    folder = dataset(tmp_path / "set", np.degrees(Q) * 3, fps=30)
+    degrees = POSITION | {"units": {"q": "deg"}}
+    (log,) = read_logs(folder, JOINTS, degrees)
+    assert log.sample_rate == pytest.approx(30, rel=1e-3)
+    assert any("times are frame numbers at 30 frames per second and not measured" in x for x in log.remarks)
+    (log,) = read_logs(folder, JOINTS, degrees | {"sample_rate": 60})
+    assert log.sample_rate == pytest.approx(60, rel=1e-6)
+    assert log.remarks == ()
+
+
+def test_a_mapping_for_a_data_set_names_its_motors(tmp_path):
+    found = suggest_mapping(dataset(tmp_path / "set", np.degrees(Q)), ["Shoulder", "elbow", "gripper"])
+    assert '"elbow": {name: "elbow"}' in found.text
+    assert '"Shoulder": {name: "shoulder"}' in found.text
+    assert found.missing == ("q of gripper",)
+
+
+NO_LIMITS = {
+    "0": 'effort="0" velocity="0" lower="0" upper="0"',
+    "absent": "",
+    "inf": 'effort="inf" velocity="INF" lower="-inf" upper="+inf"',
+    "nan": 'effort="nan" velocity="NaN" lower="nan" upper="nan"',
+    "1e16": 'effort="1e16" velocity="1e9" lower="-1e16" upper="1e16"',
+    "largest": 'effort="1.7976931348623157e+308" velocity="1.7976931348623157e+308" '
+    'lower="-1.7976931348623157e+308" upper="1.7976931348623157e+308"',
+}
+
+
+@pytest.mark.parametrize("form", NO_LIMITS)
+@pytest.mark.parametrize("name", ["two_link", "scara", "six_dof"])
+def test_all_forms_of_no_limit_mean_unlimited_and_are_stated_once(robots, tmp_path, name, form):
+    text = re.sub(r"<limit [^>]*/>", f"<limit {NO_LIMITS[form]}/>", (robots / f"{name}.urdf").read_text())
+    (tmp_path / "x.urdf").write_text(text)
+    arm = load_arm(tmp_path / "x.urdf")
+    for joint in arm.chain.coordinates:
+        assert (joint.limits, joint.effort, joint.velocity) == (None, None, None)
+    (note,) = [x for x in arm.robot.diagnostics if x.code == "unlimited"]
+    assert "velocity of all joints; effort of all joints" in note.message
+    ranges = {joint.name: [-0.4, 0.5] for joint in arm.chain.coordinates}
+    with pytest.raises(
+        SpelgenError, match="got no position limits, expected a range to move in; write 'simulation"
+    ):
+        excite(arm, duration=5, trials=1)
+    (tmp_path / "x.yaml").write_text(json.dumps({"simulation": {"positions": ranges}}))
+    motion = excite(load_arm(tmp_path / "x.urdf"), duration=5, trials=1).motion
+    assert -0.4 < motion.q.min() < motion.q.max() < 0.5
+    random = np.random.default_rng(0)
+    t = np.arange(500) / 100
+    w = random.uniform(1, 2, len(ranges))
+    log = Trajectory(
+        t, 0.4 * np.sin(t[:, None] * w), 0.4 * w * np.cos(t[:, None] * w), np.sin(t[:, None] * w) * 5
+    )
+    assert not any("limit" in x.message for x in check_logs([log], arm).findings)
+
+
+def test_a_mapping_file_drops_nothing_that_the_settings_state(robots, tmp_path):
+    (tmp_path / "x.urdf").write_text((robots / "two_link.urdf").read_text())
+    (tmp_path / "x.yaml").write_text(
+        "input: position\nlogs: {units: {q: deg}, joints: {joint1: {name: pan}, joint2: {name: lift, sign: -1}}}\n"
+    )
+    (tmp_path / "m.yaml").write_text(
+        "columns: {q: 'pos_{joint}', u: 'goal_{joint}'}\njoints: {joint2: {offset: 0.5}}\n"
+    )
+    table = {"t": T} | {
+        f"{name}_{motor}": np.degrees(Q[:, k])
+        for k, motor in enumerate(("pan", "lift"))
+        for name in ("pos", "goal")
+    }
+    pa.csv.write_csv(pa.table(table), tmp_path / "log.csv")
+    (log,) = read_logs(tmp_path / "log.csv", load_arm(tmp_path / "x.urdf"), tmp_path / "m.yaml")
+    np.testing.assert_allclose(log.q, Q * [1, -1] + [0, 0.5], atol=1e-9)
+    np.testing.assert_allclose(log.u, log.q)
+
+
+def test_weights_of_servos_without_effort_limits_are_accepted(tmp_path):
+    _require_finite({"servo.limit": torch.tensor([float("inf"), 5.0])}, tmp_path)
+    for name, value in (("servo.limit", float("nan")), ("servo.log_kp", float("inf"))):
+        with pytest.raises(RunError, match="no finite numbers"):
+            _require_finite({name: torch.tensor([value])}, tmp_path)

@@ -1,0 +1,310 @@
+"""Jumps in logs: each kind of fault, drawn at random, is named, and its remedy gives the sound log back."""
+
+import re
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+import yaml
+
+from spelgen.arm.configured_arm import load_arm
+from spelgen.errors import LogError, SpelgenError
+from spelgen.log_checks.check_logs import check_logs
+from spelgen.logs.checks import check
+from spelgen.logs.read import read_logs
+from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.log_mapping import LogMapping
+
+ROBOTS = ("two_link", "scara", "six_dof")
+FORMATS = ("csv", "parquet", "npz")
+
+
+@pytest.fixture(params=ROBOTS)
+def arm(robots, request):
+    return load_arm(robots / f"{request.param}.urdf")
+
+
+def motion(arm, seed: int, rate: float = 100.0, seconds: float = 20.0) -> dict[str, np.ndarray]:
+    """Columns of a smooth motion in SI units with a noise of encoders."""
+    random = np.random.default_rng(seed)
+    t = np.arange(round(seconds * rate)) / rate
+    columns = {"t": t}
+    for joint in arm.chain.joint_names:
+        w, phase = random.uniform(0.5, 1.5), random.uniform(0, 6)
+        size, middle = random.uniform(0.3, 0.8), random.uniform(-0.2, 0.2)
+        columns[f"q_{joint}"] = middle + size * np.sin(w * t + phase) + 1e-5 * random.standard_normal(len(t))
+        columns[f"qd_{joint}"] = size * w * np.cos(w * t + phase)
+        columns[f"tau_{joint}"] = 8 * np.sin(w * t + phase) + 0.1 * random.standard_normal(len(t))
+    return columns
+
+
+def written(columns, path):
+    """A log file of these columns, by its suffix."""
+    if path.suffix == ".npz":
+        np.savez(path, **columns)
+    elif path.suffix == ".csv":
+        pa.csv.write_csv(pa.table(columns), path)
+    else:
+        pa.parquet.write_table(pa.table(columns), path)
+    return path
+
+
+def errors(logs, arm) -> str:
+    try:
+        check(logs, arm.chain.joint_names, arm.chain.joint_types)
+    except SpelgenError as error:
+        return str(error)
+    return ""
+
+
+def advised(text: str) -> LogMapping:
+    """The mapping in the one line of an error."""
+    (line,) = re.findall(r"write '(.*)' under 'logs'", text)
+    return LogMapping.model_validate(yaml.safe_load(line))
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("kind", ["-180..180", "0..360", "differentiated"])
+def test_wraps_of_angles_without_limits_are_removed_before_anything_else(robots, tmp_path, form, kind):
+    for number, name in enumerate(ROBOTS):
+        text = (robots / f"{name}.urdf").read_text().replace('type="revolute"', 'type="continuous"')
+        (tmp_path / f"{name}.urdf").write_text(text)
+        arm = load_arm(tmp_path / f"{name}.urdf")
+        columns = motion(arm, number)
+        turning = [
+            x
+            for x, kind in zip(arm.chain.joint_names, arm.chain.joint_types, strict=True)
+            if kind == "revolute"
+        ]
+        joint = turning[number % len(turning)]
+        columns[f"q_{joint}"] = 0.2 + 0.9 * columns["t"] + 0.5 * np.sin(columns["t"])
+        columns[f"qd_{joint}"] = 0.9 + 0.5 * np.cos(columns["t"])
+        wrapped = columns | {f"q_{joint}": columns[f"q_{joint}"] % (2 * np.pi)}
+        if kind == "-180..180":
+            wrapped[f"q_{joint}"] = (columns[f"q_{joint}"] + np.pi) % (2 * np.pi) - np.pi
+        mapping = LogMapping(velocity="differentiated" if kind == "differentiated" else "logged")
+        (sound,) = read_logs(written(columns, tmp_path / f"sound{number}.{form}"), arm, mapping.model_dump())
+        (log,) = read_logs(written(wrapped, tmp_path / f"wrapped{number}.{form}"), arm, mapping.model_dump())
+        turns = (log.q - sound.q) / (2 * np.pi)
+        assert turns == pytest.approx(np.broadcast_to(turns[0].round(), turns.shape), abs=1e-9)
+        assert log.qd == pytest.approx(sound.qd, abs=1e-6)
+        assert any(joint in remark and "wraps" in remark for remark in log.remarks)
+        for read in (log, sound):
+            assert errors([read], arm) == ""
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("form", ["sign bit", "overflow", "unsigned", "turn", "degrees"])
+def test_words_of_a_register_are_named_and_the_line_to_write_decodes_them(arm, tmp_path, form, seed):
+    random = np.random.default_rng(seed)
+    columns, joints = motion(arm, seed), arm.chain.joint_names
+    joint = joints[random.integers(len(joints))]
+    turning = arm.chain.joint_types[joints.index(joint)] == "revolute"
+    counts, per_turn = 2 ** int(random.integers(12, 17)), int(random.choice([4096, 16384]))
+    if form == "turn" and not turning:
+        pytest.skip("a joint that slides has no turns")
+    unit, scale = (
+        ("deg", 180 / np.pi) if form in ("degrees", "turn") and turning else ("counts", per_turn / 6.2832)
+    )
+    size = {"degrees": counts * 360 / per_turn, "turn": 360.0}.get(form, counts)
+    if unit == "counts" or form == "degrees":
+        grid = 360 / per_turn if unit == "deg" else 1
+        values = np.round(columns[f"q_{joint}"] * scale / grid) * grid
+        size = size if unit == "deg" else counts
+    else:
+        values = columns[f"q_{joint}"] * scale
+    words = {
+        "sign bit": np.where(values < 0, size - values, values),
+        "degrees": np.where(values < 0, size - values, values),
+        "overflow": (values + 0.3 * size) % size - 0.3 * size if form == "overflow" else values,
+        "unsigned": values % size,
+        "turn": values % size,
+    }[form]
+    if form == "overflow":  # at +- half of the register, with the joint in the middle of a revolution
+        words = (values - values.mean() + size) % size - size / 2
+        values = values - values.mean() + size / 2
+    base = {"joints": {joint: {"counts_per_turn" if turning else "counts_per_metre": per_turn}}}
+    if unit == "counts":
+        base["joints"][joint]["units"] = {"q": "counts"}
+    else:
+        base["joints"][joint]["units"] = {"q": "deg"}
+    file = written(columns | {f"q_{joint}": words.astype(float)}, tmp_path / "log.csv")
+    (log,) = read_logs(file, joints, base)
+    told = errors([log], arm)
+    assert f"joint {joint!r}: got q that jumps by " in told
+    line = advised(told).joints[joint].model_dump(exclude_unset=True)
+    fixed = base | {"joints": {joint: base["joints"][joint] | line}}
+    (decoded,) = read_logs(file, joints, fixed)
+    factor = LogMapping.model_validate(base).scale("q", joint)
+    expected = values * factor
+    difference = decoded.q[:, joints.index(joint)] - expected
+    assert np.ptp(difference) < 1e-6
+    if form != "overflow":  # of which no one knows in which revolution it began
+        assert difference[0] == pytest.approx(0, abs=1e-6)
+    assert "jumps" not in errors([decoded], arm)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("form", ["sign bit", "unsigned"])
+def test_words_of_a_load_register_are_named_too(arm, tmp_path, form, seed):
+    columns, joints = motion(arm, seed), arm.chain.joint_names
+    joint = joints[seed % len(joints)]
+    load, size = np.round(columns[f"tau_{joint}"] * 100 / 3), {"sign bit": 1024, "unsigned": 65536}[form]
+    words = np.where(load < 0, size - load, load) if form == "sign bit" else load % size
+    file = written(columns | {f"tau_{joint}": words}, tmp_path / "log.csv")
+    base = {"gain": 0.03}
+    (log,) = read_logs(file, joints, {"joints": {joint: base}})
+    told = errors([log], arm)
+    assert f"joint {joint!r}: got tau that jumps by {size} " in told
+    line = advised(told).joints[joint].model_dump(exclude_unset=True)
+    (decoded,) = read_logs(file, joints, {"joints": {joint: base | line}})
+    assert decoded.tau[:, joints.index(joint)] == pytest.approx(0.03 * load, abs=1e-9)
+    assert errors([decoded], arm) == ""
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("quantity", ["q", "qd", "tau"])
+def test_outliers_of_any_size_are_named_and_dropped_on_request(arm, tmp_path, form, quantity):
+    random = np.random.default_rng(len(form) + len(quantity))
+    joints = arm.chain.joint_names
+    for size in (0.3, 2 * np.pi, 1e5) if quantity == "q" else (1e2, 1e5):
+        columns = motion(arm, int(random.integers(1000)))
+        joint = joints[random.integers(len(joints))]
+        rows = np.sort(random.choice(np.arange(5, 1990, 20), 4, replace=False))
+        name = f"{quantity}_{joint}"
+        wrong = columns | {name: columns[name].copy()}
+        wrong[name][rows] += size * random.choice([-1, 1], 4)
+        file = written(wrong, tmp_path / f"log.{form}")
+        (log,) = read_logs(file, joints)
+        told = errors([log], arm)
+        times = ", ".join(f"{x:.4g}" for x in columns["t"][rows])
+        assert f"joint {joint!r}: got {quantity} that deviates from its neighbours by " in told
+        assert f"in 4 samples, at t = {times} s" in told
+        (kept,) = read_logs(file, joints, {"dropouts": "dropped"})
+        assert np.setdiff1d(columns["t"], kept.t) == pytest.approx(columns["t"][rows])
+        assert kept.repairs == (f"4 rows left out as dropouts: {quantity} of {joint!r} at t = {times} s",)
+        assert errors([kept], arm) == ""
+
+
+@pytest.mark.parametrize("often", [2, 5, 25])
+def test_rows_that_are_written_several_times_are_read_once_with_their_own_rate(arm, tmp_path, often):
+    columns, joints = motion(arm, often, rate=250.0), arm.chain.joint_names
+    held = np.arange(len(columns["t"])) // often * often
+    all_held = {name: x if name == "t" else x[held] for name, x in columns.items()}
+    (log,) = read_logs(written(all_held, tmp_path / "all.csv"), joints)
+    assert log.sample_rate == pytest.approx(250 / often, rel=0.01)
+    assert log.repairs[0].startswith(f"every row is written {often} times: ")
+    assert log.q == pytest.approx(columns_of(columns, "q", joints)[::often])
+    # rows of which only some columns are held cannot be removed
+    some = {name: x[held] if name.startswith("tau") else x for name, x in columns.items()}
+    (log,) = read_logs(written(some, tmp_path / "some.csv"), joints)
+    told = f"tau that changes {250 / often:.3g} times a second in rows at 250 Hz: each value lasts {often} samples"
+    if 250 / often < 24:
+        assert told in errors([log], arm)
+    else:
+        notes = check([log], joints, arm.chain.joint_types)
+        assert [x.message for x in notes] == [told] * len(joints)
+
+
+@pytest.mark.parametrize("rate", [100.0, 60.0, 27.0])
+def test_the_newest_state_written_at_a_rate_that_is_no_multiple_of_its_own(arm, tmp_path, rate):
+    """Each state is written two or three times, three or four times, ...: it is read once."""
+    columns, joints = motion(arm, 5, rate=250.0), arm.chain.joint_names
+    newest = np.floor(np.arange(len(columns["t"])) * rate / 250 + 1e-9)
+    first = np.searchsorted(newest, newest)
+    log = {name: x if name == "t" else x[first] for name, x in columns.items()}
+    (found,) = read_logs(written(log, tmp_path / "log.csv"), joints)
+    assert len(found) == pytest.approx(len(np.unique(newest)), rel=0.02)
+    # a state at which all joints reverse may be read twice
+    assert np.mean((np.diff(found.q, axis=0) != 0).any(axis=1)) > 0.98
+
+
+def test_frames_that_are_written_twice_now_and_then_are_counted_and_dropped_on_request(arm, tmp_path):
+    columns, joints = motion(arm, 5, rate=30.0, seconds=60), arm.chain.joint_names
+    random = np.random.default_rng(0)
+    rows = np.arange(len(columns["t"]))
+    repeats = np.sort(random.choice(np.arange(10, len(rows) - 10, 3), 150, replace=False))
+    rows[repeats] -= 1
+    log = {name: x if name == "t" else x[rows] for name, x in columns.items()}
+    file = written(log, tmp_path / "log.csv")
+    (kept,) = read_logs(file, joints)
+    (note,) = kept.repairs
+    assert "rows repeat the row before in motion: 'dropouts: dropped' under 'logs' removes them" in note
+    # where all joints reverse, a repeat is no step behind
+    count = int(note.split(" rows ")[0])
+    assert 0.95 * len(repeats) < count <= len(repeats)
+    (dropped,) = read_logs(file, joints, {"dropouts": "dropped"})
+    assert len(dropped) == len(rows) - count
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_velocities_that_are_magnitudes_are_an_error_and_differentiating_remedies_it(arm, tmp_path, sign):
+    columns, joints = motion(arm, 7), arm.chain.joint_names
+    joint = joints[-1]
+    random = np.random.default_rng(1)
+    columns[f"qd_{joint}"] = sign * np.abs(columns[f"qd_{joint}"] + 0.005 * random.standard_normal(2000))
+    file = written(columns, tmp_path / "log.csv")
+    (log,) = read_logs(file, joints)
+    told = errors([log], arm)
+    assert f"joint {joint!r}: got qd that is the magnitude of dq/dt" in told
+    assert not any("one way" in note.message for note in check_logs([log], arm).findings)
+    (log,) = read_logs(file, joints, advised(told).model_dump())
+    assert errors([log], arm) == ""
+
+
+def test_quick_but_sound_signals_have_no_jumps():
+    t = 0.02 * np.arange(3000)
+    random = np.random.default_rng(0)
+    steps = np.repeat(random.uniform(-1, 1, 60), 50)
+    q = np.zeros_like(t)
+    for k in range(1, len(t)):  # a servo that follows steps within some samples
+        q[k] = q[k - 1] + 0.4 * (steps[k - 1] - q[k - 1])
+    counts = 2 * np.pi / 4096
+    q = np.round(q / counts) * counts
+    log = Trajectory(t, q[:, None], np.gradient(q, t)[:, None], np.zeros((len(t), 0)), u=steps[:, None])
+    assert check([log], ["a"], ["revolute"]) == []
+    bang = np.where(np.sin(t) > 0, 260.0, 0.0) + np.round(random.uniform(0, 8, len(t)))
+    smooth = np.sin(t)[:, None]
+    log = Trajectory(t, smooth, np.cos(t)[:, None], bang[:, None])
+    codes = [x.code for x in check([log], ["a"], ["revolute"])]
+    assert codes == []
+    with pytest.raises(LogError, match=r"q that jumps by 3.003 between two samples, 1 time, at t = 30 s"):
+        check(
+            [Trajectory(t, smooth + 3 * (t > 30)[:, None], np.cos(t)[:, None], bang[:, None])],
+            ["a"],
+            ["revolute"],
+        )
+
+
+def columns_of(columns, quantity, joints):
+    return np.stack([columns[f"{quantity}_{joint}"] for joint in joints], axis=1)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_wrapped_commands_of_servos_are_unwrapped_with_their_positions(robots, tmp_path, form):
+    """Position and command wrap at different rows, and may start a revolution apart."""
+    for number, name in enumerate(ROBOTS):
+        text = (robots / f"{name}.urdf").read_text().replace('type="revolute"', 'type="continuous"')
+        (tmp_path / f"{name}.urdf").write_text(text)
+        (tmp_path / f"{name}.yaml").write_text("input: position\n")
+        arm = load_arm(tmp_path / f"{name}.urdf")
+        t = 0.02 * np.arange(1500)
+        columns = {"t": t}
+        for k, joint in enumerate(arm.chain.joint_names):
+            u = 3.0 + 0.8 * (k + number) * t + 0.4 * np.sin(t + k)
+            columns |= {f"u_{joint}": u, f"q_{joint}": u - 0.1 * np.cos(t)}
+        wrapped = dict(columns)
+        for joint, kind in zip(arm.chain.joint_names, arm.chain.joint_types, strict=True):
+            if kind == "revolute":
+                for quantity in ("q", "u"):
+                    angle = columns[f"{quantity}_{joint}"]
+                    wrapped[f"{quantity}_{joint}"] = (angle + np.pi) % (2 * np.pi) - np.pi
+        (log,) = read_logs(written(wrapped, tmp_path / f"log{number}.{form}"), arm)
+        followed = columns_of(columns, "u", arm.chain.joint_names) - columns_of(
+            columns, "q", arm.chain.joint_names
+        )
+        assert log.u is not None
+        assert log.u - log.q == pytest.approx(followed, abs=1e-9)
+        assert np.abs(np.diff(log.q, axis=0)).max() < 0.2

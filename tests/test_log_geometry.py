@@ -1,0 +1,236 @@
+"""`spelgen logs` names the lines for a log whose columns, zeros or gravity are others than the settings state.
+
+Faults are drawn: joint, order, angle and direction. Every line is written into the settings, the log is read again, and
+it is then the log without the fault. Inertials of the URDF are 30 % wrong, torques have noise, and friction.
+"""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from spelgen.arm.configured_arm import load_arm
+from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
+from spelgen.errors import SpelgenError
+from spelgen.log_checks.check_logs import check_logs, require_sound_logs
+from spelgen.logs.read import read_logs, write_logs
+from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.log_mapping import LogMapping
+
+ROBOTS = ("rpr", "six_dof", "ur10e")
+RATE, SECONDS = 100.0, 20.0
+
+
+@pytest.fixture(scope="module", params=ROBOTS)
+def arm(request, robots, tmp_path_factory):
+    folder = tmp_path_factory.mktemp(request.param)
+    # without limits: motions are drawn as for any arm
+    text = re.sub(r'effort="[^"]*"', 'effort="0"', (robots / f"{request.param}.urdf").read_text())
+    (folder / "arm.urdf").write_text(text)
+    return load_arm(folder / "arm.urdf")
+
+
+def excitation(arm, rng):
+    t = np.arange(0.0, SECONDS, 1 / RATE)
+    n = len(arm.chain.coordinates)
+    q = rng.uniform(-0.5, 0.5, n) * np.ones((len(t), 1))
+    for omega in 2 * np.pi * rng.uniform(0.05, 0.5, (4, n)):
+        q = q + rng.uniform(0.1, 0.4, n) * np.sin(omega * t[:, None] + rng.uniform(0, 6, n))
+    return t, q
+
+
+def pick_and_place(arm, rng):
+    t = np.arange(0.0, SECONDS, 1 / RATE)
+    s = np.clip((t % 2.0) / 1.6, 0.0, 1.0)[:, None]  # 1.6 s of motion, 0.4 s of rest
+    stops = rng.uniform(-1.0, 1.0, (round(SECONDS / 2) + 1, len(arm.chain.coordinates)))
+    number = (t // 2.0).astype(int)
+    return t, stops[number] + (10 * s**3 - 15 * s**4 + 6 * s**5) * (stops[number + 1] - stops[number])
+
+
+def recorded(arm, seed, motion=excitation, noise=0.02, gravity=1.0) -> Trajectory:
+    """Return a log of an arm whose inertials are 30 % off the URDF's."""
+    rng = np.random.default_rng(seed)
+    t, q = motion(arm, rng)
+    qd = np.gradient(q, t, axis=0)
+    qdd = np.gradient(qd, t, axis=0)
+    factors = np.exp(0.3 * rng.standard_normal((len(arm.chain.bodies), 2)))
+    parameters = urdf_parameters(arm.chain).reshape(-1, 10) * np.repeat(factors, (4, 6), axis=1)
+    still = np.zeros_like(q)
+    load = regressor(arm.chain, q, still, still) @ parameters.ravel()
+    rigid = regressor(arm.chain, q, qd, qdd) @ parameters.ravel() + (gravity - 1.0) * load
+    size = rigid.std(axis=0)
+    tau = rigid + 0.1 * size * (np.sign(qd) + qd / np.abs(qd).max(axis=0))
+    return Trajectory(t, q, qd, tau + noise * size * rng.standard_normal(q.shape), "motion")
+
+
+def flipped(log, k, motion, torque):
+    sign = 1.0 - 2.0 * (np.arange(log.q.shape[1]) == k)
+    q, qd = (log.q * sign, log.qd * sign) if motion else (log.q, log.qd)
+    return replace(log, q=q, qd=qd, tau=log.tau * sign if torque else log.tau)
+
+
+def drawn_joint(log, rng, first=0):
+    # the last link may be symmetric: its sense and its zero are then no matter
+    return int(rng.integers(first, log.q.shape[1] - 1))
+
+
+def ordered(log, rng):
+    order = rng.permutation(log.q.shape[1])
+    while (order == np.arange(len(order))).all():
+        order = rng.permutation(len(order))
+    return order
+
+
+def wrong_order(log, rng):
+    order = ordered(log, rng)
+    return replace(log, q=log.q[:, order], qd=log.qd[:, order], tau=log.tau[:, order])
+
+
+FAULTS = {
+    "position": ("joint-sense", lambda log, rng: flipped(log, drawn_joint(log, rng), True, False)),
+    "torque": ("torque-sense", lambda log, rng: flipped(log, drawn_joint(log, rng), False, True)),
+    "position and torque": ("joint-sense", lambda log, rng: flipped(log, drawn_joint(log, rng), True, True)),
+    "order": ("joint-order", wrong_order),
+    "order of torques": ("torque-order", lambda log, rng: replace(log, tau=log.tau[:, ordered(log, rng)])),
+}
+
+
+def told(arm, log, mapping=None):
+    """Return the only error about a log."""
+    report = check_logs([log], arm, mapping)
+    (error,) = report.errors
+    return str(error)
+
+
+def mended(arm, error, logs):
+    """Return the arm with the first line that an error advises in its settings, and the logs read again with it."""
+    line, place = re.search(r"write '(.*?)' ((?:under 'logs' )?)in the robot's YAML", error).groups()
+    settings = arm.robot.path.with_suffix(".yaml")
+    settings.write_text(f"logs: {{{line}}}\n" if place else f"{line}\n")
+    try:
+        again = load_arm(arm.robot.path)
+        return again, read_logs([logs], again)
+    finally:
+        settings.unlink()
+
+
+@pytest.mark.parametrize("motion", [excitation, pick_and_place])
+@pytest.mark.parametrize("noise", [0.005, 0.05])
+def test_a_log_that_means_what_it_says_is_not_doubted(arm, motion, noise):
+    report = check_logs([recorded(arm, 3, motion, noise)], arm)
+    about_geometry = [x for x in report.findings if x.code in ("gravity", "joint-zero", "torque-scale")]
+    assert (report.errors, about_geometry) == ((), [])
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_line_that_is_named_mends_the_log(arm, fault, tmp_path):
+    code, spoil = FAULTS[fault]
+    seed = sum(map(ord, fault + arm.chain.name))
+    log = recorded(arm, seed, (excitation, pick_and_place)[seed % 2])
+    wrong = spoil(log, np.random.default_rng(seed))
+    error = told(arm, wrong)
+    assert f"--accept {code}" in error
+    write_logs(tmp_path / "log.csv", [wrong], arm.chain.joint_names)
+    again, (read,) = mended(arm, error, tmp_path / "log.csv")
+    for name in ("q", "qd", "tau"):
+        np.testing.assert_allclose(getattr(read, name), getattr(log, name), atol=1e-9)
+    assert check_logs([read], again).errors == ()
+
+
+@pytest.mark.parametrize("angle", [90, 180, -90, 37])
+def test_a_zero_offset_is_named_to_a_tenth_of_a_radian(arm, angle, tmp_path):
+    rng = np.random.default_rng(angle % 360)
+    turning = [k for k, x in enumerate(arm.chain.coordinates) if x.joint_type == "revolute"]
+    k = turning[1] if len(turning) > 2 else 2
+    log = recorded(arm, int(rng.integers(1000)))
+    if arm.chain.name == "rpr":  # its last link is rigidly turned: other masses could make up for it
+        assert check_logs([turned(log, k, np.deg2rad(angle))], arm).errors == ()
+        return
+    wrong = turned(log, k, np.deg2rad(angle))
+    error = told(arm, wrong)
+    assert "--accept joint-zero" in error
+    write_logs(tmp_path / "log.csv", [wrong], arm.chain.joint_names)
+    _, (read,) = mended(arm, error, tmp_path / "log.csv")
+    # half a turn to either side is the same zero
+    assert np.abs(np.angle(np.exp(1j * (read.q - log.q)))).max() < 0.1
+
+
+def turned(log, k, angle):
+    q = log.q.copy()
+    q[:, k] -= angle
+    return replace(log, q=q)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_direction_of_gravity_is_found(arm, seed, tmp_path):
+    """On a wall, on a ceiling, and anyhow: torques of a base with this mounting."""
+    rng = np.random.default_rng(seed)
+    direction = [np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), rng.standard_normal(3)][seed]
+    gravity = 9.81 * direction / np.linalg.norm(direction)
+    mounted = replace(arm, chain=replace(arm.chain, gravity=tuple(gravity.tolist())))
+    log = recorded(mounted, seed)
+    write_logs(tmp_path / "log.csv", [log], arm.chain.joint_names)
+    error = told(arm, log)
+    lines = re.findall(r"'gravity: \[(.*?)\]'", error)
+    assert lines, error  # rpr on a ceiling is as well an arm with a joint that turns the other way
+    np.testing.assert_allclose(list(map(float, lines[0].split(","))), gravity, atol=0.3)
+
+
+@pytest.mark.parametrize("part", [0.0, -0.12, 0.2])
+def test_compensated_gravity_is_called_so(arm, part):
+    error = told(arm, recorded(arm, 5, gravity=part))
+    assert "gravity is compensated" in error and "--accept gravity-compensated" in error
+    assert "sign:" not in error and "gain:" not in error
+
+
+def test_another_unit_is_offered_as_gain(arm):
+    """Per mille of 3 Nm: gravity shows the factor as exactly as the masses of the URDF are right."""
+    log = recorded(arm, 6)
+    error = told(arm, replace(log, tau=log.tau / 0.003))
+    gains = list(map(float, re.findall(r"gain: ([\d.e-]+)", error)))
+    assert "--accept torque-unit" in error and len(gains) == log.q.shape[1]
+    np.testing.assert_allclose(np.log(gains), np.log(0.003), atol=np.log(2))
+
+
+def test_a_link_with_a_mistyped_mass_is_named(arm):
+    """One mass of the URDF is six times too large, and its tensor about the centre of mass is right."""
+    moments = [np.linalg.norm(np.array(body.inertia[1:4], dtype=float)) for body in arm.chain.bodies]
+    # the first joint of these arms is vertical: its body's first moment is invisible
+    k = 1 + int(np.argmax(moments[1:]))
+    body = arm.chain.bodies[k]
+    heavy = replace(body, inertia=(*(6 * float(x) for x in body.inertia[:4]), *body.inertia[4:]))
+    mistyped = replace(arm.chain, bodies=(*arm.chain.bodies[:k], heavy, *arm.chain.bodies[k + 1 :]))
+    log = recorded(arm, 10)
+    report = check_logs([log], replace(arm, chain=mistyped))
+    assert report.errors == ()
+    (note,) = (x for x in report.findings if x.code == "urdf-inertials")
+    assert note.where == f"link {body.link!r}"
+    assert not [x for x in check_logs([log], arm).findings if x.code == "urdf-inertials"]
+
+
+def test_training_refuses_it_unless_it_is_accepted(arm):
+    wrong = flipped(recorded(arm, 7), 1, True, False)
+    with pytest.raises(SpelgenError, match="--accept joint-sense"):
+        require_sound_logs([wrong], arm)
+    require_sound_logs([wrong], arm, LogMapping.model_validate({"accept": ["joint-sense"]}))
+
+
+def test_a_line_keeps_what_the_mapping_states(arm):
+    """A gain and a sense that are there already are multiplied."""
+    joint = arm.chain.joint_names[1]
+    mapping = LogMapping.model_validate({"joints": {joint: {"gain": 14.2, "sign": -1}}})
+    error = told(arm, flipped(recorded(arm, 8), 1, True, False), mapping)
+    assert f"'joints: {{{joint}: {{sign: 1, gain: -14.2}}}}' under 'logs'" in error
+
+
+def test_a_slow_arm_with_right_torques_is_not_refused(arm):
+    """At 12.5 Hz and an eighth of the speed, accelerations are differences of noisy positions."""
+    log = recorded(arm, 9)
+    t, qd = 8.0 * log.t, log.qd / 8.0
+    rigid = regressor(arm.chain, log.q, qd, np.gradient(qd, t, axis=0)) @ urdf_parameters(arm.chain)
+    rng = np.random.default_rng(0)
+    q = log.q + 1e-4 * rng.standard_normal(log.q.shape)
+    tau = rigid + 0.1 * rigid.std(axis=0) * np.sign(qd) + 0.05 * rng.standard_normal(q.shape)
+    slow = Trajectory(t, q, np.gradient(q, t, axis=0), tau, "motion")
+    assert check_logs([slow], arm).errors == ()
