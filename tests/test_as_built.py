@@ -223,7 +223,7 @@ class TestMotionFile:
     def test_what_excite_writes_is_read_back(self, robots, tmp_path):
         found = spelgen.excite(spelgen.load_arm(robots / "two_link.urdf"), duration=2.0, trials=2)
         (tmp_path / "m.csv").write_text(found.csv())
-        motion = read_motion(tmp_path / "m.csv", found.chain.joint_names)
+        motion = read_motion(tmp_path / "m.csv", found.arm.joint_names)
         for name in ("t", "q", "qd", "qdd"):
             np.testing.assert_allclose(getattr(motion, name), getattr(found.motion, name), atol=1e-9)
 

@@ -49,7 +49,7 @@ def arm(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def logs():
-    return servo_logs(5, 16.0, TRUTH)
+    return servo_logs(5, 24.0, TRUTH)
 
 
 @pytest.fixture(scope="module")
