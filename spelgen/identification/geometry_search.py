@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from spelgen.identification.log_geometry import Fit, GeometryProblem, Hypothesis, Vector3
+from spelgen.identification.log_geometry import GeometryProblem, Hypothesis, HypothesisFit, Vector3
 from spelgen.identification.tuning import GEOMETRY
 
 STANDARD_GRAVITY = 9.81  # m/s^2
@@ -18,11 +18,11 @@ STEP = 1e-4  # [rad, m] of finite differences
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class HypothesisComparison:
     """Readings of a log that are better than the unchanged log, the best first; they explain it equally well."""
 
-    unchanged: Fit
-    better: tuple[Fit, ...]
+    unchanged: HypothesisFit
+    better: tuple[HypothesisFit, ...]
 
     @property
     def codes(self) -> tuple[str, ...]:
@@ -30,7 +30,7 @@ class Comparison:
         return self.better[0].hypothesis.codes
 
 
-def compare_readings(problem: GeometryProblem, factors: Sequence[np.ndarray] = ()) -> Comparison:
+def compare_readings(problem: GeometryProblem, factors: Sequence[np.ndarray] = ()) -> HypothesisComparison:
     """Return the readings of a log that are significantly better than the unchanged log.
 
     factors: (n,) each, of the torques, as another unit or motor constant has them.
@@ -48,14 +48,14 @@ def compare_readings(problem: GeometryProblem, factors: Sequence[np.ndarray] = (
         fits = [*tried, unchanged]
     likely = _likely(unchanged, fits)
     if not likely:
-        return Comparison(unchanged, _rescaled(coarse, unchanged, factors))
+        return HypothesisComparison(unchanged, _rescaled(coarse, unchanged, factors))
     finer = problem.thinned(GEOMETRY.confirming_samples)
     unchanged = finer.fit(problem.unchanged)
     confirmed = [finer.fit(fit.hypothesis) for fit in likely[: GEOMETRY.named]]
-    return Comparison(unchanged, _likely(unchanged, confirmed))
+    return HypothesisComparison(unchanged, _likely(unchanged, confirmed))
 
 
-def _likely(unchanged: Fit, fits: Sequence[Fit]) -> tuple[Fit, ...]:
+def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[HypothesisFit, ...]:
     """Return the fits about as good as the best one, if it is significantly better than the unchanged log."""
     best = min(fit.cost for fit in fits)
     if best > unchanged.cost - GEOMETRY.needed:
@@ -63,7 +63,9 @@ def _likely(unchanged: Fit, fits: Sequence[Fit]) -> tuple[Fit, ...]:
     return tuple(sorted((fit for fit in fits if fit.cost < best + GEOMETRY.ambiguous), key=_rank))
 
 
-def _rescaled(problem: GeometryProblem, unchanged: Fit, factors: Sequence[np.ndarray]) -> tuple[Fit, ...]:
+def _rescaled(
+    problem: GeometryProblem, unchanged: HypothesisFit, factors: Sequence[np.ndarray]
+) -> tuple[HypothesisFit, ...]:
     """Return the fit with the best factor of the torques, if it is better at all.
 
     Gravity has shown already that a factor is needed: light bodies, whose cost is small, explain small torques.
@@ -73,12 +75,14 @@ def _rescaled(problem: GeometryProblem, unchanged: Fit, factors: Sequence[np.nda
     return (best,) if best.cost < unchanged.cost else ()
 
 
-def _rank(fit: Fit) -> float:
+def _rank(fit: HypothesisFit) -> float:
     """Return the cost, plus a penalty by which changes that are rarer come after others that explain as much."""
     return fit.cost + GEOMETRY.rare * sum(RARE.get(code, 0) for code in fit.hypothesis.codes)
 
 
-def single_changes(problem: GeometryProblem, base: Fit, factors: Sequence[np.ndarray]) -> list[Fit]:
+def single_changes(
+    problem: GeometryProblem, base: HypothesisFit, factors: Sequence[np.ndarray]
+) -> list[HypothesisFit]:
     """Return fits with one more change than the base has."""
     reading = base.hypothesis
     changed = [*_senses(reading), *_swapped(reading), *_scaled(reading, factors)]
@@ -122,7 +126,7 @@ def _scaled(base: Hypothesis, factors: Sequence[np.ndarray]) -> Iterator[Hypothe
         yield _changed(base, "torque-unit", torque_scale=base.torque_scale * factor)
 
 
-def reordered(problem: GeometryProblem, unchanged: Fit) -> list[Fit]:
+def reordered(problem: GeometryProblem, unchanged: HypothesisFit) -> list[HypothesisFit]:
     """Return the best orders of all columns, and of the torques, by exchanging two joints at a time.
 
     Long arms have local minima: the search starts at random orders, too.
@@ -150,7 +154,9 @@ def reordered(problem: GeometryProblem, unchanged: Fit) -> list[Fit]:
     return [fit for fit in fits.values() if not np.array_equal(fit.hypothesis.torque_source, starts[0])]
 
 
-def _with_offset(problem: GeometryProblem, base: Fit, joint: int, revolute: bool) -> list[Fit]:
+def _with_offset(
+    problem: GeometryProblem, base: HypothesisFit, joint: int, revolute: bool
+) -> list[HypothesisFit]:
     """Return the fit with the best zero offset of a joint; none if it is below the errors of calibration."""
     reading = base.hypothesis
 
@@ -188,7 +194,7 @@ def _with_offset(problem: GeometryProblem, base: Fit, joint: int, revolute: bool
     return [best if is_right_angle else problem.fit(shifted(round(offset, 4)))]
 
 
-def _with_gravity(problem: GeometryProblem, base: Fit) -> list[Fit]:
+def _with_gravity(problem: GeometryProblem, base: HypothesisFit) -> list[HypothesisFit]:
     """Return the fits with the best direction of gravity, and with the part of gravity in compensated torques."""
     present = np.array(base.hypothesis.gravity)
     size = float(np.linalg.norm(present))
@@ -208,7 +214,7 @@ def _with_gravity(problem: GeometryProblem, base: Fit) -> list[Fit]:
     return fits
 
 
-def _gravity(problem: GeometryProblem, base: Fit, gravity: np.ndarray) -> Fit:
+def _gravity(problem: GeometryProblem, base: HypothesisFit, gravity: np.ndarray) -> HypothesisFit:
     x, y, z = (float(value) + 0.0 for value in gravity)
     return problem.fit(_changed(base.hypothesis, "gravity", gravity=(x, y, z)))
 
@@ -217,7 +223,7 @@ def _nearest_axis(gravity: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(gravity) * np.sign(gravity) * (np.abs(gravity) == np.abs(gravity).max()))
 
 
-def _gravity_columns(problem: GeometryProblem, fit: Fit) -> np.ndarray:
+def _gravity_columns(problem: GeometryProblem, fit: HypothesisFit) -> np.ndarray:
     """Return the derivative of the torques with respect to the vector of gravity, (S, n, 3)."""
     bodies = [problem.torque(replace(fit.hypothesis, gravity=x), fit.parameters) for x in UNIT_GRAVITIES]
     return np.asarray(np.stack(bodies[1:], axis=2) - bodies[0][..., None])
@@ -226,7 +232,7 @@ def _gravity_columns(problem: GeometryProblem, fit: Fit) -> np.ndarray:
 UNIT_GRAVITIES: tuple[Vector3, ...] = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-def _best_direction(problem: GeometryProblem, fit: Fit) -> Fit:
+def _best_direction(problem: GeometryProblem, fit: HypothesisFit) -> HypothesisFit:
     """Return the fit with the best direction of gravity near the direction of a fit."""
     size = float(np.linalg.norm(fit.hypothesis.gravity))
     for _ in range(GEOMETRY.refinements):
@@ -242,7 +248,7 @@ def _best_direction(problem: GeometryProblem, fit: Fit) -> Fit:
     return fit
 
 
-def _with_compensation(problem: GeometryProblem, base: Fit) -> list[Fit]:
+def _with_compensation(problem: GeometryProblem, base: HypothesisFit) -> list[HypothesisFit]:
     """Return the fit with the part of gravity that a compensating controller has not taken out of the torques."""
     present = np.array(base.hypothesis.gravity)
     without = _gravity(problem, base, np.zeros(3))

@@ -86,7 +86,7 @@ class Hypothesis:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class HypothesisFit:
     """Least squares with the prior under a hypothesis.
 
     cost: negative log posterior up to a constant. misfit: its part from the torque residual. parameters: (K,), inertial
@@ -153,7 +153,7 @@ class GeometryProblem:
             self._equations[key] = rows, block_products(rows, 1)[:, 0]
         return self._equations[key]
 
-    def fit(self, hypothesis: Hypothesis) -> Fit:
+    def fit(self, hypothesis: Hypothesis) -> HypothesisFit:
         """Return the fit that minimises the cost.
 
         The noise of a joint is marginalised: its log likelihood is -N / 2 log(residual sum of squares), minimised by
@@ -182,9 +182,9 @@ class GeometryProblem:
         misfit = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
         cost = misfit + prior.freedom * float(np.log1p(distance / prior.freedom))
         cost += self._implausible(x, covariance, normal)
-        return Fit(hypothesis, cost, misfit, x, covariance, errors)
+        return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors)
 
-    def step(self, fit: Fit, columns: np.ndarray) -> np.ndarray:
+    def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:
         """Return the Gauss-Newton step (D,) of parameters with the torque Jacobian `columns` (S, n, D)."""
         rows, _ = self.equations(fit.hypothesis)
         tau = fit.hypothesis.signals(self.samples).tau
@@ -199,7 +199,7 @@ class GeometryProblem:
         vector[:bodies] += self._prior.precision @ (self._prior.mean - fit.parameters[:bodies])
         return np.asarray((inverse(matrix) @ vector)[-columns.shape[2] :])
 
-    def wrong_links(self, fit: Fit) -> Iterator[tuple[int, float, float]]:
+    def wrong_links(self, fit: HypothesisFit) -> Iterator[tuple[int, float, float]]:
         """Yield bodies whose first moment is far from the URDF's, its ratio to the URDF's, and standard deviations.
 
         The ratio is along the direction of the URDF's first moment. A body counts only if the difference is visible in

@@ -71,7 +71,7 @@ class DriveHintTuning:
 
 
 @dataclass(frozen=True)
-class GeometryTuning:
+class LogGeometryTuning:
     """Numbers of the test of a log's geometry, chosen by benchmarks/log_geometry.py. Costs: negative log posteriors."""
 
     # [s] residuals of recorded arms stay correlated for about 0.2 s: the likelihood counts one error in that time
@@ -136,4 +136,4 @@ class GeometryTuning:
     compensated: float = 0.5
 
 
-TUNING, HINTS, GEOMETRY = IdentificationTuning(), DriveHintTuning(), GeometryTuning()
+TUNING, HINTS, GEOMETRY = IdentificationTuning(), DriveHintTuning(), LogGeometryTuning()

@@ -15,7 +15,7 @@ from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.drive_samples import DriveLog, DriveSamples
 from spelgen.identification.geometry_search import compare_readings
 from spelgen.identification.least_squares import varying
-from spelgen.identification.log_geometry import Fit, GeometryProblem, MotionSamples
+from spelgen.identification.log_geometry import GeometryProblem, HypothesisFit, MotionSamples
 from spelgen.identification.torque_delay import delay_of
 from spelgen.identification.tuning import HINTS
 from spelgen.listing import Listing, number
@@ -191,7 +191,7 @@ class TorqueLogs:
             summary.notes.extend(late.notes)
 
 
-def _link_notes(problem: GeometryProblem, fit: Fit) -> Iterator[Diagnostic]:
+def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagnostic]:
     """Yield a warning for each link whose inertials in the URDF are far from the log's."""
     for k, ratio, deviation in problem.wrong_links(fit):
         message = (

@@ -10,8 +10,8 @@ import yaml
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Chain
 from spelgen.errors import Diagnostic, LogError
-from spelgen.identification.geometry_search import Comparison
-from spelgen.identification.log_geometry import Fit, Hypothesis
+from spelgen.identification.geometry_search import HypothesisComparison
+from spelgen.identification.log_geometry import Hypothesis, HypothesisFit
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.log_checks.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
@@ -48,7 +48,7 @@ class Remedies:
     mapping: LogMapping
     by_name: bool
 
-    def finding(self, comparison: Comparison) -> LogError | Diagnostic:
+    def finding(self, comparison: HypothesisComparison) -> LogError | Diagnostic:
         """Return the finding of a better reading: an error, or a warning about small angles and moderate factors."""
         best, codes = comparison.better[0], comparison.codes
         changes = [self._change(code, best.hypothesis) for code in codes]
@@ -168,7 +168,7 @@ def _number(value: float) -> float:
     return int(rounded) if rounded.is_integer() else rounded
 
 
-def _evidence(best: Fit, unchanged: Fit) -> str:
+def _evidence(best: HypothesisFit, unchanged: HypothesisFit) -> str:
     """Return the error reduction of a reading: mean over joints of the squared error."""
     if best.hypothesis.codes == ("torque-unit",):
         return "by the URDF's gravity"

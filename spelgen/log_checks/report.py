@@ -214,7 +214,7 @@ def signal_tables(joints: Sequence[JointReport], quantities: Sequence[str]) -> t
     units = []
     for kind, unit in UNITS.items():
         if any(joint.kind == kind for joint in joints):
-            units.append(", ".join(dict.fromkeys(getattr(unit, MEASURES[name]) for name in quantities)))
+            units.append(", ".join(dict.fromkeys(asdict(unit)[MEASURES[name]] for name in quantities)))
     head = ("joint", quantities[0], "of its range", *quantities[1:])
     columns = [f"{name} {what}" for what in ("noise", "step") for name in quantities]
     commands = "u: commanded positions" if "u" in quantities else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from functools import partial
 from math import inf, nan
 from typing import NamedTuple
@@ -59,8 +60,8 @@ def find_beyond_limits(joint: JointEvidence) -> str | None:
 
 def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
     """Find a quantity above the joint's limit, "velocity" or "effort"."""
-    bound: float | None = getattr(joint.coordinate, limit)
-    unit = getattr(UNITS[joint.coordinate.joint_type], MEASURES[quantity])
+    limits = {"velocity": joint.coordinate.velocity, "effort": joint.coordinate.effort}
+    bound, unit = limits[limit], asdict(UNITS[joint.coordinate.joint_type])[MEASURES[quantity]]
     largest = joint.report.largest(quantity)
     if not bound or largest <= bound * (1 + TUNING.limit_noise):
         return None
