@@ -49,19 +49,19 @@ def arm(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def logs():
-    return servo_logs(5, 24.0, TRUTH)
+    return servo_logs(6, 16.0, TRUTH)
 
 
 @pytest.fixture(scope="module")
 def fitted(arm, logs, tmp_path_factory):
     folder = tmp_path_factory.mktemp("run") / "run"
-    return spelgen.fit(spelgen.build(arm, "closed-form"), logs[:4], arm=arm, folder=folder)
+    return spelgen.fit(spelgen.build(arm, "closed-form"), logs[:5], arm=arm, folder=folder)
 
 
 @pytest.fixture(scope="module")
 def results(fitted, logs):
     """The evaluation of the fit on the log that was not fitted."""
-    return spelgen.evaluate(fitted, logs[4:])
+    return spelgen.evaluate(fitted, logs[5:])
 
 
 def test_ratios_to_kp_are_found(fitted):
@@ -87,7 +87,7 @@ def test_replay_of_another_motion_beats_the_baselines(fitted, logs, results):
         assert errors["model"] < 0.4 * min(errors[LINEAR_SERVOS], errors[DELAYED_COMMAND])
     assert results.replays[0].errors["model"].mean < 3e-3
     assert "Commands replayed, whole log" in results.text()
-    again = spelgen.evaluate(fitted.folder, logs[4:])
+    again = spelgen.evaluate(fitted.folder, logs[5:])
     assert again.to_dict() == results.to_dict()
 
 
@@ -185,7 +185,7 @@ def test_its_report_shows_servos_and_replays_and_no_torques(fitted, results):
     write_json(RunFolder(fitted.folder).evaluation, results.to_dict())
     page = render_report(fitted.folder)
     told = " ".join(page.split())
-    assert "Typical log replayed: motion 4" in page and told.count('class="line hold"') >= 2
+    assert "Typical log replayed: motion 5" in page and told.count('class="line hold"') >= 2
     kd = f"{number(TRUTH.kd[0] / TRUTH.kp[0])[:4]}"
     assert '<h2 id="servos">Servos</h2>' in page and f"<td>{kd}" in page and "dry/kp of elbow" in told
     assert "<td>command [rad]</td>" in page

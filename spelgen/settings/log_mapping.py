@@ -115,7 +115,14 @@ class LogUnits(JointUnits):
 
 
 class JointWords(Group):
-    """Sizes of one joint's words, in logged units; None: its values are no words."""
+    """Sizes of the register words of one joint, in logged units; default: its values are not words of a register.
+
+    Attributes:
+        q: Position.
+        qd: Velocity.
+        tau: Torque.
+        u: Commanded position.
+    """
 
     q: Positive | None = None
     qd: Positive | None = None
@@ -124,7 +131,15 @@ class JointWords(Group):
 
 
 class MotorCalibration(Group):
-    """Calibration of one motor, as LeRobot writes it: the range of motion [counts], and whether it is mirrored."""
+    """Calibration of one motor, as LeRobot writes it.
+
+    Attributes:
+        range_min: Lower end of the range of motion [counts].
+        range_max: Upper end of the range of motion [counts].
+        drive_mode: 1 for a motor whose direction is reversed.
+        homing_offset: Offset of the position, which is not used.
+        id: Number of the motor on its bus, which is not used.
+    """
 
     range_min: Number
     range_max: Number
