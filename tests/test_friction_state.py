@@ -25,10 +25,14 @@ from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.runtime.friction_laws import FrictionLaws
+from spelgen.runtime.rows import Joint
 from spelgen.runtime.sliding_friction import SlidingFriction
 
-FRICTION, SPEED = (1.5, 4.0), (2.0, 0.5)
 REACH = [[3e-4, 3e-3, 3e-2], [3e-5, 3e-4, 3e-3]]
+JOINTS = (
+    Joint("a", "revolute", lower=-3.0, upper=3.0, speed=2.0, friction=1.5, armature=0.1),
+    Joint("b", "prismatic", lower=0.0, upper=1.0, speed=0.5, friction=4.0, armature=0.1),
+)
 
 
 def swings(samples: int, seed: int = 0) -> np.ndarray:
@@ -65,7 +69,7 @@ def test_a_step_of_any_length_is_exact_in_one_direction():
 
 
 def test_load_dependent_friction_is_smooth_at_right_angles():
-    laws = SlidingFriction(FRICTION, SPEED)
+    laws = SlidingFriction(JOINTS)
     constants = laws.prepare()
     still = torch.ones(2).double()
 
@@ -82,7 +86,7 @@ def test_load_dependent_friction_is_smooth_at_right_angles():
 
 def test_bristles_are_passive():
     """d/dt stored energy = supplied power - dissipated power, and the dissipated power is never negative."""
-    laws = FrictionLaws(FRICTION, SPEED, REACH)
+    laws = FrictionLaws(JOINTS, breakaway={"revolute": REACH[0], "prismatic": REACH[1]})
     with torch.no_grad():
         for weight in laws.parameters():
             weight += torch.randn(weight.shape, generator=torch.Generator().manual_seed(1)).double()
