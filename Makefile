@@ -33,7 +33,7 @@ demo: $(STAMP) ## robots/rpr.urdf from URDF to C: train on a simulated arm that 
 	$(BIN)/spelgen logs $(DEMO)/logs --robot robots/rpr.urdf
 	$(BIN)/spelgen train $(DEMO)/rpr_spel.py --robot robots/rpr.urdf \
 	    --data $(DEMO)/logs -o $(DEMO)/run
-	$(BIN)/spelgen evaluate $(DEMO)/run --data $(DEMO)/logs \
+	$(BIN)/spelgen evaluate $(DEMO)/run --quick --data $(DEMO)/logs \
 	    --truth $(DEMO)/logs/as_built.urdf
 	$(BIN)/spelgen report $(DEMO)/run > $(DEMO)/summary.txt
 	$(BIN)/spelgen export $(DEMO)/run --to c -o $(DEMO)/rpr_c
@@ -77,7 +77,7 @@ UNUSED := anyio certifi charset-normalizer colorlog embreex h11 httpcore httpx i
 lock: ## write the pinned versions and hashes anew: the newest that the ranges of pyproject.toml admit
 	$(PYTHON) -m venv .lock-venv
 	.lock-venv/bin/pip install -qq uv
-	printf 'hatchling\neditables\n' | $(LOCK) $(UNUSED:%=--no-emit-package %) --extra simulate pyproject.toml - > .lock-venv/demo
+	printf 'hatchling\neditables\ncasadi\n' | $(LOCK) $(UNUSED:%=--no-emit-package %) --extra simulate pyproject.toml - > .lock-venv/demo
 	$(LOCK) --constraints .lock-venv/demo --all-extras pyproject.toml > .lock-venv/tools
 	sed -n '/^#/p' requirements.txt | cat - .lock-venv/demo > .lock-venv/lock && mv .lock-venv/lock requirements.txt
 	sed -n '/^#/p' requirements-tools.txt | cat - .lock-venv/tools > .lock-venv/lock && mv .lock-venv/lock requirements-tools.txt
