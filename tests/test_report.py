@@ -13,6 +13,7 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.design import PRESETS
 from spelgen.emission.build import build
 from spelgen.emission.specify import make_spec
+from spelgen.emission.text import description
 from spelgen.errors import RunError
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.render.report_page import render_report, write_report
@@ -133,9 +134,21 @@ def test_numbers_are_those_of_the_run(run):
     assert "The model explains 99 % of the variance of the torques and is off by 1.23 % of the motion" in text
     assert "But URDF is better after 1 step." in text
     assert "34 for training, 17 for validation" in text
+    assert description(RunFolder(run).read_spec()) in text
+    assert "import torch" not in text, "the description of the model, and not the example of its module"
     assert "--objective rollout --set seed=7 --set epochs=30 --set cutoff=8.0 --set decimation=1" in text
     assert "2,000 steps on the momentum" in text and "rk4, 4 steps between samples" in text
     assert "spelgen build rpr.urdf -o module.py spelgen train module.py --data LOGS" in text
+
+
+def test_a_trajectory_of_which_a_part_validates_counts_once(run):
+    config = json.loads((run / "config.json").read_text())
+    for validation, said in (
+        (["a (last part)"], "trained on 1 trajectory,"),
+        (["b"], "trained on 2 trajectories,"),
+    ):
+        (run / "config.json").write_text(json.dumps(config | {"training": ["a"], "validation": validation}))
+        assert said in render_report(run)
 
 
 def test_a_run_of_a_custom_preset_names_the_file_that_it_needs(run, robots, tmp_path):

@@ -82,6 +82,13 @@ def _functions(spec: ModelSpec) -> str:
 
 def header(spec: ModelSpec) -> str:
     """Return the documentation of the module: the arm, an example, the structure of M, and the joints."""
+    example = _EXAMPLE.format(module=module_name(spec), n=len(spec.joints))
+    about = fill(description(spec), WIDTH, break_long_words=False, break_on_hyphens=False)
+    return "\n\n".join([about, example, _picture(spec), _joint_table(spec)])
+
+
+def description(spec: ModelSpec) -> str:
+    """Return sentences about a model: its robot, its parts, and the joints that V depends on."""
     kind = class_summary(spec)
     lines = [f"Robot {_quoted(spec.robot)}. {kind[0].upper()}{kind[1:]}"]
     if spec.links and spec.design.net != "none":
@@ -94,9 +101,7 @@ def header(spec: ModelSpec) -> str:
         lines.append("Inputs are commanded positions u of servos: tau = clip(kp (u - q) - kd qd).")
     if not spec.started_from_urdf:
         lines.append("The URDF has no physically consistent inertials: initial links have 1 kg each.")
-    example = _EXAMPLE.format(module=module_name(spec), n=len(spec.joints))
-    about = fill(" ".join(lines), WIDTH, break_long_words=False, break_on_hyphens=False)
-    return "\n\n".join([about, example, _picture(spec), _joint_table(spec)])
+    return " ".join(lines)
 
 
 def module_name(spec: ModelSpec) -> str:

@@ -19,6 +19,7 @@ from pydantic import (
 
 from spelgen.errors import RunError, SettingsError, SpelgenError
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.windows import LAST_PART
 from spelgen.settings.fits import CONFIGS, FitConfig, Objective, Substeps
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.messages import validated
@@ -86,6 +87,11 @@ class Record(BaseModel):
     def options(self) -> Content:
         """The options of the fit by name, as JSON."""
         return self._options(self.config)
+
+    @property
+    def trajectories(self) -> int:
+        """Number of trajectories for training and validation; a trajectory that was cut counts once."""
+        return len(self.training) + sum(not name.endswith(LAST_PART) for name in self.validation)
 
     def to_dict(self) -> Content:
         """Return the content of config.json."""

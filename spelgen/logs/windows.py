@@ -14,6 +14,9 @@ from spelgen.dynamics.bristles import BristleReach, bristles_along
 from spelgen.errors import Diagnostic, LogError
 from spelgen.logs.trajectory import Trajectory, set_aside
 
+LAST_PART = " (last part)"
+"""Ends the name of the part of a trajectory that validates what is fitted to the rest of it."""
+
 
 @dataclass(frozen=True, eq=False)
 class Windows:
@@ -130,7 +133,7 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
             f"validation on the last {t[-1] - t[cut]:.3g} s"
         )
         note = Diagnostic("info", "validation-split", "logs", None, message)
-        last = replace(trajectory[cut:], name=f"{trajectory.name} (last part)")
+        last = replace(trajectory[cut:], name=trajectory.name + LAST_PART)
         return Split((trajectory[:cut],), (last,), note)
     # whole trajectories: neighbouring windows share samples, and would validate on training data
     count = min(max(1, round(fraction * total)), total - 1)

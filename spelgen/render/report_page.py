@@ -11,7 +11,7 @@ from jinja2 import TemplateError
 
 from spelgen.arm.configured_arm import Arm
 from spelgen.emission.specify import arm_of_spec
-from spelgen.emission.text import header
+from spelgen.emission.text import description
 from spelgen.errors import RunError, SpelgenError, in_one_line
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import result_tables
@@ -167,13 +167,12 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         sections["settings"] = settings(record)
     if metrics:
         sections["losses"] = loss_chart(metrics, best_epoch(metrics))
-    docstring = header(spec)  # its second paragraph describes the structure
     joints = named_joints(spec.joint_names, spec.joint_types)
     return render_page(
         "report.html.jinja",
         **sections,
         spec=spec,
-        about=" ".join(docstring.split("\n\n")[1].split()),
+        about=description(spec),
         units=UNITS,
         numbers=head_numbers(model, record, metrics, run.results),
         verdict=run.verdict,
