@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,8 @@ from spelgen.emission.build import build
 from spelgen.emission.specify import make_spec
 from spelgen.emission.text import description
 from spelgen.errors import RunError
+from spelgen.evaluation.results import Results
+from spelgen.evaluation.verdict import verdict
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.render.report_page import render_report, write_report
 from spelgen.render.run_facts import commands
@@ -73,6 +76,7 @@ EVALUATION = {
                      "message": "<b>said</b>"}],
     "traces": traces("traj_00"),
 }  # fmt: skip
+EVALUATION["assessment"] = asdict(verdict(Results.from_dict(EVALUATION)))
 
 
 def write_model(folder: Path, model) -> None:

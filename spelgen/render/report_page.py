@@ -13,10 +13,11 @@ from spelgen.arm.configured_arm import Arm
 from spelgen.emission.specify import arm_of_spec
 from spelgen.emission.text import description
 from spelgen.errors import RunError, SpelgenError, in_one_line
+from spelgen.evaluation.measurements import Verdict
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.traces import Traces
-from spelgen.evaluation.verdict import Limits, Verdict, verdict
+from spelgen.evaluation.verdict import Limits
 from spelgen.files import write_json, write_text
 from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import Content, Record
@@ -63,9 +64,7 @@ class Run:
     @property
     def verdict(self) -> Verdict | None:
         """Assessment of the model; None before its evaluation."""
-        if self.results is None:
-            return None
-        return verdict(self.results, self.baselines, self.limits)
+        return None if self.results is None else self.results.assessment
 
 
 def open_run(path: Path | str) -> Run:
