@@ -92,9 +92,10 @@ class TorqueLogs:
                     weightless = _weightless(problem, evidence)
             if is_right and moving is not None:
                 self._check_drives(moving, summary)
+        has_errors = bool(summary.errors)
         for joint in evidence:
             passed = accepted | {code for code in UNIT_CODES if self._is_declared(joint.coordinate.name)}
-            if summary.errors:  # one cause, one message
+            if has_errors:  # one cause, one message
                 passed.add("torque-beyond-drive")
             if joint not in weightless:  # other masses than the URDF's explain it
                 passed.add(WITHOUT_GRAVITY)
