@@ -18,8 +18,7 @@ from spelgen.errors import LogError, SpelgenError, SpelgenErrors
 from spelgen.identification import drive_samples
 from spelgen.identification.drive_hints import drive_problem, find_coupling
 from spelgen.identification.drive_samples import DriveLog
-from spelgen.log_checks import check_torque_logs
-from spelgen.log_checks import robot_checks
+from spelgen.log_checks import check_torque_logs, robot_checks
 from spelgen.log_checks.check_logs import check_logs, require_sound_logs
 from spelgen.log_checks.statistics import noise_level, quantisation_step, statistics
 from spelgen.logs import checks, read, segments

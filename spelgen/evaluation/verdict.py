@@ -17,6 +17,7 @@ from spelgen.evaluation.measurements import Measurements, Verdict
 from spelgen.evaluation.tuning import TUNING
 from spelgen.labels import listed, share, thousandths
 from spelgen.listing import number
+from spelgen.logs.checks import ELASTIC
 
 SEEN = "tested-on-training-data"
 STANDSTILL = " near standstill"
@@ -60,6 +61,9 @@ def verdict(
     sentence = f"Good enough for {listed(uses.good)}" if uses.good else "Not accurate enough yet"
     if any(diagnostic.code == SEEN for diagnostic in results.diagnostics):
         sentence = f"Evaluated on training logs: {sentence[0].lower()}{sentence[1:]}"
+    elastic = next((x for x in results.diagnostics if x.code == ELASTIC), None)
+    if elastic is not None:
+        sentence = f"Below the resonance of an elastic joint only: {sentence[0].lower()}{sentence[1:]}"
     if uses.good and uses.bad:
         sentence += f", not for {listed(uses.bad)}"
     joint, speed, proof = _worst_joint(results)
@@ -69,7 +73,7 @@ def verdict(
         details.append(f"worst at {joint}{speed}")
     if recommendations:
         details.append(f"next, record {next(iter(recommendations))}")
-    because = []
+    because = [] if elastic is None else [f"{elastic.where}: {elastic.message}."]
     for detail in details:
         # longer details follow the first sentence
         if len(f"{sentence}; {detail}".split()) <= TUNING.headline:
