@@ -24,24 +24,33 @@ LAST = (
     "M{n}{n} is constant: joint {n} is the last and carries one rigid body. "
     "It needs one parameter and no network."
 )
-ROOT = "M does not depend on joint 1: it moves the whole arm as one rigid body. It is not an input of the networks of M."
-UPRIGHT = "V does not depend on joint 1: gravity does no work in a rotation about an axis parallel to it. It is not an input of the network of V."
+ROOT = (
+    "M does not depend on joint 1: it moves the whole arm as one rigid body. "
+    "It is not an input of the networks of M."
+)
+UPRIGHT = (
+    "V does not depend on joint 1: gravity does no work in a rotation about an axis parallel to it. "
+    "It is not an input of the network of V."
+)
 SIX_AXES = [LAST.format(n=6), ROOT, UPRIGHT]
 WORDS = {
     "two_link": [LAST.format(n=2), ROOT],
     "rpr": [
         "M32 is always zero: prismatic joint 2 is parallel to the axis of joint 3, and a rotation has no velocity "
         "along its axis. Nothing is learned for it.",
-        "M22 is constant: the diagonal entry of a prismatic joint is the mass that it carries. It needs one parameter and no network.",
+        "M22 is constant: the diagonal entry of a prismatic joint is the mass that it carries. "
+        "It needs one parameter and no network.",
         LAST.format(n=3),
         ROOT,
         UPRIGHT,
-        "V does not depend on joint 2: gravity does no work in a translation orthogonal to it. It is not an input of the network of V.",
+        "V does not depend on joint 2: gravity does no work in a translation orthogonal to it. "
+        "It is not an input of the network of V.",
     ],
     "scara": [
-        "M31, M32 and M43 are always zero: prismatic joint 3 is parallel to the axes of joints 1, 2 and 4, and a rotation has no "
-        "velocity along its axis. Nothing is learned for them.",
-        "M33 is constant: the diagonal entry of a prismatic joint is the mass that it carries. It needs one parameter and no network.",
+        "M31, M32 and M43 are always zero: prismatic joint 3 is parallel to the axes of joints 1, 2 and 4, and a "
+        "rotation has no velocity along its axis. Nothing is learned for them.",
+        "M33 is constant: the diagonal entry of a prismatic joint is the mass that it carries. "
+        "It needs one parameter and no network.",
         LAST.format(n=4),
         ROOT,
         "M does not depend on joint 3: its motion commutes with joints 1 and 2, as if it were the first joint. "
@@ -231,7 +240,8 @@ CHECKS: dict[str, Check] = {
     "both joints are prismatic, and the angle between their axes is constant": lambda s, about, _: all(
         s.slides(a, b) and _steady(s.cosines(a, [b])) for a, b in zip(about[::2], about[1::2], strict=True)
     ),
-    "the load of joint # keeps its distance from the plane that contains the axis of joint # and is parallel to joint #": (
+    "the load of joint # keeps its distance from the plane that contains the axis of joint # and is parallel to "
+    "joint #": (
         lambda s, about, named: (
             (about == named[:2] and named[2] == named[0] and s.slides(named[0]) and s.turns(named[1]))
             and _steady(s.carried(*named[:2]))
