@@ -37,7 +37,7 @@ BLOCK = 2**14
 
 
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
-    """Return the typical break-away displacements of joints of these types."""
+    """Return the typical break-away displacements, (n, K) [rad, m], of joints of these types; motors: C, (n, n)."""
     return BristleReach(np.array([BREAKAWAY[kind] for kind in kinds]), motors)
 
 
@@ -52,7 +52,13 @@ def bristle_reach(model: PortHamiltonian) -> BristleReach:
 
 
 def moved_bristles(z: torch.Tensor, displacement: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
-    """Return z after a monotonic displacement of the drives: exact; shapes as z, or broadcast to it."""
+    """Return the deflections after a monotonic displacement of the drives, exactly.
+
+    Args:
+        z: (..., n, K) deflections of the bristles [rad, m].
+        displacement: (..., n, 1) displacement of the drives [rad, m].
+        reach: (n, K) break-away displacements [rad, m].
+    """
     return (z + displacement).clamp(-reach, reach)
 
 

@@ -53,9 +53,11 @@ def _of_model(model: PortHamiltonian, prepared: object, q: Tensor) -> MotionEqua
     pose = model.configuration(q, prepared)
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
+        """Return the friction torque, (W, n) [Nm, N]."""
         return model.friction_torque(pose, qd, *known_past(model, z))
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
+        """Return the force M qdd, (W, n) [Nm, N]."""
         return model.input_force(pose, qd, tau) - model.nonlinear_effects(pose, qd) - friction(qd, z)
 
     return MotionEquations(pose.mass, force, friction)
@@ -66,9 +68,11 @@ def _of_any(dynamics: Any, q: Tensor) -> MotionEquations:
     mass = torch.as_tensor(dynamics.mass_matrix(q))
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
+        """Return the friction torque, (W, n) [Nm, N]."""
         return torch.as_tensor(dynamics.friction_torque(q, qd, *known_past(dynamics, z)))
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
+        """Return the force M qdd, (W, n) [Nm, N]."""
         qdd = torch.as_tensor(dynamics.forward_dynamics(q, qd, tau, *known_past(dynamics, z)))
         return (mass @ qdd.unsqueeze(-1)).squeeze(-1)
 

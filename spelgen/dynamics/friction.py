@@ -68,7 +68,7 @@ def joint_friction(
 ) -> DriveFriction:
     """Return the friction of joints: from the settings of a drive, or from <dynamics> of the URDF if there are none.
 
-    joints: of a URDF, or the coordinates of an arm. speeds: see ``DriveFriction``.
+    joints: of a URDF, or the coordinates of an arm. speeds: C, (n, n), see ``DriveFriction``.
     """
     losses = []
     for joint in joints:

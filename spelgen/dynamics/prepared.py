@@ -93,11 +93,12 @@ class PreparedModel:
     ) -> State:
         """Return q, qd and z after dt [s] under a constant tau, by ``substeps`` steps of the classical Runge-Kutta.
 
-        z is exact in the displacements; its initial value is ``memory(qd)`` by default.
+        q, qd, tau: (..., n). z: (..., n, K), ``memory(qd)`` by default; its update is exact in the displacements.
         """
         z = self.memory(qd) if z is None else z
 
         def rhs(q: Tensor, speed: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+            """Return qd and qdd, (..., n) each."""
             return speed, self.forward_dynamics(q, speed, tau, z)
 
         for _ in range(substeps):
@@ -135,6 +136,7 @@ class PreparedModel:
         vars(plain).pop("forward_dynamics", None)
 
         def function(state: Tensor, tau: Tensor, z: Tensor) -> Tensor:
+            """Return the rate of the state (q, qd), or the state after dt, (2 n,)."""
             position, speed = state.split(n)
             if dt is None:
                 return torch.cat([speed, plain.forward_dynamics(position, speed, tau, z)])
@@ -174,7 +176,7 @@ class PreparedModel:
 
 
 def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: Tensor) -> tuple[Tensor, ...]:
-    """Return the derivatives of a function with respect to its first ``variables`` inputs, for a batch of states."""
+    """Return the Jacobians, (batch, m, n) each, of a function with respect to its first ``variables`` inputs."""
     if not torch.is_grad_enabled():
         states = tuple(x.detach() for x in states)
     # torch 2.13: vmap of a derivative of linalg.solve is wrong in forward mode, or without autograd

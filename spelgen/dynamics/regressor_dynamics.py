@@ -131,6 +131,7 @@ class RegressorDynamics:
         chain, momenta = self._bodies(q)
 
         def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
+            """Return the force M qdd, (T, n) [Nm, N]."""
             bias = applied(momenta, self.chain.accelerations(chain, qd))
             return tau @ self.inputs.mT - bias - self.friction_torque(q, qd, z)
 

@@ -71,7 +71,10 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
 
 
 def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
-    """Return the state at rest, or of steady motion, in which friction balances the other torques as far as it can."""
+    """Return the state at rest, or of steady motion, in which friction balances the other torques as far as it can.
+
+    q, qd, u: positions, velocities and commands, (..., n) [rad, m].
+    """
     servo = drives.servo
     torque = servo.kp * beyond(u - q, servo.dead_zone) - servo.kd * qd
     torque = torque.clamp(-servo.limit, servo.limit) - drives.offset

@@ -18,14 +18,14 @@ def number(value: float) -> float | None:
 
 
 def listed(values: np.ndarray) -> object:
-    """Return an array as nested lists of numbers."""
+    """Return an array (...,) as nested lists of numbers."""
     if values.ndim == 0:
         return number(values.item())
     return list(map(listed, values))
 
 
 def array(values: object) -> np.ndarray:
-    """Return the array of nested lists of `listed`; NaN for None."""
+    """Return the array (...,) of nested lists of `listed`; NaN for None."""
     return np.array(values, dtype=float)
 
 

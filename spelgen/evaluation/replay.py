@@ -53,7 +53,7 @@ class ServoModel:
         self._model = without_idle_residuals(model)
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """See `CommandFollower`. All parts run in one batch, in which shorter ones are padded."""
+        """Return the positions per part, (K, n). All parts run in one batch, in which shorter ones are padded."""
         steps = max(steps_between(log) for log, _ in parts)
         lengths = [rows.stop - rows.start - 1 for _, rows in parts]
         commands, intervals = [], []

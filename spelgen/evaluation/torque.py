@@ -74,7 +74,7 @@ def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
 
 
 def friction_past(dynamics: Any, samples: DynamicsSamples) -> tuple[Tensor, ...]:
-    """Return the arguments for the friction state on these samples, see `known_past`."""
+    """Return z, (T, n, K), and the direction, (T, n), of these samples as arguments, see `known_past`."""
     z = None if samples.z is None else torch.from_numpy(samples.z)
     direction = None if samples.direction is None else torch.from_numpy(samples.direction)
     return known_past(dynamics, z, direction)

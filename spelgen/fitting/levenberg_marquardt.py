@@ -79,10 +79,10 @@ class LeastSquaresProblem(Protocol[Parameters]):
     """Cost of parameters x, computed from a residual (or from its sums of squares, if the residual is too large)."""
 
     def residual(self, x: Parameters) -> torch.Tensor:
-        """Return the residual, from which the cost and the normal equations are computed."""
+        """Return the residual, from which the cost is computed: of samples, (T, n), or squared and summed, (n,)."""
 
     def cost(self, x: Parameters, residual: torch.Tensor) -> float:
-        """Return the cost; infinite if the residual diverged."""
+        """Return the cost for this residual, (...,); infinite if the residual diverged."""
 
     def normal_equations(self, x: Parameters, residual: torch.Tensor) -> NormalEquations:
         """Return Gauss-Newton Hessian and negative gradient with respect to the free parameters, (k, k) and (k,)."""

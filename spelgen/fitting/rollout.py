@@ -52,6 +52,7 @@ def roll_out(
         def rhs(
             q: torch.Tensor, p: torch.Tensor, z: torch.Tensor, tau: torch.Tensor = tau
         ) -> tuple[torch.Tensor, torch.Tensor]:
+            """Return the rates of q and p, (W, n) each."""
             return model.port_hamiltonian_rhs(q, p, tau, prepared, *known_past(model, z))
 
         for substep in range(substeps):
@@ -79,6 +80,7 @@ def _adaptive_step(
     from torchdiffeq import odeint  # its import takes half a second
 
     def rate(t: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        """Return the rate of the state (q, p), (W, 2 n), per sample interval."""
         q_now, p_now = state.chunk(2, dim=-1)
         return step * torch.cat(rhs(q_now, p_now, memory_after(dynamics, z, q_now - q)), dim=-1)
 
@@ -155,7 +157,7 @@ def rollout_errors(
 def rollout_loss(
     model: ArmModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
 ) -> torch.Tensor:
-    """Return the mean squared scaled error of the rollout, (): SPEL eq. 8 with other units.
+    """Return the mean squared scaled error, (), of the rollouts (W, K, n): SPEL eq. 8 with other units.
 
     The paper sums squared geodesic distances and velocity errors over joints and samples in rad and rad/s. Scaled, all
     joints and samples have the same weight, and the loss of a prediction of standstill is 1.

@@ -98,7 +98,7 @@ class DenseMass(nn.Module):
         return mass, DenseIntermediates(intermediates, factor, moved, scale)
 
     def kinetic_vjp(self, qd: Tensor, intermediates: DenseIntermediates) -> Tensor:
-        """Return the derivative of 1/2 qd^T M(q) qd with respect to the encoding."""
+        """Return d(1/2 qd^T M(q) qd) / d encoding, (..., 2 n), at the velocity qd (..., n)."""
         _, factor, moved, scale = intermediates
         speed = moved @ qd.unsqueeze(-1)
         momentum = speed / scale.unsqueeze(-1)

@@ -74,7 +74,7 @@ class DerivedMass(nn.Module):
         return self.network.prepare(rows[:-1].flatten(1).mT, offset.flatten())
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
-        """Return M'(q), and the intermediates of its derivatives: of the network, and t."""
+        """Return M'(q), (..., n, n), and the intermediates of its derivatives: of the network, and t."""
         rows, intermediates = self.network.forward(encoded, layers)
         mass = rows.reshape(*rows.shape[:-1], *self.center.shape)
         fraction = self.fraction(mass.detach())
@@ -87,7 +87,7 @@ class DerivedMass(nn.Module):
         return torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(norm)).clamp(min=1.0)), 1.0)
 
     def kinetic_vjp(self, qd: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
-        """Return the derivative of 1/2 qd^T M(q) qd with respect to the encoding."""
+        """Return d(1/2 qd^T M(q) qd) / d encoding, (..., 2 n), at the velocity qd (..., n)."""
         network, fraction = intermediates
         half = 0.5 * fraction.unsqueeze(-1) * qd
         return self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))

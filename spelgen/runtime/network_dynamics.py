@@ -47,7 +47,7 @@ class NetworkDynamics(PortHamiltonian):
         return {"mass": self.mass.prepare(), "potential": potential, "friction": self.friction.prepare()}
 
     def configuration(self, q: Tensor, parameters: dict[str, Parameters]) -> NetworkConfiguration:
-        """Return all that depends on q only."""
+        """Return all that depends on q, (..., n), only."""
         encoded = self.encoding.forward(q)
         mass, intermediates = self.mass.forward(encoded, parameters["mass"])
         return NetworkConfiguration(encoded, mass, intermediates, parameters)

@@ -22,7 +22,7 @@ class Network(Protocol):
     """Learned functions y of the encoded positions, with explicit derivatives."""
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
-        """Return the layers that give offset + output_map y in place of y."""
+        """Return the layers of offset (rows,) + output_map (rows, outputs) y."""
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, Intermediates]:
         """Return offset + output_map y, (..., rows), and the intermediates of ``vjp`` and ``jvp``."""
@@ -44,7 +44,7 @@ class Mass(Protocol):
         """Return M(q), (..., n, n), and the intermediates of its derivatives."""
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Intermediates) -> Tensor:
-        """Return the derivative of 1/2 qd^T M(q) qd with respect to the encoding."""
+        """Return d(1/2 qd^T M(q) qd) / d encoding, (..., 2 n), at the velocity qd (..., n)."""
 
     def jvp(self, rate: Tensor, intermediates: Intermediates) -> Tensor:
         """Return dM/dt, (..., n, n), for this rate of the encoding."""

@@ -27,7 +27,7 @@ class ResidualDynamics(RigidBodyDynamics):
         return prepared._replace(residual=self.residuals.prepare(prepared.armature))
 
     def configuration(self, q: Tensor, prepared: RigidParameters) -> RigidConfiguration:
-        """Return all that depends on q only."""
+        """Return all that depends on q, (..., n), only."""
         at = super().configuration(q, prepared)
         if self.residuals is None:
             return at

@@ -151,7 +151,7 @@ class ResidualTerms(nn.Module):
         )
 
     def at(self, q: Tensor, parameters: ResidualParameters) -> ResidualConfiguration:
-        """Return all that depends on q only."""
+        """Return all that depends on q, (..., n), only."""
         encoded = self.encoding.forward(q)
         splines = torch.einsum("...ik,ikm->...im", self.splines(q), parameters.splines)
         smooth, friction = splines.unbind(-1)

@@ -129,7 +129,7 @@ class RigidBodyDynamics(PortHamiltonian):
         return RigidParameters(points, armature, self.friction.prepare())
 
     def configuration(self, q: Tensor, prepared: RigidParameters) -> RigidConfiguration:
-        """Return all that depends on q only."""
+        """Return all that depends on q, (..., n), only."""
         chain, ratios = self.chain.forward(q, prepared.points), self.chain.ratios
         mass = ratios.mT @ (chain.jacobian @ chain.jacobian.mT) @ ratios + prepared.armature
         return RigidConfiguration(chain, mass, applied(chain.jacobian, chain.weight) @ ratios, prepared)

@@ -47,6 +47,7 @@ def rollout(
         torque = tau[first]
 
         def derivative(_: float, state: np.ndarray, torque: np.ndarray = torque) -> np.ndarray:
+            """Return the derivative of the state (q, qd), (2 n,), under a constant torque (n,) [Nm, N]."""
             qd = state[n:]
             return np.concatenate([qd, dynamics.forward_dynamics(state[:n], qd, torque)])
 
