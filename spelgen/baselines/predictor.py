@@ -203,7 +203,7 @@ def of_dynamics(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor
 
 
 class CommandFollower(Protocol):
-    """Predictor of positions under position commands. about: what it is, and how it was fitted."""
+    """Predictor of positions under position commands. about: its name and the method of its fit."""
 
     @property
     def about(self) -> str: ...

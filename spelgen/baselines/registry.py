@@ -90,7 +90,7 @@ class IdentifiedArm(Baseline):
         except (LogError, np.linalg.LinAlgError):
             return {}
         fits = {key: fit for (key, _), fit in zip(FRICTION.values(), identified, strict=True)}
-        # base parameters and intervals are those of Coulomb friction; of bristles only the parameters are kept
+        # with Coulomb friction all results are kept, with bristles only the parameters
         parameters = {key: fit.parameters.tolist() for key, fit in fits.items()}
         return {**fits["parameters"].to_dict(), **parameters}
 

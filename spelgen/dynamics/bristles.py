@@ -92,7 +92,7 @@ def turning_points(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     The second array is the index of the latest reversal at each sample, (T, n).
     """
     steps = np.diff(path, axis=0, prepend=path[:1])
-    # at rest, the direction is that of the motion before
+    # at rest, the direction of the last motion remains
     moving = np.where(steps != 0, np.arange(len(path))[:, None], 0)
     direction = np.sign(np.take_along_axis(steps, np.maximum.accumulate(moving, axis=0), axis=0))
     turns = np.zeros(path.shape, dtype=bool)

@@ -39,7 +39,7 @@ class DriveFriction:
     speeds: np.ndarray | None = None
 
     def __call__(self, qd: np.ndarray) -> np.ndarray:
-        """Return the friction torque at the joints, (..., n), at velocities qd (..., n): C^T times that of the drives,
+        """Return the joint friction torque, (..., n), at velocities qd (..., n): C^T times the drives' torque
 
             viscous v + s (forward - backward)/2 + s^2 (forward + backward)/2,    s = tanh(v / smoothing_velocity)
 
@@ -52,7 +52,7 @@ class DriveFriction:
     def torque(self, qd: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return the joint torque (..., n) at velocity qd (..., n), with the direction of dry friction given.
 
-        direction: (..., n) in [-1, 1], of the drives: s in the formula of `__call__`, or that of a friction state.
+        direction: (..., n) in [-1, 1], of the drives: s of `__call__`, or the direction of a friction state.
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
         odd, even = self.forward - self.backward, self.forward + self.backward
@@ -135,7 +135,7 @@ class FrictionModel:
     def torque(
         self, constants: np.ndarray, qd: np.ndarray, bent: np.ndarray | None, motors: np.ndarray
     ) -> np.ndarray:
-        """Return the torque without that of the armature, (..., n) [Nm, N], for ``constants`` (effects, n)."""
+        """Return the torque without the armature's contribution, (..., n) [Nm, N], for ``constants`` (effects, n)."""
         speed = qd @ motors.T
         torque: np.ndarray = (self._effects(speed, np.zeros_like(speed), bent) * constants).sum(
             axis=-2

@@ -37,7 +37,7 @@ NETWORK = ParameterInfo("network", "1")
 def parameter_table(model: nn.Module) -> dict[str, ParameterInfo]:
     """Return the meaning of the parameters of a model, by name, and of the buffers that a fit may set.
 
-    Such buffers are those that a part declares: quantities that only some logs determine, as a friction compensation.
+    A part declares such buffers: quantities that only some logs determine, for example a friction compensation.
     """
     table = {name: NETWORK for name, _ in model.named_parameters()}
     for path, module in model.named_modules():

@@ -141,9 +141,9 @@ COULOMB_SMOOTHING_VELOCITY = 0.05
 def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) -> PinocchioDynamics:
     """Return the dynamics of these joints of a URDF and of their mimic joints; all other joints are locked at zero.
 
-    Inertials, damping and friction are those of the URDF; gravity and inputs those of the settings. drives: with rotors
-    of the settings, and their friction, if there is any, in place of that of the URDF. Raises the errors of Pinocchio
-    if it cannot read the file.
+    The URDF defines inertials, damping and friction; the settings define gravity and inputs. drives: with rotors of the
+    settings; if the settings have friction, it replaces the friction of the URDF. Raises the errors of Pinocchio if it
+    cannot read the file.
     """
     robot, settings = read_urdf(urdf), load_settings(urdf)
     model = pin.buildModelFromXML(urdf_bytes(urdf).decode(errors="replace"))

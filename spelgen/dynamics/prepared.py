@@ -30,8 +30,8 @@ class State(NamedTuple):
 class PreparedModel:
     """A copy of a model with constant parameters.
 
-    q, qd, qdd and tau are (..., n); units are rad and Nm, or m and N. z, (..., n, K), is the friction state; without it
-    friction is that of joints that have moved at qd for a long time. tip: kinematics of the tip, see
+    q, qd, qdd and tau are (..., n); units are rad and Nm, or m and N. z, (..., n, K), is the friction state; by
+    default, the steady state of motion at qd. tip: kinematics of the tip, see
     ``tip_kinematics``. elements: bristles per joint, K.
     """
 
@@ -127,7 +127,7 @@ class PreparedModel:
     ) -> tuple[Tensor, Tensor]:
         """Return A, (..., 2 n, 2 n), and B, (..., 2 n, n): derivatives with respect to (q, qd) and tau.
 
-        They are those of the rate (qd, qdd) for constant z; with dt [s], those of the result of ``step``.
+        Without dt of the rate (qd, qdd) for constant z; with dt [s] of the result of ``step``.
         """
         n = self.n
         z = self.memory(qd) if z is None else z

@@ -73,7 +73,7 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
 
 
 def without_past(windows: Windows, past: int) -> Windows:
-    """Return the windows without their first `past` steps; z stays that of the first sample."""
+    """Return the windows without their first `past` steps; z remains the state at the first sample."""
     return Windows(
         windows.dt[:, past:], windows.q[:, past:], windows.qd[:, past:], windows.tau[:, past:], windows.z
     )

@@ -40,5 +40,5 @@ def record(value: object) -> dict[str, Any]:
 
 
 def finite(values: np.ndarray | torch.Tensor) -> tuple[float | None, ...]:
-    """Return the numbers of (T,) unrounded; None for those that are not finite."""
+    """Return the numbers of (T,) unrounded; None for nan and inf."""
     return tuple(x if math.isfinite(x) else None for x in values.tolist())

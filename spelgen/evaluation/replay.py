@@ -105,7 +105,7 @@ def replays(
 def _replay(
     name: str, predictors: Mapping[str, CommandFollower], parts: Sequence[LogRows], qd: np.ndarray
 ) -> tuple[Replay, list[np.ndarray]]:
-    """Return the errors of each predictor from initial velocities qd (parts, n), and those of the model (K, n)."""
+    """Return the errors of each predictor from initial velocities qd (parts, n), and the errors of the model (K, n)."""
     q = np.stack([log.q[rows.start] for log, rows in parts])
     errors: dict[str, list[np.ndarray]] = {}
     for predictor, follower in predictors.items():

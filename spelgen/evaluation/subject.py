@@ -1,4 +1,4 @@
-"""The model that is evaluated, with its fit and its arm as far as they are known."""
+"""The model that is evaluated, with its fit and its arm if they are known."""
 
 from __future__ import annotations
 

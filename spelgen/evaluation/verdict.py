@@ -1,4 +1,4 @@
-"""The assessment of an evaluation in words: what the model is good enough for, where it fails, what to record next."""
+"""The assessment of an evaluation in words: suitable uses, failures, and the motions to record next."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Limits = Sequence[tuple[float, float] | None]
 
 @dataclass(frozen=True)
 class Verdict:
-    """An assessment. sentence: uses, failures, what to record next. because: the figures behind it."""
+    """An assessment. sentence: uses, failures, motions to record. because: the figures behind it."""
 
     sentence: str
     because: str
@@ -260,7 +260,7 @@ def _recommendations(
 
 
 def _outside(trained: Mapping[str, Any], tested: Mapping[str, Any], joints: Sequence[str]) -> list[str]:
-    """Return the quantities whose range in the test logs exceeds that of the training logs by a tenth."""
+    """Return the quantities whose range in the test logs exceeds their range in the training logs by a tenth."""
     exceeded = []
     for quantity, word in (("q", "positions"), ("qd", "velocities")):
         ranges = zip(joints, trained.get(quantity, ()), tested.get(quantity, ()), strict=False)

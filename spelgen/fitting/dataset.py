@@ -26,7 +26,7 @@ from spelgen.settings.fits import DEFAULTS, Solver
 class WindowChoice:
     """Choice of the windows for training and validation.
 
-    validation: trajectories, or the fraction of the logs that validates. These are whole trajectories, chosen at random
+    validation: trajectories, or the fraction of the logs that validates: whole trajectories, chosen at random
     with `seed` before windows are cut, so that no sample is in both parts. window, stride, reach: see `cut_windows`.
     """
 
@@ -60,7 +60,7 @@ class TrainingData:
     """Windows of the logs for training and validation.
 
     preprocessing: the resolved one. digest: of all numbers, so that a fit resumes on the same data only. recordings:
-    all trajectories, those of validation included.
+    all trajectories, with validation.
     """
 
     training: Windows

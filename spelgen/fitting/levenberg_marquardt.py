@@ -52,7 +52,7 @@ class SolverState(Generic[Parameters]):
     """Iterate of the solver.
 
     residual: of the problem at x, reused by its normal equations. damping: of the next step. steps: accepted steps,
-    those of former calls included.
+    former calls included.
     """
 
     x: Parameters

@@ -166,7 +166,9 @@ class TorqueLogObjective(Objective):
             return None
         try:
             return urdf_regularizer(urdf, self.model.joint_names, self.model, data.training)
-        except Exception as error:  # Pinocchio and its parser raise many kinds; the fit goes on without
+        except (
+            Exception
+        ) as error:  # Pinocchio and its parser raise many types; the fit continues without a regularizer
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             message = f"fitted without the URDF's regularizer: {reason}"
             notes.append(Diagnostic("info", "no-regularizer", urdf.name, None, message))

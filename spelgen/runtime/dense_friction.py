@@ -26,7 +26,7 @@ class DenseFriction(nn.Module):
         self.nominal = nn.Buffer(vector(joint.friction for joint in joints))
         rows = axes * len(joints)
         row, column = torch.tril_indices(rows, rows)
-        # from the entries of a lower triangle, row by row, to the matrix: (rows, rows, entries)
+        # from the entries of a lower triangle, rows in sequence, to the matrix: (rows, rows, entries)
         spread = torch.eye(rows * rows).double()[:, rows * row + column].reshape(rows, rows, -1)
         self.entries = nn.Buffer(spread[axes - 1 :: axes])
         self.initial = nn.Buffer(INITIAL_FACTOR * torch.eye(rows).double()[axes - 1 :: axes])

@@ -56,7 +56,7 @@ class DenseMass(nn.Module):
         self.nominal = nn.Buffer(factor)
         self.moving = nn.Buffer(torch.linalg.inv(factor)[:, 2::3])
         row, column = torch.tril_indices(self.size, self.size, -1)
-        # positions in U of the entries below its diagonal, row by row
+        # positions in U of the entries below its diagonal, rows in sequence
         self.below = nn.Buffer(row * self.size + column)
         # initially U is the identity, and e is one
         initial = vector([0.0] * len(row) + [math.log(math.e - 1)] * self.size)
@@ -79,7 +79,7 @@ class DenseMass(nn.Module):
         return self._lower(entries), F.softplus(scale)
 
     def _lower(self, entries: Tensor) -> Tensor:
-        """Return the matrix, (..., 3 n, 3 n), with these entries below its diagonal, row by row."""
+        """Return the matrix, (..., 3 n, 3 n), with these entries below its diagonal, rows in sequence."""
         rows = entries.new_zeros(*entries.shape[:-1], self.size * self.size)
         rows = rows.index_copy(-1, self.below, entries)
         return rows.reshape(*entries.shape[:-1], self.size, self.size)

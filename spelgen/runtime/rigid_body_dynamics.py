@@ -41,8 +41,8 @@ class RigidBodyDynamics(PortHamiltonian):
     """Rigid bodies with trained inertial parameters, friction and a torque offset.
 
     z, (..., n, K) [rad, m], is the state of the friction bristles; their energy is part of H. Without z,
-    dry friction depends on velocity. motor_speeds: rows of C, the motors rotate at C qd, and friction, its
-    state and the armature are those of the motors; None: every motor drives its own joint. servo: position
+    dry friction depends on velocity. motor_speeds: rows of C, the motors rotate at C qd and have the
+    friction, its state and the armature; None: every motor drives its own joint. servo: position
     servos of the joints, if there are any.
     """
 
@@ -177,7 +177,7 @@ class RigidBodyDynamics(PortHamiltonian):
         return matrix if self.motors is None else self.motors.mT @ matrix @ self.motors
 
     def _motor(self, qd: Tensor) -> Tensor:
-        """Return velocities or displacements of the motors, (..., n), for those of the joints."""
+        """Return velocities or displacements of the motors, (..., n), from the joints' (..., n)."""
         return qd if self.motors is None else qd @ self.motors.mT
 
     def memory(self, qd: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
-"""The arm as it was built: a robot that differs from its URDF as real robots do, drawn from a seed.
+"""The arm as it was built: a robot that differs from its URDF as real robots do, random with a seed.
 
 Inertials are perturbed; the drives have armature, viscous friction, Coulomb friction that depends on the direction, and
-presliding hysteresis. The result is a URDF with a settings file beside it: the ground truth of simulated logs.
+presliding hysteresis. The result is a URDF with a settings file: the ground truth of simulated logs.
 """
 
 from __future__ import annotations

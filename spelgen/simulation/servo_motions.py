@@ -28,7 +28,7 @@ def servo_motions(
 ) -> SimulatedLogs:
     """Return trajectories under random commands; the same settings give the same logs.
 
-    Arguments and errors are those of `random_inputs`.
+    Arguments and errors: see `random_inputs`.
     """
     protocol = settings.simulation
     lowest, highest = initial_range(arm, settings)

@@ -61,7 +61,7 @@ def track(
 
     Each recording has its own gains, and its own phases or initial position. The last `test_fraction` of each recording
     is for testing. Logged are positions from the encoders after a zero-phase low-pass, velocities by central
-    differences of these, and motor torques. Arguments and errors are those of `random_inputs`; `settings.tracking` is
+    differences, and motor torques. Arguments and errors: see `random_inputs`; `settings.tracking` is
     used as well.
     """
     protocol = settings.simulation

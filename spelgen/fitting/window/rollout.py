@@ -170,7 +170,7 @@ class RolloutObjective(MomentumObjective):
         return TUNING.first_stage if self.fixed else 1.0
 
     def _release(self, end: Status) -> bool:
-        """Start the second part, in which no weights are fixed, and return whether it is not at its end already."""
+        """Start the second stage, in which all weights are trained; False if there is none or its time is used up."""
         if not self.fixed or end == "out of time" or not self.epoch:
             return False
         self.model.load_state_dict(self.best_weights)
