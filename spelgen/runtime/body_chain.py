@@ -94,27 +94,27 @@ class BodyChain(nn.Module):
         place, mass = torch.unflatten(points, -1, (-1, 4)).tensor_split((3,), dim=-3)
         return ChainConfiguration(place, mass, axes, jacobian, (self.base * mass).flatten(-3))
 
-    def motion(self, at: ChainConfiguration, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def motion(self, cache: ChainConfiguration, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return velocities of points, (..., 3, bodies, 4), twists, and axis rates (Featherstone, 2.31)."""
         rates = qd @ self.ratios.mT
-        velocity = torch.unflatten(applied(at.jacobian.mT, rates), -1, (3, -1, 4))
-        twists = (at.axes * rates.unsqueeze(-2)) @ self.carriers
-        (w, u), (a, m) = twists.chunk(2, dim=-2), at.axes.chunk(2, dim=-2)
+        velocity = torch.unflatten(applied(cache.jacobian.mT, rates), -1, (3, -1, 4))
+        twists = (cache.axes * rates.unsqueeze(-2)) @ self.carriers
+        (w, u), (a, m) = twists.chunk(2, dim=-2), cache.axes.chunk(2, dim=-2)
         linear = torch.linalg.cross(w, m, dim=-2) + torch.linalg.cross(u, a, dim=-2)
         return velocity, twists, torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
 
-    def accelerations(self, at: ChainConfiguration, qd: Tensor) -> Tensor:
+    def accelerations(self, cache: ChainConfiguration, qd: Tensor) -> Tensor:
         """Return accelerations of the points at constant qd, gravity included, (..., 12 bodies)."""
-        velocity, twists, turning = self.motion(at, qd)
+        velocity, twists, turning = self.motion(cache, qd)
         steady = (turning * (qd @ self.ratios.mT).unsqueeze(-2)) @ self.carriers
         w, (a, u) = twists[..., :3, :, None], steady.unsqueeze(-1).chunk(2, dim=-3)
-        turned = torch.linalg.cross(w, velocity, dim=-3) + torch.linalg.cross(a, at.place, dim=-3)
-        return torch.addcmul(turned, u, at.mass).flatten(-3) + at.weight
+        turned = torch.linalg.cross(w, velocity, dim=-3) + torch.linalg.cross(a, cache.place, dim=-3)
+        return torch.addcmul(turned, u, cache.mass).flatten(-3) + cache.weight
 
-    def kinetic_gradient(self, at: ChainConfiguration, qd: Tensor) -> Tensor:
+    def kinetic_gradient(self, cache: ChainConfiguration, qd: Tensor) -> Tensor:
         """Return d/dq of the kinetic energy at qd, (..., n)."""
-        velocity, _, turning = self.motion(at, qd)
-        momenta = [torch.linalg.cross(at.place, velocity, dim=-3), at.mass * velocity]
+        velocity, _, turning = self.motion(cache, qd)
+        momenta = [torch.linalg.cross(cache.place, velocity, dim=-3), cache.mass * velocity]
         # momenta of all carried bodies, projected onto the axis of each body
         carried = torch.cat(momenta, dim=-3).sum(dim=-1) @ self.carriers.mT
         return (turning * carried).sum(dim=-2) @ self.ratios

@@ -23,18 +23,18 @@ class DenseInputDynamics(NetworkDynamics):
         """Return the parameter cache, by part."""
         return super().prepare() | {"input": self.input_network.prepare(self.moving, self.moving.sum(dim=1))}
 
-    def _gains(self, at: NetworkConfiguration) -> Tensor:
+    def _gains(self, cache: NetworkConfiguration) -> Tensor:
         """Return the diagonal of G, (..., n)."""
-        return self.input_network.forward(at.encoded, at.parameters["input"])[0]
+        return self.input_network.forward(cache.encoded, cache.parameters["input"])[0]
 
     def input_matrix(self, q: Tensor) -> Tensor:
         """Return G(q), (..., n, n)."""
         return torch.diag_embed(self._gains(self.at(q)))
 
-    def input_force(self, at: NetworkConfiguration, qd: Tensor, tau: Tensor) -> Tensor:
+    def input_force(self, cache: NetworkConfiguration, qd: Tensor, tau: Tensor) -> Tensor:
         """Return G(q) tau, (..., n) [Nm, N]."""
-        return self._gains(at) * tau
+        return self._gains(cache) * tau
 
-    def input_torque(self, at: NetworkConfiguration, force: Tensor) -> Tensor:
+    def input_torque(self, cache: NetworkConfiguration, force: Tensor) -> Tensor:
         """Return the inputs, (..., n), that give this force."""
-        return force / self._gains(at)
+        return force / self._gains(cache)

@@ -54,37 +54,39 @@ class NetworkDynamics(PortHamiltonian):
 
     def potential_energy(self, q: Tensor | NetworkConfiguration) -> Tensor:
         """Return V(q), (...) [J]."""
-        at: NetworkConfiguration = self.at(q)
-        return self.potential.forward(at.encoded, at.parameters["potential"])[0].squeeze(-1)
+        cache: NetworkConfiguration = self.at(q)
+        return self.potential.forward(cache.encoded, cache.parameters["potential"])[0].squeeze(-1)
 
     def gravity(self, q: Tensor | NetworkConfiguration) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
-        at: NetworkConfiguration = self.at(q)
-        return -self.lagrangian_gradient(at, torch.zeros_like(at.mass[..., 0]))
+        cache: NetworkConfiguration = self.at(q)
+        return -self.lagrangian_gradient(cache, torch.zeros_like(cache.mass[..., 0]))
 
     def lagrangian_gradient(self, q: Tensor | NetworkConfiguration, qd: Tensor) -> Tensor:
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        at: NetworkConfiguration = self.at(q, qd)
-        intermediates = self.potential.forward(at.encoded, at.parameters["potential"])[1]
-        kinetic = self.mass.kinetic_vjp(qd, at.intermediates)
-        return self.encoding.vjp(at.encoded, kinetic - self.potential.vjp(intermediates, qd.new_ones(1)))
+        cache: NetworkConfiguration = self.at(q, qd)
+        intermediates = self.potential.forward(cache.encoded, cache.parameters["potential"])[1]
+        kinetic = self.mass.kinetic_vjp(qd, cache.intermediates)
+        return self.encoding.vjp(cache.encoded, kinetic - self.potential.vjp(intermediates, qd.new_ones(1)))
 
     def nonlinear_effects(self, q: Tensor | NetworkConfiguration, qd: Tensor) -> Tensor:
         """Return dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq, (..., n)."""
-        at: NetworkConfiguration = self.at(q, qd)
-        mass_rate = self.mass.jvp(self.encoding.jvp(at.encoded, qd), at.intermediates)
-        return applied(mass_rate, qd) - self.lagrangian_gradient(at, qd)
+        cache: NetworkConfiguration = self.at(q, qd)
+        mass_rate = self.mass.jvp(self.encoding.jvp(cache.encoded, qd), cache.intermediates)
+        return applied(mass_rate, qd) - self.lagrangian_gradient(cache, qd)
 
     def friction_torque(self, q: Tensor | NetworkConfiguration, qd: Tensor) -> Tensor:
         """Return D(q, qd) qd, (..., n) [Nm, N]."""
-        at: NetworkConfiguration = self.at(q, qd)
-        layers = at.parameters["friction"]
-        return self.friction.forward(at.encoded, qd, layers, qd.unsqueeze(-1)).squeeze(-1)
+        cache: NetworkConfiguration = self.at(q, qd)
+        layers = cache.parameters["friction"]
+        return self.friction.forward(cache.encoded, qd, layers, qd.unsqueeze(-1)).squeeze(-1)
 
     def dissipation(self, q: Tensor | NetworkConfiguration, qd: Tensor) -> Tensor:
         """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
-        at: NetworkConfiguration = self.at(q, qd)
-        return self.friction.forward(at.encoded, qd, at.parameters["friction"], torch.eye(self.n).to(qd))
+        cache: NetworkConfiguration = self.at(q, qd)
+        return self.friction.forward(
+            cache.encoded, qd, cache.parameters["friction"], torch.eye(self.n).to(qd)
+        )
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
         """Return the rate of (q, p), (..., 2 n), or of (q, p, tau) with a constant tau, (..., 3 n)."""
