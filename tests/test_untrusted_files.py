@@ -148,7 +148,6 @@ def test_windows_without_motion_are_not_fitted(robots, scale, config):
         fit(model, logs, config)
 
 
-@pytest.mark.timed
 def test_twenty_thousand_recordings_of_two_samples_take_seconds(tmp_path, arm):
     count = 20_000
     t = np.tile([0.0, 0.01], count)
