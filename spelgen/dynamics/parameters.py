@@ -1,4 +1,4 @@
-"""Parameters of a model: meaning and number; its residual terms, and the model without residual terms."""
+"""Group, unit and number of a model's trained parameters; removal of its residual terms."""
 
 from __future__ import annotations
 
@@ -35,9 +35,10 @@ NETWORK = ParameterInfo("network", "1")
 
 
 def parameter_table(model: nn.Module) -> dict[str, ParameterInfo]:
-    """Return the meaning of the parameters of a model, by name, and of the buffers that a fit may set.
+    """Return the group and unit of each parameter of a model, by name, and of each buffer that a fit may set.
 
-    A part declares such buffers: quantities that only some logs determine, for example a friction compensation.
+    Parts of the model declare such buffers for quantities that only some logs determine, for example a friction
+    compensation.
     """
     table = {name: NETWORK for name, _ in model.named_parameters()}
     for path, module in model.named_modules():

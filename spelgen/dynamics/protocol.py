@@ -138,7 +138,7 @@ class VelocityState:
         return qd
 
     def velocity(self, q: Tensor, p: Tensor) -> Tensor:
-        """Return p, (..., n): it is the velocity."""
+        """Return qd, (..., n): p is a velocity here."""
         return p
 
     def port_hamiltonian_rhs(

@@ -81,7 +81,7 @@ class MassEntries:
         self.rows = rows
 
     def __call__(self, *terms: Tensor) -> Tensor:
-        """Return the symmetric matrix (..., n, n) of these functions and constants, each (...,)."""
+        """Return M, (..., n, n): its entries are linear in the terms, functions of q and constants of shape (...,)."""
         return runtime.symmetric(*([_sum(sums, terms) for sums in row] for row in self.rows))
 
 

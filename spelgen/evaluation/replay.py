@@ -34,7 +34,7 @@ class ReplayErrors:
 
 @dataclass(frozen=True)
 class Replay:
-    """The errors of a replay by predictor. name: the parts of the logs that were replayed."""
+    """Errors of replayed commands per predictor. name: the replayed segments, for example whole logs."""
 
     name: str
     errors: dict[str, ReplayErrors]

@@ -51,7 +51,7 @@ class AsBuiltTuning:
     viscous: tuple[float, float] = (0.3, 1.0)
     # Armature, relative to the mean diagonal entry of M.
     armature: tuple[float, float] = (0.02, 0.2)
-    # Moderate motion: angular frequency [rad/s] that turns a speed into an acceleration.
+    # Angular frequency [rad/s] of moderate motion: its acceleration is this number times its speed.
     acceleration: float = 2.0
     # Random positions, and the fraction of the joint ranges they cover, from which magnitudes are computed.
     positions: int = 50
