@@ -55,6 +55,7 @@ class DriveFriction:
         direction: (..., n) in [-1, 1], of the drives: s of `__call__`, or the direction of a friction state.
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
+        # s (f - b) / 2 + s^2 (f + b) / 2 is f at s = 1, b at s = -1, and has no jump between them.
         odd, even = self.forward - self.backward, self.forward + self.backward
         torque: np.ndarray = self.viscous * v + 0.5 * direction * (odd + direction * even)
         return torque if self.speeds is None else torque @ self.speeds

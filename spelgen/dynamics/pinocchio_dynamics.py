@@ -97,6 +97,7 @@ class PinocchioDynamics:
         force = tau @ self.inputs.T - self.friction(qd)
         if self._same:  # a copy: Pinocchio overwrites its result in the next call
             return np.array(self._by_joint(pin.aba, self.configuration(q), qd, force))
+        # Mimic joints constrain the model of all b joints: J^T M J qdd = force, which `aba` cannot solve.
         force = force - self.nonlinear_effects(q, qd)
         return np.linalg.solve(self.mass_matrix(q), force[..., None])[..., 0]
 

@@ -38,6 +38,7 @@ class NormalEquations(NamedTuple):
     def step(self, damping: float | torch.Tensor = 0.0) -> torch.Tensor:
         """Return the damped step (..., k); damping: one number, or (...), one per system of equations."""
         factor = torch.as_tensor(damping, dtype=self.curvature.dtype)[..., None, None]
+        # Marquardt's scaling by diag H, not Levenberg's by 1: steps do not depend on the units of the parameters.
         diagonal = torch.diag_embed(self.curvature.diagonal(dim1=-2, dim2=-1))
         result: torch.Tensor = torch.linalg.solve(self.curvature + factor * diagonal, self.descent)
         return result
@@ -150,10 +151,12 @@ def _accepted_step(
     for _ in range(TUNING.max_trials):
         step = normal.step(damping)
         predicted = normal.predicted_decrease(step)
+        # More damping predicts a smaller decrease still: there is nothing to try after this.
         if predicted < max(TUNING.min_predicted_decrease * state.cost, min_decrease):
             return Termination.SMALL_PREDICTION
         best = _best_candidate(problem, state, step, predicted)
         if best.cost < state.cost:
+            # The lower bound keeps the damping within reach of the next few failures.
             return replace(best, damping=max(damping / TUNING.damping_factor, TUNING.min_damping))
         damping *= TUNING.damping_factor
     return Termination.NO_DECREASE
@@ -171,6 +174,7 @@ def _best_candidate(
         candidate = initial_state(problem, x, state.damping, state.steps + 1)
         if candidate.cost < best.cost:
             best = candidate
+        # The quadratic model holds here: further candidates would cost evaluations and gain little.
         if state.cost - best.cost >= TUNING.min_gain_ratio * predicted:
             break
     return best

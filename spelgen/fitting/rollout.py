@@ -60,6 +60,7 @@ def roll_out(
             if substep == 0:
                 velocities.append(qd)  # of the sample that the interval starts at
         positions.append(q)
+    # rk4 computes the velocity at the start of an interval anyway: only the last one is missing.
     velocities = [*velocities[1:], model.velocity(model.at(q, prepared=prepared), p)]
     return torch.stack(positions, dim=1), torch.stack(velocities, dim=1)  # each (W, K-1, n)
 
@@ -130,6 +131,7 @@ def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
             f"windows in which no joint moves by {AT_REST:g} rad or m", expected="motion", do="record some"
         )
     changed = windows.qd[:, 1:] - windows.qd[:, :1]
+    # A constant torque, mostly of gravity, is no scale of the torque that moves the arm.
     varied = windows.tau - windows.tau.mean(dim=(0, 1))
     return LossScales(
         _scale(moved.square().mean(dim=0)),
@@ -223,6 +225,7 @@ def choose_substeps(model: ArmModel, windows: Windows, scales: LossScales, start
     """Return the minimum number of rk4 steps per sample interval, at least `start`, with a small integration error."""
     substeps, coarse = start, probed(model, windows, scales, start)
     while substeps < TUNING.max_substeps:
+        # Half the step divides the error of rk4 by 16: the difference of the two is the error of the coarse one.
         fine = probed(model, windows, scales, 2 * substeps)
         if integration_error(coarse, fine) < TUNING.integration_fraction:
             break

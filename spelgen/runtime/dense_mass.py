@@ -93,6 +93,8 @@ class DenseMass(nn.Module):
         """Return M(q), (..., n, n), and the intermediates of its derivatives."""
         raw, intermediates = self.network.forward(encoded, layers)
         factor, scale = self._factor(raw)
+        # Triangular solutions, not an inverse of M^-1, whose condition number is the square of its
+        # factor's.
         moved = self._unit_solved(factor, self.moving)
         mass = moved.mT @ (moved / scale.unsqueeze(-1))
         return mass, DenseIntermediates(intermediates, factor, moved, scale)
@@ -102,8 +104,10 @@ class DenseMass(nn.Module):
         _, factor, moved, scale = intermediates
         speed = moved @ qd.unsqueeze(-1)
         momentum = speed / scale.unsqueeze(-1)
+        # With w = U^-1 A qd and p = w / e: dT/dU = -U^-T p w^T, and dT/de = -p^2 / 2.
         by_factor = -self._unit_solved(factor.mT, momentum, upper=True) @ speed.mT
         by_entry = by_factor.flatten(-2).index_select(-1, self.below)
+        # e = softplus(s): de/ds = 1 - exp(-e) = -expm1(-e).
         by_scale = 0.5 * momentum.squeeze(-1) ** 2 * torch.expm1(-scale)
         cotangent = torch.cat([by_entry, by_scale], dim=-1)
         return self.network.vjp(intermediates.network, cotangent)
@@ -113,6 +117,7 @@ class DenseMass(nn.Module):
         _, factor, moved, scale = intermediates
         pushed = self.network.jvp(intermediates.network, rate)
         entries, raw_rate = pushed.tensor_split((len(self.below),), dim=-1)
+        # d(U^-1 A) = -U^-1 dU U^-1 A.
         turned = self._unit_solved(factor, self._lower(entries) @ moved)
         by_factor = moved.mT @ (turned / scale.unsqueeze(-1))
         by_scale = raw_rate * torch.expm1(-scale) / scale**2

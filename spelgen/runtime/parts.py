@@ -1,10 +1,11 @@
-"""The interfaces between a model and its parts."""
+"""The interfaces between a model and its parts, and symmetric matrices from their lower triangle."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
 Row = Sequence[float]
@@ -71,3 +72,12 @@ class Inputs(Protocol):
 
     def torque(self, force: Tensor) -> Tensor:
         """Return the inputs, (..., n), that give this force."""
+
+
+def symmetric(*rows: Sequence[Tensor | float]) -> Tensor:
+    """Return the symmetric matrix, (..., n, n), of the rows of its lower triangle: (...) or numbers."""
+    n = len(rows)
+    entries = [rows[max(i, j)][min(i, j)] for i in range(n) for j in range(n)]
+    like = next(entry for entry in entries if isinstance(entry, Tensor))
+    filled = [entry if isinstance(entry, Tensor) else torch.full_like(like, entry) for entry in entries]
+    return torch.stack(filled, dim=-1).reshape(*like.shape, n, n)

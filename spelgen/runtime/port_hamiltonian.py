@@ -63,6 +63,7 @@ class PortHamiltonian(nn.Module):
             others: further vectors (..., n), which are only checked.
             prepared: result of ``prepare``; None: computed here.
         """
+        # A configuration of former calls, which has been checked.
         if isinstance(q, tuple):
             return q
         dtype = self.get_buffer("friction.nominal").dtype
@@ -106,6 +107,7 @@ class PortHamiltonian(nn.Module):
     def hamiltonian(self, q: Position, p: Tensor, *state: Tensor) -> Tensor:
         """Return H, (...) [J]."""
         cache = self.at(q, p)
+        # 1/2 p^T M^-1 p is 1/2 p^T qd.
         return 0.5 * (p * self.velocity(cache, p)).sum(dim=-1) + self.potential_energy(cache, *state)
 
     def forward_dynamics(self, q: Position, qd: Tensor, tau: Tensor, *state: Tensor | None) -> Tensor:
@@ -120,6 +122,7 @@ class PortHamiltonian(nn.Module):
         cache = self.at(q, qd, qdd)
         force = applied(cache.mass, qdd) + self.nonlinear_effects(cache, qd)
         force = force + self.friction_torque(cache, qd, *state)
+        # Inputs may have an offset: it is the force at tau = 0.
         return self.input_torque(cache, force - self.input_force(cache, qd, 0 * qd))
 
     def port_hamiltonian_rhs(

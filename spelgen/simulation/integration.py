@@ -42,6 +42,7 @@ def rollout(
     tolerances = {"rtol": TUNING.rtol * tolerance_factor, "atol": TUNING.atol * tolerance_factor}
     states = np.empty((t.size, 2 * n))
     states[0] = initial
+    # A multistep method has no valid history across a jump of tau.
     changes = np.flatnonzero((tau[1:-1] != tau[:-2]).any(axis=1)) + 1
     for first, last in pairwise([0, *changes.tolist(), t.size - 1]):
         torque = tau[first]
