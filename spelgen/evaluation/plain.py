@@ -35,8 +35,7 @@ Curve = Annotated[np.ndarray, PlainValidator(array), PlainSerializer(listed)]
 
 def record(value: object) -> dict[str, Any]:
     """Return the JSON form of a dataclass with numbers and curves."""
-    fields: dict[str, Any] = TypeAdapter(type(value)).dump_python(value)
-    return fields
+    return dict(TypeAdapter(type(value)).dump_python(value))
 
 
 def finite(values: np.ndarray | torch.Tensor) -> tuple[float | None, ...]:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.baseline import arm_of_model
+from spelgen.baselines.baseline import LinearServoRecord, arm_of_model
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
 from spelgen.emission.assemble import ArmModel, spec_of
 from spelgen.evaluation.tuning import TUNING
@@ -69,10 +68,10 @@ class Subject:
         return arm_of_model(self.model, self.fit.urdf)
 
     @property
-    def linear_servos(self) -> Mapping[str, Any] | None:
+    def linear_servos(self) -> LinearServoRecord | None:
         """Parameters of the linear servos that were fitted with it."""
         servo = None if self.fit is None else self.fit.record.servo
-        linear: Mapping[str, Any] | None = None if servo is None else servo["linear"]
+        linear: LinearServoRecord | None = None if servo is None else servo["linear"]
         return linear
 
 

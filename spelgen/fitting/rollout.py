@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
@@ -17,7 +17,7 @@ from spelgen.logs.windows import Windows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import Solver
 
-SOLVER: dict[str, Any] = {
+SOLVER: dict[str, object] = {
     "method": "dopri5",
     "rtol": TUNING.adaptive_rtol,
     "atol": TUNING.adaptive_atol,
