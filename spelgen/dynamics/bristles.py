@@ -75,6 +75,7 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     drives, reach = np.arange(path.shape[1]), torch.from_numpy(bristles.values)
     turned_at = np.take_along_axis(path, corners, axis=0)
     at_corners = [torch.zeros_like(reach)]
+    # Few reversals, one after the other; all samples between them are independent given the last reversal.
     for displacement in torch.from_numpy(np.diff(turned_at, axis=0)):
         at_corners.append(moved_bristles(at_corners[-1], displacement[:, None], reach))
     turned_with, z = torch.stack(at_corners), np.empty((*q.shape, bristles.elements))
@@ -119,6 +120,7 @@ def encoded(q: np.ndarray) -> np.ndarray:
     if not step.any():
         return q
     # the composition of two clamps is a clamp: log2(T) passes over all samples in place of T
+    # Backlash of one step: the output follows the input only beyond it, out[k] = clip(out[k-1], low[k], high[k]).
     low, high = q - step, q + step
     shift = 1
     while shift < len(q):
@@ -133,6 +135,7 @@ def encoder_step(q: np.ndarray) -> np.ndarray:
     """Return the encoder step (n,) of positions (T, n); 0 if they are not quantised."""
     steps = np.zeros(q.shape[1])
     for joint, values in enumerate(q.T):
+        # Floating-point positions do not repeat; steps of an encoder do.
         levels = np.unique(values)
         if len(levels) > 1 and len(levels) < len(values) / 4:  # repeated values
             steps[joint] = np.diff(levels).min()

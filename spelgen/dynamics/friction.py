@@ -78,6 +78,7 @@ def joint_friction(
             losses.append((drive.viscous, *drive.coulomb))
         else:
             losses.append((joint.damping, joint.friction, -joint.friction))
+    # Without coupling two products with C are saved in each step of an integration.
     if speeds is not None and np.array_equal(speeds, np.eye(len(speeds))):
         speeds = None
     viscous, forward, backward = np.array(losses).T
@@ -130,6 +131,7 @@ class FrictionModel:
         """
         motors = np.eye(qd.shape[-1]) if motors is None else motors
         effects = self._effects(qd @ motors.T, qdd @ motors.T, bent)
+        # The torque of drive j acts on joint i by C_ji.
         columns: np.ndarray = effects[..., None, :, :] * motors.T[:, None]
         return columns.reshape(*qd.shape, -1)
 

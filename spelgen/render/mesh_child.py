@@ -21,8 +21,10 @@ from spelgen.files import read_bytes
 from spelgen.render.tuning import TUNING
 
 if TYPE_CHECKING:
-    from trimesh import Trimesh
     from yourdfpy import Visual
+
+Mesh = Any
+"""A mesh of trimesh, whose functions are annotated in part."""
 
 
 class MeshFolder:
@@ -66,12 +68,12 @@ def main(urdf: str, links: list[str], output: IO[bytes]) -> None:
     import yourdfpy
 
     model = yourdfpy.URDF.load(urdf, build_scene_graph=False, load_meshes=False)
-    arrays: dict[str, np.ndarray] = {}
+    arrays: dict[str, Any] = {}
     for link in model.robot.links:
         if link.name not in links or not link.visuals:
             continue
         gc.collect()  # meshes contain reference cycles, so the meshes of other links would fill the memory
-        mesh = trimesh.util.concatenate([_shape(visual, Path(urdf)) for visual in link.visuals])
+        mesh: Mesh = trimesh.util.concatenate([_shape(visual, Path(urdf)) for visual in link.visuals])
         # the area overflows for corners that are too far away
         if (
             not (np.isfinite(mesh.vertices).all() and mesh.area < np.inf)
@@ -89,7 +91,7 @@ def main(urdf: str, links: list[str], output: IO[bytes]) -> None:
     output.write(buffer.getbuffer())
 
 
-def _shape(visual: Visual, urdf: Path) -> Trimesh:
+def _shape(visual: Visual, urdf: Path) -> Mesh:
     """Return the mesh of one <visual> in the frame of its link."""
     from trimesh import creation
 
@@ -109,13 +111,13 @@ def _shape(visual: Visual, urdf: Path) -> Trimesh:
     return shape
 
 
-def _read(path: Path) -> Trimesh:
+def _read(path: Path) -> Mesh:
     """Return the mesh in a file. Raises ValueError if it has no triangles."""
     import trimesh
 
     content = io.BytesIO(read_bytes(path, SpelgenError, largest=TUNING.max_mesh_bytes))
     format, resolver = path.suffix.lower().lstrip("."), MeshFolder(path.parent)
-    mesh: Any = trimesh.load(content, file_type=format, resolver=resolver, force="mesh")  # type: ignore[arg-type]
+    mesh: Mesh = trimesh.load(content, file_type=format, resolver=resolver, force="mesh")  # type: ignore[arg-type]
     # files repeat the vertices of each triangle: unmerged, the surface would tear when it is simplified
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     if not len(mesh.faces):
