@@ -65,7 +65,7 @@ def linear_response(
     Returns:
         (..., K, n) positions at the end of each interval [rad, m].
     """
-    system = np.zeros((len(frequency), 3, 3))  # of position, velocity and command
+    system = np.zeros((len(frequency), 3, 3))  # state: position, velocity, command
     system[:, 0, 1] = 1.0
     system[:, 1, 0], system[:, 1, 2] = -(frequency**2), frequency**2
     system[:, 1, 1] = -2 * damping * frequency

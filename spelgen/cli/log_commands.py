@@ -58,7 +58,7 @@ def excite(
     """
     from spelgen.excitation.design import excite as design_motion
 
-    options.require_free(output, force=force)  # before minutes of search
+    options.require_free(output, force=force)  # checked first: the search takes minutes
     arm = options.load(robot, joints, tip, angle_tolerance)
     with progress_bar("searching") as progress:
         motion = design_motion(

@@ -64,7 +64,7 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
     constants = model.friction.prepare()
     reach = constants.bristle_reach.T.contiguous()
     steepness = (constants.bristle_fractions / constants.bristle_reach).movedim(-1, 0).contiguous()
-    batch = steepness.shape[1:-1] or (1,)  # of constants
+    batch = steepness.shape[1:-1] or (1,)  # batch of the constants
     shape = len(reach), *[1] * len(batch), model.n
     steepness = steepness.reshape(len(reach), *batch, model.n)
     return ServoDrives(model.servo.prepare(), constants, model.torque_offset, reach.view(shape), steepness)
@@ -143,7 +143,8 @@ def replayed(model: PortHamiltonian, q: Tensor, qd: Tensor, commands: Tensor, dt
         for now, interval in zip(commands.unbind(1), dt.unbind(1), strict=True):
             pose = model.configuration(q, prepared)
             bias = middle_bias = model.nonlinear_effects(pose, qd)
-            if previous_bias is not None:  # of the interval's middle
+            # extrapolated to the middle of the interval: the bias is known at its start only
+            if previous_bias is not None:
                 middle_bias = bias + (bias - previous_bias) / 2
             previous_bias = bias
             load = Load(pose.mass, middle_bias, model.gravity(pose), coupled=True)

@@ -84,7 +84,9 @@ def subject(tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None = 
     if arm is not None:
         urdf = Path(arm) if isinstance(arm, str | Path) else arm.robot.path
     weights = next(model.parameters(), None)
-    if weights is not None and (weights.dtype != torch.float64 or not weights.is_cpu):  # as logs are
+    if weights is not None and (
+        weights.dtype != torch.float64 or not weights.is_cpu
+    ):  # logs are float64 on the CPU
         model = copy.deepcopy(model).double().cpu()
     return Subject(model, model.joint_names, urdf, fit)
 

@@ -205,7 +205,7 @@ def _worst_joint(results: Measurements) -> tuple[str, str, str]:
 def _worst_motion(results: Measurements) -> tuple[str, float]:
     """Return the joint of the largest error in the longest rollouts, divided by its motion, and this error."""
     for last in results.horizons[-1:]:
-        errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # NaN of None
+        errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # None becomes NaN
         if np.isfinite(errors).all():
             return results.joints[errors.argmax()], errors.max()
     return "", math.inf

@@ -75,7 +75,7 @@ def _expressions(
     motors = constant(model.motors)
     frames = body_frames(model.arm.bodies, q)
     rigid_mass, rigid_potential = mass_and_potential(model, q)
-    # of motors and residual terms
+    # M of the motors' rotors and of the residual terms
     added_mass = constant(model.constant_mass) + symmetric(model, residuals["mass"])
     mass = rigid_mass + added_mass
     rigid_gravity = rigid_torque(model, frames, standstill, standstill)

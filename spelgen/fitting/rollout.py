@@ -58,7 +58,7 @@ def roll_out(
         for substep in range(substeps):
             q, p, z, qd = advance(model, rhs, q, p, z, dt.unsqueeze(-1) / substeps)
             if substep == 0:
-                velocities.append(qd)  # of the sample that the interval starts at
+                velocities.append(qd)  # at the start of the interval
         positions.append(q)
     # rk4 computes the velocity at the start of an interval anyway: only the last one is missing.
     velocities = [*velocities[1:], model.velocity(model.at(q, prepared=prepared), p)]

@@ -19,7 +19,7 @@ class NetworkConfiguration(NamedTuple):
 
     encoded: Tensor  # input of the networks, see ``JointEncoding``
     mass: Tensor  # M(q), (..., n, n)
-    intermediates: Intermediates  # of the derivatives of M
+    intermediates: Intermediates  # intermediates of the derivatives of M
     parameters: dict[str, Parameters]
 
 

@@ -20,10 +20,10 @@ from spelgen.runtime.rows import Joint, Link, vector
 class RigidParameters(NamedTuple):
     """All that depends on the parameters only."""
 
-    points: Tensor  # of the bodies in body frames, block diagonal, (4 bodies, 4 bodies)
+    points: Tensor  # points of the bodies in body frames, block diagonal, (4 bodies, 4 bodies)
     armature: Tensor  # inertia of the rotors, part of M, (n, n)
     friction: FrictionConstants
-    residual: Parameters = None  # of the residual terms
+    residual: Parameters = None  # parameter cache of the residual terms
 
 
 class RigidConfiguration(NamedTuple):
@@ -34,7 +34,7 @@ class RigidConfiguration(NamedTuple):
     gravity: Tensor  # dV/dq of the bodies, (..., n)
     prepared: RigidParameters
     varied: Tensor | float = 1.0  # factor on friction, (..., n)
-    residual: Configuration = None  # of the residual terms
+    residual: Configuration = None  # configuration cache of the residual terms
 
 
 class RigidBodyDynamics(PortHamiltonian):

@@ -1,4 +1,4 @@
-"""Simulate logs of an arm, in memory, by the protocol that its settings name; random torques are one."""
+"""Simulated logs of an arm in memory, by the protocol that its settings name, for example random torques."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ def float_energies(arm: Chain, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[
 
 
 def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
-    """Return values (2 S,) as blocks (blocks, S): the first half, but in block ``index`` + 1 the second half."""
+    """Return blocks (blocks, S) of values (2 S,): the second half in block ``index`` + 1, the first in all others."""
     base, moved = np.split(values, 2)
     result = np.tile(base, (blocks, 1))
     result[index + 1] = moved
