@@ -71,7 +71,7 @@ def workers(jobs: int, address: str | None = None) -> Iterator[RunTasks]:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     import ray
 
-    cluster: dict[str, object] = {"address": address}
+    cluster: dict[str, Any] = {"address": address}
     if address is None:
         cluster = {"num_cpus": jobs, "include_dashboard": False, "object_store_memory": OBJECT_STORE}
     try:

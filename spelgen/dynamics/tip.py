@@ -69,7 +69,7 @@ def tip_kinematics(
     joints do not lead to the link.
     """
     if isinstance(arm, str | Path):
-        robot, names = read_urdf(Path(arm)), list(joints or ())
+        robot, names = read_urdf(Path(arm)), tuple(joints or ())
     else:
         robot, names = arm.robot, arm.chain.joint_names
         link = link or arm.tip
