@@ -141,8 +141,7 @@ def logs(
         Path | None, typer.Option(metavar="FILE", help="Also write an HTML page with plots.")
     ] = None,
     suggest: Annotated[
-        Path | None,
-        typer.Option(help="Write a mapping drafted from the column names of the first log."),
+        Path | None, typer.Option(help="Write a mapping drafted from the column names of the first log.")
     ] = None,
     force: Force = False,
     accept: Accept = None,

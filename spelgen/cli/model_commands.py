@@ -31,8 +31,7 @@ def init(
     joints: Joints = None,
     tip: Tip = None,
     output: Annotated[
-        Path | None,
-        options.output_option("FILE.yaml", "Output file; default: ROBOT.yaml beside the URDF."),
+        Path | None, options.output_option("FILE.yaml", "Output file; default: ROBOT.yaml beside the URDF.")
     ] = None,
     force: Force = False,
 ) -> None:

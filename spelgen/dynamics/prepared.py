@@ -36,11 +36,7 @@ class PreparedModel:
     """
 
     def __init__(
-        self,
-        model: PortHamiltonian,
-        tip: TipKinematics | None = None,
-        *,
-        dtype: torch.dtype = torch.float64,
+        self, model: PortHamiltonian, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
     ) -> None:
         # networks that are zero would take most of the time
         reduced = without_idle_residuals(model)

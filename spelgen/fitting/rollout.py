@@ -17,11 +17,7 @@ from spelgen.logs.windows import Windows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import Solver
 
-SOLVER: dict[str, object] = {
-    "method": "dopri5",
-    "rtol": TUNING.adaptive_rtol,
-    "atol": TUNING.adaptive_atol,
-}
+SOLVER: dict[str, object] = {"method": "dopri5", "rtol": TUNING.adaptive_rtol, "atol": TUNING.adaptive_atol}
 AT_REST = 1e-6  # [rad, m] below the resolution of encoders
 
 

@@ -59,12 +59,7 @@ def rollout(
             warnings.simplefilter("error", ODEintWarning)
             try:
                 states[span] = odeint(
-                    derivative,
-                    states[first],
-                    t[span],
-                    tfirst=True,
-                    mxstep=TUNING.most_steps,
-                    **tolerances,
+                    derivative, states[first], t[span], tfirst=True, mxstep=TUNING.most_steps, **tolerances
                 )
             except ODEintWarning as warning:
                 raise _stuck(t[first], str(warning).split(" (")[0].lower()) from warning
