@@ -58,7 +58,7 @@ def excite(
     """
     from spelgen.excitation.design import excite as design_motion
 
-    options.require_free(output, force=force)  # before minutes of search
+    options.require_free(output, force=force)  # checked first: the search takes minutes
     arm = options.load(robot, joints, tip, angle_tolerance)
     with progress_bar("searching") as progress:
         motion = design_motion(
@@ -141,8 +141,7 @@ def logs(
         Path | None, typer.Option(metavar="FILE", help="Also write an HTML page with plots.")
     ] = None,
     suggest: Annotated[
-        Path | None,
-        typer.Option(help="Write a mapping drafted from the column names of the first log."),
+        Path | None, typer.Option(help="Write a mapping drafted from the column names of the first log.")
     ] = None,
     force: Force = False,
     accept: Accept = None,

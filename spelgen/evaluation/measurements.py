@@ -20,7 +20,7 @@ SCHEMA = 11
 
 @dataclass(frozen=True)
 class Verdict:
-    """An assessment. sentence: uses, failures, what to record next. because: the figures behind it."""
+    """An assessment. sentence: uses, failures, motions to record. because: the figures behind it."""
 
     sentence: str
     because: str

@@ -23,10 +23,8 @@ from spelgen.render.tuning import TUNING
 if TYPE_CHECKING:
     from yourdfpy import Visual
 
-MEMORY = 1_073_741_824  # bytes
-SECONDS = 30  # of processor time, of which imports and the simplification of fine meshes take most
-MAX_BYTES = 50_000_000  # of a file
-MAX_FACES = 2_000_000  # of a link: a limit for archives that expand without end
+Mesh = Any
+"""A mesh of trimesh, whose functions are annotated in part."""
 
 
 class MeshFolder:
@@ -37,7 +35,7 @@ class MeshFolder:
 
     def get(self, name: str) -> bytes:
         """Return the content of a file. Raises SpelgenError."""
-        return read_bytes(self._folder / Path(name.strip()).name, SpelgenError, largest=MAX_BYTES)
+        return read_bytes(self._folder / Path(name.strip()).name, SpelgenError, largest=TUNING.max_mesh_bytes)
 
     __getitem__ = get
 
@@ -64,8 +62,8 @@ def main(urdf: str, links: list[str], output: IO[bytes]) -> None:
     with suppress(ImportError):  # not on Windows
         import resource
 
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+        resource.setrlimit(resource.RLIMIT_AS, (TUNING.mesh_memory,) * 2)
+        resource.setrlimit(resource.RLIMIT_CPU, (TUNING.mesh_seconds,) * 2)
     import trimesh
     import yourdfpy
 
@@ -75,9 +73,12 @@ def main(urdf: str, links: list[str], output: IO[bytes]) -> None:
         if link.name not in links or not link.visuals:
             continue
         gc.collect()  # meshes contain reference cycles, so the meshes of other links would fill the memory
-        mesh: Any = trimesh.util.concatenate([_shape(visual, Path(urdf)) for visual in link.visuals])
+        mesh: Mesh = trimesh.util.concatenate([_shape(visual, Path(urdf)) for visual in link.visuals])
         # the area overflows for corners that are too far away
-        if not (np.isfinite(mesh.vertices).all() and mesh.area < np.inf) or len(mesh.faces) > MAX_FACES:
+        if (
+            not (np.isfinite(mesh.vertices).all() and mesh.area < np.inf)
+            or len(mesh.faces) > TUNING.max_mesh_faces
+        ):
             raise ValueError(f"{link.name}: too many triangles, or corners that are no numbers")
         if len(mesh.faces) > TUNING.faces // len(links):
             # an equal number of faces per link bounds the size of the page
@@ -90,7 +91,7 @@ def main(urdf: str, links: list[str], output: IO[bytes]) -> None:
     output.write(buffer.getbuffer())
 
 
-def _shape(visual: Visual, urdf: Path) -> Any:
+def _shape(visual: Visual, urdf: Path) -> Mesh:
     """Return the mesh of one <visual> in the frame of its link."""
     from trimesh import creation
 
@@ -110,13 +111,13 @@ def _shape(visual: Visual, urdf: Path) -> Any:
     return shape
 
 
-def _read(path: Path) -> Any:
+def _read(path: Path) -> Mesh:
     """Return the mesh in a file. Raises ValueError if it has no triangles."""
     import trimesh
 
-    content = io.BytesIO(read_bytes(path, SpelgenError, largest=MAX_BYTES))
+    content = io.BytesIO(read_bytes(path, SpelgenError, largest=TUNING.max_mesh_bytes))
     format, resolver = path.suffix.lower().lstrip("."), MeshFolder(path.parent)
-    mesh: Any = trimesh.load(content, file_type=format, resolver=resolver, force="mesh")  # type: ignore[arg-type]
+    mesh: Mesh = trimesh.load(content, file_type=format, resolver=resolver, force="mesh")  # type: ignore[arg-type]
     # files repeat the vertices of each triangle: unmerged, the surface would tear when it is simplified
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     if not len(mesh.faces):

@@ -65,7 +65,7 @@ class StarterJoint(NamedTuple):
 
 
 def starter(urdf: str, joints: Sequence[StarterJoint], tip: str) -> str:
-    """Return YAML for a URDF with this file name and last link: explanations begin with ``##``, settings with ``# ``."""
+    """Return YAML for a URDF of this name and last link: explanations begin with ``##``, settings with ``# ``."""
     drives, logs = "", ""
     for joint in joints:
         drive = {
