@@ -283,6 +283,25 @@ def test_the_report_is_available_as_json(run, robots):
     assert found["verdict"]["sentence"] in " ".join(Page(render_report(run)).text)
 
 
+def test_a_root_mean_square_that_few_starts_dominate_is_stated_beside_the_median(run):
+    def note(median):
+        changed = json.loads(json.dumps(EVALUATION))
+        changed["traces"]["growth"]["relative"]["model"]["median"] = [0.001, median]
+        (run / "evaluation.json").write_text(json.dumps(changed))
+        return " ".join(Page(render_report(run)).text)
+
+    rms = EVALUATION["horizons"][-1]["errors"]["model"]["mean_relative_rms"]
+    assert "After 1 s the median error is" in note(rms / 3)
+    assert "few starts dominate" not in note(rms / 1.5)
+
+
+def test_warnings_about_the_logs_are_in_the_report(run):
+    config = json.loads((run / "config.json").read_text())
+    config["warnings"] = ["link 'upper_arm': its first moment is 0.30 times the URDF's"]
+    (run / "config.json").write_text(json.dumps(config))
+    assert "link 'upper_arm': its first moment is 0.30 times" in " ".join(Page(render_report(run)).text)
+
+
 def test_meshes_are_drawn_where_the_robot_is_named(run, robots, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())

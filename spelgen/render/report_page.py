@@ -27,7 +27,14 @@ from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, parameter_tables
 from spelgen.render.report_charts import coverage_panels, evaluation_charts, loss_chart
-from spelgen.render.run_facts import best_epoch, commands, head_numbers, settings, training_facts
+from spelgen.render.run_facts import (
+    best_epoch,
+    commands,
+    head_numbers,
+    outlier_note,
+    settings,
+    training_facts,
+)
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.spec import ModelSpec
 from spelgen.structure.structure import derive
@@ -172,6 +179,7 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         units=UNITS,
         numbers=head_numbers(model, record, metrics, run.results),
         verdict=run.verdict,
+        outliers=None if run.results is None else outlier_note(run.results),
         config=record,
         evaluation=run.results,
         tables=tables,
