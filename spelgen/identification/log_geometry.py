@@ -151,6 +151,11 @@ class GeometryProblem:
         other._equations = {self.unchanged.motion_key: (rows, block_products(rows, 1)[:, 0])}
         return other
 
+    def prediction_deviation(self, fit: HypothesisFit) -> np.ndarray:
+        """Return the standard deviation of the torques of a fit, (S, n) [Nm, N], from its parameters' covariance."""
+        rows, _ = self.equations(fit.hypothesis)
+        return np.asarray(np.sqrt(np.einsum("snk,kl,snl->sn", rows, fit.covariance, rows, optimize=True)))
+
     def coulomb_friction(self, fit: HypothesisFit) -> np.ndarray:
         """Return the Coulomb friction of a fit, (n,) [Nm, N]."""
         joints = len(self.speeds)

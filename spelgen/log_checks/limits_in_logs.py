@@ -72,6 +72,7 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
     # the torques at a limit do not count
     fit = problem.on_torques(free).fit(problem.unchanged)
     residual = problem.torque(problem.unchanged, fit.parameters) - samples.tau
+    deviation, friction = problem.prediction_deviation(fit), problem.coulomb_friction(fit)
     # of few torques the residual is no noise
     noise = np.sqrt(
         np.square(residual * free).sum(axis=0) / np.maximum(free.sum(axis=0) - TUNING.free_samples, 1e-9)
@@ -79,8 +80,11 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
     for k, coordinate in enumerate(problem.arm.coordinates):
         unit, levels = UNITS[coordinate.joint_type].torque, flat.levels["tau"][:, k]
         sides = zip(SIDES, at_torque[..., k], strict=True)
-        excess = np.array([_median(side * residual[rows, k]) for side, rows in sides])
-        is_clipped = excess > np.maximum(TUNING.certain * noise[k], TUNING.excess * np.abs(levels))
+        doubt = TUNING.certain * deviation[:, k]
+        excess = np.array([_median((side * residual[:, k] - doubt)[rows]) for side, rows in sides])
+        # wrong friction of few free samples must not be confused with it
+        sure = max(TUNING.certain * noise[k], TUNING.excess * samples.tau[:, k].std(), abs(friction[k]))
+        is_clipped = excess > sure
         if is_clipped.any():
             limits = " and ".join(f"{x:.4g}" for x in levels[is_clipped])
             needed = np.abs(residual + samples.tau)[at_torque[is_clipped, :, k].any(axis=0), k].max()
@@ -91,10 +95,9 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
             do = f"log torques without this limit, or record slower motion; --accept {CLIPPED} if it is right"
             where = f"joint {coordinate.name!r}, tau"
             findings.errors.append(LogError(got, element=where, expected="the torques that moved it", do=do))
-    friction = problem.coulomb_friction(fit)
     for k, coordinate in enumerate(problem.arm.coordinates if not findings.errors else ()):
         for level, rows in zip(flat.levels["q"][:, k], at_position[..., k], strict=True):
-            difference = _median(np.abs(residual[rows, k]))
+            difference = _median((np.abs(residual) - TUNING.certain * deviation)[rows, k])
             if difference > TUNING.certain * noise[k] + 2 * abs(friction[k]):
                 message = (
                     f"q stays at {level:.4g} while its torque differs by {difference:.3g} from the model of the other "

@@ -47,9 +47,9 @@ class LogCheckTuning:
     near_limit: float = 0.02
     # [1] Samples that determine the parameters of a joint in the model that contradicts a limit.
     free_samples: int = 30
-    # [1] Contradiction: median difference at the limit in standard deviations of the residual, and of the limit.
+    # [1] Contradiction: median difference at the limit in standard deviations of the residual, and of the torque.
     certain: float = 3.0
-    excess: float = 0.05
+    excess: float = 0.08
     # [1] Trajectories that a page draws.
     examples: int = 2
     # [1] Trajectories that a terminal and a notebook list.
