@@ -201,7 +201,10 @@ def _with_gravity(problem: GeometryProblem, base: HypothesisFit) -> list[Hypothe
     fits = []
     if size:
         fits += _with_compensation(problem, base)
-    axes = [*-np.eye(3)[::-1], *np.eye(3)]  # upright first: a prismatic vertical joint shows no sense of gravity
+    axes = [
+        *-np.eye(3)[::-1],
+        *np.eye(3),
+    ]  # upright first: a prismatic vertical joint shows no sense of gravity
     starts = [_gravity(problem, base, (size or STANDARD_GRAVITY) * axis) for axis in axes]
     lowest = min(fit.cost for fit in starts)
     best = next(fit for fit in starts if fit.cost < lowest + GEOMETRY.rare)

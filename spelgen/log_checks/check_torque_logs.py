@@ -51,7 +51,7 @@ class TorqueLogs:
         self._arm, self._mapping, self._drives = arm, mapping, arm.actuation.drives()
         self._samples: list[np.ndarray] = []
         self._moving = DriveLog(arm.chain.joint_types, self._drives, Preprocessing())
-        self._flat = FlatTops()
+        self._flat: list[FlatTops] = []
         self._declared: list[set[str]] = []
         self._seconds, self._is_bag = 0.0, False
 
@@ -60,7 +60,7 @@ class TorqueLogs:
         require_torques([trajectory])
         self._samples.append(state_samples(trajectory, self._drives.inputs))
         self._moving.add(trajectory)
-        self._flat.add(trajectory.q, trajectory.tau @ self._drives.inputs.T)
+        self._flat.append(FlatTops.of(trajectory.q, trajectory.tau @ self._drives.inputs.T))
         self._declared.append(set(trajectory.accepted))
         self._seconds += trajectory.duration
         if trajectory.file is not None:
@@ -86,7 +86,8 @@ class TorqueLogs:
             problem = self._problem(moving, motion)
             is_right = problem is None or self._is_within_limits(problem, accepted, summary)
             if problem is not None and is_right:
-                comparison = self._comparison(problem, evidence)
+                undeclared = [not self._is_declared(name) for name in self._arm.chain.joint_names]
+                comparison = compare_readings(problem, torque_factors(evidence, undeclared))
                 is_right = self._is_read_right(problem, comparison, accepted, summary)
                 if is_right:
                     weightless = _weightless(problem, evidence)
@@ -123,16 +124,11 @@ class TorqueLogs:
 
     def _is_within_limits(self, problem: GeometryProblem, accepted: set[str], summary: Findings) -> bool:
         """Return True without an error that torques are clipped; add it, and warnings about mechanical stops."""
-        findings = find_limits(problem, self._flat)
+        findings = find_limits(problem, FlatTops.joined(self._flat))
         errors = [x for x in findings.errors if CLIPPED not in accepted]
         summary.errors.extend(errors)
         summary.notes.extend(findings.notes)
         return not errors
-
-    def _comparison(self, problem: GeometryProblem, joints: Sequence[JointEvidence]) -> HypothesisComparison:
-        """Return the comparison of the log with other readings of it."""
-        undeclared = [not self._is_declared(name) for name in self._arm.chain.joint_names]
-        return compare_readings(problem, torque_factors(joints, undeclared))
 
     def _is_read_right(
         self,
