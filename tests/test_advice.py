@@ -107,6 +107,22 @@ def test_commands_of_position_servos(arm):
     np.testing.assert_allclose(read.u, servo.u)
 
 
+def test_gain_of_motor_currents(arm):
+    """A draft states the gain 1 for currents; the gains of a fit (gain: trained) need none."""
+    names, path = arm.chain.joint_names, logged(arm, recorded(arm, 11), tau=0.5)
+    settings = arm.robot.path.with_suffix(".yaml")
+
+    def warned(gain, drives=""):
+        joints = ", ".join(f"{name}: {{gain: {gain}}}" for name in names)
+        settings.write_text(f"logs: {{units: {{tau: A}}, joints: {{{joints}}}}}\n{drives}")
+        return "motor currents with a gain of 1" in message_of(load_arm(arm.robot.path), path)
+
+    assert warned(1.0) and not message_of(load_arm(arm.robot.path), path).startswith("joint")
+    assert not warned(2.0)
+    trained = ", ".join(f"{name}: {{gain: trained, gear: 1}}" for name in names)
+    assert not warned(1.0, f"torque: motor\njoints: {{{trained}}}\n")
+
+
 def test_unit_of_torques_beyond_the_drive(robots, tmp_path):
     """Of a planar arm without gravity: only the drive's limit shows the unit."""
     text = (robots / "scara.urdf").read_text()

@@ -36,12 +36,14 @@ from spelgen.logs.checks import Findings, run_checks
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_torques
+from spelgen.settings.log_mapping import CURRENTS
 
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
     from spelgen.settings.log_mapping import LogMapping
 
 COUPLED, WRONG_VELOCITY, WRONG_LINK = "coupled-motors", "velocity-is-no-derivative", "urdf-inertials"
+CURRENT = "current-without-gain"
 
 
 class TorqueLogs:
@@ -80,10 +82,13 @@ class TorqueLogs:
         evidence = list(map(JointEvidence, self._arm.chain.coordinates, completed))
         # with wrong velocities friction is wrong too, and hints about drives would be wrong with wrong torques
         is_sound = not summary.errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
+        unscaled = list(self._current_note())
+        summary.notes.extend(unscaled)
         moving = self._moving.samples()
         weightless: list[JointEvidence] = []
         if is_sound:
-            problem = self._problem(moving, motion)
+            # with torques of unknown factors another reading may seem better
+            problem = None if unscaled else self._problem(moving, motion)
             is_right = problem is None or self._is_within_limits(problem, accepted, summary)
             if problem is not None and is_right:
                 undeclared = [not self._is_declared(name) for name in self._arm.chain.joint_names]
@@ -104,6 +109,25 @@ class TorqueLogs:
             for check, message in run_checks(CHECKS, joint, passed):
                 summary.add(check, message, f"{where}, tau" if check.severity == "error" else where)
         return completed, (*signal_tables(completed, QUANTITIES), _physics_table(completed))
+
+    def _current_note(self) -> Iterator[Diagnostic]:
+        """Yield a warning about motor currents with the gain 1 of a draft, unless a fit is to find their gains."""
+        settings, names = self._arm.settings.joints, []
+        for name in self._arm.chain.joint_names:
+            is_trained = name in settings and settings[name].gain == "trained"
+            if (
+                self._mapping.unit("tau", name) in CURRENTS
+                and self._mapping.joint(name).gain == 1.0
+                and not is_trained
+            ):
+                names.append(name)
+        if names:
+            message = (
+                "motor currents with a gain of 1: write 'gain', Nm per A at the joint, the gear included, under 'logs' "
+                "in the robot's YAML; until then, senses, order and zeros of the joints are not tested"
+            )
+            where = f"joint {', '.join(map(repr, names))}"
+            yield Diagnostic("warning", CURRENT, where, None, message)
 
     def _is_declared(self, joint: str) -> bool:
         """Whether the mapping states the unit of a joint's torque."""
