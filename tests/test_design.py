@@ -39,7 +39,7 @@ def test_what_is_refused_names_the_two_options():
             second = rest.partition(";")[0]
             named = dict(part.split(": ") for part in (first, second))
             assert len(named) == 2 and named.items() <= values.items()
-    # 96 of networks alone; rigid bodies with friction state and without, with residual networks and without
+    # 96 of networks only; rigid bodies with friction state and without, with residual networks and without
     assert len(COMBINATIONS) - len(refused) == 96 + 2 * 2
 
 

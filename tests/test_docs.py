@@ -1,7 +1,7 @@
-"""Console and Python blocks of each documentation page run in order and print what the page shows.
+"""Console and Python blocks of each documentation page run in order and print the outputs on the page.
 
-In a ```console block a line `$ COMMAND` is followed by what it prints, and an ```output block follows the Python block
-that prints it; `pytest --update` writes both anew. ```text blocks and indented ones are not run: they show long runs,
+In a ```console block a line `$ COMMAND` is followed by its output, and an ```output block follows the Python block
+that prints it; `pytest --update` rewrites both. ```text blocks and indented ones are not run: they show long runs,
 or no commands. A tutorial is a notebook as well, of the same cells.
 """
 

@@ -22,7 +22,7 @@ GOLDEN = Path(__file__).parent / "golden"
 PRESETS = get_args(Preset)
 FORMS = pytest.mark.parametrize("standalone", [False, True], ids=["thin", "standalone"])
 
-# What emitted modules use of torch: reading the whole of it takes mypy many times as long, for the same types.
+# The part of torch that emitted modules use: all of it would take mypy many times as long, for the same types.
 MYPY = """[mypy]
 strict = True
 [mypy-torch.*,numpy.*,sympy.*]

@@ -1,4 +1,4 @@
-"""Errors of an evaluation equal those of exact solutions; baselines are exact; results are valid JSON."""
+"""Errors of an evaluation equal the errors of exact solutions; baselines are exact; results are valid JSON."""
 
 import json
 from dataclasses import replace
@@ -278,7 +278,7 @@ def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
 
 
 def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
-    """No run, no file of logs: an arm, arrays, and whatever else predicts; the filter reaches torques too."""
+    """No run, no file of logs: an arm, arrays, and other dynamics; the filter reaches torques too."""
     arm = load_arm(cart)
     model, dynamics = build(arm, preset="closed-form"), urdf_dynamics(cart, ["slide", "swing"])
     logs = motions(dynamics, count=2, samples=130, rate=100.0)
@@ -342,7 +342,7 @@ def moving(samples=600, rate=100.0, still=0) -> Trajectory:
 
 
 class Torques:
-    """Dynamics that have torques alone."""
+    """Dynamics that have torques only."""
 
     def __init__(self, inverse_dynamics):
         self.inverse_dynamics = inverse_dynamics
@@ -370,7 +370,7 @@ def test_torque_errors_are_pooled_over_samples_with_pauses_and_without():
     samples = []
     for name, count, size in (("long", 400, 10.0), ("short", 50, 0.1)):
         motion = random.standard_normal((count, 2))
-        motion[: count // 5] = 0.001  # stands still
+        motion[: count // 5] = 0.001  # at rest
         tau = size * random.standard_normal((count, 2))
         samples.append(DynamicsSamples(name, motion, motion, motion, tau))
     found = torque_errors(Torques(lambda q, qd, qdd: torch.zeros_like(q) + 0.2), samples)

@@ -73,7 +73,7 @@ def test_the_optimised_motion_is_more_informative(loaded, found):
 
 
 def test_the_condition_number_is_that_of_the_regressor(arm, found):
-    """By Pinocchio's regressor: no column of friction or rotor, rigid bodies alone, by numerical rank."""
+    """By Pinocchio's regressor: no column of friction or rotors, rigid bodies only, by numerical rank."""
     pin = pytest.importorskip("pinocchio")
     from spelgen.dynamics.pinocchio_arm import pinocchio_model
     from spelgen.settings.settings import Settings

@@ -177,7 +177,7 @@ def test_the_filter_reaches_torques():
 def test_predictions_at_gaps_are_not_numbers():
     log = swings(0)
     t = log.t.copy()
-    t[1:] += 1.0  # the first sample stands alone
+    t[1:] += 1.0  # the first sample is a segment by itself
     found = spelgen.fit(Model(), [swings(1), swings(2)], TorqueFit(evaluations=20))
     tau = found.predict(Trajectory(t, log.q, log.qd, log.tau, "gap"))
     assert np.isnan(tau[0]).all() and np.isfinite(tau[1:]).all()
@@ -206,7 +206,7 @@ def test_a_fit_to_torques_tells_their_error(tmp_path):
 
 @pytest.mark.parametrize("samples, preset", [(4, "spel"), (4, "closed-form"), (22, "phnode")])
 def test_both_solvers_agree(tmp_path, samples, preset, monkeypatch):
-    """In what they predict and in its gradient."""
+    """Equal predictions and equal gradients."""
     # where bristles begin to slide steps of 1e-7 have gradients of 1e-3
     monkeypatch.setitem(SOLVER, "rtol", 1e-9)
     monkeypatch.setitem(SOLVER, "atol", 1e-11)

@@ -55,7 +55,7 @@ def motions(count: int = 4, samples: int = 25) -> list[Trajectory]:
 
 @pytest.fixture(scope="module", autouse=True)
 def short_epochs():
-    """Two steps an epoch: what is written, and when, is the same after twenty."""
+    """Two steps per epoch: the files, and the times of writing, do not depend on the number of steps."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(momentum, "TUNING", FittingTuning(epoch_steps=2))
         yield
@@ -91,7 +91,7 @@ USES = {
 
 @pytest.mark.parametrize("use", USES)
 def test_a_module_in_a_run_folder_is_neither_read_nor_executed(plain, start, tmp_path, use):
-    """A file with a side effect, beside a valid specification."""
+    """A file with a side effect in a folder with a valid specification."""
     run, mark = copied(plain, tmp_path / "run"), tmp_path / "mark"
     (run / "module.py").write_text(f"open({str(mark)!r}, 'w').close()\n")
     if use == "export":  # needs the URDF
@@ -198,7 +198,7 @@ def test_a_full_disk_is_told_with_the_file(start, tmp_path):
     assert trained(start, run, options=RunOptions(resume=True))
 
 
-# ---- what lies in it may be anything
+# ---- the folder may contain anything
 
 
 CHANGES = {
@@ -242,7 +242,7 @@ def test_files_that_are_broken_or_pipes_are_told(plain, tmp_path, name, what):
     else:
         (tmp_path / name).write_bytes(what)
     if name == "metrics.jsonl" and what not in (None, b"[]"):
-        load_run(tmp_path)  # a torn last line is left out
+        load_run(tmp_path)  # an incomplete last line is omitted
     else:
         with pytest.raises(spelgen.SpelgenError, match=r"\S"):
             load_run(tmp_path)
@@ -336,7 +336,7 @@ SPECS = {
 
 @pytest.mark.parametrize("case", SPECS)
 def test_a_specification_of_another_content_is_refused(plain, tmp_path, case):
-    """In one line that names the file or what is wrong, by whatever reads it; nothing is assembled."""
+    """Every reader reports it in one line that names the file or the defect; nothing is assembled."""
     change, message = SPECS[case]
     run = copied(plain, tmp_path)
     content = json.loads((run / "spec.json").read_text())

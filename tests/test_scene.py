@@ -1,4 +1,4 @@
-"""The 3D scene of a page: link poses equal those of the kinematics, and shapes are closed."""
+"""The 3D scene of a page: link poses equal the poses of the kinematics, and shapes are closed."""
 
 import json
 from itertools import pairwise

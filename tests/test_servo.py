@@ -121,7 +121,7 @@ def test_joints_get_the_laws_that_they_have(fitted):
         laws = fitted.model.friction.prepare()
     assert laws.stribeck[0] < 0.15 * TRUTH.coulomb[0]
     assert float(laws.stribeck[1]) == pytest.approx(TRUTH.stribeck[1], rel=0.3)
-    # its velocity is that of another form: the curves are compared, by kp
+    # its velocity belongs to another form of the curve: the curves are compared, divided by kp
     speeds = torch.tensor([0.05, 0.1, 0.2, 0.4]).double()
     with torch.no_grad():
         dry = laws.dry(speeds[:, None].expand(-1, 2), torch.zeros(4, 2).double())
@@ -156,7 +156,7 @@ def test_intervals_leave_out_whole_motions(logs):
         numbers[count] = len(set(stretches))
         by_log = {(log.name, stretch) for (log, _), stretch in zip(windows.rows, stretches, strict=True)}
         assert len(by_log) == numbers[count]  # none is of two logs
-    # three logs are too few to tell how their motions differ: each is cut in two
+    # three logs are too few for the differences between motions: each is cut in two
     assert numbers == {1: 5, 3: 6, 4: 4, 5: 5}
 
 
@@ -210,10 +210,10 @@ def test_what_is_told_covers_the_truth(fitted):
             ("static_error", TRUTH.coulomb[k] / TRUTH.kp[k] + TRUTH.dead_zone[k]),
         ):
             assert joint[what]["determined"]
-            # friction of the simulated elbow falls as a Gaussian, that of the model from rest on
+            # friction of the simulated elbow falls as a Gaussian, friction of the model from rest on
             assert joint[what]["value"] == pytest.approx(truth, rel=0.03 if k == 0 else 0.04), what
             assert joint[what]["low"] < truth < joint[what]["high"], what
-    # the elbow's small weight does not tell dry friction from a dead zone
+    # with the elbow's small weight dry friction and a dead zone are confounded
     assert told[0]["dry"]["determined"] and "dry/kp of elbow" in servo_summary(fitted.record.servo).text
 
 
@@ -317,7 +317,7 @@ def moved(model, seconds, count=1):
     with torch.no_grad():
         model.raw_armature.copy_((torch.tensor(TRUTH.armature) / model.armature).log())
         model.servo.delay.fill_(TRUTH.delay)
-    t, every = np.arange(0.0, seconds, 0.0025), 8  # of which logs have one in so many
+    t, every = np.arange(0.0, seconds, 0.0025), 8  # logs have one of `every` samples
     u = np.random.default_rng(0).uniform(-0.4, 0.4, (count, int(2 * seconds), 2)).repeat(200, axis=1)
     nothing = np.zeros((len(t), 0))
     logs = [Trajectory(t, x, np.zeros_like(x), nothing, u=x) for x in u]

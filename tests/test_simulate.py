@@ -83,7 +83,7 @@ class TestMotion:
         np.testing.assert_allclose(energies, energies[0], atol=1e-10)
 
     def test_what_friction_takes_and_motors_give_is_what_the_energy_gains(self, robots):
-        """dE/dt = qd (tau - friction(qd)), integrated beside the motion by another solver at other steps."""
+        """dE/dt = qd (tau - friction(qd)), integrated with the motion by another solver at other steps."""
         rpr, settings = load(robots / "rpr.urdf")
         engine, friction = arm_dynamics(rpr, settings), make_friction(rpr, settings)
         tau = np.array([2.0, -1.0, 1.0])
@@ -306,5 +306,5 @@ class TestInMemory:
             jacobian @ pin.rnea(model, data, jacobian * q + [0, -0.1], jacobian * qd, jacobian * qdd)
             for q, qd, qdd in states
         ]
-        held = (log.tau[1:-2, 0] + log.tau[:-3, 0]) / 2  # the slope at a sample is that of both intervals
+        held = (log.tau[1:-2, 0] + log.tau[:-3, 0]) / 2  # the slope at a sample is the mean of both intervals
         np.testing.assert_allclose(needed[1:-2], held, atol=0.02)

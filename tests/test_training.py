@@ -356,7 +356,7 @@ def test_early_stop_and_time_limit(module, logs, tmp_path):
 
 
 def until_a_signal(module: Path, logs: Path, folder: Path) -> None:
-    """Run a training without end in a process of its own, and write to `told` how it ended."""
+    """Run a training without end in a process of its own, and write the way it ended to `told`."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever runs the tests may ignore it
     with folder.with_name("told").open("w") as told:
         os.dup2(told.fileno(), 2)
@@ -478,7 +478,7 @@ def test_the_learning_rate_rises_and_falls(logs, tmp_path):
 
 
 def test_few_windows_are_taken_all_at_once():
-    """L-BFGS comes nearer in as many steps, and a weight decay of its own is what it gets."""
+    """L-BFGS has a lower loss after equally many steps, and a weight decay of its own."""
     config = Rollout(momentum_steps=0, epochs=6)
     assert config.resolved(100).record(rigid_bodies=False).keys() & {"batch", "learning_rate"} == set()
     assert (config.resolved(100).optimizer, config.resolved(100).weight_decay) == ("lbfgs", 2e-5)
