@@ -301,7 +301,7 @@ class TestDemo:
         assert lines[-1].startswith(f"wrote {folder / 'run' / 'report.html'}")
         assert max(map(len, lines[:-1])) <= 80
 
-    def test_nothing_is_replaced_without_force(self, demo, robots):
+    def test_files_are_replaced_only_with_force(self, demo, robots):
         folder, _ = demo
         arguments = ["simulate", str(robots / "rpr.urdf"), "--as-built", "1", "-o", str(folder / "logs")]
         done = CliRunner().invoke(app, arguments)

@@ -88,7 +88,7 @@ def test_damping_far_beyond_an_explicit_step_is_integrated():
     assert (qd[:, 2:] - exact(stiff, windows)[:, 2:]).abs().max() < 1e-2
 
 
-def test_friction_that_remembers_is_integrated_however_stiff_it_is():
+def test_stiff_friction_with_a_state_is_integrated():
     stiff, windows = Bristled(1e-3, 5.0), pushed(push=1.0)  # less than the 2 N that make it slide
     q, qd = roll_out_stiff(stiff, windows, 8)
     held = 1e-3 / 2  # z / reach = 1 / 2 at rest
@@ -126,7 +126,7 @@ def test_torques_by_recursion_are_the_regressors(robots, robot):
     np.testing.assert_allclose(torque, regressor(arm, q, qd, qdd) @ parameters, rtol=1e-10, atol=1e-10)
 
 
-def test_the_urdf_stands_once_as_it_is_and_once_with_its_drives(robots):
+def test_the_urdf_is_a_baseline_without_and_with_drives(robots):
     pytest.importorskip("pinocchio")
     arm = load_arm(robots / "rpr.urdf")
     names = [coordinate.name for coordinate in arm.chain.coordinates]
@@ -188,7 +188,7 @@ def digests(folder):
     }
 
 
-def test_least_squares_is_kept_with_a_run_and_stands_in_its_evaluation(robots, tmp_path):
+def test_least_squares_is_kept_with_a_run_and_evaluated(robots, tmp_path):
     """End to end on the command line: torques of the URDF's own bodies are explained by both, the model and it."""
     arm = load_arm(robots / "rpr.urdf")
     bodies = RegressorDynamics(arm.chain, urdf_parameters(arm.chain), np.full(3, 0.1), lambda qd, _: 0.5 * qd)

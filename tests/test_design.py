@@ -94,7 +94,7 @@ def test_a_preset_of_your_own(rpr, robots, tmp_path, monkeypatch):
         ),
     ],
 )
-def test_a_wrong_preset_is_told_with_its_place(tmp_path, monkeypatch, change, message):
+def test_a_wrong_preset_is_reported_with_its_line(tmp_path, monkeypatch, change, message):
     monkeypatch.chdir(tmp_path)
     values = asdict(load_design("hybrid")) | change
     text = "".join(f"{key}: {'null' if value is None else value}\n" for key, value in values.items())

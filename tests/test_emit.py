@@ -162,7 +162,7 @@ def test_no_text_of_the_urdf_becomes_code(tmp_path, standalone):
     assert read_spec(path).robot == HOSTILE[0]
 
 
-def test_check_tells_a_changed_urdf_from_a_fresh_one(tmp_path):
+def test_check_detects_a_changed_urdf(tmp_path):
     urdf = tmp_path / "rpr.urdf"
     shutil.copy(ROOT / "robots" / "rpr.urdf", urdf)
     shutil.copy(ROOT / "robots" / "rpr.yaml", tmp_path)

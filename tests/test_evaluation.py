@@ -94,7 +94,7 @@ def test_pinocchios_configurations_of_any_batch_are_those_of_each_state(cart):
     assert dynamics.configuration(q[:0]).shape == (0, 4, 3)
 
 
-def test_the_urdf_baseline_follows_the_order_of_joints_asked_for(cart):
+def test_the_urdf_baseline_has_the_requested_order_of_joints(cart):
     q, qd, qdd = draw(20, 2), draw(20, 2, seed=1), draw(20, 2, seed=2)
     turned = urdf_dynamics(cart, ("swing", "slide"))
     tau = turned.inverse_dynamics(q.flip(-1), qd.flip(-1), qdd.flip(-1))
@@ -128,7 +128,7 @@ def test_the_tip_is_the_end_of_the_fixed_links(cart):
         tip_kinematics(cart, "cart", joints=("slide", "swing"))
 
 
-def test_a_constant_velocity_is_exact_where_nothing_accelerates():
+def test_constant_velocity_is_exact_without_acceleration():
     dt = 0.1 + 0.05 * torch.rand(4, 3, dtype=torch.float64)
     qd = draw(4, 1, 2)
     t = torch.cat([torch.zeros(4, 1), dt.cumsum(dim=1)], dim=1)

@@ -65,7 +65,7 @@ def test_closed_form_bodies_go_back_exactly(robot, tmp_path):
     assert not [x for x in loaded.robot.diagnostics if x.severity == "warning"]
 
 
-def test_friction_goes_back_as_the_urdf_can_say_it(tmp_path):
+def test_exported_friction_in_the_urdf(tmp_path):
     run, model = run_of("rpr", tmp_path, "closed-form", heavier)
     loaded, _ = exported(run, tmp_path / "learned.urdf")
     for index, name in enumerate(model.joint_names):

@@ -91,7 +91,7 @@ def test_replay_of_another_motion_beats_the_baselines(fitted, logs, results):
     assert again.to_dict() == results.to_dict()
 
 
-def test_a_module_of_servos_stands_alone_and_says_so(arm, tmp_path):
+def test_a_standalone_module_of_servos(arm, tmp_path):
     source = spelgen.generate(arm, "closed-form", standalone=True)
     assert "stores 1/2 kp d(q - u)^2" in source
     model = import_source(source, tmp_path / "servo.py").Model()
@@ -104,7 +104,7 @@ def test_a_module_of_servos_stands_alone_and_says_so(arm, tmp_path):
     assert "in ratio to kp only" in " ".join(spelgen.inspect(arm).text().split())
 
 
-def test_within_its_dead_zone_a_servo_gives_nothing(arm):
+def test_within_its_dead_zone_a_servo_has_no_torque(arm):
     servo = spelgen.build(arm, "closed-form").servo
     servo.dead_zone[:] = torch.tensor([0.02, 0.0])
     u, still = torch.tensor([[0.015, 0.1], [0.05, 0.1]]).double(), torch.zeros(2, 2).double()
@@ -131,7 +131,7 @@ def test_joints_get_the_laws_that_they_have(fitted):
     )
 
 
-def test_intervals_count_errors_that_are_alike_once():
+def test_intervals_count_correlated_errors_once():
     rng = torch.Generator().manual_seed(0)
     found, told = [], []
     for _ in range(300):
@@ -148,7 +148,7 @@ def test_intervals_count_errors_that_are_alike_once():
     )  # a fiftieth of it, if samples were all new
 
 
-def test_intervals_leave_out_whole_motions(logs):
+def test_blocks_of_intervals_are_whole_motions(logs):
     numbers = {}
     for count in (1, 3, 4, 5):
         windows = servo_windows(logs[:count], Preprocessing())
@@ -201,7 +201,7 @@ def test_commands_are_read_and_written(tmp_path, logs, arm):
         assert again[0].tau.shape == (len(logs[0]), 0)
 
 
-def test_what_is_told_covers_the_truth(fitted):
+def test_reported_intervals_cover_the_truth(fitted):
     told = fitted.record.servo["joints"]
     for k, joint in enumerate(told):
         for what, truth in (
@@ -229,7 +229,7 @@ def test_what_is_told_covers_the_truth(fitted):
         ("sliders", ((0,), (1,)), {("armature", 0), ("armature", 1)}),
     ],
 )
-def test_what_servo_logs_can_tell_at_all(robots, tmp_path, robot, groups, left):
+def test_identifiable_ratios_of_servo_logs(robots, tmp_path, robot, groups, left):
     path = tmp_path / "sliders.urdf" if robot == "sliders" else robots / f"{robot}.urdf"
     if robot == "sliders":  # at right angles, of which each moves by itself
         path.write_text(SLIDERS)
@@ -299,7 +299,7 @@ def test_a_missing_column_is_named(tmp_path, logs, arm, quantity):
         spelgen.read_logs(path, arm)
 
 
-def test_what_does_not_belong_together_is_told(arm, logs, robots):
+def test_incompatible_models_and_logs_are_reported(arm, logs, robots):
     with pytest.raises(SettingsError, match="preset with bristle friction"):
         spelgen.build(arm, "spel")
     with pytest.raises(OptionError, match="input: torque' in their settings, this has 'position'"):

@@ -207,7 +207,7 @@ def test_training_finds_the_true_parameters():
         torch.testing.assert_close(model.state_dict()[name], value, atol=0.05, rtol=0)
 
 
-def test_the_run_folder_tells_what_was_done(module, logs, tmp_path):
+def test_the_run_folder_records_the_training(module, logs, tmp_path):
     result = train(module, [logs], tmp_path / "run", quick(epochs=2))
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names == {
@@ -238,7 +238,7 @@ class Interrupted(TrainingProgress):
 
 
 @pytest.mark.parametrize(("optimizer", "steps"), [("adamw", 20), ("lbfgs", 3)])
-def test_resuming_repeats_what_would_have_been(module, logs, tmp_path, monkeypatch, optimizer, steps):
+def test_a_resumed_training_equals_an_uninterrupted_one(module, logs, tmp_path, monkeypatch, optimizer, steps):
     monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", FittingTuning(epoch_steps=steps))
     config = quick(optimizer=optimizer, momentum_steps=20 if optimizer == "adamw" else 0)
     straight, broken = tmp_path / "straight", tmp_path / "broken"
@@ -366,7 +366,7 @@ def until_a_signal(module: Path, logs: Path, folder: Path) -> None:
 
 @pytest.mark.usefixtures("short_epochs")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_leaves_a_usable_run(module, logs, tmp_path, number):
+def test_a_run_is_usable_after_a_signal(module, logs, tmp_path, number):
     folder = tmp_path / "run"
     child = multiprocessing.get_context("fork").Process(target=until_a_signal, args=(module, logs, folder))
     child.start()
