@@ -238,7 +238,9 @@ class Interrupted(TrainingProgress):
 
 
 @pytest.mark.parametrize(("optimizer", "steps"), [("adamw", 20), ("lbfgs", 3)])
-def test_a_resumed_training_equals_an_uninterrupted_one(module, logs, tmp_path, monkeypatch, optimizer, steps):
+def test_a_resumed_training_equals_an_uninterrupted_one(
+    module, logs, tmp_path, monkeypatch, optimizer, steps
+):
     monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", FittingTuning(epoch_steps=steps))
     config = quick(optimizer=optimizer, momentum_steps=20 if optimizer == "adamw" else 0)
     straight, broken = tmp_path / "straight", tmp_path / "broken"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from lxml import etree
@@ -12,9 +12,6 @@ from lxml import etree
 from spelgen.dynamics.constraint import mimic_constraint
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot
-
-if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import Arm
 
 
 class TipKinematics:
@@ -59,7 +56,7 @@ class TipKinematics:
 
 
 def tip_kinematics(
-    arm: Arm | Path | str, link: str | None = None, *, joints: Sequence[str] | None = None
+    arm: Any, link: str | None = None, *, joints: Sequence[str] | None = None
 ) -> TipKinematics:
     """Return the kinematics of ``link``.
 
@@ -69,7 +66,7 @@ def tip_kinematics(
     joints do not lead to the link.
     """
     if isinstance(arm, str | Path):
-        robot, names = read_urdf(Path(arm)), tuple(joints or ())
+        robot, names = read_urdf(Path(arm)), list(joints or ())
     else:
         robot, names = arm.robot, arm.chain.joint_names
         link = link or arm.tip

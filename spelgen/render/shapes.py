@@ -10,7 +10,7 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, cast
 
 import numpy as np
 from lxml import etree
@@ -37,7 +37,7 @@ def joined(meshes: Sequence[Trimesh]) -> Shape:
 
     if not meshes:
         return Shape(np.zeros((0, 3)), np.zeros((0, 3), dtype=int))
-    mesh: Any = trimesh.util.concatenate(meshes)
+    mesh = cast("Trimesh", trimesh.util.concatenate(meshes))
     return Shape(np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
