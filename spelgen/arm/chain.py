@@ -88,6 +88,7 @@ def _independent(joints: Iterable[UrdfJoint]) -> tuple[UrdfJoint, ...]:
 
 def _refuse_free_joints(robot: Robot, chain: Sequence[UrdfJoint]) -> None:
     """Raise ArmError for a floating or planar joint between the chain's joints; one below the arm is held fixed."""
+    # A mobile base has such a joint below the arm: the arm is described relative to it.
     below = robot.path_to(chain[0].parent)
     for joint in robot.path_to(chain[-1].parent):
         if joint.type in ("floating", "planar") and joint not in below:
@@ -158,6 +159,7 @@ def _up_to(robot: Robot, tip: str) -> tuple[UrdfJoint, ...]:
 
 def _longest(robot: Robot) -> ChainChoice:
     """Return the longest chain. Raises ArmError for several of equal length without an unambiguous criterion."""
+    # Arms are the longest chain of a robot; hands, tools and sensors are on shorter branches.
     chains = _chains(robot)
     length = max(map(len, chains), default=0)
     longest = [chain for chain in chains if len(chain) == length]
