@@ -231,9 +231,7 @@ def test_the_first_noise_is_that_of_least_squares(correlation):
     slopes = ((0, torch.arange(3), x, measured[:, 0]), (1, torch.arange(0), x[:, :0], measured[:, 1]))
     jacobian.joint_rows = lambda _: slopes
     jacobian.torque_std = torch.ones(2).double()
-    jacobian.samples = SimpleNamespace(
-        count=count, stride=torque_problem.TUNING.correlation_length / correlation
-    )
+    jacobian.samples = SimpleNamespace(count=count, correlation_length=lambda time: correlation)
     jacobian.rigid = SimpleNamespace(free_mask=lambda *_: torch.ones(3, dtype=torch.bool))
     problem = torque_problem.TorqueProblem(jacobian, torch.ones(2), None, None, torch.zeros(2))
     problem = problem.with_least_squares_noise(torch.zeros(3).double())

@@ -59,7 +59,7 @@ class NoiseEstimator:
     @classmethod
     def of(cls, jacobian: TorqueJacobian) -> NoiseEstimator:
         """Return the estimator for the samples of a Jacobian."""
-        correlation_length = max(1.0, TUNING.correlation_length / jacobian.samples.stride)
+        correlation_length = jacobian.samples.correlation_length(TUNING.correlation_time)
         # a joint of constant torque has a standard deviation of zero, by which nothing can be divided
         torque_std = torch.maximum(jacobian.torque_std, 1e-3 * jacobian.torque_std.max())
         return cls(jacobian.samples.count, correlation_length, torque_std)
@@ -119,7 +119,7 @@ class TorqueProblem:
     @property
     def selection_correlation_length(self) -> float:
         """Samples per independent error in the choice of friction models and residual terms."""
-        return max(1.0, TUNING.selection_correlation_length / self.jacobian.samples.stride)
+        return self.jacobian.samples.correlation_length(TUNING.selection_correlation_time)
 
     def with_least_squares_noise(self, x: torch.Tensor) -> TorqueProblem:
         """Return the problem under the noise of unconstrained least squares, linearized at x (K,).

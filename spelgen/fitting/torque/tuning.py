@@ -25,15 +25,12 @@ class TorqueTuning:
 
     # [1] Stride of the samples at 100 Hz: after the filter at 8 Hz every second one contains all information.
     decimation: int = 2
-    # [1] Residual correlation length after the filter, in samples of 20 ms (0.06 s): so many consecutive errors count
-    # as one. White noise has this length after the filter. With 5, M(q) of the arms of `benchmarks/truth.py` is 5 %
-    # worse, and three seconds of the UR10e of `benchmarks/ablation.py` are better (torque nMSE 0.0080 -> 0.0062).
-    # Lengths estimated from the residual are unstable: a joint with a large residual gets a small weight, and its
-    # residual grows (Panda: 0.0015 -> 0.0030).
-    correlation_length: float = 3.1
-    # [1] The same for comparisons of friction models and for the selection of residual terms, in samples of 20 ms
-    # (0.1 s).
-    selection_correlation_length: float = 5.0
+    # [s] Correlation time of the torque residual after the filter: the samples within it count as one independent
+    # error. The errors of recorded arms are correlated over 0.2 s, white noise over 0.06 s after the filter.
+    # `docs/decisions.md` compares both.
+    correlation_time: float = 0.2
+    # [s] The same for comparisons of friction models and for the selection of residual terms.
+    selection_correlation_time: float = 0.1
     # [1] Outer iterations of noise and prior after the initial fit.
     iterations: int = 5
     # [1] Twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773,
