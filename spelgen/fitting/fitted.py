@@ -123,7 +123,8 @@ class Fit:
         Raises RunError unless rigid bodies were fitted to torques.
         """
         delay = self.record.preprocessing.torque_delay or 0.0
-        return posterior_of(self.model, self.checkpoint.posterior, delay, self.folder)
+        file = None if self.folder is None else RunFolder(self.folder).checkpoint
+        return posterior_of(self.model, self.checkpoint.posterior, delay, file)
 
     @overload
     def predict(self, trajectory: Trajectory, *, std: Literal[False] = False) -> np.ndarray: ...

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.body_regressor import regressor_of
+from spelgen.dynamics.base_combinations import base_combinations, constants_regressor
 from spelgen.dynamics.parameters import friction_factor
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
@@ -25,16 +25,14 @@ from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import ParameterVector
-from spelgen.fitting.torque.samples import SampleBlock, TorqueSamples
-from spelgen.identification.intervals import Interval, interval_listing
-from spelgen.labels import BASE_ORDER, INERTIAL_PARAMETERS, UNITS, parameter_name
+from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.identification.intervals import Interval, base_unit, interval_listing
+from spelgen.labels import UNITS, parameter_name
 from spelgen.listing import Listing
+from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.runtime.friction_laws import FrictionLaws
 from spelgen.runtime.inputs import MotorInputs
 
-# Relative length below which a column of the regressor depends on the columns before it; smallest coefficient.
-DEPENDENT = 1e-8
-ROUNDING = 1e-9
 # Finite difference, in standard deviations of the parameters.
 STEP = 1e-4
 # Speeds, relative to the typical speed, and positions at which viscous and Coulomb friction approximate friction.
@@ -63,17 +61,21 @@ class Posterior:
     """Posterior of a model that was fitted to torques.
 
     covariance: (K, K) of the rigid-body, drive and friction parameters. torque_std: (n,) RMS torque residual of samples
-    that were held out [Nm, N]. delay, delay_std: of the torques relative to the positions [s].
+    that were held out [Nm, N], below the cutoff of the fit's filter. delay: of the torques relative to the positions.
     """
 
     model: ArmModel
     covariance: Tensor
     torque_std: np.ndarray
-    delay: float = 0.0
-    delay_std: float = 0.0
+    delay: Interval | None = None
+
+    def uncertain(self, function: Callable[[ArmModel], Tensor]) -> Uncertain:
+        """Return a function of the model, such as ``lambda model: model.armature``, with standard deviations."""
+        value, root = self.propagate(function)
+        return Uncertain(value.numpy(), root.norm(dim=-1).numpy())
 
     def propagate(self, function: Callable[[ArmModel], Tensor]) -> Propagated:
-        """Return a function of the model, such as ``lambda model: model.armature``, with its errors."""
+        """Return a function of the model, (...), and its derivative times R."""
 
         def at(x: Tensor) -> Tensor:
             return evaluate_with(self.model, self._vector.unflatten(x), function)
@@ -86,9 +88,9 @@ class Posterior:
     def mass_matrix(self, q: np.ndarray) -> Uncertain:
         """Return M (T, n, n) at q (T, n), with standard deviations."""
         position, zero = torch.as_tensor(q), torch.zeros(len(q), self.model.n).double()
-        at_rest, columns = self._regressor(position, zero, zero), []
+        at_rest, columns = constants_regressor(self.model, position, zero, zero), []
         for unit in torch.eye(self.model.n).double():
-            columns.append(self._regressor(position, zero, unit.expand_as(zero)) - at_rest)
+            columns.append(constants_regressor(self.model, position, zero, unit.expand_as(zero)) - at_rest)
         with torch.no_grad():
             return self._linear(self.model.mass_matrix(position), torch.stack(columns, dim=-2))
 
@@ -96,7 +98,9 @@ class Posterior:
         """Return gravity torques (T, n) [Nm, N] at q (T, n), with standard deviations."""
         position, zero = torch.as_tensor(q), torch.zeros(len(q), self.model.n).double()
         with torch.no_grad():
-            return self._linear(self.model.gravity(position), self._regressor(position, zero, zero))
+            return self._linear(
+                self.model.gravity(position), constants_regressor(self.model, position, zero, zero)
+            )
 
     def torque(self, *motion: np.ndarray) -> Uncertain:
         """Return the torques (T, n) [Nm, N] that would be logged, with standard deviations.
@@ -104,18 +108,17 @@ class Posterior:
         motion: q, qd, qdd (T, n), and z and direction where known. The standard deviation includes the torque residual
         of held-out samples, that is noise and errors of the model.
         """
-        q, qd, qdd, *state = (torch.as_tensor(np.ascontiguousarray(x)) for x in motion)
-        model, root = self.model, self._root.clone()
-        constants, of_bodies = self._constants.root, self._vector.mask("bodies")
-        root[of_bodies] = constants[: int(of_bodies.sum())]
+        q, *motion_and_state = (torch.as_tensor(np.ascontiguousarray(x)) for x in motion)
+        model, root, of_bodies = self.model, self._root.clone(), self._vector.mask("bodies")
+        root[of_bodies] = self._constants.root[: int(of_bodies.sum())]
         with torch.no_grad():
-            value = model.inverse_dynamics(q, qd, qdd, *state)
+            value = model.inverse_dynamics(q, *motion_and_state)
             inputs = model.input_matrix(q[:1])[0]
             inverse = torch.linalg.inv(inputs + torch.diag((~inputs.any(dim=1)).double()))
         variance = (inverse.square() @ torch.from_numpy(self.torque_std).square()).expand_as(q).clone()
-        samples = TorqueSamples(SampleBlock(q, qd, qdd, torch.zeros_like(q), *state), len(q))
+        samples = DynamicsSamples("", motion[0], motion[1], motion[2], np.zeros_like(motion[0]), *motion[3:])
         for first in range(0, len(q), BLOCK):
-            block = samples.select(slice(first, first + BLOCK))
+            block = TorqueSamples.of([samples[first : first + BLOCK]])
             rows = torch.zeros(block.count, model.n, root.shape[1]).double()
             for joint, columns, jacobian, _ in TorqueJacobian(model, block).joint_rows(self._x):
                 rows[:, joint] = jacobian @ root[columns]
@@ -129,8 +132,7 @@ class Posterior:
         values, roots = (combination @ factor for factor in self._constants)
         result = []
         for name, value, root in zip(names, values.tolist(), roots, strict=True):
-            unit = {"m": "kg", "h": "kg m"}.get(name[0], "kg m²")
-            result.append(Interval(name, value, float(root.norm()), unit))
+            result.append(Interval(name, value, float(root.norm()), base_unit(name)))
         return tuple(result)
 
     @cached_property
@@ -156,54 +158,75 @@ class Posterior:
         return tuple(name for name in names if name[0] in "mh" and name not in known)
 
     @cached_property
-    def drives(self) -> tuple[Interval, ...]:
-        """Armature, viscous and Coulomb friction, torque offset and trained gain per joint, and the torque delay.
+    def drives(self) -> dict[str, tuple[Interval, ...]]:
+        """Armature, viscous and Coulomb friction, torque offset and trained gain, each per joint, by quantity.
 
         Viscous and Coulomb friction approximate the friction model by least squares up to the typical speed.
         """
-        model, inputs = self.model, self.model.inputs
-        gains = isinstance(inputs, MotorInputs) and len(inputs.gain_rows) > 0
-
+        model = self.model
+        trained = model.inputs.gain_rows.tolist() if isinstance(model.inputs, MotorInputs) else []
         load, factor = self._loads()
 
         def constants(model: ArmModel) -> Tensor:
             rows = [model.armature, *_friction_line(model.friction, load, factor), model.torque_offset]
-            return torch.stack([*rows, model.inputs.gains().sum(dim=1)] if gains else rows)
+            if isinstance(model.inputs, MotorInputs) and trained:
+                rows.append(model.inputs.gains().sum(dim=1))
+            return torch.stack(rows)
 
-        value, root = self.propagate(constants)
-        result = []
-        for joint, (name, joint_type) in enumerate(zip(model.joint_names, model.joint_types, strict=True)):
-            unit = UNITS[joint_type]
-            quantities = [
-                ("armature", unit.inertia), ("viscous", f"{unit.torque} s/{unit.position}"),
-                ("coulomb", unit.torque), ("offset", unit.torque), ("gain", ""),
-            ]  # fmt: skip
-            for row, (quantity, label) in enumerate(quantities[: len(value)]):
-                std = float(root[row, joint].norm())
-                if quantity != "gain" or std:
-                    positive = quantity in ("armature", "coulomb", "gain")
-                    result.append(
-                        Interval(f"{quantity} {name}", float(value[row, joint]), std, label, positive)
-                    )
-        if self.delay:
-            result.append(Interval("torque delay", self.delay, self.delay_std, "s"))
-        return tuple(result)
+        value, std = self.uncertain(constants)
+        units = [UNITS[joint_type] for joint_type in model.joint_types]
+        rows = {
+            "armature": [unit.inertia for unit in units],
+            "viscous": [f"{unit.torque} s/{unit.position}" for unit in units],
+            "coulomb": [unit.torque for unit in units],
+            "offset": [unit.torque for unit in units],
+            "gain": [""] * model.n,
+        }
+        result = {}
+        for row, (quantity, labels) in enumerate(list(rows.items())[: len(value)]):
+            positive, joints = quantity in ("armature", "coulomb", "gain"), range(model.n)
+            result[quantity] = tuple(
+                Interval(model.joint_names[k], float(value[row, k]), float(std[row, k]), labels[k], positive)
+                for k in (trained if quantity == "gain" else joints)
+            )
+        return result
+
+    @property
+    def drive_columns(self) -> dict[str, list[str]]:
+        """Cells of a table of the drives, (n,) per quantity."""
+        columns = {}
+        for quantity, of_joints in self.drives.items():
+            cells = {x.name: f"{x.text} {x.unit}".rstrip() for x in of_joints}
+            columns[quantity] = [cells.get(name, "") for name in self.model.joint_names]
+        return columns
 
     @property
     def listings(self) -> tuple[Listing, Listing]:
-        """Two tables with 95 % intervals: base parameters, and constants of the drives."""
-        note = f"Unidentifiable on their own: {', '.join(self.unidentifiable) or 'none'}."
+        """Two tables with 95 % intervals: the determined base parameters, and constants of the drives."""
+        determined = [x for x in self.base_parameters if x.determined in ("firm", "fair")]
+        note = (
+            f"{len(self.base_parameters) - len(determined)} more are not determined to 20 %. Unidentifiable on their "
+            f"own: {', '.join(self.unidentifiable) or 'none'}."
+        )
         title = "Base parameters [kg, m], with half 95 % intervals; numbers after names: joint"
+        columns = {"joint": list(self.model.joint_names), **self.drive_columns}
+        drives = tuple(zip(*columns.values(), strict=True))
+        note_delay = "" if self.delay is None else f"Torque delay: {self.delay.text} s."
         return (
-            interval_listing(title, self.base_parameters, note),
-            interval_listing("Drives and friction, with half 95 % intervals", self.drives),
+            interval_listing(title, determined, note),
+            Listing("Drives, with half 95 % intervals", tuple(columns), drives, note_delay),
         )
 
     def to_dict(self) -> Content:
         """Return all intervals in their JSON form."""
-        groups = {"base_parameters": self.base_parameters, "bodies": self.bodies, "drives": self.drives}
-        result: Content = {name: [x.to_dict() for x in group] for name, group in groups.items()}
-        return result | {"unidentifiable": self.unidentifiable, "torque_std": self.torque_std.tolist()}
+        return {
+            "base_parameters": [x.to_dict() for x in self.base_parameters],
+            "bodies": [x.to_dict() for x in self.bodies],
+            "unidentifiable": list(self.unidentifiable),
+            "drives": {name: [x.to_dict() for x in of_joints] for name, of_joints in self.drives.items()},
+            "torque_delay": None if self.delay is None else self.delay.to_dict(),
+            "torque_deviation": self.torque_std.tolist(),
+        }
 
     def _loads(self) -> tuple[Tensor, Tensor]:
         """Return gravity torques on the drives and residual factors on friction at random positions, (P, n) each."""
@@ -227,46 +250,17 @@ class Posterior:
         """R, (K, k), without directions of negligible variance."""
         values, vectors = torch.linalg.eigh(self.covariance)
         kept = values > 1e-14 * values.max()
-        return vectors[:, kept] * values[kept].sqrt()
+        root: Tensor = vectors[:, kept] * values[kept].sqrt()
+        return root
 
     @cached_property
-    def _base(self) -> tuple[list[str], Tensor]:
-        """Names and combinations (r, 10 B + n) of the base parameters, by inertial parameters and armatures.
-
-        They are those of `identification.base_parameters`, without exact arithmetic: a column of the regressor at
-        random states in the span of the columns before it is regrouped into these (Gautier and Khalil, IEEE T-RA
-        6:368, 1990).
-        """
-        model, bodies = self.model, len(self.model.chain.parents)
-        order = [10 * body + INERTIAL_PARAMETERS.index(name) for body in range(bodies) for name in BASE_ORDER]
-        order += range(10 * bodies, 10 * bodies + model.n)
-        shape = (3, 2 * len(order) // model.n + 1, model.n)  # twice as many equations as parameters
-        q, qd, qdd = torch.from_numpy(np.random.default_rng(0).uniform(-3.0, 3.0, shape))
-        columns = self._regressor(q, qd, qdd).flatten(0, 1)
-        remainder = torch.linalg.qr(columns[:, order]).R.diagonal().abs()
-        is_base = remainder > DEPENDENT * columns[:, order].norm(dim=0).clamp(min=1.0)
-        base = torch.tensor(order)[is_base]
-        combination = torch.linalg.lstsq(columns[:, base], columns).solution
-        combination[combination.abs() < ROUNDING] = 0.0
-        names = []
-        for index, row in zip(base.tolist(), combination, strict=True):
-            if index >= 10 * bodies:
-                names.append(f"armature{index - 10 * bodies + 1}")
-            else:
-                regrouped = int(row[: 10 * bodies].count_nonzero()) > 1
-                names.append(parameter_name(index) + ("R" if regrouped else ""))
-        return names, combination
+    def _base(self) -> tuple[tuple[str, ...], Tensor]:
+        return base_combinations(self.model)
 
     @cached_property
     def _constants(self) -> Propagated:
         """Inertial parameters of all bodies, then armatures, (10 B + n,)."""
         return self.propagate(lambda model: torch.cat([model.inertial_parameters.flatten(), model.armature]))
-
-    def _regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Return the derivative of joint torques with respect to these constants, (T, n, 10 B + n)."""
-        motors = motors_of(self.model)
-        rotors = (qdd @ motors.mT).unsqueeze(-2) * motors.mT
-        return torch.cat([regressor_of(self.model.chain, q, qd, qdd), rotors], dim=-1)
 
     def _linear(self, value: Tensor, rows: Tensor) -> Uncertain:
         """Return a value (...) with the standard deviation of the constants' contribution, rows (..., 10 B + n)."""
@@ -291,22 +285,30 @@ def posterior_of(
             "a fit without intervals", file=file, expected="rigid bodies fitted to torques, and not adapted",
             do="fit the preset closed-form or hybrid by the objective torque",
         )  # fmt: skip
-    covariance, torque_std, delay_std = map(content.get, ("covariance", "torque_std", "delay_std"))
     vector = ParameterVector(model)
     count = len(vector.flatten(vector.initial))
-    tensors = {(count, count): covariance, (model.n,): torque_std}
-    sound = isinstance(delay_std, float) and all(
-        isinstance(x, Tensor) and x.shape == shape and x.dtype == torch.float64 and bool(x.isfinite().all())
-        for shape, x in tensors.items()
+    covariance, torque_std = (
+        _tensor(content, "covariance", (count, count)),
+        _tensor(content, "torque_std", (model.n,)),
     )
-    if not sound:
+    delay_std = content.get("delay_std")
+    if covariance is None or torque_std is None or not isinstance(delay_std, float):
         raise RunError(
             "a posterior of another model",
             file=file,
             element="posterior",
             do="restore it from a copy, or fit again",
         )
-    return Posterior(model, covariance, torque_std.numpy(), delay, delay_std)
+    late = Interval("torque delay", delay, delay_std, "s") if delay else None
+    return Posterior(model, covariance, torque_std.numpy(), late)
+
+
+def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | None:
+    """Return a tensor by its name; None if it is absent, has another shape or type, or is not finite."""
+    tensor = content.get(name)
+    if isinstance(tensor, Tensor) and tensor.shape == shape and tensor.dtype == torch.float64:
+        return tensor if bool(tensor.isfinite().all()) else None
+    return None
 
 
 def _friction_line(friction: FrictionLaws, load: Tensor, factor: Tensor) -> Tensor:

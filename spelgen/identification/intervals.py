@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -57,20 +58,22 @@ class Interval:
 
     def to_dict(self) -> dict[str, object]:
         """Return the estimate in its JSON form."""
-        ends = {"deviation": self.std, "low": self.low, "high": self.high}
-        return {
-            "name": self.name,
-            "unit": self.unit,
-            "value": self.value,
-            **ends,
-            "determined": self.determined,
-        }
+        numbers = {"value": self.value, "deviation": self.std, "low": self.low, "high": self.high}
+        finite = {
+            name: x if math.isfinite(x) else None for name, x in numbers.items()
+        }  # JSON has no infinity
+        return {"name": self.name, "unit": self.unit, **finite, "determined": self.determined}
+
+
+def base_unit(name: str) -> str:
+    """Return the unit of a base parameter of bodies, by the letter of its first parameter; "" for others."""
+    return {"m": "kg", "h": "kg m", "I": "kg m²"}.get(name[0], "kg m²" if name.startswith("armature") else "")
 
 
 def interval_listing(title: str, intervals: Sequence[Interval], note: str = "") -> Listing:
     """Return a table of estimates with half of their 95 % intervals."""
-    rows = [(x.name, f"{x.value:.5g}", f"{x.half:.2g}", x.unit, x.determined) for x in intervals]
-    return Listing(title, ("parameter", "value", "+-", "", "determined"), tuple(rows), note, left=(0, 3, 4))
+    rows = [(x.name, f"{x.value:.5g}", f"{x.half:.2g}", x.determined) for x in intervals]
+    return Listing(title, ("parameter", "value", "+-", "determined"), tuple(rows), note, left=(0, 3))
 
 
 def jackknife_covariance(curvature: Tensor, descent: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
@@ -102,5 +105,5 @@ def larger_covariance(covariance: Tensor, lower_bound: Tensor) -> Tensor:
     half = torch.linalg.solve_triangular(root, covariance, upper=False)
     relative = torch.linalg.solve_triangular(root, half.mT, upper=False)
     values, vectors = torch.linalg.eigh((relative + relative.mT) / 2)
-    scaled = root @ vectors * values.clamp(min=1.0).sqrt()
+    scaled: Tensor = root @ vectors * values.clamp(min=1.0).sqrt()
     return scaled @ scaled.mT

@@ -1,8 +1,7 @@
 """Result of a servo fit: ratios to kp with confidence intervals, and the ratios that the logs do not determine.
 
-Errors are correlated within a motion, and by the form of the model even over a whole log. So each log is one
-observation: a jackknife of the weighted least-squares solution, with one step without each log (Cameron and Miller,
-J. Human Resources 50:317, 2015, CV3). A parameter that the logs do not determine keeps the interval of its prior.
+Errors are correlated within a motion, and by the form of the model even over a whole log. So each log is one block of
+a jackknife (see `jackknife_covariance`). A parameter that the logs do not determine keeps the interval of its prior.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from spelgen.fitting.servo.laws import sliding_friction
 from spelgen.fitting.servo.parameters import DEAD_ZONE, ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
 from spelgen.fitting.servo.tuning import ServoIntervalTuning
+from spelgen.identification.intervals import jackknife_covariance
 from spelgen.listing import Listing, number
 
 if TYPE_CHECKING:
@@ -94,7 +94,9 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     # a joint at the break-away torque: the errors are far from linear in the parameters
     if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
-    return end, ServoSolution(blocks, precision, covariance(blocks, precision, step))
+    _, covariance = jackknife_covariance(*blocks, torch.diag(precision))
+    # the step is the effect of half the integration step
+    return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
 
 def sum_by_block(windows: NormalEquations, numbers: torch.Tensor) -> NormalEquations:
@@ -105,26 +107,6 @@ def sum_by_block(windows: NormalEquations, numbers: torch.Tensor) -> NormalEquat
         return sums.index_add(0, numbers, terms)
 
     return NormalEquations(*map(summed, windows))
-
-
-def covariance(blocks: NormalEquations, precision: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
-    """Return the covariance of the parameters, (k, k): J + S^-1 P S^-1 + d d^T.
-
-    J is the jackknife covariance of the steps without each block, and S the Hessian of all blocks and the prior.
-
-    Args:
-        blocks: normal equations of B blocks, (B, k, k) and (B, k), with gradients that balance the gradient of the
-        prior. precision: P of the prior, (k,). change: d (k,), change of the parameters by half the integration step.
-    """
-    count, prior = len(blocks.curvature), torch.diag(precision)
-    hessian = blocks.curvature.sum(dim=0) + prior
-    # Newton steps without each block: its gradient is minus the sum of all others
-    shifts = torch.linalg.solve(hessian - blocks.curvature, -blocks.descent.unsqueeze(-1)).squeeze(-1)
-    shifts = shifts - shifts.mean(dim=0)
-    inverse = torch.linalg.inv(hessian)
-    jackknife = (count - 1) / count * shifts.mT @ shifts
-    result: torch.Tensor = jackknife + inverse @ prior @ inverse + torch.outer(change, change)
-    return result
 
 
 def identifiable(blocks: NormalEquations, precision: torch.Tensor, indices: torch.Tensor) -> torch.Tensor:

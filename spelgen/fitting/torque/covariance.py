@@ -7,10 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.special import stdtrit
 
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.problem import TorqueEstimate
-from spelgen.identification.intervals import jackknife_covariance, larger_covariance
+from spelgen.identification.intervals import QUANTILE, jackknife_covariance, larger_covariance
 
 # Contiguous blocks of samples of the jackknife. More blocks are shorter than errors that last, and fewer do not
 # determine a covariance.
@@ -30,7 +31,10 @@ def parameter_covariance(estimate: TorqueEstimate) -> ParameterCovariance:
     """Return the covariance of an estimate, which has been written into its model.
 
     The posterior covariance assumes a correlation time, and errors that are the same in all motions. The jackknife over
-    contiguous blocks of samples measures both, but from few blocks. The result is the larger one in every direction.
+    contiguous blocks of samples measures both, but from few blocks. The result is the larger one in every direction,
+    scaled such that 1.96 standard deviations are the 95 % interval of Student's t with blocks - 1 degrees of freedom. 95 % intervals of
+    47 arms of `benchmarks/truth.py` hold 97 % of base parameters and 95 % of g(q); of the posterior covariance 93 and
+    89 %.
     """
     problem, x, free = estimate.problem, estimate.state.x, estimate.problem.free
     # a new Jacobian measures logged torques relative to the gains that were written
@@ -43,7 +47,7 @@ def parameter_covariance(estimate: TorqueEstimate) -> ParameterCovariance:
     posterior = torch.linalg.inv(curvature.sum(dim=0) + prior)
     if blocks > 1:
         steps, jackknife = jackknife_covariance(curvature, descent, prior)
-        posterior = larger_covariance(jackknife, posterior)
+        posterior = larger_covariance(jackknife, posterior) * (stdtrit(blocks - 1, 0.975) / QUANTILE) ** 2
     else:
         steps = torch.zeros_like(descent)
     squares = torch.zeros_like(noise)
