@@ -207,6 +207,7 @@ def test_what_is_told_covers_the_truth(fitted):
     for k, joint in enumerate(told):
         for what, truth in (
             ("kd", TRUTH.kd[k] / TRUTH.kp[k]),
+            ("lag", TRUTH.kd[k] / TRUTH.kp[k] + TRUTH.delay),
             ("armature", TRUTH.armature[k] / TRUTH.kp[k]),
             ("static_error", TRUTH.coulomb[k] / TRUTH.kp[k] + TRUTH.dead_zone[k]),
         ):

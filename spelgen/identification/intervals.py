@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from scipy.special import stdtrit
 from torch import Tensor
 
 from spelgen.identification.tuning import TUNING
@@ -14,6 +15,11 @@ from spelgen.listing import Listing
 
 QUANTILE = 1.96
 """Half of a 95 % interval of a normal distribution, in standard deviations."""
+# Contiguous blocks of samples of a jackknife. More blocks are shorter than errors that last, and fewer do not
+# determine a covariance.
+BLOCKS = 10
+# Smallest number of samples of a block: half a second.
+MIN_BLOCK = 25
 DETERMINED = ("firm", "fair", "weak", "may be zero")
 
 
@@ -74,6 +80,11 @@ def interval_listing(title: str, intervals: Sequence[Interval], note: str = "") 
     """Return a table of estimates with half of their 95 % intervals."""
     rows = [(x.name, f"{x.value:.5g}", f"{x.half:.2g}", x.determined) for x in intervals]
     return Listing(title, ("parameter", "value", "+-", "determined"), tuple(rows), note, left=(0, 3))
+
+
+def student_scale(blocks: int) -> float:
+    """Return the factor on standard deviations from so many blocks, for 95 % intervals of 1.96 standard deviations."""
+    return float(stdtrit(blocks - 1, 0.975)) / QUANTILE
 
 
 def jackknife_covariance(curvature: Tensor, descent: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:

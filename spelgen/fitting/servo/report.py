@@ -31,18 +31,19 @@ TUNING = ServoIntervalTuning()
 QUANTILE = 0.975
 RATIOS = {
     "kd": ("kd/kp", "s"),
+    "lag": ("lag", "s"),
     "armature": ("armature/kp", "s^2"),
     "dry": ("dry/kp", "rad, m"),
     "static_error": ("static error", "rad, m"),
     "dead_zone": ("half dead zone", "rad, m"),
 }
-"""Label and unit of each ratio to kp. dry: mean dry friction of a joint in motion. static_error: the sum of dry / kp
-and
-half the dead zone."""
+"""Label and unit of each ratio to kp. lag: kd / kp plus the delay. dry: mean dry friction of a joint in motion.
+static_error: the sum of dry / kp and half the dead zone."""
 ABOUT = (
     "divided by kp, with half a 95 % interval. kp itself is scaled by the URDF's masses, unless it is known. kd is the "
-    "sum of kd and viscous friction, which such logs do not distinguish. dry: dry friction; open where it cannot be "
-    "distinguished from a dead zone, as without gravity. static error: the sum of dry/kp and half the dead zone"
+    "sum of kd and viscous friction, which such logs do not distinguish. lag: the sum of kd/kp and the delay, one "
+    "quantity in slow motion. dry: dry friction; open where it cannot be distinguished from a dead zone, as without "
+    "gravity. static error: the sum of dry/kp and half the dead zone"
 )
 
 
@@ -138,6 +139,7 @@ def ratios(model: ArmModel, qd: torch.Tensor, gravity: torch.Tensor) -> dict[str
     dry = sliding_friction(model.friction, qd, gravity) / kp
     return {
         "kd": servo.kd() / kp,
+        "lag": servo.kd() / kp + servo.delay,
         "armature": model.armature / kp,
         "dry": dry,
         "static_error": dry + servo.dead_zone,
@@ -154,14 +156,17 @@ def ratios_with_deviations(
     qd, gravity = rollouts.motion.qd, rollouts.load.gravity
     values = evaluate_with(rollouts.model, tensors, lambda model: ratios(model, qd, gravity))
     p, n = parameters.prior_mean.joints.shape
-    blocks = solution.covariance[: p * n, : p * n].view(p, n, p, n).diagonal(dim1=1, dim2=3)  # (p, p, n)
+    # the parameters of each joint, and the delay, which all joints share: (p + 1, p + 1, n)
+    index = torch.cat([torch.arange(p * n).view(p, n), torch.full((1, n), len(solution.covariance) - 1)])
+    blocks = solution.covariance[index.unsqueeze(1), index.unsqueeze(0)]
     result = {}
     for name, value in values.items():
         # the ratio of a joint depends on the parameters of this joint only: the gradient of the sum has all derivatives
         derivatives = torch.autograd.grad(
             value.sum(), list(tensors.values()), retain_graph=True, materialize_grads=True
         )
-        relative = torch.cat([x.reshape(n, -1).mT for x in derivatives]) / value.detach()
+        by_delay = torch.full((1, n), float(name == "lag")).double()
+        relative = torch.cat([*(x.reshape(n, -1).mT for x in derivatives), by_delay]) / value.detach()
         variance = torch.einsum("pn,pqn,qn->n", relative, blocks, relative)
         result[name] = value.detach(), variance.clamp(min=0).sqrt()
     return result
@@ -236,7 +241,7 @@ def _undetermined(record: Content) -> str:
     names = []
     for joint in record["joints"]:
         for ratio, (label, _) in RATIOS.items():
-            if ratio != "dead_zone" and not joint[ratio]["determined"]:
+            if ratio != "dead_zone" and ratio in joint and not joint[ratio]["determined"]:
                 names.append(f"{label} of {joint['joint']}")
     if not names:
         return "All ratios are determined"

@@ -7,17 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.special import stdtrit
 
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.problem import TorqueEstimate
-from spelgen.identification.intervals import QUANTILE, jackknife_covariance, larger_covariance
-
-# Contiguous blocks of samples of the jackknife. More blocks are shorter than errors that last, and fewer do not
-# determine a covariance.
-BLOCKS = 10
-# Smallest number of samples of a block: half a second.
-MIN_BLOCK = 25
+from spelgen.identification.intervals import (
+    BLOCKS,
+    MIN_BLOCK,
+    jackknife_covariance,
+    larger_covariance,
+    student_scale,
+)
 
 
 class ParameterCovariance(NamedTuple):
@@ -48,7 +47,7 @@ def parameter_covariance(estimate: TorqueEstimate) -> ParameterCovariance:
     posterior = torch.linalg.inv(curvature.sum(dim=0) + prior)
     if blocks > 1:
         steps, jackknife = jackknife_covariance(curvature, descent, prior)
-        posterior = larger_covariance(jackknife, posterior) * (stdtrit(blocks - 1, 0.975) / QUANTILE) ** 2
+        posterior = larger_covariance(jackknife, posterior) * student_scale(blocks) ** 2
     else:
         steps = torch.zeros_like(descent)
     squares = torch.zeros_like(noise)
