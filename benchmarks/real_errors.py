@@ -20,6 +20,7 @@ RIPPLE_PERIODS = (
     160,
 )  # per revolution of a joint: eccentric bearings, gear teeth, motors
 CABLE_BREAKAWAY = (0.05, 0.5)  # [rad, m] displacement at which the hysteresis of a cable saturates
+CURRENT_CORRELATION = 0.01  # [s]
 BACKLASH_TORQUE = (
     0.05  # of the torque's standard deviation: half width of the transition between tooth flanks
 )
@@ -39,8 +40,9 @@ class RealErrors:
     backlash: float = 0.0  # [rad, m]
     encoder_step: float = 0.0  # [rad, m]
     sensor_cutoff: float = np.inf  # [Hz] of the first-order low-pass of the torque signal
-    correlated_noise: float = 0.0  # [1] relative to the standard deviation of the torque
-    noise_correlation: float = 0.0  # [s] correlation time of the correlated noise
+    current_noise: float = 0.0  # [1] of the motor current, relative to the standard deviation of the torque
+    slow_noise: float = 0.0  # [1] changes of the torque without a cause in this list, likewise
+    slow_correlation: float = 0.0  # [s] correlation time of the slow noise
     gain: float = 0.0  # [1] relative standard deviation of the torque's unit, per joint
     zero: float = 0.0  # [rad, m] standard deviation of the zero of positions, per joint
 
@@ -63,8 +65,9 @@ def draw_errors(rng: np.random.Generator) -> RealErrors:
         backlash=level(0.4, 1e-4, 2e-3),
         encoder_step=2 * np.pi / 2 ** int(rng.integers(12, 19)),
         sensor_cutoff=level(0.4, 15.0, 60.0, np.inf),
-        correlated_noise=level(0.95, 0.02, 0.15),
-        noise_correlation=level(1.0, 0.2, 2.0),
+        current_noise=level(0.95, 0.03, 0.2),
+        slow_noise=level(0.95, 0.02, 0.15),
+        slow_correlation=level(1.0, 0.2, 2.0),
         gain=level(0.4, 0.005, 0.03),
         zero=level(0.5, 5e-4, 5e-3),
     )
@@ -119,21 +122,29 @@ class ErrorProcess:
 
     def sensed(self, torque: np.ndarray, rate: float, rng: np.random.Generator) -> np.ndarray:
         """Return the torque (T, n) after the low-pass of its sensor, with correlated noise; rate: of samples [Hz]."""
-        noise = self.errors.correlated_noise * torque.std(axis=0) * rng.normal(size=torque.shape)
-        if np.isfinite(self.errors.sensor_cutoff):
-            keep = np.exp(-2 * np.pi * self.errors.sensor_cutoff / rate)
-            state = keep * torque[:1]
-            torque = lfilter([1 - keep], [1, -keep], torque, axis=0, zi=state)[0]
-        if not self.errors.correlated_noise:
-            return torque
-        keep = np.exp(-1 / (rate * self.errors.noise_correlation))
-        first = np.zeros((1, torque.shape[1]))
-        return torque + lfilter([np.sqrt(1 - keep**2)], [1, -keep], noise, axis=0, zi=first)[0]
+        errors, seen = self.errors, torque
+        if np.isfinite(errors.sensor_cutoff):
+            keep = np.exp(-2 * np.pi * errors.sensor_cutoff / rate)
+            seen = lfilter([1 - keep], [1, -keep], seen, axis=0, zi=keep * seen[:1])[0]
+        noises = (errors.current_noise, CURRENT_CORRELATION), (errors.slow_noise, errors.slow_correlation)
+        for level, time in noises:
+            if level:
+                deviation = level * torque.std(axis=0)
+                seen = seen + deviation * _correlated_noise(torque.shape, rate * time, rng)
+        return seen
 
     def encoded(self, q: np.ndarray) -> np.ndarray:
         """Return positions (T, n) in steps of the encoder."""
         step = self.errors.encoder_step
         return q if not step else step * np.round(q / step)
+
+
+def _correlated_noise(shape: tuple[int, ...], time: float, rng: np.random.Generator) -> np.ndarray:
+    """Return stationary noise (T, n) of variance one, with autocorrelation exp(-lag / time), in samples."""
+    keep = np.exp(-1 / time)
+    first = keep * rng.normal(size=(1, shape[1]))
+    white = np.sqrt(1 - keep**2) * rng.normal(size=shape)
+    return np.asarray(lfilter([1.0], [1.0, -keep], white, axis=0, zi=first)[0])
 
 
 def play(q: np.ndarray, reach: np.ndarray) -> np.ndarray:
