@@ -19,10 +19,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -34,8 +35,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from real_logs import OUTSIDE, TESTS, TRAINING, Torque, after, first, torque_of
 from recordings import folder_of, panda_urdf
+from rivals import RIVALS, Method, Prediction
 
 import spelgen
+from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.friction import FrictionModel
@@ -112,40 +115,46 @@ class Problem:
         """Samples of the test recordings by group, pauses included."""
         return {group: self.samples_of(logs, pauses=True) for group, logs in self.fold.tests.items()}
 
-    def errors(self, torque: Torque) -> dict[str, list[float]]:
-        """Return the mean nMSE of each group: moving samples, and pauses included."""
-        return {group: _errors(torque, samples) for group, samples in self.tests.items()}
+    def figures(self, prediction: Prediction) -> Row:
+        """Return, per group of tests, the mean nMSE: moving samples, and pauses included; and the coverage.
+
+        coverage: share of the torques of moving samples within their 95 % intervals, if the method has any.
+        """
+        nmse, coverage = {}, {}
+        for group, samples in self.tests.items():
+            errors, inside = [], []
+            for x in samples:
+                residual, moving = prediction.torque(x) - x.tau, is_moving(x.qd)
+                both = mean_nmse(residual[moving], x.tau[moving]), mean_nmse(residual, x.tau)
+                errors.append([np.inf if error is None else error for error in both])
+                if prediction.std is not None:
+                    inside.append(np.abs(residual[moving]) <= 1.96 * prediction.std(x)[moving])
+            nmse[group] = [float(x) for x in np.mean(errors, axis=0)]
+            if inside:
+                coverage[group] = round(float(np.concatenate(inside).mean()), 4)
+        return {"nmse": nmse} | ({"coverage": coverage} if coverage else {})
 
 
-def _errors(torque: Torque, samples: Sequence[DynamicsSamples]) -> list[float]:
-    errors = []
-    for x in samples:
-        residual, moving = torque(x) - x.tau, is_moving(x.qd)
-        both = mean_nmse(residual[moving], x.tau[moving]), mean_nmse(residual, x.tau)
-        errors.append([np.inf if nmse is None else nmse for nmse in both])
-    return [float(x) for x in np.mean(errors, axis=0)]
-
-
-def urdf_values(problem: Problem) -> Torque:
+def urdf_values(problem: Problem) -> Prediction:
     """Return the torque of the URDF, with the drives of the settings if there are any."""
     urdf, names = problem.fold.urdf, problem.arm.chain.joint_names
-    return torque_of(urdf_dynamics(urdf, names, drives=drives_known(urdf, names)))
+    return Prediction(torque_of(urdf_dynamics(urdf, names, drives=drives_known(urdf, names))))
 
 
-def cross_validated_ridge(problem: Problem) -> Torque:
+def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> Torque:
     """Return the torque of ridge regression; its penalty is chosen by cross-validation over blocks of time.
 
     The penalty is relative to the squared length of each column of the regressor of rigid bodies, viscous and Coulomb
     friction, armature and offset; each joint is weighted by the range of its torque.
     """
-    chain, friction = problem.arm.chain, FrictionModel()
+    friction = FrictionModel()
 
     def columns(x: DynamicsSamples) -> np.ndarray:
         return np.concatenate([regressor(chain, x.q, x.qd, x.qdd), friction.columns(x.qd, x.qdd)], axis=2)
 
-    tau = np.concatenate([x.tau for x in problem.samples])
+    tau = np.concatenate([x.tau for x in samples])
     scale = np.maximum(tau.std(axis=0), 1e-3 * tau.std(axis=0).max())[:, None]
-    rows = np.concatenate([*map(columns, problem.samples)]) / scale  # (T, n, K)
+    rows = np.concatenate([*map(columns, samples)]) / scale  # (T, n, K)
     length = np.sqrt(np.square(rows).sum(axis=(0, 1)))
     length[length == 0] = 1.0
     rows = np.concatenate([rows / length, tau[:, :, None] / scale], axis=2)
@@ -167,30 +176,35 @@ def cross_validated_ridge(problem: Problem) -> Torque:
     return lambda x: columns(x) @ best
 
 
-def by_least_squares(*, memory: bool) -> Callable[[Problem], Torque]:
+def by_least_squares(*, memory: bool) -> Method:
     """Return the method of `identify` with Coulomb friction or with bristle states, joints weighted by range."""
     method = LeastSquares("range", friction=FrictionModel(memory=memory))
-    return lambda problem: torque_of(least_squares(problem.arm.chain, problem.samples, method).dynamics)
 
-
-def by_preset(preset: str) -> Callable[[Problem], Torque]:
-    """Return the method of `spelgen train` with a preset and without options."""
-
-    def fitted(problem: Problem) -> Torque:
-        model = spelgen.build(problem.fold.urdf, preset)
-        fit = spelgen.fit(model, problem.logs, preprocessing=problem.preprocessing, arm=problem.fold.urdf)
-        return torque_of(fit.model)
+    def fitted(problem: Problem) -> Prediction:
+        return Prediction(torque_of(least_squares(problem.arm.chain, problem.samples, method).dynamics))
 
     return fitted
 
 
-METHODS: dict[str, Callable[[Problem], Torque]] = {
+def by_preset(preset: str) -> Method:
+    """Return the method of `spelgen train` with a preset and without options."""
+
+    def fitted(problem: Problem) -> Prediction:
+        model = spelgen.build(problem.fold.urdf, preset)
+        fit = spelgen.fit(model, problem.logs, preprocessing=problem.preprocessing, arm=problem.fold.urdf)
+        return Prediction(torque_of(fit.model))
+
+    return fitted
+
+
+METHODS: dict[str, Method] = {
     "URDF": urdf_values,
-    "ridge": cross_validated_ridge,
+    "ridge": lambda problem: Prediction(cross_validated_ridge(problem.arm.chain, problem.samples)),
     "least squares": by_least_squares(memory=False),
     "with memory": by_least_squares(memory=True),
     "closed-form": by_preset("closed-form"),
     DEFAULT: by_preset(DEFAULT),
+    **RIVALS,
 }
 
 
@@ -261,8 +275,11 @@ def measured(fold: Fold, seconds: float, methods: Iterable[str]) -> Iterator[Row
     for name in methods:
         since = time.process_time()
         try:
-            torque = METHODS[name](problem)
-            row: Row = {"fit_s": round(time.process_time() - since, 2), "nmse": problem.errors(torque)}
+            prediction = METHODS[name](problem)
+            row: Row = {"fit_s": round(time.process_time() - since, 2)} | problem.figures(prediction)
+        except ImportError as error:  # a rival that is not installed
+            print(f"{name} skipped: {error}", file=sys.stderr)
+            continue
         except (SpelgenError, np.linalg.LinAlgError) as error:
             row = {"error": str(error)}
         yield common | {"method": name} | row
@@ -376,7 +393,8 @@ def main() -> None:
     parser.add_argument("folder", nargs="?", type=Path)
     parser.add_argument("--only", nargs="+", default=[""], help="folds whose names contain one of these")
     parser.add_argument("--seconds", nargs="+", choices=list(map(duration_name, SECONDS)))
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=[DEFAULT, *REFERENCES])
+    parser.add_argument("--rivals", type=Path, metavar="PYTHON", help="of the environment of `rivals.py`")
     parser.add_argument("--out", type=Path, default=Path("runs/leaderboard.jsonl"))
     parser.add_argument("--before", type=Path, help="results to compare with")
     parser.add_argument("--list", action="store_true", help="show the results of --out, and fit nothing")
@@ -391,6 +409,8 @@ def main() -> None:
                 rows.append(row)
                 file.write(json.dumps(row) + "\n")
                 file.flush()
+        if options.rivals:
+            rows = by_rivals(options)
     cells = {
         cell: errors
         for cell, errors in cells_of(rows).items()
@@ -403,6 +423,25 @@ def main() -> None:
     for row in rows:
         if "error" in row:
             print(f"{row['fold']}, {row['seconds']} s, {row['method']}: {row['error']}")
+
+
+def by_rivals(options: argparse.Namespace) -> list[Row]:
+    """Append the results of the rivals, in their own environment; return all results."""
+    command = [
+        options.rivals,
+        __file__,
+        folder_of(options.folder),
+        "--out",
+        options.out,
+        "--only",
+        *options.only,
+    ]
+    seconds = ["--seconds", *options.seconds] if options.seconds else []
+    subprocess.run(
+        [*map(str, command), *seconds, "--methods", *RIVALS], check=True, stdout=subprocess.DEVNULL
+    )
+    options.methods = [*options.methods, *RIVALS]
+    return rows_of(options.out)
 
 
 def missing(options: argparse.Namespace, rows: Sequence[Row]) -> Iterator[Row]:

@@ -83,10 +83,8 @@ def of_recordings(folder: Path) -> dict[str, ResidualStatistics]:
     for fold in folds(folder):
         if "/split" in fold.name:
             problem = Problem(fold, np.inf)
-            torque, samples = (
-                by_least_squares(memory=True)(problem),
-                problem.samples_of(problem.logs, pauses=True),
-            )
+            torque = by_least_squares(memory=True)(problem).torque
+            samples = problem.samples_of(problem.logs, pauses=True)
             statistics = residual_statistics([torque(x) - x.tau for x in samples], [x.tau for x in samples])
             if statistics is not None:
                 found[fold.name.removesuffix("/split")] = statistics
