@@ -85,12 +85,21 @@ def mujoco_sysid(problem: Problem) -> Prediction:
     }  # fmt: skip
     for k in range(1, compiled.nbody):
         body = compiled.body(k).name
-        parameters.add(sysid.body_inertia_param(spec, compiled, body, sysid.InertiaType.Pseudo, **bounds))
+
+        def set_inertia(changed: Any, parameter: Any, body: str = body) -> None:
+            _set_inertia(changed.body(body), sysid.model_modifier.pi_from_theta(parameter.value))
+
+        parameters.add(
+            sysid.body_inertia_param(
+                spec, compiled, body, sysid.InertiaType.Pseudo, modifier=set_inertia, **bounds
+            )
+        )
     for name, range_ in zip(names, scale, strict=True):
 
         def set_drive(changed: Any, parameter: Any, name: str = name) -> None:
             joint = changed.joint(name)
-            joint.damping, joint.frictionloss, joint.armature = parameter.value
+            damping, joint.frictionloss, joint.armature = parameter.value
+            joint.damping = [damping, 0.0, 0.0]  # the coefficients of |qd| and qd^2 are zero
 
         parameters.add(
             sysid.Parameter(
@@ -109,11 +118,29 @@ def mujoco_sysid(problem: Problem) -> Prediction:
         return np.array(rows) + values["offset"].value
 
     def residual(x: np.ndarray, values: Any) -> tuple[list[np.ndarray], None, None]:
-        values.update_from_vector(x)
-        return [((torque(samples, values) - samples.tau) / scale).ravel()], None, None
+        """Return the residuals (S, k) of k parameter vectors, the columns of x."""
+        columns = []
+        for vector in x.reshape(len(x), -1).T:
+            values.update_from_vector(vector)
+            columns.append(((torque(samples, values) - samples.tau) / scale).ravel())
+        return [np.stack(columns, axis=1).reshape(-1, *x.shape[1:])], None, None
 
     best, _ = sysid.optimize(parameters, residual, optimizer="mujoco", verbose=False, max_iters=50)
     return Prediction(lambda x: torque(x, best))
+
+
+def _set_inertia(body: Any, parameters: np.ndarray) -> None:
+    """Set the inertial parameters (m, m c, I about the origin as 3 x 3) of a body of an MjSpec.
+
+    The modifier of sysid 4.0.0 sets the orientation to NaN, which MuJoCo 4.0.0 rejects.
+    """
+    mass, moment, inertia = parameters[0], parameters[1:4], parameters[4:].reshape(3, 3)
+    center = moment / mass
+    about_center = inertia - mass * (center @ center * np.eye(3) - np.outer(center, center))
+    body.explicitinertial = True
+    body.mass, body.ipos, body.iquat = mass, center, (1.0, 0.0, 0.0, 0.0)
+    body.inertia[:] = 0.0  # the full inertia replaces it
+    body.fullinertia[:] = about_center[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].reshape(body.fullinertia.shape)
 
 
 class InverseDynamicsKernel(nn.Module):
