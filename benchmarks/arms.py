@@ -24,22 +24,17 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from leaderboard import cross_validated_ridge
+from leaderboard import cross_validated_ridge, folds
 from motions import smooth_motion
 from real_logs import (
-    TESTS,
-    TRAINING,
     Torque,
-    after,
-    first,
     least_squares_torque,
     mean,
-    read,
     samples_of,
     torque_of,
     trained,
 )
-from recordings import folder_of, panda_urdf
+from recordings import folder_of
 from rivals import deep_lagrangian, network
 
 import spelgen
@@ -72,7 +67,6 @@ class Case:
 
 AHEAD = (0.1, 0.5, 1.0)  # s
 
-SPLITS = {"xmate3": 12.0, "ar5": 36.0}  # s of training
 ROBOT = Path(__file__).parents[1] / "robots" / "ur10e.urdf"
 EFFECTS = {
     "spring": "a spring of 120 Nm at joint 2 and of 8 Nm/rad at joint 1",
@@ -137,24 +131,11 @@ def states_ahead(folder: Path) -> None:
 
 
 def splits(folder: Path) -> Iterator[Split]:
-    """The arms of the reference logs, with the splits that its README gives."""
-    urdf = folder / "ur10e" / "ur10e.urdf"
-    arm = load_arm(urdf).chain
-    logs = {x: read(folder / "ur10e" / f"{x}.parquet", arm) for x in (*TRAINING, *TESTS)}
-    yield "UR10e, nine", urdf, [logs[x] for x in TRAINING], [logs[x] for x in TESTS]
-    urdf = panda_urdf(folder)
-    whole = read(folder / "panda" / "exciting_traj1.parquet", load_arm(urdf).chain)
-    yield "Panda", urdf, [first(whole, 12.0)], [after(whole, 12.0)]
-    for name, seconds in SPLITS.items():
-        urdf = folder / name / f"{name}.urdf"
-        (log,) = (folder / name).glob("*.parquet")
-        whole = read(log, load_arm(urdf).chain)
-        yield name, urdf, [first(whole, seconds)], [after(whole, seconds)]
-    urdf = folder / "shanghai" / "shanghai.urdf"
-    arm = load_arm(urdf).chain
-    each = [read(log, arm) for log in sorted((folder / "shanghai").glob("*.parquet"))]
-    for k, test in enumerate(each):
-        yield f"shanghai {k + 1}", urdf, [x for x in each if x is not test], [test]
+    """Yield the documented splits of the recordings."""
+    for fold in folds(folder):
+        if "/split" in fold.name:
+            tests = next(iter(fold.tests.values()))
+            yield fold.name.removesuffix("/split"), fold.urdf, list(fold.training), list(tests)
 
 
 def real(folder: Path) -> Iterator[Case]:

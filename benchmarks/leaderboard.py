@@ -2,6 +2,7 @@
 
     python benchmarks/leaderboard.py [FOLDER] [--only NAME ...] [--seconds 3 5 all] [--methods NAME ...] [--list]
                                      [--out runs/leaderboard.jsonl] [--before FILE]
+                                     [--page docs/leaderboard.md] [--rivals PYTHON]
 
 FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. The folds are the documented
 splits (`split`), splits of one recording with the training part at its end (`reversed`), and each motion of an arm as
@@ -12,7 +13,8 @@ samples. A cell is one fold, duration and group of test recordings; its error is
 
 Results are appended to a file of JSON lines, one per fold, duration and method; a run continues where it stopped. The
 tables show the error per cell, and the default preset, `hybrid`, divided by the best of the other methods in
-`REFERENCES`. `--before` compares with another file of results, cell by cell.
+`REFERENCES`. `--before` compares with another file of results, cell by cell. `--rivals` adds the methods of
+`rivals.py`, run by the Python of an environment in which they are installed.
 """
 
 from __future__ import annotations
@@ -33,6 +35,18 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from leaderboard_tables import (
+    DEFAULT,
+    REFERENCES,
+    Row,
+    cells_of,
+    changes,
+    errors_table,
+    method_lines,
+    summary,
+    text,
+    write_page,
+)
 from real_logs import OUTSIDE, TESTS, TRAINING, Torque, after, first, torque_of
 from recordings import folder_of, panda_urdf
 from rivals import RIVALS, Method, Prediction
@@ -58,13 +72,6 @@ RIDGES = tuple(10.0**k for k in range(-9, 3))
 RIDGE_FOLDS = 5
 TRAINED_FIRST = {"panda": 12.0, "xmate3": 12.0, "ar5": 36.0, "tx40": 5.4}  # [s] of the only recording
 AIRBOT_TRAINING = ("ps_N7T25QR-5", "ps_N7T25QR-6_again")
-DEFAULT = "hybrid"
-REFERENCES = ("URDF", "ridge", "least squares", "with memory", "closed-form")
-GOALS = (1.05, 1.25)  # of the default divided by the best reference: on 95 % of the cells, and on every cell
-
-Row = dict[str, object]
-Cell = tuple[str, str, str]
-"""Fold, duration, group of test recordings."""
 
 
 @dataclass(frozen=True)
@@ -289,100 +296,6 @@ def duration_name(seconds: float) -> str:
     return "all" if np.isinf(seconds) else f"{seconds:g}"
 
 
-def cells_of(rows: Iterable[Row]) -> dict[Cell, dict[str, float]]:
-    """Return the error on moving samples of each method, by cell."""
-    cells: dict[Cell, dict[str, float]] = {}
-    for row in rows:
-        groups = row.get("nmse")
-        if isinstance(groups, dict):
-            for group, (moving, _) in groups.items():
-                cell = str(row["fold"]), str(row["seconds"]), group
-                cells.setdefault(cell, {})[str(row["method"])] = moving
-    return cells
-
-
-def errors_table(cells: Mapping[Cell, Mapping[str, float]], methods: Sequence[str]) -> list[list[str]]:
-    """Return the table of errors: one row per cell of the splits, one per fold and duration of the motions."""
-    table: dict[tuple[str, str, str], list[Mapping[str, float]]] = {}
-    for (fold, seconds, group), errors in cells.items():
-        arm, kind = fold.split("/")
-        if kind.startswith("motion"):
-            fold, group = f"{arm}/motion pairs", ""
-        table.setdefault((fold, seconds, group), []).append(errors)
-    lines = [["fold", "trained on [s]", "tested on", *methods, f"{DEFAULT} / best"]]
-    for (fold, seconds, group), each in table.items():
-        medians = [_median([x[name] for x in each if name in x]) for name in methods]
-        label = group or f"{len(each)} pairs, median"
-        ratios = [ratio for x in each if (ratio := ratio_to_best(x)) is not None]
-        lines.append([fold, seconds, label, *medians, f"{np.median(ratios):.2f}" if ratios else "-"])
-    return lines
-
-
-def _median(values: Sequence[float]) -> str:
-    return f"{np.median(values):.3g}" if values else "-"
-
-
-def ratio_to_best(errors: Mapping[str, float]) -> float | None:
-    """Return the error of the default divided by the least of the references; None if one of both is absent."""
-    best = min((errors[name] for name in REFERENCES if name in errors), default=None)
-    return None if best is None or DEFAULT not in errors else errors[DEFAULT] / best
-
-
-def summary(cells: Mapping[Cell, Mapping[str, float]]) -> list[str]:
-    """Return lines about the default divided by the best reference."""
-    ratios = {cell: x for cell, errors in cells.items() if (x := ratio_to_best(errors)) is not None}
-    if not ratios:
-        return []
-    lines = []
-    groups = {"all": ratios}
-    for cell, ratio in ratios.items():
-        kind = "motion pairs" if "/motion" in cell[0] else "splits"
-        for name in (kind, f"{cell[1]} s" if cell[1] != "all" else "all data"):
-            groups.setdefault(name, {})[cell] = ratio
-    for name, chosen in groups.items():
-        values = np.array(list(chosen.values()))
-        share = 100 * (values <= GOALS[0]).mean()
-        lines.append(
-            f"{DEFAULT} / best, {name}: median {np.median(values):.3f}, 95 % quantile "
-            f"{np.quantile(values, 0.95):.3f}, maximum {values.max():.3f}; "
-            f"at most {GOALS[0]} on {share:.0f} % of {len(values)} cells"
-        )
-    worst = sorted(((x, cell) for cell, x in ratios.items() if x > GOALS[1]), reverse=True)
-    lines += [f"  above {GOALS[1]}: {x:.2f}  {', '.join(cell)}" for x, cell in worst]
-    return lines
-
-
-def changes(before: Mapping[Cell, Mapping[str, float]], now: Mapping[Cell, Mapping[str, float]]) -> list[str]:
-    """Return lines about each method's errors divided by those of other results, cell by cell."""
-    lines = []
-    for name in METHODS:
-        ratios = {
-            cell: errors[name] / before[cell][name]
-            for cell, errors in now.items()
-            if name in errors and before.get(cell, {}).get(name)
-        }
-        if ratios:
-            values, worst = np.array(list(ratios.values())), max(ratios, key=lambda cell: ratios[cell])
-            lines.append(
-                f"{name} / before: median {np.median(values):.3f}, geometric mean "
-                f"{np.exp(np.log(values).mean()):.3f}, {np.mean(values > 1.03):.0%} worse by more than 3 %, "
-                f"{np.mean(values < 0.97):.0%} better; maximum {ratios[worst]:.2f} ({', '.join(worst)}), "
-                f"minimum {values.min():.2f}; {len(values)} cells"
-            )
-    return lines
-
-
-def text(table: Sequence[Sequence[str]]) -> str:
-    """Return a table as aligned text."""
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    return "\n".join(
-        "  ".join(
-            x.ljust(w) if k < 3 else x.rjust(w) for k, (x, w) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in table
-    )
-
-
 def rows_of(path: Path) -> list[Row]:
     """Return the results in a file of JSON lines, [] if there is none."""
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
@@ -397,6 +310,7 @@ def main() -> None:
     parser.add_argument("--rivals", type=Path, metavar="PYTHON", help="of the environment of `rivals.py`")
     parser.add_argument("--out", type=Path, default=Path("runs/leaderboard.jsonl"))
     parser.add_argument("--before", type=Path, help="results to compare with")
+    parser.add_argument("--page", type=Path, help="Markdown page whose tables are replaced")
     parser.add_argument("--list", action="store_true", help="show the results of --out, and fit nothing")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -417,9 +331,11 @@ def main() -> None:
         if any(x in cell[0] for x in options.only) and cell[1] in (options.seconds or cell[1])
     }
     print(text(errors_table(cells, [x for x in METHODS if x in options.methods])) + "\n")
-    print("\n".join(summary(cells)))
+    print("\n".join(summary(cells)) + "\n\n" + text(method_lines(rows, list(METHODS))))
+    if options.page:
+        write_page(options.page, rows, cells, list(METHODS))
     if options.before:
-        print("\n".join(changes(cells_of(rows_of(options.before)), cells)))
+        print("\n".join(changes(cells_of(rows_of(options.before)), cells, METHODS)))
     for row in rows:
         if "error" in row:
             print(f"{row['fold']}, {row['seconds']} s, {row['method']}: {row['error']}")
