@@ -16,6 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.signal import welch
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -64,12 +65,12 @@ def residual_statistics(
         products = sum((x[k:] * x[:-k]).sum(axis=0) * len(x) / (len(x) - k) for x in residuals)
         return float((products / power)[varies].mean())
 
-    frequency = welch(residuals[0], FREQUENCY, nperseg=SEGMENT, axis=0)[0]
-    spectrum = sum(len(x) * welch(x, FREQUENCY, nperseg=SEGMENT, axis=0)[1] for x in residuals)
-    band = np.digitize(
-        frequency, BANDS[1:-1]
-    )  # the last band contains what the filter lets through above 8 Hz
-    shares = np.stack([spectrum[band == k].sum(axis=0) for k in range(len(BANDS) - 1)]) / spectrum.sum(axis=0)
+    frequency = np.fft.rfftfreq(SEGMENT, 1 / FREQUENCY)
+    spectrum = sum(len(x) * welch(x, FREQUENCY, nperseg=SEGMENT, detrend=False, axis=0)[1] for x in residuals)
+    cumulative = cumulative_trapezoid(spectrum, frequency, axis=0, initial=0.0)
+    # the remainder above 8 Hz, which the filter does not remove, belongs to the last band
+    edges = [*np.searchsorted(frequency, BANDS[:-1]), len(frequency) - 1]
+    shares = np.diff(cumulative[edges], axis=0) / cumulative[-1]
     level = float(np.sqrt(power / torque_power)[varies].mean())
     powers = tuple(float(x) for x in shares[:, varies].mean(axis=1))
     return ResidualStatistics(level, tuple(map(correlation, LAGS)), powers)
