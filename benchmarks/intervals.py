@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,9 @@ from spelgen.fitting.torque.parameters import ParameterVector
 
 QUANTITIES = ("base", "friction", "mass", "gravity")
 QUANTILE = 1.96
+NEGLIGIBLE = 1e-6  # relative to the largest true value of a quantity
+Uncertain = Callable[[Callable[[ArmModel], torch.Tensor]], tuple[np.ndarray, np.ndarray]]
+"""Gives the value and the standard deviation of a function of a fitted model, both (k,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,50 +47,61 @@ class TrueValues:
     gravity: np.ndarray
 
 
+def propagated(model: ArmModel, covariance: torch.Tensor) -> Uncertain:
+    """Return the function that gives values and standard deviations of functions of a fitted model.
+
+    Args:
+        model: fitted model.
+        covariance: (K, K) of its rigid parameters, propagated to first order.
+    """
+    parameters = ParameterVector(model).initial
+
+    def uncertain(function: Callable[[ArmModel], torch.Tensor]) -> tuple[np.ndarray, np.ndarray]:
+        def values(*tensors: torch.Tensor) -> torch.Tensor:
+            return evaluate_with(model, dict(zip(parameters, tensors, strict=True)), function)
+
+        blocks = jacobian(values, tuple(parameters.values()))
+        slopes = torch.cat([block.flatten(1) for block in blocks], dim=1)
+        variance = torch.einsum("jk,kl,jl->j", slopes, covariance, slopes)
+        return values(*parameters.values()).detach().numpy(), variance.clamp(min=0).sqrt().numpy()
+
+    return uncertain
+
+
 def interval_ratios(
-    model: ArmModel, covariance: torch.Tensor, true: TrueValues, sliding: SteadySliding, q: np.ndarray
+    uncertain: Uncertain, true: TrueValues, sliding: SteadySliding, q: np.ndarray
 ) -> dict[str, list[float]]:
     """Return the errors divided by the half width of the 95 % interval, per quantity of `QUANTITIES`.
 
     Values whose truth is zero with an error of zero (joints that gravity does not load) are omitted.
 
     Args:
-        model: fitted model.
-        covariance: (K, K) of its rigid parameters, propagated to first order.
+        uncertain: gives values and standard deviations of the fitted model.
         true: values, with g and M at the positions q.
         sliding: conditions of the friction constants.
         q: (T, n) positions.
     """
-    parameters = ParameterVector(model).initial
     positions, combination = torch.from_numpy(q), torch.from_numpy(true.combination)
-    sizes: list[int] = []
-
-    def quantities(*tensors: torch.Tensor) -> torch.Tensor:
-        named = dict(zip(parameters, tensors, strict=True))
-        return evaluate_with(model, named, all_of)
-
-    def all_of(other: ArmModel) -> torch.Tensor:
-        base = combination @ torch.cat([other.inertial_parameters.flatten(), other.armature])
-        mass = other.mass_matrix(positions).diagonal(dim1=-2, dim2=-1)
-        values = [base, _sliding_friction(other, sliding), mass.flatten(), other.gravity(positions).flatten()]
-        sizes[:] = [len(x) for x in values]
-        return torch.cat(values)
-
-    value = quantities(*parameters.values()).detach().numpy()
-    blocks = jacobian(quantities, tuple(parameters.values()))
-    slopes = torch.cat([block.flatten(1) for block in blocks], dim=1)
-    variance = torch.einsum("jk,kl,jl->j", slopes, covariance, slopes)
-    half = QUANTILE * variance.clamp(min=0).sqrt().numpy()
     diagonal = np.diagonal(true.mass, axis1=1, axis2=2)
-    truth = np.concatenate([x.ravel() for x in (true.base, true.friction, diagonal, true.gravity)])
-    error = np.abs(value - truth)
-    informative = (error > 1e-9 * np.abs(truth).max()) | (half > 1e-9 * np.abs(truth).max())
-    ratio = np.where(informative, error / np.maximum(half, 1e-12), np.nan)
-    parts = np.split(ratio, np.cumsum(sizes)[:-1])
-    return {
-        name: [round(float(x), 3) for x in part[~np.isnan(part)]]
-        for name, part in zip(QUANTITIES, parts, strict=True)
-    }
+    truths = [x.ravel() for x in (true.base, true.friction, diagonal, true.gravity)]
+
+    def quantities(model: ArmModel) -> torch.Tensor:
+        base = combination @ torch.cat([model.inertial_parameters.flatten(), model.armature])
+        mass = model.mass_matrix(positions).diagonal(dim1=-2, dim2=-1)
+        friction, gravity = _sliding_friction(model, sliding), model.gravity(positions)
+        return torch.cat([base, friction, mass.flatten(), gravity.flatten()])
+
+    value, std = uncertain(quantities)
+    parts = np.cumsum([len(x) for x in truths])[:-1]
+    ratios = {}
+    for name, truth, found, width in zip(
+        QUANTITIES, truths, np.split(value, parts), np.split(QUANTILE * std, parts), strict=True
+    ):
+        error, negligible = np.abs(found - truth), NEGLIGIBLE * np.abs(truth).max()
+        informative = np.maximum(error, width) > negligible
+        ratio = error[informative] / np.maximum(width[informative], negligible)
+        ratios[name] = [round(float(x), 3) for x in ratio]
+    return ratios
 
 
 def _sliding_friction(model: ArmModel, sliding: SteadySliding) -> torch.Tensor:

@@ -65,9 +65,9 @@ def draw_errors(rng: np.random.Generator) -> RealErrors:
         backlash=level(0.4, 1e-4, 2e-3),
         encoder_step=2 * np.pi / 2 ** int(rng.integers(12, 19)),
         sensor_cutoff=level(0.4, 15.0, 60.0, np.inf),
-        current_noise=level(0.95, 0.03, 0.2),
-        slow_noise=level(0.95, 0.02, 0.15),
-        slow_correlation=level(1.0, 0.2, 2.0),
+        current_noise=level(0.95, 0.03, 0.15),
+        slow_noise=level(0.95, 0.03, 0.15),
+        slow_correlation=level(1.0, 0.2, 3.0),
         gain=level(0.4, 0.005, 0.03),
         zero=level(0.5, 5e-4, 5e-3),
     )

@@ -70,6 +70,7 @@ POSITION_NOISE = 1e-5  # rad, m: of an encoder of 18 bits
 SHARE = (0.03, 0.15)  # Coulomb friction by the deviation of the rigid torque, drawn log-uniformly
 TINY = 1e-9
 FIRST_REALISTIC = 10_000
+UNEXCITED = 1e-3  # squared length of a direction, relative to a base parameter's column
 BRISTLES = np.geomspace(2e-4, 3e-2, 6)[
     :, None
 ]  # [rad, m] break-away displacements: not the ones of fitted models
@@ -236,15 +237,19 @@ class Truth:
 
         motion: of the links. combination, columns: `inertial_columns` of the logged motion.
         """
+        bodies = self.bodies.inertial_parameters.detach().numpy().ravel()
+        exact = combination @ np.concatenate([bodies, self.armature])
         if self.case.errors is None:
-            bodies = self.bodies.inertial_parameters.detach().numpy().ravel()
-            return np.asarray(combination @ np.concatenate([bodies, self.armature]))
+            return np.asarray(exact)
         torque = self.process.gain * (self._rigid_torque(motion) + self.armature * motion[2])
-        scale = torque.std(axis=0)[:, None] + TINY
-        rows = (columns / scale).reshape(-1, columns.shape[2])
+        scale = torque.std(axis=0) + TINY
+        rows = (columns / scale[:, None]).reshape(-1, columns.shape[2])
         length = np.linalg.norm(rows, axis=0) + TINY
-        target = (torque / scale.T).ravel()
-        return np.asarray(np.linalg.lstsq(rows / length, target, rcond=1e-10)[0] / length)
+        # directions that the test motion does not excite keep the exact values
+        rows = np.vstack([rows / length, np.sqrt(UNEXCITED) * np.eye(len(length))])
+        residual = ((torque - columns @ exact) / scale).ravel()
+        change = np.linalg.lstsq(rows, np.append(residual, np.zeros(len(length))), rcond=None)[0]
+        return np.asarray(exact + change / length)
 
 
 def _limit(value: float | None, default: float) -> float:
