@@ -47,7 +47,7 @@ from scipy.signal import butter, sosfiltfilt
 sys.path.insert(0, str(Path(__file__).parent))
 
 from figaroh_identification import figaroh_dynamics
-from intervals import SteadySliding, TrueValues, interval_ratios
+from intervals import SteadySliding, TrueValues, Uncertain, interval_ratios, propagated
 from real_errors import ErrorProcess, RealErrors, draw_errors, play
 from residual_statistics import residual_statistics
 from truth_summary import summary
@@ -438,12 +438,12 @@ def measure(fitted: Fitted, truth: Truth, motion: Motion) -> dict[str, Any]:
         "nmse": float(nmse.mean()),
         "nmse_filtered": float(filtered.mean()),
     }
-    if fitted.covariance is not None:
+    if fitted.uncertain is not None:
         sliding = SteadySliding(q[::100], np.quantile(np.abs(qd), (0.5, 0.9), axis=0))
         values = TrueValues(
             combination, true_base, truth.sliding_friction(sliding), true_mass[::20], true_gravity[::200]
         )
-        errors["intervals"] = interval_ratios(dynamics, fitted.covariance, values, sliding, q[::200])
+        errors["intervals"] = interval_ratios(fitted.uncertain, values, sliding, q[::200])
     return errors
 
 
@@ -451,14 +451,14 @@ def measure(fitted: Fitted, truth: Truth, motion: Motion) -> dict[str, Any]:
 class Fitted:
     """Fitted dynamics, and their parameters.
 
-    bodies: (B, 10) in the frames of the joints. armature: (n,). covariance: (K, K) of the parameters of the default
-    preset. residual: correlation and spectrum of the torque residual, of one method.
+    bodies: (B, 10) in the frames of the joints. armature: (n,). uncertain: gives intervals of the default preset.
+    residual: correlation and spectrum of the torque residual, of one method.
     """
 
     dynamics: Any
     bodies: np.ndarray
     armature: np.ndarray
-    covariance: torch.Tensor | None = None
+    uncertain: Uncertain | None = None
     residual: list[float] | None = None
 
 
@@ -470,7 +470,12 @@ def fit_hybrid(urdf: Path, logs: list[spelgen.Trajectory]) -> Fitted:
     samples = dynamics_samples(logs, preprocessing=preprocessing, reach=bristle_reach(model))
     solution = fit_torque(model, samples)
     with torch.no_grad():
-        return Fitted(model, model.inertial_parameters.numpy(), model.armature.numpy(), solution.covariance)
+        return Fitted(
+            model,
+            model.inertial_parameters.numpy(),
+            model.armature.numpy(),
+            propagated(model, solution.covariance),
+        )
 
 
 def fit_least_squares(memory: bool) -> Callable[[Path, list[spelgen.Trajectory]], Fitted]:
