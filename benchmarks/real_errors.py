@@ -86,7 +86,7 @@ class ErrorProcess:
         self._waves = rng.integers(1, 6, n)
         self._periods = rng.choice(RIPPLE_PERIODS, n)
         self._ripple = errors.ripple * dry * rng.uniform(0.3, 1.0, n)
-        self._cable = errors.cable * dry * rng.uniform(0.3, 1.0, n)
+        self.cable = errors.cable * dry * rng.uniform(0.3, 1.0, n)
         self._breakaway = np.exp(rng.uniform(*np.log(CABLE_BREAKAWAY), n))
 
     def friction_factor(self, q: np.ndarray) -> np.ndarray:
@@ -100,12 +100,13 @@ class ErrorProcess:
         warm = np.exp(-t / self.errors.warm_up_time)
         return (1 + self.errors.warm_up * (warm - warm.mean()))[:, None] * drift
 
-    def position_torque(self, q: np.ndarray) -> np.ndarray:
-        """Return the torque of ripple and of the hysteresis of cables along a motion (T, n)."""
-        torque = self._ripple * np.sin(self._periods * q + self._ripple_phase)
-        if self.errors.cable:
-            torque = torque + self._cable * play(q, self._breakaway)
-        return torque
+    def ripple(self, q: np.ndarray) -> np.ndarray:
+        """Return the torque ripple at positions (T, n)."""
+        return np.asarray(self._ripple * np.sin(self._periods * q + self._ripple_phase))
+
+    def hysteresis(self, q: np.ndarray) -> np.ndarray:
+        """Return the friction of cables along a motion (T, n); it is `cable` long after a reversal."""
+        return self.cable * play(q, self._breakaway) if self.cable.any() else np.zeros_like(q)
 
     def deflection(self, torque: np.ndarray, inertia: np.ndarray) -> np.ndarray:
         """Return the positions of the motor less the ones of the link, (T, n) [rad, m].

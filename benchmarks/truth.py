@@ -197,7 +197,7 @@ class Truth:
         for speed in sliding.speeds:
             qd, direction = np.broadcast_to(speed, q.shape), np.ones_like(q)
             both = self._friction(q, qd, direction) - self._friction(q, -qd, -direction)
-            rows.append(self.process.gain * both.mean(axis=0) / 2)
+            rows.append(self.process.gain * (both.mean(axis=0) / 2 + self.process.cable))
         return np.stack(rows)
 
     def sensed(
@@ -216,8 +216,8 @@ class Truth:
             twist = self.process.deflection(link, self.inertia)
             rate = np.gradient(twist, 1 / FINE, axis=0)
             q, qd, qdd = q + twist, qd + rate, qdd + np.gradient(rate, 1 / FINE, axis=0)
-        friction = self.friction_torque(q, qd) * temperature
-        torque = link + self.armature * qdd + friction + self.offset + self.process.position_torque(q)
+        friction = self.friction_torque(q, qd) * temperature + self.process.hysteresis(q)
+        torque = link + self.armature * qdd + friction + self.offset + self.process.ripple(q)
         gain = self.process.gain
         return (q + self.process.zero, qd, qdd), gain * torque, gain * friction
 
