@@ -92,7 +92,8 @@ def test_errors_that_are_absent_change_nothing():
     np.testing.assert_array_equal(process.temperature_factor(np.arange(500) / RATE, rng), np.ones((500, 2)))
     np.testing.assert_array_equal(process.deflection(torque, np.ones(2)), np.zeros((500, 2)))
     for absent in (
-        process.position_torque(q),
+        process.ripple(q),
+        process.hysteresis(q),
         process.friction_factor(q) - 1,
         process.gain - 1,
         process.zero,
