@@ -45,7 +45,7 @@ def init(
     # the settings file is not read: this command writes it
     arm = make_arm(read_urdf(robot), joints=options.names(joints), tip=tip)
     drives = [StarterJoint(x.name, x.joint_type, x.damping, x.friction) for x in arm.coordinates]
-    say(f"wrote {write_text(path, starter(robot.name, drives))}")
+    say(f"wrote {write_text(path, starter(robot.name, drives, arm.bodies[-1].link))}")
 
 
 def build(

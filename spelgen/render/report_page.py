@@ -13,10 +13,11 @@ from spelgen.arm.configured_arm import Arm
 from spelgen.emission.specify import arm_of_spec
 from spelgen.emission.text import description
 from spelgen.errors import RunError, SpelgenError, in_one_line
+from spelgen.evaluation.measurements import Verdict
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.traces import Traces
-from spelgen.evaluation.verdict import Limits, Verdict, verdict
+from spelgen.evaluation.verdict import Limits
 from spelgen.files import write_json, write_text
 from spelgen.fitting.posterior import Posterior, posterior_of
 from spelgen.fitting.run_folder import RunFolder, fitted_model
@@ -27,7 +28,14 @@ from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, parameter_tables
 from spelgen.render.report_charts import coverage_panels, evaluation_charts, loss_chart
-from spelgen.render.run_facts import best_epoch, commands, head_numbers, settings, training_facts
+from spelgen.render.run_facts import (
+    best_epoch,
+    commands,
+    head_numbers,
+    outlier_note,
+    settings,
+    training_facts,
+)
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.spec import ModelSpec
 from spelgen.structure.structure import derive
@@ -64,9 +72,7 @@ class Run:
     @property
     def verdict(self) -> Verdict | None:
         """Assessment of the model; None before its evaluation."""
-        if self.results is None:
-            return None
-        return verdict(self.results, self.baselines, self.limits)
+        return None if self.results is None else self.results.assessment
 
 
 def open_run(path: Path | str) -> Run:
@@ -186,6 +192,7 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         units=UNITS,
         numbers=head_numbers(model, record, metrics, run.results),
         verdict=run.verdict,
+        outliers=None if run.results is None else outlier_note(run.results),
         config=record,
         evaluation=run.results,
         tables=tables,
