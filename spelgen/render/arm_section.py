@@ -57,11 +57,11 @@ class AnimatedMotion:
 
 @dataclass(frozen=True)
 class AnimatedArm:
-    """The picture of the arm. data: JSON for the script. motions: labels of the motions."""
+    """The picture of the arm. data: JSON for the script. motions: their labels. tubes: see ``Scene``."""
 
     data: Markup
     motions: tuple[str, ...]
-    has_meshes: bool
+    tubes: str
 
 
 def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
@@ -107,7 +107,7 @@ def arm_section(arm: Chain, urdf: Path, traces: Traces | None = None) -> Animate
     motions = [] if traces is None else _motions(traces)
     motions = motions or [_sweep(arm)]
     data = record(shapes) | {"motions": list(map(record, motions))}
-    return AnimatedArm(json_data(data), tuple(motion.label for motion in motions), shapes.has_meshes)
+    return AnimatedArm(json_data(data), tuple(motion.label for motion in motions), shapes.tubes)
 
 
 def _motions(traces: Traces) -> list[AnimatedMotion]:
