@@ -35,7 +35,7 @@ def test_closed_form_bodies_go_to_mujoco_exactly(robot):
     mujoco.mj_fullM(simulated, data, full)
     np.testing.assert_allclose(full, model.mass_matrix(q).numpy(), rtol=1e-9, atol=1e-12)
     tip = tip_kinematics(arm)
-    np.testing.assert_allclose(data.site(tip.link).xpos, tip.position(q).numpy(), atol=1e-6)
+    np.testing.assert_allclose(data.site(tip.link).xpos, tip.position(q).numpy(), atol=1e-12)
     np.testing.assert_allclose(simulated.dof_armature, model.armature.numpy())
     lower = [each.lower for each in arm.chain.coordinates if not each.continuous]
     np.testing.assert_allclose(simulated.jnt_range[simulated.jnt_limited == 1][:, 0], lower)

@@ -132,9 +132,9 @@ class Collisions:
     def penalty(self, q: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the squared violations of a margin, summed over pairs and positions q (T, n), and the gradient (T, n).
 
-        The margin is three times the clearance. Violations are relative to the margin.
+        The margin is ``TUNING.margin`` times the clearance. Violations are relative to the margin.
         """
-        value, gradient, margin = 0.0, np.zeros_like(q), 3 * self.clearance
+        value, gradient, margin = 0.0, np.zeros_like(q), TUNING.margin * self.clearance
         for row, position in enumerate(q):
             distances = self.distances(position)
             close = np.flatnonzero(distances < margin).tolist()
