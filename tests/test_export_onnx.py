@@ -49,7 +49,9 @@ def check_readme(found, model, arm, folder, tolerance):
     names = readme_results(found.files, folder)
     at = torch.ones(5, model.n, dtype=torch.float64)
     past = [model.memory(at)] if model.elements else []
-    expected = {"qdd": model.forward_dynamics(at, at, at, *past), "pose": tip_kinematics(arm).pose(at)}
+    tau = model.inverse_dynamics(at, at, at, *past)
+    expected = {"tau": tau, "qdd": model.forward_dynamics(at, at, tau, *past)}
+    expected["pose"] = tip_kinematics(arm).pose(at)
     if model.elements:
         expected["z"] = model.memory_after(past[0], at).flatten(1)
     for key, value in expected.items():

@@ -29,7 +29,8 @@ def test_the_lines_of_the_readme_run(tmp_path, float32):
     found = export(model, "torch", arm=arm, float32=float32)
     names, at = readme_results(found.files, tmp_path), torch.ones(5, model.n, dtype=torch.float64)
     z = model.memory(at)
-    expected = {"qdd": model.forward_dynamics(at, at, at, z), "z": model.memory_after(z, at)}
+    tau = model.inverse_dynamics(at, at, at, z)
+    expected = {"tau": tau, "qdd": model.forward_dynamics(at, at, tau, z), "z": model.memory_after(z, at)}
     expected["jacobian"] = tip_kinematics(arm).jacobian(at)
     for key, value in expected.items():
         assert names[key].dtype == (torch.float32 if float32 else torch.float64)
