@@ -1,9 +1,7 @@
-"""Shared by all tests: one thread for tiny matrices, the order of files, tests with bounds of time, common fixtures."""
+"""Shared by all tests: one thread for tiny matrices, the order of files, common fixtures."""
 
-import fcntl
 import gc
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -34,49 +32,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the longest files first, so that no worker is left with one of them when the others are done."""
     order = {name: index for index, name in enumerate(LONGEST_FILES)}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))  # stable: others keep their order
-
-
-class WorkerLock:
-    """A readers-writer lock between the workers of pytest-xdist, on two files of the checkout.
-
-    Every test locks ``running``, a timed one exclusively. To do so it locks ``entry`` first, so that no other test
-    starts while a timed one waits for those that are running.
-    """
-
-    def __init__(self) -> None:
-        self.running = os.open(ROOT / "tests" / "conftest.py", os.O_RDONLY)
-        self.exclusive = False
-
-    def acquire(self, exclusive: bool) -> None:
-        with open(ROOT / "pyproject.toml") as entry:
-            fcntl.flock(entry, fcntl.LOCK_EX)
-            fcntl.flock(self.running, fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH)
-        self.exclusive = exclusive
-
-    def release(self) -> None:
-        fcntl.flock(self.running, fcntl.LOCK_UN)
-        self.exclusive = False
-
-
-LOCK = WorkerLock()
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[object]:
-    """Run tests marked ``timed`` while no other worker runs a test, which would slow them down.
-
-    Consecutive timed tests keep the lock: other workers wait for them only once.
-    """
-    timed, timed_next = (
-        x is not None and x.get_closest_marker("timed") is not None for x in (item, nextitem)
-    )
-    if not (timed and LOCK.exclusive):
-        LOCK.acquire(exclusive=timed)
-    try:
-        return (yield)
-    finally:
-        if not (timed and timed_next):
-            LOCK.release()
 
 
 def pytest_collection_finish() -> None:

@@ -43,7 +43,6 @@ def test_triangles_without_common_corners_stay_one_surface(tmp_path):
     assert drawn.area == pytest.approx(ball.area, rel=0.02)
 
 
-@pytest.mark.timed  # the process that reads meshes is stopped after a minute
 def test_an_arm_of_fine_meshes_is_drawn(tmp_path):
     trimesh.creation.icosphere(subdivisions=7, radius=0.1).export(tmp_path / "m.stl")  # 327,680 faces
     visual = '<visual><geometry><mesh filename="m.stl"/></geometry></visual>'
@@ -189,7 +188,6 @@ def bounds() -> Iterator[None]:
     assert time.monotonic() - begin < 60  # a process that waits for a pipe uses no processor time
 
 
-@pytest.mark.timed
 def test_meshes_of_all_formats_are_drawn_within_bounds(tmp_path):
     """One arm has a link per format, as an arm is drawn only if all of its meshes can be read."""
     links, joints = [], []
@@ -208,7 +206,6 @@ def test_meshes_of_all_formats_are_drawn_within_bounds(tmp_path):
     assert {link.name for link in found.links if len(link.shape.faces)} >= {make.__name__ for make in DRAWN}
 
 
-@pytest.mark.timed
 @pytest.mark.parametrize("make", OMITTED)
 def test_hostile_meshes_are_omitted_within_bounds(tmp_path, make):
     path = tmp_path / "r.urdf"

@@ -192,7 +192,6 @@ def server():
         process.stdin.close()
 
 
-@pytest.mark.timed
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
 @pytest.mark.parametrize("name", CASES)
 def test_is_refused_or_built_in_bounds(server, tmp_path, name):

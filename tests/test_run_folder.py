@@ -348,7 +348,6 @@ def test_a_specification_of_another_content_is_refused(plain, tmp_path, case):
         assert "\n" not in str(caught.value)
 
 
-@pytest.mark.timed
 def test_a_huge_file_is_not_read(plain, start, tmp_path):
     run = copied(plain, tmp_path)
     with (run / "notes.bin").open("wb") as file:

@@ -88,7 +88,7 @@ def excite(
 
     for path in (output, trajectory, html):
         if path is not None:
-            options.require_free(path, force=force)  # before minutes of search
+            options.require_free(path, force=force)  # checked first: the search takes minutes
     arm = options.load(robot, joints, tip, angle_tolerance)
     with progress_bar("searching") as progress:
         motion = design_motion(
@@ -182,8 +182,7 @@ def logs(
         Path | None, typer.Option(metavar="FILE", help="Also write an HTML page with plots.")
     ] = None,
     suggest: Annotated[
-        Path | None,
-        typer.Option(help="Write a mapping drafted from the column names of the first log."),
+        Path | None, typer.Option(help="Write a mapping drafted from the column names of the first log.")
     ] = None,
     force: Force = False,
     accept: Accept = None,

@@ -17,7 +17,10 @@ from spelgen.settings.settings import Settings
 def arm_dynamics(
     arm: Chain, settings: Settings, friction: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> PinocchioDynamics:
-    """Return the dynamics of the arm with joint torques as inputs. Raises ArmError if a body has no inertial."""
+    """Return the dynamics of the arm with joint torques as inputs. Raises ArmError if a body has no inertial.
+
+    friction: function of qd, (..., n), that returns the friction torque, (..., n) [Nm, N].
+    """
     return PinocchioDynamics(pinocchio_model(arm, settings), body_constraint(arm), friction)
 
 

@@ -30,17 +30,13 @@ class State(NamedTuple):
 class PreparedModel:
     """A copy of a model with constant parameters.
 
-    q, qd, qdd and tau are (..., n); units are rad and Nm, or m and N. z, (..., n, K), is the friction state; without it
-    friction is that of joints that have moved at qd for a long time. tip: kinematics of the tip, see
+    q, qd, qdd and tau are (..., n); units are rad and Nm, or m and N. z, (..., n, K), is the friction state; by
+    default, the steady state of motion at qd. tip: kinematics of the tip, see
     ``tip_kinematics``. elements: bristles per joint, K. dtype: of parameters and states.
     """
 
     def __init__(
-        self,
-        model: PortHamiltonian,
-        tip: TipKinematics | None = None,
-        *,
-        dtype: torch.dtype = torch.float64,
+        self, model: PortHamiltonian, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
     ) -> None:
         # networks that are zero would take most of the time
         reduced = without_idle_residuals(model)
@@ -97,11 +93,12 @@ class PreparedModel:
     ) -> State:
         """Return q, qd and z after dt [s] under a constant tau, by ``substeps`` steps of the classical Runge-Kutta.
 
-        z is exact in the displacements; its initial value is ``memory(qd)`` by default.
+        q, qd, tau: (..., n). z: (..., n, K), ``memory(qd)`` by default; its update is exact in the displacements.
         """
         z = self.memory(qd) if z is None else z
 
         def rhs(q: Tensor, speed: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+            """Return qd and qdd, (..., n) each."""
             return speed, self.forward_dynamics(q, speed, tau, z)
 
         for _ in range(substeps):
@@ -130,7 +127,7 @@ class PreparedModel:
     ) -> tuple[Tensor, Tensor]:
         """Return A, (..., 2 n, 2 n), and B, (..., 2 n, n): derivatives with respect to (q, qd) and tau.
 
-        They are those of the rate (qd, qdd) for constant z; with dt [s], those of the result of ``step``.
+        Without dt of the rate (qd, qdd) for constant z; with dt [s] of the result of ``step``.
         """
         n = self.n
         z = self.memory(qd) if z is None else z
@@ -139,6 +136,7 @@ class PreparedModel:
         vars(plain).pop("forward_dynamics", None)
 
         def function(state: Tensor, tau: Tensor, z: Tensor) -> Tensor:
+            """Return the rate of the state (q, qd), or the state after dt, (2 n,)."""
             position, speed = state.split(n)
             if dt is None:
                 return torch.cat([speed, plain.forward_dynamics(position, speed, tau, z)])
@@ -178,7 +176,7 @@ class PreparedModel:
 
 
 def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: Tensor) -> tuple[Tensor, ...]:
-    """Return the derivatives of a function with respect to its first ``variables`` inputs, for a batch of states."""
+    """Return the Jacobians, (batch, m, n) each, of a function with respect to its first ``variables`` inputs."""
     if not torch.is_grad_enabled():
         states = tuple(x.detach() for x in states)
     # torch 2.13: vmap of a derivative of linalg.solve is wrong in forward mode, or without autograd

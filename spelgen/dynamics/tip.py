@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,6 +13,9 @@ from scipy.spatial.transform import Rotation
 from spelgen.dynamics.constraint import mimic_constraint
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot, UrdfJoint
+
+if TYPE_CHECKING:
+    from spelgen.arm.configured_arm import Arm
 
 
 class TipKinematics:
@@ -103,7 +106,7 @@ def _placement(joint: UrdfJoint) -> np.ndarray:
 
 
 def tip_kinematics(
-    arm: Any, link: str | None = None, *, joints: Sequence[str] | None = None
+    arm: Arm | Path | str, link: str | None = None, *, joints: Sequence[str] | None = None
 ) -> TipKinematics:
     """Return the kinematics of ``link``.
 
@@ -113,7 +116,7 @@ def tip_kinematics(
     joints do not lead to the link.
     """
     if isinstance(arm, str | Path):
-        robot, names = read_urdf(Path(arm)), list(joints or ())
+        robot, names = read_urdf(Path(arm)), tuple(joints or ())
     else:
         robot, names = arm.robot, arm.chain.joint_names
         link = link or arm.tip

@@ -111,11 +111,13 @@ def evaluate(
 def _preprocessing(
     used: Preprocessing | None, chosen: Preprocessing | None, logs: Sequence[Trajectory]
 ) -> Preprocessing:
-    """Return the preprocessing of test logs: the given one, else that of the fit, else the default."""
+    """Return the preprocessing of test logs: the given one, or the fit's, or the default."""
     if chosen is None and used is not None:
         return used
     preprocessing = chosen or Preprocessing()
-    if used is not None and preprocessing.torque_delay is None:  # of the logger, whatever the filter
+    if (
+        used is not None and preprocessing.torque_delay is None
+    ):  # a property of the logger, independent of the filter
         preprocessing = replace(preprocessing, torque_delay=used.torque_delay)
     return preprocessing.resolved([trajectory.sample_rate for trajectory in logs])
 
@@ -151,7 +153,7 @@ def _evaluate_torques(
             progress(len(horizons), len(lengths), f"predicting {name} ahead")
         horizon, predictions = predict(name, k, tests, predictors, tip, notes)
         horizons.append(horizon)
-        # the curves of the longest horizon contain those of the shorter ones
+        # the curves of the longest horizon contain the shorter ones
         if k == max(lengths.values()):
             longest = predictions
     all_dynamics: dict[str, RigidDynamics] = {}

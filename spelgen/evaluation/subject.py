@@ -1,17 +1,16 @@
-"""The model that is evaluated, with its fit and its arm as far as they are known."""
+"""The model that is evaluated, with its fit and its arm if they are known."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.baseline import arm_of_model
+from spelgen.baselines.baseline import LinearServoRecord, arm_of_model
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
 from spelgen.emission.assemble import ArmModel, spec_of
 from spelgen.evaluation.tuning import TUNING
@@ -69,10 +68,10 @@ class Subject:
         return arm_of_model(self.model, self.fit.urdf)
 
     @property
-    def linear_servos(self) -> Mapping[str, Any] | None:
+    def linear_servos(self) -> LinearServoRecord | None:
         """Parameters of the linear servos that were fitted with it."""
         servo = None if self.fit is None else self.fit.record.servo
-        linear: Mapping[str, Any] | None = None if servo is None else servo["linear"]
+        linear: LinearServoRecord | None = None if servo is None else servo["linear"]
         return linear
 
 
@@ -85,7 +84,9 @@ def subject(tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None = 
     if arm is not None:
         urdf = Path(arm) if isinstance(arm, str | Path) else arm.robot.path
     weights = next(model.parameters(), None)
-    if weights is not None and (weights.dtype != torch.float64 or not weights.is_cpu):  # as logs are
+    if weights is not None and (
+        weights.dtype != torch.float64 or not weights.is_cpu
+    ):  # logs are float64 on the CPU
         model = copy.deepcopy(model).double().cpu()
     return Subject(model, model.joint_names, urdf, fit)
 

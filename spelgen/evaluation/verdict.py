@@ -1,4 +1,4 @@
-"""The assessment of an evaluation in words: what the model is good enough for, where it fails, what to record next."""
+"""The assessment of an evaluation in words: suitable uses, failures, and the motions to record next."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Limits = Sequence[tuple[float, float] | None]
 
 @dataclass(frozen=True)
 class Verdict:
-    """An assessment. sentence: uses, failures, what to record next. because: the figures behind it."""
+    """An assessment. sentence: uses, failures, motions to record. because: the figures behind it."""
 
     sentence: str
     because: str
@@ -205,7 +205,7 @@ def _worst_joint(results: Measurements) -> tuple[str, str, str]:
 def _worst_motion(results: Measurements) -> tuple[str, float]:
     """Return the joint of the largest error in the longest rollouts, divided by its motion, and this error."""
     for last in results.horizons[-1:]:
-        errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # NaN of None
+        errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # None becomes NaN
         if np.isfinite(errors).all():
             return results.joints[errors.argmax()], errors.max()
     return "", math.inf
@@ -260,7 +260,7 @@ def _recommendations(
 
 
 def _outside(trained: Mapping[str, Any], tested: Mapping[str, Any], joints: Sequence[str]) -> list[str]:
-    """Return the quantities whose range in the test logs exceeds that of the training logs by a tenth."""
+    """Return the quantities whose range in the test logs exceeds their range in the training logs by a tenth."""
     exceeded = []
     for quantity, word in (("q", "positions"), ("qd", "velocities")):
         ranges = zip(joints, trained.get(quantity, ()), tested.get(quantity, ()), strict=False)

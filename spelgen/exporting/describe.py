@@ -89,6 +89,7 @@ class Trained:
 
 def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
     """Return the description of a trained model. Raises RunError for a preset without rigid bodies."""
+    # In double precision: the model may be in single precision or on another device.
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
     if not isinstance(exact, RigidBodyDynamics):
         preset = model.spec.options.preset
@@ -139,6 +140,7 @@ def unique_identifiers(names: Sequence[str]) -> tuple[str, ...]:
         if not plain or keyword.iskeyword(plain) or keyword.issoftkeyword(plain) or plain[0].isdigit():
             plain = f"joint_{plain or number}"
         unique, count = plain, 2
+        # Two names may differ only in characters that identifiers cannot have.
         while unique in identifiers:
             unique, count = f"{plain}_{count}", count + 1
         identifiers.append(unique)
@@ -189,6 +191,7 @@ def _residuals(model: ArmModel) -> Residuals:
     """Return the residual terms that are not zero."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
+    # Only entries of the lower triangle that any function contributes to.
     entries: np.ndarray = np.argwhere(np.tril(functions.any(axis=0).reshape(model.n, model.n)))
     mass = _network(weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
     if mass is None:
@@ -231,6 +234,7 @@ def _network(
         weights.append(functions.T)
         biases.append(np.zeros(functions.shape[1]))
     for k in range(1, len(weights)):
+        # tanh(x) = 2 sigmoid(2 x) - 1: twice the layer before, and twice minus the sum in the layer after.
         weights[k - 1], biases[k - 1] = 2 * weights[k - 1], 2 * biases[k - 1]
         weights[k], biases[k] = 2 * weights[k], biases[k] - weights[k].sum(axis=1)
     return SigmoidNetwork(tuple(weights), tuple(biases))

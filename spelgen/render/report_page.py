@@ -135,10 +135,7 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
     folder = Path(folder)
     if not RunFolder(folder).path.is_dir():
         raise RunError(
-            "no run",
-            file=folder,
-            expected="a folder with spec.json",
-            do="make one with `spelgen train`",
+            "no run", file=folder, expected="a folder with spec.json", do="make one with `spelgen train`"
         )
     # the files of a run folder are untrusted: each of them may have any content
     try:

@@ -29,10 +29,7 @@ if TYPE_CHECKING:
 
 
 def head_numbers(
-    model: ArmModel | None,
-    record: Record | None,
-    metrics: Sequence[Content],
-    results: Results | None,
+    model: ArmModel | None, record: Record | None, metrics: Sequence[Content], results: Results | None
 ) -> list[tuple[str, str]]:
     """Return the most important figures with their labels.
 

@@ -17,14 +17,10 @@ import numpy as np
 
 from spelgen.errors import SpelgenError
 from spelgen.files import read_bytes
+from spelgen.urdf.tuning import TUNING
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
-
-MEMORY = 1_073_741_824  # bytes
-SECONDS = 30  # of processor time, of which imports and the simplification of fine meshes take most
-MAX_BYTES = 50_000_000  # of a file
-MAX_FACES = 2_000_000  # of a mesh: a limit for archives that expand without end
 
 
 class MeshFolder:
@@ -35,7 +31,7 @@ class MeshFolder:
 
     def get(self, name: str) -> bytes:
         """Return the content of a file. Raises SpelgenError."""
-        return read_bytes(self._folder / Path(name.strip()).name, SpelgenError, largest=MAX_BYTES)
+        return read_bytes(self._folder / Path(name.strip()).name, SpelgenError, largest=TUNING.max_mesh_bytes)
 
     __getitem__ = get
 
@@ -51,8 +47,8 @@ def main(faces: int, meshes: list[tuple[str, list[float]]], output: IO[bytes]) -
     with suppress(ImportError):  # not on Windows
         import resource
 
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+        resource.setrlimit(resource.RLIMIT_AS, (TUNING.mesh_memory,) * 2)
+        resource.setrlimit(resource.RLIMIT_CPU, (TUNING.mesh_seconds,) * 2)
     arrays: dict[str, np.ndarray] = {}
     for index, (path, scale) in enumerate(meshes):
         gc.collect()  # meshes contain reference cycles, so the meshes of other links would fill the memory
@@ -70,7 +66,7 @@ def _read(path: Path, scale: list[float], faces: int) -> Trimesh:
     """Return the scaled mesh in a file, with at most `faces` triangles. Raises ValueError if it has none."""
     import trimesh
 
-    content = io.BytesIO(read_bytes(path, SpelgenError, largest=MAX_BYTES))
+    content = io.BytesIO(read_bytes(path, SpelgenError, largest=TUNING.max_mesh_bytes))
     format, resolver = path.suffix.lower().lstrip("."), MeshFolder(path.parent)
     mesh: Any = trimesh.load(content, file_type=format, resolver=resolver, force="mesh")  # type: ignore[arg-type]
     # files repeat the vertices of each triangle: unmerged, the surface would tear when it is simplified
@@ -78,7 +74,7 @@ def _read(path: Path, scale: list[float], faces: int) -> Trimesh:
     mesh.apply_scale(scale)
     # the area overflows for corners that are too far away
     is_finite = np.isfinite(mesh.vertices).all() and mesh.area < np.inf
-    if not is_finite or not 0 < len(mesh.faces) <= MAX_FACES:
+    if not is_finite or not 0 < len(mesh.faces) <= TUNING.max_mesh_faces:
         raise ValueError(f"{path}: no triangles, too many triangles, or corners that are no numbers")
     if len(mesh.faces) > faces:
         mesh = mesh.simplify_quadric_decimation(face_count=faces, aggression=3)
