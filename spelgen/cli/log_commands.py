@@ -28,6 +28,32 @@ from spelgen.files import write_text
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
 
+Acceleration = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X|X,X,X", help="Largest acceleration, of all joints or per joint [rad/s^2, m/s^2]."
+    ),
+]
+Start = Annotated[
+    str | None,
+    typer.Option(
+        "--from",
+        metavar="X,X,X",
+        help="Position before the motion [rad, m]. Default: zero, or the middle of a range without zero.",
+    ),
+]
+SurroundingsFile = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.yaml", help="Floor, boxes and clearance, which the motion respects."),
+]
+TrajectoryFile = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Also write approach and motion as a JointTrajectory of ROS 2, in JSON or YAML.",
+    ),
+]
+
 
 def excite(
     robot: Robot,
@@ -47,31 +73,10 @@ def excite(
     speed: Annotated[
         float, typer.Option(min=0.05, max=1.0, help="Fraction of the velocity limits to use.")
     ] = 0.7,
-    acceleration: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X|X,X,X", help="Largest acceleration, of all joints or per joint [rad/s^2, m/s^2]."
-        ),
-    ] = None,
-    start: Annotated[
-        str | None,
-        typer.Option(
-            "--from",
-            metavar="X,X,X",
-            help="Position before the motion [rad, m]. Default: zero, or the middle of a range without zero.",
-        ),
-    ] = None,
-    surroundings: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.yaml", help="Floor, boxes and clearance, which the motion respects."),
-    ] = None,
-    trajectory: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Also write approach and motion as a JointTrajectory of ROS 2, in JSON or YAML.",
-        ),
-    ] = None,
+    acceleration: Acceleration = None,
+    start: Start = None,
+    surroundings: SurroundingsFile = None,
+    trajectory: TrajectoryFile = None,
     html: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Also write a page that shows the motion.")
     ] = None,
