@@ -24,7 +24,7 @@ from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.labels import UNITS, named_joints
-from spelgen.render.arm_section import arm_section, matrix
+from spelgen.render.arm_section import arm_section, evaluated_motions, matrix
 from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, parameter_tables
 from spelgen.render.report_charts import coverage_panels, evaluation_charts, loss_chart
@@ -176,7 +176,9 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
     sections = dict.fromkeys(("arm", "cells", "training", "settings", "losses"))
     sections |= evaluation_charts(traces, spec)
     if run.arm is not None:
-        sections["arm"] = arm_section(run.arm.chain, Path(robot or run.arm.robot.path), traces)
+        sections["arm"] = arm_section(
+            run.arm.chain, Path(robot or run.arm.robot.path), evaluated_motions(traces)
+        )
         sections["cells"] = matrix(run.arm.chain, derive(run.arm.chain, spec.options.assume))
     if record is not None:
         sections["training"] = training_facts(record, metrics, run.baselines, model)
