@@ -13,14 +13,14 @@ ROOT = Path(__file__).parents[1]
 # The files that take longest. Workers of pytest-xdist take whole files in this order, so the longest start first.
 LONGEST_FILES = (
     "test_types",
+    "test_export_onnx",
     "test_torque_fit",
     "test_servo",
-    "test_contracts",
-    "test_workflow",
-    "test_coupled_motors",
-    "test_export_onnx",
-    "test_training",
     "test_meshes",
+    "test_workflow",
+    "test_training",
+    "test_coupled_motors",
+    "test_contracts",
     "test_docs",
     "test_evaluation",
     "test_selection",
@@ -29,7 +29,7 @@ LONGEST_FILES = (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the longest files first, so that no worker is left with one of them when the others are done."""
+    """Run the longest files first, so that none of them runs at the end while the other workers are idle."""
     order = {name: index for index, name in enumerate(LONGEST_FILES)}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))  # stable: others keep their order
 
@@ -58,7 +58,7 @@ def shared() -> Path:
 
 @pytest.fixture
 def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Epochs of few windows take four steps: for tests of what stands around a fit."""
+    """Epochs of few windows take four steps, for tests of files, commands and messages of a fit."""
     from spelgen.fitting.tuning import FittingTuning
 
     monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", FittingTuning(epoch_steps=4))
@@ -66,7 +66,7 @@ def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def short_torque_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fits to torques take two steps a round and few rounds: for tests of what stands around a fit."""
+    """Torque fits take two steps in few outer iterations, for tests of files, commands and messages."""
     from spelgen.fitting.torque.tuning import TorqueTuning
 
     tuning = TorqueTuning(

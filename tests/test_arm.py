@@ -315,7 +315,7 @@ class TestExactness:
                 joint("b", "3", "4", xyz="0 0 1"),
             )
         )
-        # "b" stands one metre along the z axis of joint "a", seen from the tilted slider
+        # "b" is one metre along the z axis of joint "a", seen from the tilted slider
         slider, last = arm.bodies[1:]
         assert last.translation == slider.rotation[2]
         assert (exact(slider) @ exact(last) == IDENTITY).all()

@@ -69,7 +69,7 @@ def test_every_file_imports_only_from_its_layer_and_those_above():
     assert {name: found for name, found in wrong.items() if found} == {}
 
 
-def test_no_file_reaches_what_it_must_not():
+def test_no_file_imports_from_a_higher_layer():
     """Derivation imports no torch and fits import no symbolic algebra, neither directly nor through others."""
     wrong = {}
     for name, never in NEVER.items():

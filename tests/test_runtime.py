@@ -339,7 +339,7 @@ def network_of_first_stage(network, inputs, generator):
             weight.zero_()
             for (joint, now, sign, constant), column in zip(inputs, drawn.unbind(1), strict=True):
                 if sign:
-                    # the bumps of -x are those of x in reverse
+                    # the bumps of -x are the bumps of x in reverse
                     weight[:, now] += column.flip(-1) if grid and sign < 0 else column * (1 if grid else sign)
                 elif grid:
                     bumps = torch.exp(-((constant / (2 / 3) - network.grid) ** 2))

@@ -175,7 +175,7 @@ def test_a_line_break_in_a_name_is_shown_as_one():
     assert lines[:3] == [r"# a\nb", r"use\nit", r"Joints, in this order: j\r1, j\u20282."]
 
 
-def test_an_impossible_learning_rate_is_told_without_words_of_pydantic():
+def test_an_invalid_learning_rate_is_reported_in_plain_words():
     with pytest.raises(SettingsError) as caught:
         validated(Rollout, {"learning_rate": 1e30})
     assert str(caught.value) == "learning_rate: got 1e+30, expected a number within +-1e+12"

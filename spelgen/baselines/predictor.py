@@ -81,7 +81,7 @@ def _stepper(
         pose = pose_at(q)
         damping, stiffness = _friction_slopes(dynamics, pose, qd, z, width)
         h = GAMMA * step
-        # Elimination of the position leaves M + h D + h^2 K: one factorisation of size n serves both stages.
+        # With the position eliminated the matrix is M + h D + h^2 K: one factorisation of size n serves both stages.
         factors, pivots, _ = torch.linalg.lu_factor_ex(
             pose.mass + torch.diag_embed(h * damping + h * h * stiffness)
         )

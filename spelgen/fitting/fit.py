@@ -108,7 +108,7 @@ class _Fitting:
             self._resume(self.run)
         else:
             self.notes += objective.begin()
-            # A new run is written after the first steps succeeded: logs that cannot be fitted leave no folder.
+            # A new run is written after the first steps succeeded: there is no folder for logs that cannot be fitted.
             self.run.start(required_spec(request.model), request.urdf, force=request.options.force)
             self._save()
             mapping = self.record.mapping.model_dump(mode="json", exclude_defaults=True)

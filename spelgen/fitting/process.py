@@ -75,7 +75,7 @@ def locked(folder: Path | None) -> Iterator[None]:
     if folder is None:
         yield
         return
-    # Folders that do not exist yet, so that a fit that wrote nothing leaves none.
+    # Folders that do not exist yet: they are removed if the fit writes nothing.
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     file = folder / LOCK
     lock = FileLock(file, timeout=0)
