@@ -1,4 +1,4 @@
-"""Find signals that stop at a limit although the motion goes on: clipped torques, positions at a mechanical stop.
+"""Find signals that stay at a limit during a motion: clipped torques, positions at a mechanical stop.
 
 A flat top of a signal is no proof: an arm that rests, or accelerates uniformly, has flat torques. It is a limit if the
 model that least squares finds on all other samples contradicts it.
@@ -52,7 +52,7 @@ def flat_tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the values (2, n) of the flat bottoms and tops of signals (T, n), NaN without one, and their shares.
 
     Many more samples are next to the extreme value than in three times as wide a band below it; the peaks of a
-    sinusoid have as many in both.
+    sinusoid have equal numbers in both.
     """
     upright = SIDES[:, None, None] * values
     tops = upright.max(axis=1)
