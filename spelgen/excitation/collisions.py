@@ -95,7 +95,8 @@ class Collisions:
     def statement(self) -> str:
         """What is checked and what is not, in sentences."""
         pairs = counted(self.pairs, "pair")
-        text = f"Checked: {pairs} of links{self._surroundings}, approach included; all keep {1e3 * self.clearance:g} mm."
+        clearance = f"approach included; all keep {1e3 * self.clearance:g} mm"
+        text = f"Checked: {pairs} of links{self._surroundings}, {clearance}."
         if self.ignored:
             text += f" Not checked, since their shapes overlap in most positions: {', '.join(self.ignored)}."
         if self.unread:
