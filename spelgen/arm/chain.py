@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -181,9 +182,13 @@ def _longest(robot: Robot) -> ChainChoice:
 
 
 def _possible_gripper(robot: Robot, chain: Sequence[UrdfJoint]) -> tuple[Diagnostic, ...]:
-    """Return a remark if the last joint may open a gripper: it moves a link of that name, and no other joint does."""
+    """Return a remark if the last joint may open a gripper: it moves a link of that name, and no other joint does.
+
+    No jaw opens by half a turn: a joint with a larger range turns the gripper.
+    """
     last = chain[-1]
-    if not _GRIPPER.search(last.child) or any(map(_GRIPPER.search, robot.joint)):
+    turns = last.lower is not None and last.upper is not None and last.upper - last.lower > math.pi
+    if turns or not _GRIPPER.search(last.child) or any(map(_GRIPPER.search, robot.joint)):
         return ()
     message = (
         f"moves the link {last.child!r}, as the last joint of the arm: if it opens a gripper, leave it out by "
