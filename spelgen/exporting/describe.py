@@ -21,6 +21,7 @@ from spelgen.dynamics.tip_frame import tip_frame
 from spelgen.errors import RunError
 from spelgen.exporting.description import Harmonics, Residuals, Servos, SigmoidNetwork, TrainedModel
 from spelgen.exporting.entry_points import EntryPoint, entry_points
+from spelgen.live.noise import NoiseLevels
 from spelgen.runtime.friction_laws import FrictionConstants
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
@@ -38,11 +39,13 @@ class Trained:
     """A trained model and its arm.
 
     entries: names of the functions to export, for formats of functions; empty: all functions except derivatives.
+    levels: noise levels of the estimator; None: it is not exported.
     """
 
     model: ArmModel
     arm: Arm
     entries: tuple[str, ...] = ()
+    levels: NoiseLevels | None = None
 
     @cached_property
     def described(self) -> TrainedModel:

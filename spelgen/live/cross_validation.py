@@ -28,18 +28,26 @@ FOLDS = 3
 
 def noise_levels(fit: Fit) -> NoiseLevels:
     """Return the noise levels of a fit. Raises RunError if they are unknown, and cannot be found."""
-    run = None if fit.folder is None else RunFolder(fit.folder)
-    if run is not None and run.estimator.exists():
-        return require(NoiseLevels, read_json(run.estimator, RunError), run.estimator)
+    levels = stored_levels(fit)
+    if levels is not None:
+        return levels
     if not fit.logs:
         raise RunError(
-            "no noise levels of the estimator", file=None if run is None else run.estimator,
-            expected="a run of `spelgen train`, which finds them", do="fit it again",
+            "no noise levels of the estimator", file=fit.folder, expected="a run with estimator.json",
+            do="fit it again by `spelgen train`, which finds them",
         )  # fmt: skip
     levels = cross_validated_levels(fit)
-    if run is not None:
-        write_json(run.estimator, levels.model_dump(mode="json"))
+    if fit.folder is not None:
+        write_json(RunFolder(fit.folder).estimator, levels.model_dump(mode="json"))
     return levels
+
+
+def stored_levels(fit: Fit) -> NoiseLevels | None:
+    """Return the noise levels in the run folder of a fit; None if there are none."""
+    run = None if fit.folder is None else RunFolder(fit.folder)
+    if run is None or not run.estimator.exists():
+        return None
+    return require(NoiseLevels, read_json(run.estimator, RunError), run.estimator)
 
 
 def cross_validated_levels(fit: Fit) -> NoiseLevels:
@@ -54,7 +62,9 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
     for k, fold in enumerate(folds):
         others = [log for j, other in enumerate(folds) if j != k for log in other]
         tested.append((fitted_to(fit, others), fold))
-    return find_levels(tested, *limits(arm, fit.model.n))
+    levels = find_levels(tested, *limits(arm, fit.model.n))
+    # the digits that a run folder keeps
+    return NoiseLevels.model_validate(levels.model_dump(mode="json"))
 
 
 def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:

@@ -23,7 +23,10 @@ _UNITS = pseudo_inertia(torch.eye(10).double()).numpy()
 """dJ/dtheta, (10, 4, 4)."""
 LOAD_PRIOR = np.array([TUNING.load_mass] + 3 * [TUNING.load_moment] + 6 * [TUNING.load_inertia])
 _DEGREES = 6  # of freedom of the Wishart distribution
-_ITERATIONS = 40
+ITERATIONS = 40
+# Constant of the log evidence: of the Wishart density, with |dJ/dtheta| = 1/2, and of the Gaussian of Laplace's approximation.
+_LOG_GAMMA = 3 * math.log(math.pi) + sum(math.lgamma((_DEGREES - k) / 2) for k in range(4))
+EVIDENCE = -2 * _DEGREES * math.log(2) - _LOG_GAMMA - math.log(2) + 5 * math.log(2 * math.pi)
 _NORMAL = 1.96  # standard deviations of a 95 % interval
 _INERTIA = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -62,7 +65,11 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float) -> Pay
     precision = np.linalg.inv(covariance)
     linear = precision @ mean / factor
     precision = (precision - np.diag(LOAD_PRIOR**-2.0)) / factor
-    found = [_at_scale(precision, linear, scale) for scale in TUNING.scales]
+    found: list[tuple[np.ndarray, np.ndarray, float]] = []
+    theta = None
+    for scale in TUNING.scales:
+        found.append(_at_scale(precision, linear, scale, theta))
+        theta = found[-1][0]
     evidence = np.array([each[2] for each in found])
     best = evidence.max()
     weights = np.exp(evidence - best)
@@ -80,51 +87,48 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float) -> Pay
     return _described(theta, spread, log_odds, limit)
 
 
-def _at_scale(precision: np.ndarray, linear: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray, float]:
+def _at_scale(
+    precision: np.ndarray, linear: np.ndarray, scale: float, start: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the MAP estimate, its covariance, and the log evidence, for a prior mean of mass ``scale``.
 
-    Newton's method for 1/2 theta^T precision theta - linear . theta - 1/2 log det J + 1/2 tr(W^-1 J).
+    Newton's method for 1/2 theta^T precision theta - linear . theta - 1/2 log det J + 1/2 tr(W^-1 J), from ``start`` or
+    the prior mean. The cost is self-concordant: close to the minimum full steps are feasible.
     """
-    mean = scale * np.diag([TUNING.radius**2 / 5] * 3 + [1.0])
-    mean[2, 2] += scale * TUNING.distance**2
-    mean[2, 3] = mean[3, 2] = scale * TUNING.distance
-    width = mean / _DEGREES
+    variances = np.array([TUNING.radius**2 / 5] * 3)
+    height = TUNING.distance
+    around = scale * (variances[0] + variances[1] + np.array([height**2, height**2, 0.0]))
+    mean = np.array([scale, 0, 0, scale * height, around[0], 0, 0, around[1], 0, around[2]])
+    width = np.einsum("i,iab->ab", mean, _UNITS) / _DEGREES
     pull = 0.5 * np.einsum("iab,ba->i", _UNITS, np.linalg.inv(width))
-    theta = np.array([scale, 0, 0, scale * TUNING.distance, 0, 0, 0, 0, 0, 0])
-    xx, zz = mean[1, 1] + mean[2, 2], mean[0, 0] + mean[1, 1]
-    theta[[4, 7, 9]] = xx, xx, zz
+    theta = mean if start is None else start
 
     def cost(theta: np.ndarray) -> float:
-        sign, log_det = np.linalg.slogdet(np.einsum("i,iab->ab", theta, _UNITS))
-        if sign <= 0 or np.linalg.eigvalsh(np.einsum("i,iab->ab", theta, _UNITS))[0] <= 0:
+        try:
+            root = np.linalg.cholesky(np.einsum("i,iab->ab", theta, _UNITS))
+        except np.linalg.LinAlgError:
             return math.inf
+        log_det = 2 * np.log(np.diag(root)).sum()
         return float(0.5 * theta @ precision @ theta - linear @ theta - 0.5 * log_det + pull @ theta)
 
-    current = cost(theta)
-    for _ in range(_ITERATIONS):
+    for _ in range(ITERATIONS):
         ratios = np.linalg.inv(np.einsum("i,iab->ab", theta, _UNITS)) @ _UNITS
         gradient = precision @ theta - linear - 0.5 * np.einsum("iaa->i", ratios) + pull
         hessian = precision + 0.5 * np.einsum("iab,jba->ij", ratios, ratios)
         inverse = np.linalg.inv(hessian)
         step = inverse @ gradient
-        if gradient @ step < 1e-12:
+        decrement = gradient @ step
+        if decrement < 1e-15:
             break
         length = 1.0
-        while length > 1e-6 and not cost(theta - length * step) < current:
-            length /= 2
-        if length <= 1e-6:
-            break
+        if decrement > 1e-3:
+            current = cost(theta)
+            while length > 1e-6 and not cost(theta - length * step) < current:
+                length /= 2
         theta = theta - length * step
-        current = cost(theta)
     _, log_width = np.linalg.slogdet(width)
     _, log_hessian = np.linalg.slogdet(hessian)
-    # normalisation of the Wishart density; |dJ/dtheta| is 1/2
-    normal = -2 * _DEGREES * math.log(2) - _DEGREES / 2 * log_width - _LOG_GAMMA + math.log(0.5)
-    return theta, inverse, -current + normal + 5 * math.log(2 * math.pi) - 0.5 * log_hessian
-
-
-# Logarithm of the multivariate gamma function of dimension 4 at _DEGREES / 2.
-_LOG_GAMMA = 3 * math.log(math.pi) + sum(math.lgamma((_DEGREES - k) / 2) for k in range(4))
+    return theta, inverse, EVIDENCE - _DEGREES / 2 * log_width - cost(theta) - 0.5 * log_hessian
 
 
 def _described(theta: np.ndarray, covariance: np.ndarray, log_odds: float, limit: float) -> Payload:
