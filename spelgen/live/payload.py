@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from scipy.linalg import solve_triangular
 
 from spelgen.dynamics.body_regressor import pseudo_inertia
 from spelgen.live.tuning import TUNING
@@ -63,7 +64,7 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float) -> Pay
 
     factor: on the covariance of the likelihood.
     """
-    precision = np.linalg.inv(covariance)
+    precision = _inverse(covariance)
     linear = precision @ mean / factor
     precision = (precision - np.diag(LOAD_PRIOR**-2.0)) / factor
     found: list[tuple[np.ndarray, np.ndarray, float]] = []
@@ -88,6 +89,13 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float) -> Pay
     return _described(theta, spread, log_odds, limit)
 
 
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    """Return the inverse of a symmetric positive definite matrix, whose entries may differ by many orders of magnitude."""
+    root = solve_triangular(np.linalg.cholesky(matrix), np.eye(len(matrix)), lower=True)
+    inverse: np.ndarray = root.T @ root
+    return inverse
+
+
 def _at_scale(
     precision: np.ndarray, linear: np.ndarray, scale: float, start: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, float]:
@@ -103,16 +111,16 @@ def _at_scale(
     around = scale * (variances[0] + variances[1] + np.array([height**2, height**2, 0.0]))
     mean = np.array([scale, 0, 0, scale * height, around[0], 0, 0, around[1], 0, around[2]])
     width = np.einsum("i,iab->ab", mean, _UNITS) / _DEGREES
-    pull = 0.5 * np.einsum("iab,ba->i", _UNITS, np.linalg.inv(width))
+    pull = 0.5 * np.einsum("iab,ba->i", _UNITS, _inverse(width))
     theta = mean if start is None else start
 
     for power in range(0 if start is not None else -WEIGHTS, 1):
         weight = 4.0**power
         for _ in range(ITERATIONS):
-            ratios = np.linalg.inv(np.einsum("i,iab->ab", theta, _UNITS)) @ _UNITS
+            ratios = _inverse(np.einsum("i,iab->ab", theta, _UNITS)) @ _UNITS
             gradient = weight * (precision @ theta - linear) - 0.5 * np.einsum("iaa->i", ratios) + pull
             hessian = weight * precision + 0.5 * np.einsum("iab,jba->ij", ratios, ratios)
-            inverse = np.linalg.inv(hessian)
+            inverse = _inverse(hessian)
             step = inverse @ gradient
             decrement = gradient @ step
             if decrement < (0.1 if power else 1e-15):
