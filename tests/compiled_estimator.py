@@ -21,12 +21,15 @@ from spelgen.live.intake import REFUSALS
 from spelgen.live.noise import BlockNoise, NoiseLevels
 
 
-def nominal_levels(effort: np.ndarray, speed: np.ndarray, coulomb: np.ndarray) -> NoiseLevels:
-    """Return plausible noise levels of an arm with these torque limits, speeds and friction torques, (n,)."""
+def nominal_levels(
+    effort: np.ndarray, speed: np.ndarray, coulomb: np.ndarray, noise_ratio: float = 2e-3
+) -> NoiseLevels:
+    """Return noise levels of an arm with these torque limits, speeds and friction torques, (n,), and a ratio of noise to limits."""
     ones = np.ones(len(effort))
-    noise = BlockNoise(white=2e-3 * effort, disturbance=3e-3 * effort, time_constant=0.7 * ones)
+    white = noise_ratio * effort
+    noise = BlockNoise(white=white, disturbance=1.5 * white, time_constant=0.7 * ones)
     return NoiseLevels(
-        drift=noise, load=noise, observer=2e-3 * effort, peak_start=2.5 * ones, peak_scale=0.7 * ones, load_variance=1.5,
+        drift=noise, load=noise, observer=white, peak_start=2.5 * ones, peak_scale=0.7 * ones, load_variance=1.5,
         coulomb=coulomb, speed=speed, encoder=0 * ones, effort=effort, minutes=2.0, point=np.array([0.0, 0.0, 0.1]),
     )  # fmt: skip
 

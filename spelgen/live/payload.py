@@ -123,9 +123,10 @@ def _at_scale(
             inverse = _inverse(hessian)
             step = inverse @ gradient
             decrement = gradient @ step
-            if decrement < (0.1 if power else 1e-15):
-                break
             theta = theta - step / (1 + math.sqrt(2 * decrement) if decrement > 0.01 else 1)
+            # the error after a full step is about the square of the one before
+            if decrement < (0.1 if power else 1e-8):
+                break
     _, log_width = np.linalg.slogdet(width)
     _, log_hessian = np.linalg.slogdet(hessian)
     _, log_inertia = np.linalg.slogdet(np.einsum("i,iab->ab", theta, _UNITS))
