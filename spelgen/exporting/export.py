@@ -66,7 +66,9 @@ def export(
     if not isinstance(arm, Arm):
         arm = arm_of_spec(required_spec(trained), arm)
     # imported here: the packages of a format may be extras that are not installed
-    exported: Exported = pkgutil.resolve_name(exporter.function_name)(Trained(trained, arm, tuple(entries), levels))
+    exported: Exported = pkgutil.resolve_name(exporter.function_name)(
+        Trained(trained, arm, tuple(entries), levels)
+    )
     if path is not None:
         exported.write(path, force=force)
     return exported

@@ -48,7 +48,7 @@ def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint])
 def named_function(
     entry: EntryPoint, expressions: tuple[ca.SX, ...], inputs: Symbols, residuals: Symbols
 ) -> ca.Function:
-    """Return the function of an entry point, of its inputs and of the residual terms that it needs; outputs are dense."""
+    """Return the function of an entry point, of its inputs and the residual terms that it needs; outputs are dense."""
     outputs = list(map(ca.densify, expressions))
     arguments = {key: inputs[key] for key in entry.inputs}
     for key, symbols in residuals.items():

@@ -93,9 +93,7 @@ def rigid_torque(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.
     return joint_torques
 
 
-def rigid_momentum(
-    model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.SX
-) -> tuple[ca.SX, ca.SX]:
+def rigid_momentum(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return M qd and d/dq of the kinetic energy of the rigid bodies, without armature, (n, 1) each.
 
     The momentum of the bodies that a joint carries is projected onto its axis S, and onto dS/dt = twist x S.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -51,7 +52,11 @@ def noise_levels(fit: Fit) -> NoiseLevels:
 def keep_levels(fit: Fit, levels: NoiseLevels | None = None) -> None:
     """Write noise levels into the run folder of a fit; None: those that its logs show, if it is a fit to torques."""
     if levels is None:
-        if not isinstance(fit.config, TorqueFit) or not isinstance(fit.model, RigidBodyDynamics) or not fit.logs:
+        if (
+            not isinstance(fit.config, TorqueFit)
+            or not isinstance(fit.model, RigidBodyDynamics)
+            or not fit.logs
+        ):
             return
         levels = cross_validated_levels(fit)
     if fit.folder is not None:
@@ -72,7 +77,7 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
     if len(folds) == 1:
         # thirds of one log
         (log,), ends = folds[0], np.linspace(0, len(folds[0][0]), FOLDS + 1).astype(int)
-        folds = [[log[start:stop]] for start, stop in zip(ends, ends[1:], strict=False)]
+        folds = [[log[start:stop]] for start, stop in itertools.pairwise(ends)]
     arm = None if fit.urdf is None or not fit.urdf.exists() else arm_of_model(fit.model, fit.urdf)
     tested = []
     for k, fold in enumerate(folds):
@@ -84,10 +89,11 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
 
 
 def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
-    """Return the model of a fit, fitted to other logs from its initial parameters. Raises LogError for too little motion.
+    """Return the model of a fit, fitted to other logs from its initial parameters. Raises LogError for too little
+    motion.
 
-    A part of the samples suffices to find the error on other logs, and so does a model without residual terms if the fit
-    has none.
+    A part of the samples suffices to find the error on other logs, and so does a model without residual terms if the
+    fit has none.
     """
     model = assemble(required_spec(fit.model)).double()
     if residual_terms(without_idle_residuals(fit.model)) is None:
@@ -96,15 +102,17 @@ def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
     samples = [x for x in samples if len(x.q)]
     if sum(len(x.q) for x in samples) < MIN_SAMPLES:
         raise LogError(
-            "too little motion to find noise levels of the estimator", expected=f"{MIN_SAMPLES} samples that move in two thirds of "
-            "the logs", do="record longer",
+            "too little motion to find noise levels of the estimator",
+            expected=f"{MIN_SAMPLES} samples that move in two thirds of the logs", do="record longer",
         )  # fmt: skip
     fit_torque(model, TorqueSamples.of(samples, TUNING.decimation).subsampled(MAX_SAMPLES))
-    return model.requires_grad_(False).eval()
+    fitted = model.requires_grad_(False).eval()
+    assert isinstance(fitted, RigidBodyDynamics)
+    return fitted
 
 
 def limits(arm: Arm | None, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the torque limits of a URDF, (n,), infinite if unknown, and its tip in the frame of the last body, (3,)."""
+    """Return the torque limits of an arm, (n,), infinite if unknown, and its tip in the last body's frame, (3,)."""
     if arm is None:
         return np.full(n, np.inf), np.zeros(3)
     effort = np.array([joint.effort or np.inf for joint in arm.chain.coordinates])

@@ -20,7 +20,7 @@ MERGED = 0.2  # [s] contacts closer than this are one
 
 @dataclass(frozen=True)
 class ContactEvent:
-    """A contact: begin and end [s] from the start of the log, joints, largest external torque of each [Nm, N], force [N]."""
+    """A contact: begin and end from the start of the log [s], joints, their largest torques [Nm, N], force [N]."""
 
     begin: float
     end: float
@@ -33,8 +33,9 @@ class ContactEvent:
 class LogEstimate:
     """The estimates along a log.
 
-    states: of each sample. payload: at the end. since: time of its first report [s], None without one. changes: times of
-    changed loads [s]. drift: friction at the end relative to the model, per joint [%]. refused: counts of samples by reason.
+    states: of each sample. payload: at the end. since: time of its first report [s], None without one. changes: times
+    of changed loads [s]. drift: friction at the end relative to the model, per joint [%]. refused: counts of samples
+    by reason.
     """
 
     log: Trajectory
@@ -70,7 +71,8 @@ class LogEstimate:
             pairs = zip(contact.joints, contact.torques, strict=True)
             torques = ", ".join(f"{joint} {torque:+.3g}" for joint, torque in pairs)
             lines.append(
-                f"  contact at {contact.begin:.2f} to {contact.end:.2f} s: {torques} Nm, N; {contact.force:.3g} N at the tip"
+                f"  contact at {contact.begin:.2f} to {contact.end:.2f} s: {torques} Nm, N; "
+                f"{contact.force:.3g} N at the tip"
             )
         if not self.contacts:
             lines.append("  no contact")
@@ -120,12 +122,13 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
         alarms_per_minute: rate of false alarms of contact; None: default.
     """
     require_torques(logs)
-    options = {} if alarms_per_minute is None else {"alarms_per_minute": alarms_per_minute}
-    estimator = Estimator(fit, **options)
+    estimator = Estimator(fit, alarms_per_minute=alarms_per_minute or TUNING.alarms_per_minute)
     results = []
     for log in logs:
         if log.q.shape[1] != fit.model.n:
-            raise LogError(f"{log.q.shape[1]} joints", file=log.file, expected=f"{fit.model.n}, as the model has")
+            raise LogError(
+                f"{log.q.shape[1]} joints", file=log.file, expected=f"{fit.model.n}, as the model has"
+            )
         estimator.reset()
         results.append(_along(estimator, log, fit.model.joint_names))
     return results
