@@ -169,7 +169,7 @@ def synthetic_loads(case: Case, draws: int = 3) -> None:
 
 
 def corrections(case: Case, log: Trajectory, columns: Columns, ahead: float) -> np.ndarray:
-    """Return what the estimate of some time before adds to the torque of the fixed model, (T, n)."""
+    """Return friction scale minus one, and disturbance, by the estimate of some time before, (2, T, n)."""
     k = np.maximum(np.searchsorted(log.t, log.t - ahead, side="right") - 1, 0)
     scale, disturbance = columns.friction_scale[k] - 1, columns.disturbance[k]
     decay = np.exp(-ahead / case.levels.drift.time_constant) if ahead <= 0.3 else 0.0
@@ -214,7 +214,7 @@ def friction_of(case: Case, samples: DynamicsSamples) -> np.ndarray:
 
 
 def times_of(case: Case, log: Trajectory, samples: DynamicsSamples, pauses: bool) -> np.ndarray:
-    """Return the times of samples, (T,): those of a log whose only column is the time."""
+    """Return the times of samples, (T,), from a log with the time in place of torques."""
     clock = np.repeat(log.t[:, None] - log.t[0], log.q.shape[1], axis=1)
     marked = dataclasses.replace(log, tau=clock)
     same = case.samples(marked, pauses=pauses)
@@ -286,7 +286,8 @@ def changes(case: Case) -> None:
     within = np.array(delays)
     print(
         f"\nChanged load: {(within <= 3).mean():.0%} of {len(within)} found within 3 s of motion, "
-        f"median {np.median(within):.1f} s, at worst {within.max():.1f} s; {taken} of {trials} contacts of 2 s taken for a load"
+        f"median {np.median(within):.1f} s, at worst {within.max():.1f} s; "
+        f"{taken} of {trials} contacts of 2 s taken for a load"
     )
 
 

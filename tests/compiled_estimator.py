@@ -177,7 +177,7 @@ class CompiledEstimator:
         return state
 
     def restore(self, state: ctypes.Array[ctypes.c_char]) -> bool:
-        """Read a saved state; return whether it is one."""
+        """Read a saved state; return False if it is none."""
         return bool(self.library[f"{self.name}_estimator_restore"](self.state, state))
 
     def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, ahead: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The estimator finds what was added to the torques of an arm, and nothing else; its equations hold."""
+"""The estimator finds a payload, contacts and friction that were added to torques; its equations hold."""
 
 import dataclasses
 import json
@@ -166,7 +166,7 @@ def test_the_torque_of_the_estimator_carries_the_payload(arm, levels, run):
     found = estimator.torque(log.q[k], log.qd[k], qdd[k])
     bare = model.inverse_dynamics(*numbers(log.q[k], log.qd[k], qdd[k])).numpy()
     assert np.abs(found - expected).max() < 0.25 * np.abs(bare - expected).max()
-    # beyond 0.3 s the disturbance is left out
+    # beyond 0.3 s without the disturbance
     later = estimator.torque(log.q[k], log.qd[k], qdd[k], ahead=1.0)
     np.testing.assert_allclose(found - later, estimator.drift.d, atol=1e-9)
 
@@ -285,7 +285,7 @@ def test_one_log_has_one_result(arm, levels, run):
 
 @pytest.mark.parametrize("offset", [0.0, 0.5], ids=["consistent", "outside of the cone"])
 def test_the_payload_is_the_map_estimate(offset):
-    """Its cost is that of a general solver, also if the likelihood is largest far outside of the cone."""
+    """Its cost is as low as by a general solver, also if the likelihood is largest far outside of the cone."""
     random = np.random.default_rng(2)
     root = random.standard_normal((10, 10)) * LOAD_PRIOR * 2e-3
     covariance = np.linalg.inv(np.linalg.inv(root @ root.T) + np.diag(LOAD_PRIOR**-2.0))

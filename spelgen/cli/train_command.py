@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import textwrap
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -138,7 +139,7 @@ def train(
 def _payload(fit: Fit, source: Path | None) -> Payload | None:
     """Return the payload in the logs of a fit to a load, by the estimator of the adapted run; None if it has none.
 
-    The noise levels of the adapted run are those of its source; those of a new fit are found here.
+    A new fit gets its own noise levels, an adapted run has the noise levels of its source.
     """
     from spelgen.live.cross_validation import keep_levels, stored_levels
     from spelgen.live.replay import carried_payload
@@ -182,7 +183,7 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
         from spelgen.live.replay import payload_content, payload_sentence
 
         record["payload"] = payload_content(payload)
-        outcome.append(f"in these logs: {payload_sentence(payload)}")
+        outcome.append(textwrap.fill(f"in these logs: {payload_sentence(payload)}", 80))
     answer(format, record, *outcome, f"run folder: {folder}")
     if fit.status == "interrupted":
         note("the best model so far is in the run folder; resume it by --resume")

@@ -1,4 +1,4 @@
-"""The estimator in C: a header and a source beside those of the model, with the noise levels of the run."""
+"""The estimator in C: a header and a source in addition to the model, with the noise levels of the run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Functions of the estimator as CasADi expressions: those of `live.momentum`, for the C estimator."""
+"""Functions of the C estimator as CasADi expressions, equal to the functions of `live.momentum`."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def tip_force(jacobian: np.ndarray, torque: np.ndarray, variance: np.ndarray) ->
     """
     weighted = jacobian / variance
     matrix = weighted @ jacobian.T
-    # directions that no joint feels have no force
+    # a force that no joint torque depends on is zero
     matrix += 1e-3 * np.trace(matrix) / 3 * np.eye(3)
     force: np.ndarray = np.linalg.solve(matrix, weighted @ torque)
     return force

@@ -1,4 +1,4 @@
-"""Noise levels of a fit: from its run folder, else found by fits that leave out a part of its logs."""
+"""Noise levels of a fit: from its run folder, else by cross-validation on its logs."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def noise_levels(fit: Fit) -> NoiseLevels:
 
 
 def keep_levels(fit: Fit, levels: NoiseLevels | None = None) -> None:
-    """Write noise levels into the run folder of a fit; None: those that its logs show, if it is a fit to torques."""
+    """Write noise levels into the run folder of a fit; None: find them, for a fit to torques."""
     if levels is None:
         if (
             not isinstance(fit.config, TorqueFit)
@@ -72,7 +72,7 @@ def stored_levels(fit: Fit) -> NoiseLevels | None:
 
 
 def cross_validated_levels(fit: Fit) -> NoiseLevels:
-    """Return the noise levels on logs that are left out of fits in turn."""
+    """Return the noise levels by cross-validation: each fold of the logs is held out of a fit."""
     folds = [list(fit.logs[k::FOLDS]) for k in range(min(FOLDS, len(fit.logs)))]
     if len(folds) == 1:
         # thirds of one log

@@ -48,8 +48,8 @@ class EstimatorState:
 class Estimator:
     """The estimator of a fitted arm with rigid bodies under torques.
 
-    ``step`` takes samples as they are measured; ``replay`` takes a log. Samples that are not finite, out of order or
-    impossible are refused and counted in ``refused``.
+    ``step`` takes one measured sample; ``replay`` takes a log. Samples that are not finite or out of order,
+    and jumps, are refused and counted in ``refused``.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Estimator:
         self.reset()
 
     def reset(self) -> None:
-        """Forget payload, friction drift and friction state."""
+        """Start again: payload, friction drift and friction state are unknown."""
         n = self.model.n
         self.intake = Intake(self.levels, self.reach)
         self.blocks = Blocks(n, self.levels.rest_speed)
@@ -120,7 +120,7 @@ class Estimator:
             yield EstimatorState(float(t[k]), refusal, self.contact, self.payload, changed, 1 + a, d)
 
     def _advance(self, t: float, qd: np.ndarray, at: Balance, refusal: Refusal) -> bool:
-        """Use the terms of a sample; return whether the load became another one."""
+        """Use the terms of a sample; return True if the load became another one."""
         if refusal != "used":
             self.blocks.restart()
             self.half = None
@@ -165,7 +165,7 @@ class Estimator:
 
         Args:
             q, qd, qdd: (n,).
-            ahead: time until the motion [s]; the disturbance decays, and is left out beyond 0.3 s.
+            ahead: time until the motion [s]; the disturbance decays, and is omitted beyond 0.3 s.
         """
         at = [torch.as_tensor(x, dtype=torch.float64) for x in (q, qd, qdd)]
         z = torch.from_numpy((self.intake.low + self.intake.high) / 2)

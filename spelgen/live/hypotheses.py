@@ -13,7 +13,7 @@ from spelgen.live.tuning import TUNING
 
 
 class PayloadEstimate:
-    """The payload filter, and the hypotheses of another load and of a contact beside it.
+    """The payload filter, and the hypotheses of another load and of a contact.
 
     Rows of a block are used one per sample, more if samples are rare. moved: motion since the start or the last
     change [s].

@@ -37,7 +37,7 @@ _INERTIA = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """What the last body carries in addition to the arm, in the frame of the last body; zero without a payload.
+    """Inertial parameters that the last body carries in addition to the arm, in its frame; zero without a payload.
 
     status: "not yet" if the motion does not determine it. log_odds: of "no payload" against a payload. limit: upper
     limit of the mass, 95 %, for any status [kg]. mass [kg], center (3,) [m], inertia about the centre of mass (xx,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from spelgen.errors import LogError
 from spelgen.fitting.fitted import Fit
+from spelgen.listing import WIDTH
 from spelgen.live.estimator import Estimator, EstimatorState
 from spelgen.live.payload import Payload
 from spelgen.live.tuning import TUNING
@@ -81,7 +83,7 @@ class LogEstimate:
         if self.refused:
             refused = ", ".join(f"{count} {reason}" for reason, count in self.refused.items())
             lines.append(f"  samples that were not used, or only in part: {refused}")
-        return "\n".join(lines)
+        return "\n".join(textwrap.fill(line, WIDTH, subsequent_indent="    ") for line in lines)
 
 
 def payload_content(payload: Payload) -> dict[str, Any]:
@@ -114,7 +116,7 @@ def payload_sentence(payload: Payload) -> str:
 
 
 def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None = None) -> list[LogEstimate]:
-    """Return the estimates along logs, each of which starts anew.
+    """Return the estimates along logs, each from its start.
 
     Args:
         fit: of an arm under torques.

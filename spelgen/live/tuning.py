@@ -1,4 +1,4 @@
-"""Constants of the estimator; those of an arm are found from its training logs (`live.levels`)."""
+"""Constants of the estimator; noise levels are found from the training logs (`live.levels`)."""
 
 from __future__ import annotations
 
