@@ -9,7 +9,7 @@ from lxml import etree
 
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.body_regressor import quaternion
-from spelgen.exporting.describe import link_poses
+from spelgen.dynamics.tip_frame import link_poses
 from spelgen.exporting.tuning import TUNING
 from spelgen.urdf.geometry import LinkShape, link_shapes
 
