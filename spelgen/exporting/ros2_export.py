@@ -1,49 +1,112 @@
-"""--to ros2: a colcon package with the C files and a plugin of the package inverse_dynamics_solver."""
+"""--to ros2: a colcon package with the C files, a ros2_control controller and an inverse_dynamics_solver plugin."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
+
+import numpy as np
 
 from spelgen.exporting.c_export import c_files
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.exported import Exported, with_readme
 from spelgen.templates import render
+from spelgen.urdf.values import UNLIMITED
 
 _CALLED = (
-    "inverse_dynamics", "mass_matrix", "bias", "gravity", "friction", "friction_step", "friction_memory",
+    "inverse_dynamics", "mass_matrix", "bias", "gravity", "friction", "friction_step", "friction_memory", "tip_pose",
 )  # fmt: skip
-"""The functions that the plugin calls."""
+"""The functions that the plugins call."""
 
+_DEPENDENCIES = ("eigen", "inverse_dynamics_solver", "pluginlib", "rclcpp")
+_CONTROLLER_DEPENDENCIES = (
+    "controller_interface", "geometry_msgs", "hardware_interface", "rcl_interfaces", "rclcpp_lifecycle",
+    "sensor_msgs", "std_msgs", "trajectory_msgs",
+)  # fmt: skip
 _PATHS = {
     "package.xml": "package.xml",
     "CMakeLists.txt": "CMakeLists.txt",
-    "plugin.xml": "plugin.xml",
+    "solver.xml": "solver.xml",
     "solver.cpp": "src/solver.cpp",
+}
+_CONTROLLER_PATHS = {
+    "controller.xml": "controller.xml",
+    "controller.yaml": "config/controller.yaml",
+    "controller.cpp": "src/controller.cpp",
+    "control.hpp": "src/control.hpp",
 }
 
 
 def export_ros2(trained: Trained) -> Exported:
-    """Return the package. Raises RunError if its C differs from the model."""
+    """Return the package. Raises RunError if its C differs from the model.
+
+    An arm with passive joints or position servos gets no controller, since it has no effort interfaces for all joints.
+    """
     trained = replace(trained, entries=_CALLED)
     model = trained.described
     sources, checked = c_files(trained)
-    package = f"{model.name}_solver"
+    package = f"{model.name}_dynamics"
+    controller = model.servos is None and bool(model.actuated.all())
     files = {f"src/{name}": content for name, content in sources.items()}
-    for template, path in _PATHS.items():
-        text = render(
-            f"ros2/{template}.jinja",
-            package=package,
-            name=model.name,
-            upper=model.name.upper(),
-            joints=", ".join(model.identifiers),
-        )
-        files[path] = text.encode()
+    context = {"package": package, "controller": controller, "name": model.name, "upper": model.name.upper()}
+    context |= {"joints": ", ".join(model.identifiers), "estimator": False}
+    context["dependencies"] = sorted(_DEPENDENCIES + (_CONTROLLER_DEPENDENCIES if controller else ()))
+    paths = _PATHS
+    if controller:
+        paths = _PATHS | _CONTROLLER_PATHS
+        context |= _controller_numbers(trained)
+    for template, path in paths.items():
+        files[path] = render(f"ros2/{template}.jinja", **context).encode()
     use = (
-        f"Put this folder into a workspace, colcon build --packages-select {package}; "
-        f"the plugin {package}/Solver is an inverse_dynamics_solver::InverseDynamicsSolver."
+        f"Put this folder into a workspace and run colcon build --packages-select {package}. "
+        f"{package}/Solver is an inverse_dynamics_solver::InverseDynamicsSolver"
     )
+    use += "; it is built if its interface is installed."
+    if controller:
+        use += (
+            f" {package}/Controller is a controller of ros2_control for effort interfaces: ros2 run controller_manager "
+            f"spawner {model.name}_controller --param-file install/{package}/share/{package}/config/controller.yaml "
+            "compensates gravity, or tracks the topic ~/reference with mode:=computed_torque."
+        )
     about = (
         "getTorques includes friction, and updates its state by the positions of successive calls; "
         "initialize resets it."
     )
-    return with_readme(trained, "ros2", files, use=use, about=about, summary=[checked])
+    summary = [checked]
+    if not controller:
+        summary.append("no controller: it needs an effort interface of every joint")
+    return with_readme(trained, "ros2", files, use=use, about=about, summary=summary)
+
+
+def _controller_numbers(trained: Trained) -> dict[str, object]:
+    """Return names, limits and the tip's pose as text of C++ and YAML. An absent effort limit is 0 and must be set."""
+    model, coordinates = trained.described, trained.arm.chain.coordinates
+    travel = [1e-2 if joint.joint_type == "revolute" else 1e-3 for joint in coordinates]
+    continuous = [str(joint.continuous).lower() for joint in coordinates]
+    rotation = (f"{{{_listed(row)}}}" for row in model.tip.pose[:3, :3])
+    return {
+        "joint_names": ", ".join(map(cpp_string, trained.joint_names)),
+        "efforts": _listed(joint.effort or 0.0 for joint in coordinates),
+        "velocities": _listed(joint.velocity or UNLIMITED["velocity"] for joint in coordinates),
+        "frozen_travel": _listed(travel),
+        "continuous": ", ".join(continuous),
+        "tip_link": cpp_string(model.tip.link),
+        "tip_rotation": ", ".join(rotation),
+        "tip_position": _listed(model.tip.pose[:3, 3]),
+        "filled": lambda value: _listed([value] * model.n),
+    }
+
+
+def _listed(numbers: Iterable[float] | np.ndarray) -> str:
+    """Return numbers, separated by commas, that read back exactly."""
+    return ", ".join(repr(float(number)) for number in numbers)
+
+
+def cpp_string(text: str) -> str:
+    """Return a C++ literal of a text from a file; all bytes except plain letters, digits and ``_-/`` are escaped."""
+    characters: list[str] = []
+    for character in text:
+        plain = character.isascii() and (character.isalnum() or character in "_-/")
+        # an octal escape has at most three digits, so that a digit may follow
+        characters.append(character if plain else "".join(f"\\{byte:03o}" for byte in character.encode()))
+    return f'"{"".join(characters)}"'
