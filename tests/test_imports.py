@@ -23,6 +23,7 @@ certificate logs
 identification excitation simulation
 log_checks baselines
 fitting
+live
 exporting
 evaluation
 comparison

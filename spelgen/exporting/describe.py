@@ -15,15 +15,13 @@ import torch
 from scipy.interpolate import BSpline
 from torch import Tensor
 
-from spelgen.arm.arm import make_arm
-from spelgen.arm.chain import choose_chain
 from spelgen.arm.configured_arm import Arm
-from spelgen.arm.lump_links import lump_links
 from spelgen.dynamics.protocol import input_of, motors_of, residual_terms
-from spelgen.dynamics.tip import last_link
+from spelgen.dynamics.tip_frame import tip_frame
 from spelgen.errors import RunError
-from spelgen.exporting.description import Harmonics, Residuals, Servos, SigmoidNetwork, Tip, TrainedModel
+from spelgen.exporting.description import Harmonics, Residuals, Servos, SigmoidNetwork, TrainedModel
 from spelgen.exporting.entry_points import EntryPoint, entry_points
+from spelgen.live.noise import NoiseLevels
 from spelgen.runtime.friction_laws import FrictionConstants
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
@@ -41,11 +39,13 @@ class Trained:
     """A trained model and its arm.
 
     entries: names of the functions to export, for formats of functions; empty: all functions except derivatives.
+    levels: noise levels of the estimator; None: it is not exported.
     """
 
     model: ArmModel
     arm: Arm
     entries: tuple[str, ...] = ()
+    levels: NoiseLevels | None = None
 
     @cached_property
     def described(self) -> TrainedModel:
@@ -148,18 +148,6 @@ def servos_of(model: ArmModel) -> Servos | None:
         return None
     kp, kd, limit, dead_zone = map(array, model.servo.prepare())
     return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
-
-
-def tip_frame(loaded: Arm) -> Tip:
-    """Return the frame of the tip link, with the unrounded angles of the URDF."""
-    names = loaded.chain.joint_names
-    link = loaded.tip or last_link(loaded.robot, names)
-    frame = lump_links(loaded.robot, choose_chain(loaded.robot, names, None), 0.0).frames[link]
-    pose = np.eye(4)
-    pose[:3, :3] = frame.rotation
-    pose[:3, 3] = frame.position
-    bodies = make_arm(loaded.robot, joints=names, angle_tolerance=0.0).bodies
-    return Tip(link, frame.body, pose, bodies)
 
 
 def _residuals(model: ArmModel) -> Residuals:

@@ -14,6 +14,7 @@ from spelgen.exporting.describe import Trained
 from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
 from spelgen.fitting.fitted import Fit, load_run, required_spec
 from spelgen.labels import listed
+from spelgen.live.cross_validation import stored_levels
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
@@ -51,7 +52,9 @@ def export(
         require_fitting(to, Path(path))
     if isinstance(trained, str | Path):
         trained = load_run(trained)
+    levels = None
     if isinstance(trained, Fit):
+        levels = stored_levels(trained)
         trained, arm = trained.model, arm or trained.urdf
     exporter = EXPORTERS[to]
     if entries and not exporter.choice:
@@ -63,7 +66,7 @@ def export(
     if not isinstance(arm, Arm):
         arm = arm_of_spec(required_spec(trained), arm)
     # imported here: the packages of a format may be extras that are not installed
-    exported: Exported = pkgutil.resolve_name(exporter.function_name)(Trained(trained, arm, tuple(entries)))
+    exported: Exported = pkgutil.resolve_name(exporter.function_name)(Trained(trained, arm, tuple(entries), levels))
     if path is not None:
         exported.write(path, force=force)
     return exported

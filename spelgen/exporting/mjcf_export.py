@@ -11,7 +11,8 @@ from lxml import etree
 
 from spelgen.arm.arm import Chain, Coordinate
 from spelgen.dynamics.body_regressor import about_center, quaternion
-from spelgen.exporting.describe import Trained, tip_frame
+from spelgen.dynamics.tip_frame import tip_frame
+from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import Servos
 from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Parity, Values, random_inputs, relative, require_parity

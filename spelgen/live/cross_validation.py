@@ -1,0 +1,85 @@
+"""Noise levels of a fit: from its run folder, else found by fits that leave out a part of its logs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from spelgen.arm.configured_arm import Arm
+from spelgen.baselines.baseline import arm_of_model
+from spelgen.dynamics.bristles import bristle_reach
+from spelgen.dynamics.tip_frame import tip_frame
+from spelgen.emission.assemble import assemble
+from spelgen.errors import RunError
+from spelgen.files import read_json, write_json
+from spelgen.fitting.fitted import Fit, required_spec
+from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.run_record import require
+from spelgen.fitting.torque.fit import fit_torque
+from spelgen.live.levels import find_levels
+from spelgen.live.noise import NoiseLevels
+from spelgen.logs.dynamics_samples import dynamics_samples
+from spelgen.logs.trajectory import Trajectory
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
+
+FOLDS = 3
+
+
+def noise_levels(fit: Fit) -> NoiseLevels:
+    """Return the noise levels of a fit. Raises RunError if they are unknown, and cannot be found."""
+    levels = stored_levels(fit)
+    if levels is not None:
+        return levels
+    if not fit.logs:
+        raise RunError(
+            "no noise levels of the estimator", file=fit.folder, expected="a run with estimator.json",
+            do="fit it again by `spelgen train`, which finds them",
+        )  # fmt: skip
+    levels = cross_validated_levels(fit)
+    if fit.folder is not None:
+        write_json(RunFolder(fit.folder).estimator, levels.model_dump(mode="json"))
+    return levels
+
+
+def stored_levels(fit: Fit) -> NoiseLevels | None:
+    """Return the noise levels in the run folder of a fit; None if there are none."""
+    run = None if fit.folder is None else RunFolder(fit.folder)
+    if run is None or not run.estimator.exists():
+        return None
+    return require(NoiseLevels, read_json(run.estimator, RunError), run.estimator)
+
+
+def cross_validated_levels(fit: Fit) -> NoiseLevels:
+    """Return the noise levels on logs that are left out of fits in turn."""
+    folds = [list(fit.logs[k::FOLDS]) for k in range(min(FOLDS, len(fit.logs)))]
+    if len(folds) == 1:
+        # thirds of one log
+        (log,), ends = folds[0], np.linspace(0, len(folds[0][0]), FOLDS + 1).astype(int)
+        folds = [[log[start:stop]] for start, stop in zip(ends, ends[1:], strict=False)]
+    arm = None if fit.urdf is None or not fit.urdf.exists() else arm_of_model(fit.model, fit.urdf)
+    tested = []
+    for k, fold in enumerate(folds):
+        others = [log for j, other in enumerate(folds) if j != k for log in other]
+        tested.append((fitted_to(fit, others), fold))
+    levels = find_levels(tested, *limits(arm, fit.model.n))
+    # the digits that a run folder keeps
+    return NoiseLevels.model_validate(levels.model_dump(mode="json"))
+
+
+def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
+    """Return the model of a fit, fitted to other logs from its initial parameters."""
+    model = assemble(required_spec(fit.model)).double()
+    samples = dynamics_samples(logs, preprocessing=fit.preprocessing, reach=bristle_reach(model))
+    fit_torque(model, [x for x in samples if len(x.q)])
+    return model.requires_grad_(False).eval()
+
+
+def limits(arm: Arm | None, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the torque limits of a URDF, (n,), infinite if unknown, and its tip in the frame of the last body, (3,)."""
+    if arm is None:
+        return np.full(n, np.inf), np.zeros(3)
+    effort = np.array([joint.effort or np.inf for joint in arm.chain.coordinates])
+    tip = tip_frame(arm)
+    is_last = tip.carrier == len(arm.chain.bodies) - 1
+    return effort, tip.pose[:3, 3] if is_last else np.zeros(3)
