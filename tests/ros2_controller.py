@@ -37,7 +37,8 @@ def compiled(package: Path, folder: Path, *flags: str) -> ctypes.CDLL:
     )
     assert not done.returncode, done.stderr
     loaded = ctypes.CDLL(str(library))
-    for function in ("start", "interfaces", "set", "set_text", "ranges", "parameters", "state", "log"):
+    texts = "start interfaces set set_text set_flag ranges parameters state log joint_state wrench payload"
+    for function in texts.split():
         getattr(loaded, f"harness_{function}").restype = TEXT
     loaded.harness_new.restype = ctypes.c_void_p
     loaded.harness_update.restype = ctypes.c_long
@@ -105,6 +106,27 @@ class Controller:
     def text(self, name):
         """The result of a function without arguments: state, interfaces, ranges or log."""
         return self.call(name).decode()
+
+    def joint_state(self, topic):
+        """The efforts of the last message of a topic, by joint."""
+        self.text("state")
+        pointer, efforts = array(np.zeros(self.n))
+        return dict(
+            zip(self.call("joint_state", topic.encode(), pointer).decode().split(), efforts, strict=False)
+        )
+
+    def wrench(self):
+        """Frame and values of the last tip wrench, (6,)."""
+        self.text("state")
+        pointer, values = array(np.zeros(6))
+        return self.call("wrench", pointer).decode(), values
+
+    def payload(self):
+        """Frame and values of the last payload: mass, centre, inertia, interval of the mass; None without one."""
+        self.text("state")
+        pointer, values = array(np.zeros(12))
+        frame = self.call("payload", pointer)
+        return None if frame is None else (frame.decode(), values)
 
     def deactivate(self):
         """Deactivate the controller; return the last commands."""

@@ -14,7 +14,7 @@ from spelgen.templates import render
 from spelgen.urdf.values import UNLIMITED
 
 _CALLED = (
-    "inverse_dynamics", "mass_matrix", "bias", "gravity", "friction", "friction_step", "friction_memory", "tip_pose",
+    "inverse_dynamics", "mass_matrix", "bias", "gravity", "friction", "friction_step", "friction_memory",
 )  # fmt: skip
 """The functions that the plugins call."""
 
@@ -42,14 +42,19 @@ def export_ros2(trained: Trained) -> Exported:
 
     An arm with passive joints or position servos gets no controller, since it has no effort interfaces for all joints.
     """
-    trained = replace(trained, entries=_CALLED)
     model = trained.described
+    controller = model.servos is None and bool(model.actuated.all())
+    estimator = controller and trained.levels is not None
+    trained = replace(
+        trained,
+        entries=(*_CALLED, "tip_pose") if estimator else _CALLED,
+        levels=trained.levels if estimator else None,
+    )
     sources, checked = c_files(trained)
     package = f"{model.name}_dynamics"
-    controller = model.servos is None and bool(model.actuated.all())
     files = {f"src/{name}": content for name, content in sources.items()}
     context = {"package": package, "controller": controller, "name": model.name, "upper": model.name.upper()}
-    context |= {"joints": ", ".join(model.identifiers), "estimator": False}
+    context |= {"joints": ", ".join(model.identifiers), "estimator": estimator}
     context["dependencies"] = sorted(_DEPENDENCIES + (_CONTROLLER_DEPENDENCIES if controller else ()))
     paths = _PATHS
     if controller:

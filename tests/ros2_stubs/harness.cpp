@@ -1,7 +1,7 @@
 // Functions by which tests drive the exported controller in place of a controller manager.
 #include <controller_interface/chainable_controller_interface.hpp>
+#include <algorithm>
 #include <cstdlib>
-#include <cstring>
 #include <new>
 
 using Base = controller_interface::ChainableControllerInterface;
@@ -35,6 +35,13 @@ struct Harness
   std::string text;
 
   rclcpp_lifecycle::LifecycleNode & node() { return *controller->get_node(); }
+
+  const char * set(const char * name, const rclcpp::ParameterValue & value)
+  {
+    const auto result = node().set(name, value);
+    text = result.reason;
+    return result.successful ? nullptr : text.c_str();
+  }
 
   template <typename Message>
   std::vector<Message> & published(const char * topic)
@@ -162,15 +169,15 @@ void harness_write(Harness * harness, int index, double value)
 // Return null, or why the parameter was refused.
 const char * harness_set(Harness * harness, const char * name, const double * numbers, int count)
 {
-  const auto result = harness->node().set(name, value_of(numbers, count));
-  harness->text = result.reason;
-  return result.successful ? nullptr : harness->text.c_str();
+  return harness->set(name, value_of(numbers, count));
 }
 const char * harness_set_text(Harness * harness, const char * name, const char * text)
 {
-  const auto result = harness->node().set(name, rclcpp::ParameterValue(rclcpp::Values(std::string(text))));
-  harness->text = result.reason;
-  return result.successful ? nullptr : harness->text.c_str();
+  return harness->set(name, rclcpp::ParameterValue(rclcpp::Values(std::string(text))));
+}
+const char * harness_set_flag(Harness * harness, const char * name, int flag)
+{
+  return harness->set(name, rclcpp::ParameterValue(rclcpp::Values(flag != 0)));
 }
 
 // Name, lower and upper limit of each numeric parameter, one per line.
@@ -202,6 +209,50 @@ const char * harness_state(Harness * harness)
   harness->node().timer->callback();
   auto & states = harness->published<std_msgs::msg::String>("~/state");
   harness->text = states.empty() ? "" : states.back().data;
+  return harness->text.c_str();
+}
+
+// The efforts of the last joint state of a topic; return its joints, one per line.
+const char * harness_joint_state(Harness * harness, const char * topic, double * efforts)
+{
+  const auto & message = harness->published<sensor_msgs::msg::JointState>(topic).back();
+  harness->text.clear();
+  for (const auto & name : message.name) {
+    harness->text += name + "\n";
+  }
+  std::copy(message.effort.begin(), message.effort.end(), efforts);
+  return harness->text.c_str();
+}
+
+// Force and torque of the last wrench; return its frame.
+const char * harness_wrench(Harness * harness, double * values)
+{
+  const auto & message = harness->published<geometry_msgs::msg::WrenchStamped>("~/tip_wrench").back();
+  const auto & wrench = message.wrench;
+  for (const auto & vector : {wrench.force, wrench.torque}) {
+    for (double value : {vector.x, vector.y, vector.z}) {
+      *values++ = value;
+    }
+  }
+  harness->text = message.header.frame_id;
+  return harness->text.c_str();
+}
+
+// Mass, centre of mass, inertia and the interval of the mass of the last payload; return its frame, or null.
+const char * harness_payload(Harness * harness, double * values)
+{
+  const auto & messages = harness->published<geometry_msgs::msg::InertiaStamped>("~/payload");
+  if (messages.empty()) {
+    return nullptr;
+  }
+  const auto & inertia = messages.back().inertia;
+  const auto & interval = harness->published<std_msgs::msg::Float64MultiArray>("~/payload_mass_interval").back().data;
+  for (double value :
+    {inertia.m, inertia.com.x, inertia.com.y, inertia.com.z, inertia.ixx, inertia.ixy, inertia.ixz, inertia.iyy,
+      inertia.iyz, inertia.izz, interval.at(0), interval.at(1)}) {
+    *values++ = value;
+  }
+  harness->text = messages.back().header.frame_id;
   return harness->text.c_str();
 }
 const char * harness_log(Harness *) { return rclcpp::last_log().c_str(); }
