@@ -1,4 +1,4 @@
-"""The exported ros2_control controller, compiled against stand-in headers and driven by ctypes, and a simulated arm."""
+"""The exported ros2_control controller, compiled against substitutes of the ROS 2 headers, and a simulated arm."""
 
 import ctypes
 import subprocess
@@ -25,7 +25,7 @@ def compiled(package: Path, folder: Path, *flags: str) -> ctypes.CDLL:
     """The controller of an exported package and its harness as a library; no warning is accepted."""
     (name,) = (path.stem for path in (package / "src").glob("*.c") if not path.stem.endswith("_estimator"))
     include, library = [f"-I{STUBS}", f"-I{package / 'src'}"], folder / "controller.so"
-    warnings = ["-O2", "-fPIC", "-Wall", "-Wextra", "-Werror"]
+    warnings = ["-O1", "-fPIC", "-Wall", "-Wextra", "-Werror"]
     objects = []
     for source in sorted((package / "src").glob(f"{name}*.c")):
         objects.append(folder / f"{source.stem}.o")
@@ -46,7 +46,7 @@ def compiled(package: Path, folder: Path, *flags: str) -> ctypes.CDLL:
 
 
 class Controller:
-    """A controller with n joints; ``parameters`` are those of a file. An error of the start is raised."""
+    """A controller with n joints; ``parameters`` are read as from a file. An error of the start is raised."""
 
     def __init__(self, library, n, **parameters):
         self.library, self.n = library, n
@@ -108,7 +108,7 @@ class Controller:
         return self.call(name).decode()
 
     def joint_state(self, topic):
-        """The efforts of the last message of a topic, by joint."""
+        """Return the efforts of the last message of a topic, joint name to effort."""
         self.text("state")
         pointer, efforts = array(np.zeros(self.n))
         return dict(
@@ -140,10 +140,11 @@ class Controller:
 
 
 class SimulatedArm:
-    """An arm that moves as a model's C export says; semi-implicit Euler, torques are constant over a period."""
+    """An arm simulated with the C export of a model; semi-implicit Euler, torques are constant over a period."""
 
     def __init__(self, model, arm, folder: Path):
         names = ["forward_dynamics", "friction_step", "friction_memory"]
+        self.folder = folder
         (folder / "plant").mkdir()
         trained = Trained(model, arm, tuple(names))
         functions = c_functions(trained.described, trained.entry_points)

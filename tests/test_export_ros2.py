@@ -126,9 +126,9 @@ def test_it_builds_against_the_header_of_older_interfaces(package, tmp_path):
 
 
 def stand_in_packages(folder: Path) -> list[str]:
-    """Write CMake packages of the stubs; return the definitions by which CMake finds them.
+    """Write CMake packages of the stubs; return the definitions with which CMake finds them.
 
-    ament_cmake and colcon are those of the machine if they are installed.
+    ament_cmake and colcon are not replaced if the machine has them.
     """
     interfaces = [
         "controller_interface",

@@ -1,4 +1,4 @@
-"""The exported ros2_control controller: update() runs on a simulated arm, compiled against stand-in headers."""
+"""The exported ros2_control controller, compiled against substitutes of the ROS 2 headers, moves a simulated arm."""
 
 import re
 import shutil
@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
+import yaml
 from exported_runs import COUPLED, MOTORS, arm_of, moved_model
 from ros2_controller import PERIOD, Controller, SimulatedArm, compiled
 
@@ -344,7 +345,6 @@ def test_parameters_are_validated_and_take_effect(arm):
 
 
 def test_the_parameter_file_has_the_parameters_and_their_defaults(arm):
-    yaml = pytest.importorskip("yaml")
     _, library, _, package = arm
     parameters = yaml.safe_load((package / "config" / "controller.yaml").read_text())
     own = parameters["two_link_controller"]["ros__parameters"]

@@ -1,9 +1,10 @@
-"""The exported controller with the estimator: a simulated UR10e with a load, contacts, what is published."""
+"""The exported controller with the estimator: a simulated UR10e with a load, contacts, published messages."""
 
 import shutil
 
 import numpy as np
 import pytest
+import yaml
 from emitted import ROBOTS
 from ros2_controller import Controller, SimulatedArm, compiled
 
@@ -35,7 +36,7 @@ def arm_in(folder, *, loaded=False):
 
 
 def levels(arm):
-    """Noise levels as those of a good fit."""
+    """Noise levels of an accurate fit."""
     effort = np.array([c.effort for c in arm.chain.coordinates])
     noise = BlockNoise(white=2e-3 * effort, disturbance=2e-3 * effort, time_constant=np.ones(N))
     ones = np.ones(N)
@@ -147,3 +148,33 @@ def test_efforts_that_are_not_finite_do_not_stop_the_controller(ur10e):
     tau = controller.update(START, np.zeros(N), np.full(N, np.nan), PERIOD)
     assert np.isfinite(tau).all()
     assert controller.text("state") == "gravity_compensation"
+
+
+def test_hostile_inputs_never_give_torques_beyond_the_limits(ur10e):
+    library, _, _ = ur10e
+    controller = Controller(library, N, estimator="compensate", **STIFF)
+    effort = np.array([330, 330, 150, 54, 54, 54])
+    random = np.random.default_rng(1)
+    values = np.array([0.0, 1e-320, 1e300, -1e300, np.inf, -np.inf, np.nan, 3.0, 1e6])
+    for cycle in range(10_000):
+        q, qd, measured, reference = START + 0.01 * random.standard_normal((4, N))
+        for target in (q, qd, measured, reference):
+            if random.random() < 0.1:
+                target[random.integers(N)] = random.choice(values)
+        controller.reference(reference)
+        if cycle % 100 == 0:
+            controller.activate()
+            controller.set("mode", random.choice(["gravity_compensation", "computed_torque"]))
+        tau = controller.update(q, qd, measured, random.choice([PERIOD, PERIOD, 0.0, -1.0, 10.0]))
+        assert np.isfinite(tau).all()
+        assert (np.abs(tau) <= effort).all()
+    assert controller.allocations == 0
+
+
+def test_the_parameter_file_has_the_parameters_and_their_defaults(ur10e):
+    library, free, _ = ur10e
+    own = yaml.safe_load((free.folder / "package/config/controller.yaml").read_text())
+    parameters = own["ur10e_controller"]["ros__parameters"]
+    parameters.pop("type")
+    controller = Controller(library, N, **parameters)
+    assert set(parameters) == set(controller.text("parameters").split())
