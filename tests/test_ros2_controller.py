@@ -227,7 +227,10 @@ def test_a_state_that_stays_invalid_is_latched_until_the_next_activation(arm):
     for _ in range(int(0.1 / PERIOD) + 2):
         tau = controller.update([np.nan, np.nan], [np.nan, np.nan])
         np.testing.assert_allclose(tau, torques(arm[0], START, [0, 0], [0, 0]), rtol=1e-12)
-    controller.update(START, [0, 0])
+    # a valid state again: damping at this state
+    tau = controller.update(START + np.array([0.01, 0.02]), [0.1, -0.2])
+    expected = torques(arm[0], START + np.array([0.01, 0.02]), [0, 0], [-0.5, 1.0])
+    np.testing.assert_allclose(tau, expected, rtol=1e-12)
     assert controller.text("state") == INVALID
     np.testing.assert_array_equal(controller.deactivate(), [0, 0])
     controller.activate()
@@ -371,7 +374,8 @@ def test_joints_without_effort_limits_need_a_parameter(tmp_path):
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(COUPLED)
     arm = load_arm(urdf)
-    export(build(arm, "closed-form"), "ros2", tmp_path / "package", arm=arm)
+    exported = export(build(arm, "closed-form"), "ros2", tmp_path / "package", arm=arm)
+    assert "no estimator: its noise levels are found from the training logs of a fit" in repr(exported)
     library = compiled(tmp_path / "package", tmp_path)
     with pytest.raises(ValueError, match="torque_limits: got 0 for joint wrist, expected 1e-06 to 100000"):
         Controller(library, 3, measured_effort=False)
@@ -389,6 +393,7 @@ def test_arms_with_passive_joints_get_the_solver_only(tmp_path):
     urdf.with_suffix(".yaml").write_text(MOTORS)
     arm = load_arm(urdf)
     exported = export(build(arm, "closed-form"), "ros2", tmp_path / "package", arm=arm)
+    assert "no estimator" not in repr(exported)
     assert "no controller: it needs an effort interface of every joint" in repr(exported)
     assert not (tmp_path / "package/src/controller.cpp").exists()
     assert "controller" not in (tmp_path / "package/package.xml").read_text().replace(

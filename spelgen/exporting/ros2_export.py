@@ -38,21 +38,13 @@ _CONTROLLER_PATHS = {
 
 
 def export_ros2(trained: Trained) -> Exported:
-    """Return the package. Raises RunError if its C differs from the model.
-
-    An arm with passive joints or position servos gets no controller, since it has no effort interfaces for all joints.
-    """
-    model = trained.described
-    controller = model.servos is None and bool(model.actuated.all())
-    estimator = controller and trained.levels is not None
-    trained = replace(
-        trained,
-        entries=(*_CALLED, "tip_pose") if estimator else _CALLED,
-        levels=trained.levels if estimator else None,
-    )
-    sources, checked = c_files(trained)
+    """Return the package. Raises RunError if its C differs from the model."""
+    model, missing = trained.described, _missing_part(trained)
+    controller, estimator = missing is None or missing[0] != "controller", missing is None
+    entries = (*_CALLED, "tip_pose") if estimator else _CALLED
+    levels = trained.levels if estimator else None
+    sources, checked = c_files(replace(trained, entries=entries, levels=levels))
     package = f"{model.name}_dynamics"
-    files = {f"src/{name}": content for name, content in sources.items()}
     context = {"package": package, "controller": controller, "name": model.name, "upper": model.name.upper()}
     context |= {"joints": ", ".join(model.identifiers), "estimator": estimator}
     context["dependencies"] = sorted(_DEPENDENCIES + (_CONTROLLER_DEPENDENCIES if controller else ()))
@@ -60,27 +52,48 @@ def export_ros2(trained: Trained) -> Exported:
     if controller:
         paths = _PATHS | _CONTROLLER_PATHS
         context |= _controller_numbers(trained)
+    files = {f"src/{name}": content for name, content in sources.items()}
     for template, path in paths.items():
         files[path] = render(f"ros2/{template}.jinja", **context).encode()
-    use = (
-        f"Put this folder into a workspace and run colcon build --packages-select {package}. "
-        f"{package}/Solver is an inverse_dynamics_solver::InverseDynamicsSolver"
-    )
-    use += "; it is built if its interface is installed."
-    if controller:
-        use += (
-            f" {package}/Controller is a controller of ros2_control for effort interfaces: ros2 run controller_manager "
-            f"spawner {model.name}_controller --param-file install/{package}/share/{package}/config/controller.yaml "
-            "compensates gravity, or tracks the topic ~/reference with mode:=computed_torque."
-        )
     about = (
         "getTorques includes friction, and updates its state by the positions of successive calls; "
         "initialize resets it."
     )
-    summary = [checked]
-    if not controller:
-        summary.append("no controller: it needs an effort interface of every joint")
+    summary = [checked] if missing is None else [checked, f"no {missing[0]}: {missing[1]}"]
+    use = _use(package, model.name, controller=controller)
     return with_readme(trained, "ros2", files, use=use, about=about, summary=summary)
+
+
+def _missing_part(trained: Trained) -> tuple[str, str] | None:
+    """Return the part that the package does not contain, controller or estimator, and the reason; None: none is missing.
+
+    A package without controller has no estimator either.
+    """
+    model = trained.described
+    if model.servos is not None or not model.actuated.all():
+        return "controller", "it needs an effort interface of every joint"
+    if trained.levels is None:
+        return "estimator", "its noise levels are found from the training logs of a fit"
+    # its payload is in the frame of the last body, the published one in the frame of the tip link
+    if model.tip.carrier != len(model.arm.bodies) - 1:
+        return "estimator", "the tip link is not part of the last body"
+    return None
+
+
+def _use(package: str, name: str, *, controller: bool) -> str:
+    """Return the line of the README that describes the use of the package."""
+    use = (
+        f"Put this folder into a workspace and run colcon build --packages-select {package}. "
+        f"{package}/Solver is an inverse_dynamics_solver::InverseDynamicsSolver."
+    )
+    if controller:
+        use += (
+            f" {package}/Controller is a controller of ros2_control for effort interfaces: ros2 run controller_manager "
+            f"spawner {name}_controller --param-file install/{package}/share/{package}/config/controller.yaml "
+            f"compensates gravity; after ros2 param set /{name}_controller mode computed_torque it tracks the topic "
+            "~/reference (trajectory_msgs/JointTrajectoryPoint) or a preceding joint_trajectory_controller."
+        )
+    return use
 
 
 def _controller_numbers(trained: Trained) -> dict[str, object]:
