@@ -353,6 +353,9 @@ def test_the_parameter_file_has_the_parameters_and_their_defaults(arm):
     own = parameters["two_link_controller"]["ros__parameters"]
     manager = parameters["controller_manager"]["ros__parameters"]["two_link_controller"]
     assert own.pop("type") == manager["type"] == "two_link_dynamics/Controller"
+    trajectories = parameters["joint_trajectory_controller"]["ros__parameters"]
+    assert trajectories["joints"] == ["joint1", "joint2"]
+    assert trajectories["command_joints"] == ["two_link_controller/joint1", "two_link_controller/joint2"]
     controller = Controller(library, 2, **own)
     assert set(own) == set(controller.text("parameters").split())
     assert all(controller.set(name, value) is None for name, value in own.items() if isinstance(value, list))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -65,7 +66,7 @@ def export_ros2(trained: Trained) -> Exported:
 
 
 def _missing_part(trained: Trained) -> tuple[str, str] | None:
-    """Return the part that the package does not contain, controller or estimator, and the reason; None: none is missing.
+    """Return the part that the package does not contain, controller or estimator, and the reason; None: none.
 
     A package without controller has no estimator either.
     """
@@ -104,6 +105,9 @@ def _controller_numbers(trained: Trained) -> dict[str, object]:
     rotation = (f"{{{_listed(row)}}}" for row in model.tip.pose[:3, :3])
     return {
         "joint_names": ", ".join(map(cpp_string, trained.joint_names)),
+        # a JSON text is YAML
+        "yaml_joints": ", ".join(map(json.dumps, trained.joint_names)),
+        "yaml_references": ", ".join(json.dumps(f"{model.name}_controller/{x}") for x in trained.joint_names),
         "efforts": _listed(joint.effort or 0.0 for joint in coordinates),
         "velocities": _listed(joint.velocity or UNLIMITED["velocity"] for joint in coordinates),
         "frozen_travel": _listed(travel),
