@@ -109,7 +109,7 @@ def _controller_numbers(trained: Trained) -> dict[str, object]:
         "yaml_joints": ", ".join(map(json.dumps, trained.joint_names)),
         "yaml_references": ", ".join(json.dumps(f"{model.name}_controller/{x}") for x in trained.joint_names),
         "efforts": _listed(joint.effort or 0.0 for joint in coordinates),
-        "velocities": _listed(joint.velocity or UNLIMITED["velocity"] for joint in coordinates),
+        "velocities": _listed(_velocity_limit(joint.velocity) for joint in coordinates),
         "frozen_travel": _listed(travel),
         "continuous": ", ".join(continuous),
         "tip_link": cpp_string(model.tip.link),
@@ -117,6 +117,12 @@ def _controller_numbers(trained: Trained) -> dict[str, object]:
         "tip_position": _listed(model.tip.pose[:3, 3]),
         "filled": lambda value: _listed([value] * model.n),
     }
+
+
+def _velocity_limit(velocity: float | None) -> float:
+    """Return the velocity above which a joint is damped; references at the URDF's limit overshoot it a little."""
+    largest = UNLIMITED["velocity"]
+    return largest if velocity is None else min(float(f"{1.2 * velocity:.4g}"), largest)
 
 
 def _listed(numbers: Iterable[float] | np.ndarray) -> str:
