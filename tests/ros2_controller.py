@@ -30,8 +30,7 @@ def compiled(package: Path, folder: Path, *flags: str) -> ctypes.CDLL:
     for source in sorted((package / "src").glob(f"{name}*.c")):
         objects.append(folder / f"{source.stem}.o")
         subprocess.run(["gcc", "-std=c99", *warnings, "-c", source, "-o", objects[-1]], check=True)
-    # one translation unit takes less time than two
-    sources = ["-include", package / "src" / "controller.cpp", STUBS / "harness.cpp"]
+    sources = [package / "src" / "controller.cpp", STUBS / "harness.cpp"]
     command = ["g++", "-std=c++17", *warnings, "-Wpedantic", "-shared", "-Wl,-Bsymbolic", *flags, *include]
     done = subprocess.run(
         [*command, *sources, *objects, "-o", library, "-lm"], capture_output=True, text=True, check=False
