@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from spelgen.identification.identification import Identification as Identification
     from spelgen.identification.identification import LeastSquares as LeastSquares
     from spelgen.identification.identify import identify as identify
+    from spelgen.live.estimator import Estimator as Estimator
+    from spelgen.live.estimator import EstimatorState as EstimatorState
     from spelgen.log_checks.check_logs import check_logs as check_logs
     from spelgen.logs.preprocessing import Preprocessing as Preprocessing
     from spelgen.logs.read import read_logs as read_logs
@@ -71,6 +73,7 @@ _MODULES = {
     "evaluation.results": "Results",
     "dynamics.tip": "tip_kinematics",
     "exporting.export": "export",
+    "live.estimator": "Estimator EstimatorState",
     "errors": "SpelgenError",
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names.split()}

@@ -10,15 +10,28 @@ from pathlib import Path
 
 import numpy as np
 
-from spelgen.dynamics.protocol import input_of
-from spelgen.emission.specify import arm_of_spec
+from spelgen.arm.configured_arm import Arm
+from spelgen.emission.assemble import ArmModel
 from spelgen.exporting.c_estimator import CALLED, estimator_c_functions, estimator_texts
 from spelgen.exporting.c_export import compile_library
 from spelgen.exporting.c_source import c_functions, write_c
 from spelgen.exporting.describe import describe
 from spelgen.exporting.entry_points import ENTRY_POINTS
-from spelgen.fitting.fitted import Fit, required_spec
-from spelgen.live.noise import NoiseLevels
+from spelgen.live.intake import REFUSALS
+from spelgen.live.noise import BlockNoise, NoiseLevels
+
+
+def nominal_levels(
+    effort: np.ndarray, speed: np.ndarray, coulomb: np.ndarray, noise_ratio: float = 2e-3
+) -> NoiseLevels:
+    """Return noise levels of an arm with these torque limits, speeds and friction torques, (n,), and a ratio of noise to limits."""
+    ones = np.ones(len(effort))
+    white = noise_ratio * effort
+    noise = BlockNoise(white=white, disturbance=1.5 * white, time_constant=0.7 * ones)
+    return NoiseLevels(
+        drift=noise, load=noise, observer=white, peak_start=2.5 * ones, peak_scale=0.7 * ones, load_variance=1.5,
+        coulomb=coulomb, speed=speed, encoder=0 * ones, effort=effort, minutes=2.0, point=np.array([0.0, 0.0, 0.1]),
+    )  # fmt: skip
 
 _RUNNER = """
 #include "NAME_estimator.h"
@@ -112,9 +125,8 @@ class Columns:
 class CompiledEstimator:
     """An estimator in C, in a temporary folder."""
 
-    def __init__(self, fit: Fit, levels: NoiseLevels, *flags: str) -> None:
-        assert fit.urdf is not None and input_of(fit.model) == "torque"
-        model = describe(fit.model, arm_of_spec(required_spec(fit.model), fit.urdf))
+    def __init__(self, trained: ArmModel, arm: Arm, levels: NoiseLevels, *flags: str) -> None:
+        model = describe(trained, arm)
         self.n, self.name = model.n, model.name
         self.dtype = np.float32 if any(flag.endswith("_FLOAT") for flag in flags) else np.float64
         functions = c_functions(model, {name: ENTRY_POINTS[name] for name in CALLED})
@@ -146,8 +158,26 @@ class CompiledEstimator:
         parts = np.split(out, np.cumsum(sizes)[:-1], axis=1)
         return Columns(*(x[:, 0] if size == 1 else x for x, size in zip(parts, sizes, strict=True)))
 
-    def refused(self) -> np.ndarray:
-        """Return the counts of samples by reason, (7,)."""
-        counts = np.zeros(7)
+    def refused(self) -> dict[str, int]:
+        """Return the counts of samples by reason."""
+        counts = np.zeros(len(REFUSALS))
         self.library.refusals(self.state, counts.ctypes.data_as(ctypes.c_void_p))
-        return counts
+        return dict(zip(REFUSALS, counts.astype(int).tolist(), strict=True))
+
+    def saved(self) -> ctypes.Array[ctypes.c_char]:
+        """Return the saved state."""
+        state = ctypes.create_string_buffer(self.library.saved_size())
+        self.library[f"{self.name}_estimator_save"](self.state, state)
+        return state
+
+    def restore(self, state: ctypes.Array[ctypes.c_char]) -> bool:
+        """Read a saved state; return whether it is one."""
+        return bool(self.library[f"{self.name}_estimator_restore"](self.state, state))
+
+    def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, ahead: float) -> np.ndarray:
+        """Return the torques that give qdd, (n,)."""
+        tau = np.zeros(self.n, self.dtype)
+        arrays = [np.ascontiguousarray(x, self.dtype) for x in (q, qd, qdd)]
+        q_, qd_, qdd_, tau_ = (x.ctypes.data_as(ctypes.c_void_p) for x in (*arrays, tau))
+        self.library[f"{self.name}_estimator_torque"](self.state, q_, qd_, qdd_, ctypes.c_double(ahead), tau_)
+        return tau

@@ -12,7 +12,7 @@ from spelgen.exporting.c_source import CFunction, c_function
 from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.estimator_expressions import ENTRIES, estimator_functions
 from spelgen.live.noise import TAIL, NoiseLevels
-from spelgen.live.payload import EVIDENCE, ITERATIONS, LOAD_PRIOR
+from spelgen.live.payload import EVIDENCE, ITERATIONS, LOAD_PRIOR, WEIGHTS
 from spelgen.live.tuning import TUNING
 from spelgen.templates import render
 
@@ -58,6 +58,7 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         "windows": repr(60 / TUNING.window * TAIL * model.n),
         "evidence": repr(EVIDENCE),
         "iterations": ITERATIONS,
+        "weights": WEIGHTS,
         "tables": {name: _numbers(row) for name, row in tables.items()},
         "motors": list(map(_numbers, model.motors)),
         "inverse_inputs": list(map(_numbers, np.linalg.inv(model.inputs + np.diag(1 - model.actuated)))),

@@ -9,21 +9,28 @@ import numpy as np
 from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.baseline import arm_of_model
 from spelgen.dynamics.bristles import bristle_reach
+from spelgen.dynamics.parameters import without_idle_residuals, without_residuals
+from spelgen.dynamics.protocol import residual_terms
 from spelgen.dynamics.tip_frame import tip_frame
 from spelgen.emission.assemble import assemble
-from spelgen.errors import RunError
+from spelgen.errors import LogError, RunError
 from spelgen.files import read_json, write_json
 from spelgen.fitting.fitted import Fit, required_spec
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_record import require
 from spelgen.fitting.torque.fit import fit_torque
+from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.fitting.torque.tuning import TUNING
 from spelgen.live.levels import find_levels
 from spelgen.live.noise import NoiseLevels
 from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.trajectory import Trajectory
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
+from spelgen.settings.fits import TorqueFit
 
 FOLDS = 3
+MIN_SAMPLES = 300
+MAX_SAMPLES = 2**11
 
 
 def noise_levels(fit: Fit) -> NoiseLevels:
@@ -37,9 +44,18 @@ def noise_levels(fit: Fit) -> NoiseLevels:
             do="fit it again by `spelgen train`, which finds them",
         )  # fmt: skip
     levels = cross_validated_levels(fit)
+    keep_levels(fit, levels)
+    return levels
+
+
+def keep_levels(fit: Fit, levels: NoiseLevels | None = None) -> None:
+    """Write noise levels into the run folder of a fit; None: those that its logs show, if it is a fit to torques."""
+    if levels is None:
+        if not isinstance(fit.config, TorqueFit) or not isinstance(fit.model, RigidBodyDynamics) or not fit.logs:
+            return
+        levels = cross_validated_levels(fit)
     if fit.folder is not None:
         write_json(RunFolder(fit.folder).estimator, levels.model_dump(mode="json"))
-    return levels
 
 
 def stored_levels(fit: Fit) -> NoiseLevels | None:
@@ -68,10 +84,22 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
 
 
 def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
-    """Return the model of a fit, fitted to other logs from its initial parameters."""
+    """Return the model of a fit, fitted to other logs from its initial parameters. Raises LogError for too little motion.
+
+    A part of the samples suffices to find the error on other logs, and so does a model without residual terms if the fit
+    has none.
+    """
     model = assemble(required_spec(fit.model)).double()
+    if residual_terms(without_idle_residuals(fit.model)) is None:
+        model = without_residuals(model)
     samples = dynamics_samples(logs, preprocessing=fit.preprocessing, reach=bristle_reach(model))
-    fit_torque(model, [x for x in samples if len(x.q)])
+    samples = [x for x in samples if len(x.q)]
+    if sum(len(x.q) for x in samples) < MIN_SAMPLES:
+        raise LogError(
+            "too little motion to find noise levels of the estimator", expected=f"{MIN_SAMPLES} samples that move in two thirds of "
+            "the logs", do="record longer",
+        )  # fmt: skip
+    fit_torque(model, TorqueSamples.of(samples, TUNING.decimation).subsampled(MAX_SAMPLES))
     return model.requires_grad_(False).eval()
 
 

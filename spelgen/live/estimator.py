@@ -101,8 +101,11 @@ class Estimator:
             bounds.append((self.intake.low, self.intake.high))
         used = [k for k, refusal in enumerate(checked) if refusal not in IGNORED]
         low, high = (np.array([pair[side] for pair in bounds]) for side in (0, 1))
-        terms = balance(self.model, self.levels.point, [x[used] for x in (q, qd, tau)], [x[used] for x in (low, high)])
-        rows = iter(zip(*terms, strict=True))
+        rows: Iterator[tuple[np.ndarray, ...]] = iter(())
+        if used:
+            bounded = [x[used] for x in (low, high)]
+            terms = balance(self.model, self.levels.point, [x[used] for x in (q, qd, tau)], bounded)
+            rows = iter(zip(*terms, strict=True))
         for k, refusal in enumerate(checked):
             changed = False
             if refusal not in IGNORED:

@@ -62,6 +62,16 @@ class PayloadEstimate:
     def _compare(self, moving: int) -> None:
         """Begin, accept or drop the hypotheses of another load and of a contact."""
         main = self.filters[0]
+        if len(self.filters) > 1:
+            _, candidate, contact = self.filters
+            ratio = candidate.log_likelihood - max(main.log_likelihood, contact.log_likelihood)
+            if self.hypotheses_moved >= TUNING.changed_after and ratio > TUNING.changed:
+                self.filters = [candidate]
+                self.changed = True
+                self.moved = self.hypotheses_moved
+                return
+            if self.hypotheses_moved >= (TUNING.changed_after if ratio < TUNING.unlikely else TUNING.dropped_after):
+                self.filters = [main]
         if len(self.filters) == 1:
             # from the first second of motion on
             is_surprise = moving and main.surprise > moving + TUNING.surprise * math.sqrt(2 * moving)
@@ -71,12 +81,3 @@ class PayloadEstimate:
                 candidate.forget_load()
                 contact.disturbance = main.disturbance * TUNING.contact_disturbance**2
                 self.filters = [main, candidate, contact]
-            return
-        _, candidate, contact = self.filters
-        ratio = candidate.log_likelihood - max(main.log_likelihood, contact.log_likelihood)
-        if self.hypotheses_moved >= TUNING.changed_after and ratio > TUNING.changed:
-            self.filters = [candidate]
-            self.changed = True
-            self.moved = self.hypotheses_moved
-        elif self.hypotheses_moved >= TUNING.dropped_after:
-            self.filters = [main]

@@ -7,15 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from spelgen.dynamics.bristles import bristle_reach, encoder_step
-from spelgen.emission.assemble import ArmModel, assemble
 from spelgen.live.contact import ContactObserver
-from spelgen.live.filters import Block, DriftFilter
+from spelgen.live.filters import DriftFilter, LoadFilter
 from spelgen.live.intake import IGNORED, Intake
 from spelgen.live.momentum import Balance, balance
-from spelgen.live.blocks import Blocks, joined
+from spelgen.live.blocks import Block, Blocks, joined
 from spelgen.live.noise import TAIL, BlockNoise, NoiseLevels
 from spelgen.live.payload import NO_REPORT
 from spelgen.live.tuning import TUNING
@@ -24,6 +22,8 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 _TIME_CONSTANTS = np.geomspace(0.1, 6.4, 7)  # [s] of the disturbance
 _RATIOS = np.array([0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 5])  # of disturbance and white noise
+
+WINDOW = 25  # blocks of a trial of the payload filter, 5 s
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ def find_levels(
         observer=np.ones(n),
         peak_start=np.ones(n),
         peak_scale=np.ones(n),
-        load_variance=TUNING.variance,
+        load_variance=1.0,
         coulomb=np.mean([model.coulomb.numpy() for model, _ in folds], axis=0),
         speed=np.abs(joined_column(logs, "qd")).max(axis=0),
         encoder=np.min([encoder_step(log.q) for log in logs], axis=0),
@@ -80,10 +80,28 @@ def find_levels(
     )
     tested = [held_out(model, log, levels) for model, fold in folds for log in fold]
     segments = [blocks_along(each, levels) for each in tested]
-    short = block_noise(segments)
-    long = block_noise([list(itertools.starmap(joined, zip(x[::2], x[1::2]))) for x in segments])
-    levels = levels.model_copy(update={"drift": short, "load": long})
+    pairs = [list(itertools.starmap(joined, zip(x[::2], x[1::2], strict=False))) for x in segments]
+    levels = levels.model_copy(update={"drift": block_noise(segments), "load": block_noise(pairs)})
+    levels = levels.model_copy(update={"load_variance": load_variance(pairs, levels)})
     return _with_observer(levels, tested)
+
+
+def load_variance(segments: Sequence[Sequence[Block]], levels: NoiseLevels) -> float:
+    """Return the factor on the covariance of payloads, at least 1: none is carried, and the estimates show the error.
+
+    Windows of blocks are independent trials. The factor is the mean squared estimate of mass and first moments, (4,), relative
+    to its covariance.
+    """
+    squares: list[float] = []
+    for blocks in segments:
+        for start in range(0, len(blocks) - WINDOW + 1, WINDOW):
+            load = LoadFilter(levels.load, levels.effort)
+            for block in blocks[start : start + WINDOW]:
+                load.predict(block.duration)
+                for joint in range(load.n):
+                    load.update(block, joint)
+            squares.append(float(load.x[:4] @ np.linalg.solve(load.P[:4, :4], load.x[:4])) / 4)
+    return max(1.0, float(np.mean(squares))) if squares else 1.0
 
 
 def blocks_along(tested: HeldOut, levels: NoiseLevels) -> list[Block]:

@@ -42,7 +42,7 @@ class NoiseLevels(BaseModel):
     """All that the estimator knows of an arm besides its model; vectors are (n,).
 
     drift, load: noise of blocks of both filters. observer: standard deviation of the momentum observer of a moving joint [Nm,
-    N]. peak_start, peak_scale: exponential tail of the peaks of the normalised observer, beyond the largest fifth. coulomb:
+    N]. peak_start, peak_scale: exponential tail of the peaks of the normalised observer, beyond the largest fifth. load_variance: factor on the covariance of payloads. coulomb:
     friction at low speed [Nm, N]. speed: largest of the training logs [rad/s, m/s]. encoder: step of positions [rad, m].
     effort: torque limit [Nm, N]. minutes: duration of the training logs. point: tip in the frame of the last body, (3,) [m].
     """
@@ -75,7 +75,8 @@ class NoiseLevels(BaseModel):
     def thresholds(self, alarms_per_minute: float) -> np.ndarray:
         """Return the thresholds of the normalised observer, (n,), for a rate of false alarms of all joints."""
         windows = 60 / TUNING.window * TAIL * len(self.observer)
-        return np.maximum(self.peak_start + self.peak_scale * math.log(windows / alarms_per_minute), 1.0)
+        tail = self.peak_start + self.peak_scale * math.log(windows / alarms_per_minute)
+        return math.sqrt(TUNING.variance) * np.maximum(tail, 1.0)
 
 
 TAIL = 0.2

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from scipy.linalg import solve_triangular
 
 from spelgen.dynamics.body_regressor import pseudo_inertia
 from spelgen.live.tuning import TUNING
@@ -24,6 +25,7 @@ _UNITS = pseudo_inertia(torch.eye(10).double()).numpy()
 LOAD_PRIOR = np.array([TUNING.load_mass] + 3 * [TUNING.load_moment] + 6 * [TUNING.load_inertia])
 _DEGREES = 6  # of freedom of the Wishart distribution
 ITERATIONS = 40
+WEIGHTS = 12  # weights of the likelihood below one, powers of 1/4
 # Constant of the log evidence: of the Wishart density, with |dJ/dtheta| = 1/2, and of the Gaussian of Laplace's approximation.
 _LOG_GAMMA = 3 * math.log(math.pi) + sum(math.lgamma((_DEGREES - k) / 2) for k in range(4))
 EVIDENCE = -2 * _DEGREES * math.log(2) - _LOG_GAMMA - math.log(2) + 5 * math.log(2 * math.pi)
@@ -62,7 +64,7 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float) -> Pay
 
     factor: on the covariance of the likelihood.
     """
-    precision = np.linalg.inv(covariance)
+    precision = _inverse(covariance)
     linear = precision @ mean / factor
     precision = (precision - np.diag(LOAD_PRIOR**-2.0)) / factor
     found: list[tuple[np.ndarray, np.ndarray, float]] = []
@@ -87,48 +89,49 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float) -> Pay
     return _described(theta, spread, log_odds, limit)
 
 
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    """Return the inverse of a symmetric positive definite matrix, whose entries may differ by many orders of magnitude."""
+    root = solve_triangular(np.linalg.cholesky(matrix), np.eye(len(matrix)), lower=True)
+    inverse: np.ndarray = root.T @ root
+    return inverse
+
+
 def _at_scale(
     precision: np.ndarray, linear: np.ndarray, scale: float, start: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the MAP estimate, its covariance, and the log evidence, for a prior mean of mass ``scale``.
 
-    Newton's method for 1/2 theta^T precision theta - linear . theta - 1/2 log det J + 1/2 tr(W^-1 J), from ``start`` or
-    the prior mean. The cost is self-concordant: close to the minimum full steps are feasible.
+    Newton's method for weight (1/2 theta^T precision theta - linear . theta) - 1/2 log det J + 1/2 tr(W^-1 J), from
+    ``start``, or from the prior mean with an increasing weight: the likelihood may be largest far outside of the cone of
+    consistent parameters, at whose boundary Newton's method would stall (Boyd and Vandenberghe, Convex Optimization, 2004,
+    11.3). Twice the cost is self-concordant: steps damped by its decrement are feasible (9.6.4).
     """
     variances = np.array([TUNING.radius**2 / 5] * 3)
     height = TUNING.distance
     around = scale * (variances[0] + variances[1] + np.array([height**2, height**2, 0.0]))
     mean = np.array([scale, 0, 0, scale * height, around[0], 0, 0, around[1], 0, around[2]])
     width = np.einsum("i,iab->ab", mean, _UNITS) / _DEGREES
-    pull = 0.5 * np.einsum("iab,ba->i", _UNITS, np.linalg.inv(width))
+    pull = 0.5 * np.einsum("iab,ba->i", _UNITS, _inverse(width))
     theta = mean if start is None else start
 
-    def cost(theta: np.ndarray) -> float:
-        try:
-            root = np.linalg.cholesky(np.einsum("i,iab->ab", theta, _UNITS))
-        except np.linalg.LinAlgError:
-            return math.inf
-        log_det = 2 * np.log(np.diag(root)).sum()
-        return float(0.5 * theta @ precision @ theta - linear @ theta - 0.5 * log_det + pull @ theta)
-
-    for _ in range(ITERATIONS):
-        ratios = np.linalg.inv(np.einsum("i,iab->ab", theta, _UNITS)) @ _UNITS
-        gradient = precision @ theta - linear - 0.5 * np.einsum("iaa->i", ratios) + pull
-        hessian = precision + 0.5 * np.einsum("iab,jba->ij", ratios, ratios)
-        inverse = np.linalg.inv(hessian)
-        step = inverse @ gradient
-        decrement = gradient @ step
-        if decrement < 1e-15:
-            break
-        length = 1.0
-        if decrement > 1e-3:
-            current = cost(theta)
-            while length > 1e-6 and not cost(theta - length * step) < current:
-                length /= 2
-        theta = theta - length * step
+    for power in range(0 if start is not None else -WEIGHTS, 1):
+        weight = 4.0**power
+        for _ in range(ITERATIONS):
+            ratios = _inverse(np.einsum("i,iab->ab", theta, _UNITS)) @ _UNITS
+            gradient = weight * (precision @ theta - linear) - 0.5 * np.einsum("iaa->i", ratios) + pull
+            hessian = weight * precision + 0.5 * np.einsum("iab,jba->ij", ratios, ratios)
+            inverse = _inverse(hessian)
+            step = inverse @ gradient
+            decrement = gradient @ step
+            theta = theta - step / (1 + math.sqrt(2 * decrement) if decrement > 0.01 else 1)
+            # the error after a full step is about the square of the one before
+            if decrement < (0.1 if power else 1e-8):
+                break
     _, log_width = np.linalg.slogdet(width)
     _, log_hessian = np.linalg.slogdet(hessian)
-    return theta, inverse, EVIDENCE - _DEGREES / 2 * log_width - cost(theta) - 0.5 * log_hessian
+    _, log_inertia = np.linalg.slogdet(np.einsum("i,iab->ab", theta, _UNITS))
+    cost = 0.5 * theta @ precision @ theta - linear @ theta - 0.5 * log_inertia + pull @ theta
+    return theta, inverse, float(EVIDENCE - _DEGREES / 2 * log_width - cost - 0.5 * log_hessian)
 
 
 def _described(theta: np.ndarray, covariance: np.ndarray, log_odds: float, limit: float) -> Payload:

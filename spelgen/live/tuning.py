@@ -45,13 +45,15 @@ class LiveTuning:
     # Changed loads (`live.estimator`).
 
     # [1] Standard deviations of the squared residuals of a block from which on another load is considered.
-    surprise: float = 4.0
+    surprise: float = 3.0
     # [1] Factor on the standard deviation of the disturbance under the hypothesis of a contact.
     contact_disturbance: float = 8.0
     # [1] Log likelihood ratio, and [s] motion, from which on another load is accepted.
-    changed: float = 40.0
+    changed: float = 30.0
     changed_after: float = 1.0
-    # [s] Motion after which a hypothesis is dropped.
+    # [s] Motion after which the hypotheses are dropped; earlier, after `changed_after`, if the log likelihood ratio is below
+    # this.
+    unlikely: float = -8.0
     dropped_after: float = 4.0
 
     # Contacts (`live.contact`).
