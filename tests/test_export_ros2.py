@@ -1,5 +1,6 @@
 """The exported ROS 2 package compiles against stubs of its interface and computes the torques of the model."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -196,3 +197,12 @@ def test_colcon_builds_it(package, tmp_path):
         [[float(x) for x in line.split()] for line in driver_lines(each)[:-1]] for each in (by_colcon, own)
     )
     np.testing.assert_allclose(*lines, rtol=1e-13)
+
+
+@pytest.mark.skipif("AMENT_PREFIX_PATH" not in os.environ, reason="no ROS 2 on this machine")
+def test_colcon_builds_it_with_ros_2(package, tmp_path):
+    _, folder = package
+    shutil.copytree(folder, tmp_path / "src" / folder.name)
+    run("colcon", "build", "--packages-select", folder.name, cwd=tmp_path)
+    installed = tmp_path / "install" / folder.name
+    assert "Controller" in run("nm", "-D", "-C", installed / "lib" / f"lib{folder.name}.so")

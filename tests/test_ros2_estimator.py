@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import yaml
 from emitted import ROBOTS
+from pyarrow import parquet
 from ros2_controller import Controller, SimulatedArm, compiled
 
 from spelgen import build, load_arm
@@ -178,3 +179,21 @@ def test_the_parameter_file_has_the_parameters_and_their_defaults(ur10e):
     parameters.pop("type")
     controller = Controller(library, N, **parameters)
     assert set(parameters) == set(controller.text("parameters").split())
+
+
+def test_recordings_of_a_robot_cause_no_stop(ur10e, shared):
+    """Checks of jumps, frozen positions and velocities accept the samples of a UR10e."""
+    library, _, _ = ur10e
+    joints = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+    recordings = sorted((shared / "logs" / "ur10e").glob("*.parquet"))
+    assert recordings
+    for path in recordings:
+        table = parquet.read_table(path)
+        q, qd, tau = (
+            np.stack([table[f"{x}_{joint}_joint"] for joint in joints], 1) for x in ("q", "qd", "tau")
+        )
+        controller = Controller(library, N)
+        for k, period in enumerate(np.diff(table["t"].to_numpy())):
+            controller.update(q[k], qd[k], tau[k], period)
+            if k % 2 == 0:
+                assert controller.text("state") == "gravity_compensation"
