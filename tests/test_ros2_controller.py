@@ -268,7 +268,7 @@ def test_an_arm_at_rest_and_a_slow_encoder_are_not_frozen(arm):
     controller, _ = started(arm)
     random = np.random.default_rng(0)
     for cycle in range(2000):
-        noise = 0.02 * random.standard_normal(2)
+        noise = 0.02 * random.standard_normal(2) + [0.03, 0.0]  # and an offset
         q = START + np.floor(cycle / 50) * 1e-3  # 0.02 rad/s by an encoder of 1 mrad
         controller.update(q if cycle < 1000 else START + 0.02, noise + (0.02 if cycle < 1000 else 0))
         assert controller.text("state") == "gravity_compensation"

@@ -100,7 +100,7 @@ def _use(package: str, name: str, *, controller: bool) -> str:
 def _controller_numbers(trained: Trained) -> dict[str, object]:
     """Return names, limits and the tip's pose as text of C++ and YAML. An absent effort limit is 0 and must be set."""
     model, coordinates = trained.described, trained.arm.chain.coordinates
-    travel = [1e-2 if joint.joint_type == "revolute" else 1e-3 for joint in coordinates]
+    revolute = np.array([joint.joint_type == "revolute" for joint in coordinates])
     continuous = [str(joint.continuous).lower() for joint in coordinates]
     rotation = (f"{{{_listed(row)}}}" for row in model.tip.pose[:3, :3])
     return {
@@ -110,7 +110,8 @@ def _controller_numbers(trained: Trained) -> dict[str, object]:
         "yaml_references": ", ".join(json.dumps(f"{model.name}_controller/{x}") for x in trained.joint_names),
         "efforts": _listed(joint.effort or 0.0 for joint in coordinates),
         "velocities": _listed(_velocity_limit(joint.velocity) for joint in coordinates),
-        "frozen_travel": _listed(travel),
+        "position_errors": _listed(np.where(revolute, 0.2, 0.05)),
+        "frozen_travel": _listed(np.where(revolute, 1e-2, 1e-3)),
         "continuous": ", ".join(continuous),
         "tip_link": cpp_string(model.tip.link),
         "tip_rotation": ", ".join(rotation),
