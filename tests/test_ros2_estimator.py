@@ -4,12 +4,14 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from emitted import ROBOTS
 from pyarrow import parquet
 from ros2_controller import Controller, SimulatedArm, compiled
 
 from spelgen import build, load_arm
+from spelgen.dynamics.tip import tip_kinematics
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.ros2_export import export_ros2
 from spelgen.live.noise import BlockNoise, NoiseLevels
@@ -114,13 +116,17 @@ def test_without_a_payload_none_is_published_and_a_push_is_a_contact(ur10e):
     free.start(START)
     controller = Controller(library, N, measured_effort=True, joint_prefix="left_", **STIFF)
     controller.commands = np.full(N, np.nan)  # unknown before the first cycle
-    push = np.array([0.0, 30.0, 0.0, 0.0, 0.0, 0.0])
+    tip = tip_kinematics(load_arm(ROBOTS / "ur10e.urdf"))
+    force = np.array([30.0, -20.0, -60.0])  # [N] in root axes
     contacts, external = [], []
     for cycle in range(2500):
         t = cycle * PERIOD
         controller.reference(*moving(t))
         tau = controller.update(free.q, free.qd, controller.commands, PERIOD)
-        free.step(tau + push * (t > 4.5), PERIOD)
+        q, push = torch.from_numpy(free.q), np.zeros(N)
+        if t > 4.5:
+            push = tip.jacobian(q).numpy()[:3].T @ force
+        free.step(tau + push, PERIOD)
         if cycle % 10 == 0:
             contacts.append(controller.joint_state("~/contact"))
             external.append(controller.joint_state("~/external_torque"))
@@ -128,11 +134,13 @@ def test_without_a_payload_none_is_published_and_a_push_is_a_contact(ur10e):
     assert "left_shoulder_lift_joint" in contacts[-1]
     names = [f"left_{c}" for c in ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint")]
     assert list(external[-1])[:3] == names
-    np.testing.assert_allclose(external[-1][names[1]], 30, rtol=0.15)
+    assert np.abs(push).max() > 30
+    np.testing.assert_allclose(list(external[-1].values()), push, atol=0.05 * np.abs(push).max())
     assert contacts[-1][names[1]] == external[-1][names[1]]
     frame, wrench = controller.wrench()
     assert frame == "left_wrist_3"
-    assert np.linalg.norm(wrench[:3]) > 5
+    rotation = tip.pose(q).numpy()[:3, :3]
+    np.testing.assert_allclose(wrench[:3], rotation.T @ force, atol=5)
     np.testing.assert_array_equal(wrench[3:], 0)
     frame, payload = controller.payload()
     assert payload[0] == 0
