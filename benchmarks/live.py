@@ -2,9 +2,10 @@
 
     python benchmarks/live.py [FOLDER] [--arms ur10e panda ...] [--runs FOLDER]
 
-FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. Each arm is fitted to its training logs by the
-defaults of spelgen (preset hybrid), the noise levels are found by cross-validation, and the exported C estimator, which
-equals the Python estimator (tests/test_live_c.py), runs along the other logs. Payloads and contacts are added to measured torques.
+FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. Each arm is fitted to its
+training logs by the defaults of spelgen (preset hybrid), the noise levels are found by cross-validation, and the
+exported C estimator, which equals the Python estimator (tests/test_live_c.py), runs along the other logs. Payloads
+and contacts are added to measured torques.
 """
 
 from __future__ import annotations
@@ -91,7 +92,9 @@ def payload(mass: float, random: np.random.Generator) -> np.ndarray:
     """Return the parameters (10,) of a homogeneous ball that is held off the axis."""
     center = np.array([*random.uniform(-0.08, 0.08, 2), random.uniform(0.0, 0.15)])
     radius = 0.05 * max(mass, 0.1) ** (1 / 3)
-    inertia = 0.4 * mass * radius**2 * np.eye(3) + mass * (center @ center * np.eye(3) - np.outer(center, center))
+    inertia = 0.4 * mass * radius**2 * np.eye(3) + mass * (
+        center @ center * np.eye(3) - np.outer(center, center)
+    )
     return np.array([mass, *(mass * center), *inertia[np.triu_indices(3)]])
 
 
@@ -131,14 +134,16 @@ def without_load(case: Case) -> None:
         changed += columns.changed.sum()
         minutes += log.duration / 60
     print(
-        f"\nWithout a load: payload reported in {reported:.0f} of {len(case.tests)} logs, {changed:.0f} changed loads in "
+        f"\nWithout a load: payload reported in {reported:.0f} of {len(case.tests)} logs, {changed:.0f} changes in "
         f"{minutes:.1f} minutes"
     )
 
 
 def synthetic_loads(case: Case, draws: int = 3) -> None:
     scale = SMALL.get(case.name, 1.0)
-    print("\nSynthetic payloads: reported, error rms [kg], errors within the interval, and seconds until reported (median)\n")
+    print(
+        "\nSynthetic payloads: reported, error rms [kg], errors within the interval, median time of the first report\n"
+    )
     print(f"{'mass':>8}" + "".join(f"{f'{s} s':>26}" for s in (5, 10)) + f"{'first report':>16}")
     for mass in MASSES:
         random, rows, firsts = np.random.default_rng(0), {5: [], 10: []}, []
@@ -164,7 +169,7 @@ def synthetic_loads(case: Case, draws: int = 3) -> None:
 
 
 def corrections(case: Case, log: Trajectory, columns: Columns, ahead: float) -> np.ndarray:
-    """Return what the estimate of some time before adds to the torque of the fixed model, (T, n)."""
+    """Return friction scale minus one, and disturbance, by the estimate of some time before, (2, T, n)."""
     k = np.maximum(np.searchsorted(log.t, log.t - ahead, side="right") - 1, 0)
     scale, disturbance = columns.friction_scale[k] - 1, columns.disturbance[k]
     decay = np.exp(-ahead / case.levels.drift.time_constant) if ahead <= 0.3 else 0.0
@@ -209,7 +214,7 @@ def friction_of(case: Case, samples: DynamicsSamples) -> np.ndarray:
 
 
 def times_of(case: Case, log: Trajectory, samples: DynamicsSamples, pauses: bool) -> np.ndarray:
-    """Return the times of samples, (T,): those of a log whose only column is the time."""
+    """Return the times of samples, (T,), from a log with the time in place of torques."""
     clock = np.repeat(log.t[:, None] - log.t[0], log.q.shape[1], axis=1)
     marked = dataclasses.replace(log, tau=clock)
     same = case.samples(marked, pauses=pauses)
@@ -242,17 +247,18 @@ def contacts(case: Case, theta: np.ndarray | None = None) -> None:
                 for k, start in enumerate(starts):
                     rows = np.flatnonzero((log.t >= start) & (log.t < start + 0.5) & hit[:, k % n])
                     delays.append(log.t[rows[0]] - start if rows.size else np.inf)
-    print(f"\nContacts{'' if theta is None else f' with a load of {theta[0]:g} kg'}: {alarms / minutes:.1f} false alarms a minute")
+    carried = "" if theta is None else f" with a load of {theta[0]:g} kg"
+    print(f"\nContacts{carried}: {alarms / minutes:.1f} false alarms a minute")
     for fraction, delays in found.items():
         within = np.array(delays)
         print(
-            f"  step of {fraction:.0%} of effort: {np.isfinite(within).mean():.0%} found, median {1e3 * np.median(within):.0f} ms, "
-            f"{(within <= 0.15).mean():.0%} within 150 ms"
+            f"  step of {fraction:.0%} of effort: {np.isfinite(within).mean():.0%} found, "
+            f"median {1e3 * np.median(within):.0f} ms, {(within <= 0.15).mean():.0%} within 150 ms"
         )
 
 
 def changes(case: Case) -> None:
-    """A payload that appears and one that disappears in mid-log, and contacts of 2 s that must not be taken for a load."""
+    """A payload that appears and one that disappears in mid-log, and contacts of 2 s, which are no load."""
     random, delays, taken, trials = np.random.default_rng(1), [], 0, 0
     effort = case.levels.effort
     for log in case.tests:
@@ -265,16 +271,23 @@ def changes(case: Case) -> None:
             for weight in (at, 1 - at):
                 columns = case.run(log, log.tau + weight * added)
                 rows = np.flatnonzero((columns.changed > 0) & (log.t >= start))
-                delays.append(np.interp(log.t[rows[0]], log.t, moving) - np.interp(start, log.t, moving) if rows.size else np.inf)
+                delays.append(
+                    np.interp(log.t[rows[0]], log.t, moving) - np.interp(start, log.t, moving)
+                    if rows.size
+                    else np.inf
+                )
         for joint in range(min(3, len(effort))):
             touch = ((log.t >= start) & (log.t < start + 2.0)).astype(float)
-            columns = case.run(log, log.tau + np.outer(touch, 0.1 * effort * (np.arange(len(effort)) == joint)))
+            columns = case.run(
+                log, log.tau + np.outer(touch, 0.1 * effort * (np.arange(len(effort)) == joint))
+            )
             taken += int((columns.changed > 0).any() or (columns.status[log.t >= start] == PAYLOAD).any())
             trials += 1
     within = np.array(delays)
     print(
-        f"\nChanged load: {(within <= 3).mean():.0%} of {len(within)} found within 3 s of motion, median {np.median(within):.1f} s, "
-        f"at worst {within.max():.1f} s; {taken} of {trials} contacts of 2 s taken for a load"
+        f"\nChanged load: {(within <= 3).mean():.0%} of {len(within)} found within 3 s of motion, "
+        f"median {np.median(within):.1f} s, at worst {within.max():.1f} s; "
+        f"{taken} of {trials} contacts of 2 s taken for a load"
     )
 
 
@@ -309,7 +322,9 @@ def cases(folder: Path, names: Sequence[str], runs: Path) -> list[Case]:
             repeats = {x.removesuffix("_again") for x in AIRBOT}
             tests = tuple(x.stem for x in sorted((folder / name).glob("*.parquet")))
             tests = tuple(x for x in tests if x.removesuffix("_again") not in repeats)
-        read = {x: read_logs([folder / name / f"{x}.parquet"], joints)[0] for x in (*training, *tests, *others)}
+        read = {
+            x: read_logs([folder / name / f"{x}.parquet"], joints)[0] for x in (*training, *tests, *others)
+        }
         logs, held_out = [read[x] for x in training], [read[x] for x in tests]
         if split:
             held_out, logs = [after(logs[0], split)], [first(logs[0], split)]
@@ -325,7 +340,9 @@ def main() -> None:
     torch.set_num_threads(1)
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", nargs="?")
-    parser.add_argument("--arms", nargs="+", default=["ur10e", "panda", "xmate3", "ar5", "shanghai", "airbot"])
+    parser.add_argument(
+        "--arms", nargs="+", default=["ur10e", "panda", "xmate3", "ar5", "shanghai", "airbot"]
+    )
     parser.add_argument("--runs", type=Path, default=Path("runs") / "live")
     options = parser.parse_args()
     for case in cases(folder_of(options.folder), options.arms, options.runs):

@@ -24,7 +24,7 @@ from spelgen.live.noise import BlockNoise, NoiseLevels
 def nominal_levels(
     effort: np.ndarray, speed: np.ndarray, coulomb: np.ndarray, noise_ratio: float = 2e-3
 ) -> NoiseLevels:
-    """Return noise levels of an arm with these torque limits, speeds and friction torques, (n,), and a ratio of noise to limits."""
+    """Return noise levels of an arm with these limits, (n,), and a ratio of noise to torque limits."""
     ones = np.ones(len(effort))
     white = noise_ratio * effort
     noise = BlockNoise(white=white, disturbance=1.5 * white, time_constant=0.7 * ones)
@@ -32,6 +32,7 @@ def nominal_levels(
         drift=noise, load=noise, observer=white, peak_start=2.5 * ones, peak_scale=0.7 * ones, load_variance=1.5,
         coulomb=coulomb, speed=speed, encoder=0 * ones, effort=effort, minutes=2.0, point=np.array([0.0, 0.0, 0.1]),
     )  # fmt: skip
+
 
 _RUNNER = """
 #include "NAME_estimator.h"
@@ -56,7 +57,8 @@ void refusals(const NAME_estimator *e, double *counts)
         counts[k] = (double)e->refused[k];
 }
 
-/* rows: external torque, threshold, friction scale, disturbance (N each), tip force (3), refusal, changed, status, log odds, limit,
+/* rows: external torque, threshold, friction scale, disturbance (N each), tip force (3), refusal, changed, status,
+log odds, limit,
  * mass and interval, centre (3), inertia (6), parameters (10), seconds of the step and of the report, motion */
 void run(NAME_estimator *e, size_t count, const double *t, const real *q, const real *qd, const real *tau, double *out)
 {
@@ -150,7 +152,11 @@ class CompiledEstimator:
     def run(self, t: np.ndarray, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> Columns:
         """Use samples, (T,) and (T, n)."""
         out = np.zeros((len(t), 4 * self.n + 33))
-        arrays = [np.ascontiguousarray(t, float), *(np.ascontiguousarray(x, self.dtype) for x in (q, qd, tau)), out]
+        arrays = [
+            np.ascontiguousarray(t, float),
+            *(np.ascontiguousarray(x, self.dtype) for x in (q, qd, tau)),
+            out,
+        ]
         pointers = [x.ctypes.data_as(ctypes.c_void_p) for x in arrays]
         self.library.run(self.state, ctypes.c_size_t(len(t)), *pointers)
         n = self.n
@@ -171,7 +177,7 @@ class CompiledEstimator:
         return state
 
     def restore(self, state: ctypes.Array[ctypes.c_char]) -> bool:
-        """Read a saved state; return whether it is one."""
+        """Read a saved state; return False if it is none."""
         return bool(self.library[f"{self.name}_estimator_restore"](self.state, state))
 
     def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, ahead: float) -> np.ndarray:

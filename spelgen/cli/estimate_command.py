@@ -29,8 +29,8 @@ def estimate(
 ) -> None:
     """Run the estimator along logs: payload, contacts, friction drift.
 
-    It prints mass and centre of mass with 95 % intervals, contacts with times and torques, and the friction of each joint
-    relative to the model, and writes a page with their curves.
+    It prints mass and centre of mass with 95 % intervals, contacts with times and torques, and the friction of each
+    joint relative to the model, and writes a page with their curves.
     """
     paths = options.logs(data, extra_logs)
     from spelgen.fitting.fitted import load_run
@@ -45,7 +45,9 @@ def estimate(
     torque_model(fit)
     levels = noise_levels(fit)
     joints = list(fit.model.joint_names)
-    logs = read_logs(paths, joints, mapping=options.log_mapping(joints, mapping or fit.record.mapping, accept))
+    logs = read_logs(
+        paths, joints, mapping=options.log_mapping(joints, mapping or fit.record.mapping, accept)
+    )
     results = replay(fit, logs, alarms)
     page = write_estimate(fit, levels, results, output or Path(run) / "estimate.html")
     rate = f"{levels.supported_alarms:.2g} false alarms per minute"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import textwrap
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,14 +14,7 @@ import typer
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
 from spelgen.cli.options import Accept, Data, Force, MappingFile, MoreData, RobotOption, TextOrJson
-from spelgen.cli.train_settings import (
-    TIME_LIMIT,
-    Request,
-    UsageError,
-    new_run,
-    read_assignments,
-    resumed_run,
-)
+from spelgen.cli.train_settings import TIME_LIMIT, Request, UsageError, new_run, read_assignments, resumed_run
 from spelgen.errors import LogError, ModuleError, OptionError
 from spelgen.labels import counted
 from spelgen.settings.fits import Objective, Rollout, TorqueFit, WindowConfig
@@ -42,8 +36,7 @@ TrainModule = Annotated[
 NewRun = Annotated[Path | None, options.output_option("RUN", "Run folder; default: runs/<module>.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Resume the run in the run folder.")]
 Source = Annotated[
-    Path | None,
-    typer.Option("--from", metavar="RUN", help="Adapt the model of this run; replaces MODULE."),
+    Path | None, typer.Option("--from", metavar="RUN", help="Adapt the model of this run; replaces MODULE.")
 ]
 ObjectiveName = Annotated[
     Objective | None,
@@ -138,7 +131,7 @@ def train(
 def _payload(fit: Fit, source: Path | None) -> Payload | None:
     """Return the payload in the logs of a fit to a load, by the estimator of the adapted run; None if it has none.
 
-    The noise levels of the adapted run are those of its source; those of a new fit are found here.
+    A new fit gets its own noise levels, an adapted run has the noise levels of its source.
     """
     from spelgen.live.cross_validation import keep_levels, stored_levels
     from spelgen.live.replay import carried_payload
@@ -175,6 +168,7 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
         # JSON has no infinity, the loss of a rollout that diverged
         "validation_loss": fit.best_validation if math.isfinite(fit.best_validation) else None,
         "torque_nmse": fit.torque_nmse,
+        "posterior": fit.posterior.to_dict() if fit.checkpoint.posterior else None,
         "findings": [finding.to_dict() for finding in fit.diagnostics],
     }
     outcome: list[str] = [*_outcome(fit)]
@@ -182,7 +176,8 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
         from spelgen.live.replay import payload_content, payload_sentence
 
         record["payload"] = payload_content(payload)
-        outcome.append(f"in these logs: {payload_sentence(payload)}")
+        outcome.append(textwrap.fill(f"in these logs: {payload_sentence(payload)}", 80))
+    outcome += [table.text() for table in fit.posterior.listings] if fit.checkpoint.posterior else []
     answer(format, record, *outcome, f"run folder: {folder}")
     if fit.status == "interrupted":
         note("the best model so far is in the run folder; resume it by --resume")

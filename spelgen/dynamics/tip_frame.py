@@ -31,9 +31,19 @@ def tip_frame(loaded: Arm) -> Tip:
     """Return the frame of the tip link, with the unrounded angles of the URDF."""
     names = loaded.chain.joint_names
     link = loaded.tip or last_link(loaded.robot, names)
-    frame = lump_links(loaded.robot, choose_chain(loaded.robot, names, None), 0.0).frames[link]
-    pose = np.eye(4)
-    pose[:3, :3] = frame.rotation
-    pose[:3, 3] = frame.position
     bodies = make_arm(loaded.robot, joints=names, angle_tolerance=0.0).bodies
-    return Tip(link, frame.body, pose, bodies)
+    return Tip(link, *link_poses(loaded)[link], bodies)
+
+
+def link_poses(loaded: Arm) -> dict[str, tuple[int, np.ndarray]]:
+    """Return, by link, the index of the body that carries it, -1: the root link, and the pose (4, 4) in its frame.
+
+    Angles are the unrounded angles of the URDF.
+    """
+    chain = choose_chain(loaded.robot, loaded.chain.joint_names, None)
+    poses: dict[str, tuple[int, np.ndarray]] = {}
+    for link, frame in lump_links(loaded.robot, chain, 0.0).frames.items():
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = frame.rotation, frame.position
+        poses[link] = frame.body, pose
+    return poses

@@ -1,4 +1,4 @@
-"""The estimator in C: a header and a source beside those of the model, with the noise levels of the run."""
+"""The estimator in C: a header and a source in addition to the model, with the noise levels of the run."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
 
 def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
     """Return header and source of the estimator, by name of the file."""
-    tables = {
+    tables: dict[str, Iterable[float]] = {
         "load_prior": LOAD_PRIOR,
         "load_white": levels.load.white,
         "load_disturbance": levels.load.disturbance,
@@ -67,7 +67,9 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
     identity = zlib.crc32(repr(sorted((name, str(value)) for name, value in values.items())).encode())
     files: dict[str, str] = {}
     for suffix in (".h", ".c"):
-        files[f"{model.name}_estimator{suffix}"] = render(f"estimator{suffix}.jinja", **values, identity=identity)
+        files[f"{model.name}_estimator{suffix}"] = render(
+            f"estimator{suffix}.jinja", **values, identity=identity
+        )
     return files
 
 

@@ -71,7 +71,7 @@ def compiler() -> str | None:
 
 
 def compile_library(sources: Path | Sequence[Path], program: str, *flags: str) -> Path:
-    """Compile C files to a shared library beside the first. Raises RunError with the messages of the compiler."""
+    """Compile C files to a shared library. Raises RunError with the messages of the compiler."""
     sources = [sources] if isinstance(sources, Path) else sources
     library = sources[0].with_suffix(".so")
     command = [program, *_FLAGS, *flags, *map(str, sources), "-o", str(library), "-lm"]

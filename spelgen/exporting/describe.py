@@ -17,15 +17,18 @@ from torch import Tensor
 
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.protocol import input_of, motors_of, residual_terms
+from spelgen.dynamics.tip import last_link, tip_kinematics
 from spelgen.dynamics.tip_frame import tip_frame
 from spelgen.errors import RunError
 from spelgen.exporting.description import Harmonics, Residuals, Servos, SigmoidNetwork, TrainedModel
 from spelgen.exporting.entry_points import EntryPoint, entry_points
+from spelgen.listing import Listing
 from spelgen.live.noise import NoiseLevels
 from spelgen.runtime.friction_laws import FrictionConstants
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
+    from spelgen.dynamics.prepared import PreparedModel
     from spelgen.emission.assemble import ArmModel
     from spelgen.runtime.encoding import JointEncoding
     from spelgen.runtime.parts import Layers
@@ -39,12 +42,16 @@ class Trained:
     """A trained model and its arm.
 
     entries: names of the functions to export, for formats of functions; empty: all functions except derivatives.
+    intervals: tables of the 95 % intervals of a fit, for the README.
+    float32: numbers of ONNX and torch programs; otherwise float64.
     levels: noise levels of the estimator; None: it is not exported.
     """
 
     model: ArmModel
     arm: Arm
     entries: tuple[str, ...] = ()
+    intervals: tuple[Listing, ...] = ()
+    float32: bool = False
     levels: NoiseLevels | None = None
 
     @cached_property
@@ -68,6 +75,16 @@ class Trained:
         return self.arm.chain.joint_names
 
     @property
+    def tip(self) -> str:
+        """The name of the tip link."""
+        return self.arm.tip or last_link(self.arm.robot, self.joint_names)
+
+    def prepared(self) -> PreparedModel:
+        """Return the model and the kinematics of its tip for programs of torch and ONNX."""
+        dtype = torch.float32 if self.float32 else torch.float64
+        return self.model.prepared(tip_kinematics(self.arm), dtype=dtype)
+
+    @property
     def memory(self) -> int:
         """Size of the friction state z of all joints."""
         model = self.model
@@ -76,6 +93,7 @@ class Trained:
 
 def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
     """Return the description of a trained model. Raises RunError for a preset without rigid bodies."""
+    # In double precision: the model may be in single precision or on another device.
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
     if not isinstance(exact, RigidBodyDynamics):
         preset = model.spec.options.preset
@@ -126,6 +144,7 @@ def unique_identifiers(names: Sequence[str]) -> tuple[str, ...]:
         if not plain or keyword.iskeyword(plain) or keyword.issoftkeyword(plain) or plain[0].isdigit():
             plain = f"joint_{plain or number}"
         unique, count = plain, 2
+        # Two names may differ only in characters that identifiers cannot have.
         while unique in identifiers:
             unique, count = f"{plain}_{count}", count + 1
         identifiers.append(unique)
@@ -154,6 +173,7 @@ def _residuals(model: ArmModel) -> Residuals:
     """Return the residual terms that are not zero."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
+    # Only entries of the lower triangle that any function contributes to.
     entries: np.ndarray = np.argwhere(np.tril(functions.any(axis=0).reshape(model.n, model.n)))
     mass = _network(weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
     if mass is None:
@@ -196,6 +216,7 @@ def _network(
         weights.append(functions.T)
         biases.append(np.zeros(functions.shape[1]))
     for k in range(1, len(weights)):
+        # tanh(x) = 2 sigmoid(2 x) - 1: twice the layer before, and twice minus the sum in the layer after.
         weights[k - 1], biases[k - 1] = 2 * weights[k - 1], 2 * biases[k - 1]
         weights[k], biases[k] = 2 * weights[k], biases[k] - weights[k].sum(axis=1)
     return SigmoidNetwork(tuple(weights), tuple(biases))

@@ -1,4 +1,4 @@
-"""Functions of the estimator as CasADi expressions: those of `live.momentum`, for the C estimator."""
+"""Functions of the C estimator as CasADi expressions, equal to the functions of `live.momentum`."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from spelgen.exporting.rigid_expressions import body_frames, constant, rigid_mom
 ENTRIES = (
     EntryPoint(
         "momentum_balance",
-        "the terms of d/dt (p + P load) = torque - friction + N load of an arm with a payload, and the Jacobian of its tip",
+        "the terms of d/dt (p + P load) = torque - friction + N load, of an arm with a payload, and the tip's Jacobian",
         ("q", "qd", "tau", "low", "high"),
         {
-            "momentum": "Nm s, N s", "torque": "Nm, N", "friction": "Nm, N", "uncertainty": "Nm, N", "load_momentum": "SI",
-            "load_torque": "SI", "jacobian": "m, 1",
+            "momentum": "Nm s, N s", "torque": "Nm, N", "friction": "Nm, N", "uncertainty": "Nm, N",
+            "load_momentum": "SI", "load_torque": "SI", "jacobian": "m, 1",
         },
     ),
     EntryPoint(
@@ -48,7 +48,11 @@ def estimator_functions(model: TrainedModel, point: np.ndarray) -> dict[str, ca.
     still = ca.SX(model.n, 1)
     gravity = rigid_torque(model, frames, still, still)
     gradient += residuals["kinetic"] - gravity - residuals["gravity"] - residuals["torque"]
-    torque = constant(model.inputs) @ (tau - model.torque_offset) + constant(model.friction_compensation) * qd + gradient
+    torque = (
+        constant(model.inputs) @ (tau - model.torque_offset)
+        + constant(model.friction_compensation) * qd
+        + gradient
+    )
     first, second = (drive_friction(model, residuals, qd, gravity, z) for z in (high, low))
     axes = _LoadAxes(model, frames, qd)
     outputs = {
@@ -125,7 +129,9 @@ class _LoadAxes:
             alpha, a_linear = alpha + a * change + da * speed, a_linear + l * change + dl * speed
         mass, moment = load[0], load[1:4]
         inertia = ca.vertcat(
-            ca.horzcat(load[4], load[5], load[6]), ca.horzcat(load[5], load[7], load[8]), ca.horzcat(load[6], load[8], load[9])
+            ca.horzcat(load[4], load[5], load[6]),
+            ca.horzcat(load[5], load[7], load[8]),
+            ca.horzcat(load[6], load[8], load[9]),
         )
         w, v = self.twist
         linear, angular = mass * v + ca.cross(w, moment), inertia @ w + ca.cross(moment, v)
@@ -140,6 +146,11 @@ def _projected(axis: Wrench, twist: Wrench) -> ca.SX:
     (a, l), (w, v) = axis, twist  # noqa: E741
     first = ca.cross(l, w) + ca.cross(v, a)
     products = a @ w.T
-    inertia = [products[0, 0], products[0, 1] + products[1, 0], products[0, 2] + products[2, 0], products[1, 1]]
+    inertia = [
+        products[0, 0],
+        products[0, 1] + products[1, 0],
+        products[0, 2] + products[2, 0],
+        products[1, 1],
+    ]
     inertia += [products[1, 2] + products[2, 1], products[2, 2]]
     return ca.horzcat(ca.dot(l, v), first.T, *inertia)

@@ -48,7 +48,7 @@ def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint])
 def named_function(
     entry: EntryPoint, expressions: tuple[ca.SX, ...], inputs: Symbols, residuals: Symbols
 ) -> ca.Function:
-    """Return the function of an entry point, of its inputs and of the residual terms that it needs; outputs are dense."""
+    """Return the function of an entry point, of its inputs and the residual terms that it needs; outputs are dense."""
     outputs = list(map(ca.densify, expressions))
     arguments = {key: inputs[key] for key in entry.inputs}
     for key, symbols in residuals.items():
@@ -82,7 +82,7 @@ def _expressions(
     motors = constant(model.motors)
     frames = body_frames(model.arm.bodies, q)
     rigid_mass, rigid_potential = mass_and_potential(model, q)
-    # of motors and residual terms
+    # M of the motors' rotors and of the residual terms
     added_mass = constant(model.constant_mass) + symmetric(model, residuals["mass"])
     mass = rigid_mass + added_mass
     rigid_gravity = rigid_torque(model, frames, standstill, standstill)
@@ -95,6 +95,7 @@ def _expressions(
     # one recursive Newton-Euler pass; M qdd + h would take two
     force = rigid_torque(model, frames, qd, qdd) + added_mass @ qdd + added_bias + friction - compensation
     applied = constant(model.inputs) @ (tau - model.torque_offset)
+    # Half of qd times it is the kinetic energy: M is used once.
     momentum = mass @ qd
     potential = rigid_potential + residuals["energy"] + residuals["torque_energy"]
     pose, jacobian = tip_kinematics(model, q)
@@ -121,7 +122,9 @@ def _expressions(
 def drive_friction(model: TrainedModel, residuals: Symbols, qd: ca.SX, gravity: ca.SX, z: ca.SX) -> ca.SX:
     """Return the friction torque of the joints, (n, 1) [Nm, N]; gravity: of the rigid bodies, (n, 1)."""
     motors = constant(model.motors)
-    friction = friction_torque(model, motors @ qd, constant(np.linalg.inv(model.motors).T) @ gravity, z)
+    # Power is equal on both sides of the gears: C^T drive_load = joint_load.
+    load = constant(np.linalg.inv(model.motors).T) @ gravity
+    friction = friction_torque(model, motors @ qd, load, z)
     for k, joint in enumerate(model.residuals.friction):
         friction[joint] *= ca.exp(residuals["factor"][k])
     return motors.T @ friction
@@ -217,6 +220,7 @@ def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Ou
         symbols.append(symbol)
         jacobians.append(jacobian)
     by_position = ca.jtimes(force, ca.vertcat(*symbols), ca.vertcat(*jacobians))
+    # Residual terms of M enter through their coriolis terms, which are explicit in qd.
     by_velocity = ca.jacobian(force, inputs["qd"])
     right = ca.horzcat(-by_position, -by_velocity, constant(model.inputs))
     # at the accelerations of the forward dynamics
@@ -242,6 +246,7 @@ def _solve(matrix: ca.SX, right: ca.SX) -> ca.SX:
         inverse = 1 / matrix[k, k]
         row = matrix[k, k + 1 :]
         factor = inverse * row
+        # Schur complement of the pivot; M is positive definite, so no pivoting is needed.
         matrix[k + 1 :, k + 1 :] -= factor.T @ row
         right[k + 1 :, :] -= factor.T @ right[k, :]
         right[k, :] *= inverse

@@ -14,8 +14,9 @@ from spelgen.live.tuning import TUNING
 class Block:
     """The momentum balance over a block.
 
-    duration [s]. y: torque that the model does not explain, (n,) [Nm, N]. load: Phi, (n, 10). friction: mean of the model's
-    friction, (n,). uncertainty: of friction whose state is unknown, (n,). moving: whether a joint moves, (n,).
+    duration [s]. y: torque that the model does not explain, (n,) [Nm, N]. load: Phi, (n, 10). friction: mean of the
+    model's friction, (n,). uncertainty: of friction whose state is unknown, (n,). moving: whether a joint moves,
+    (n,).
     """
 
     duration: float
@@ -79,8 +80,15 @@ def joined(first: Block, second: Block) -> Block:
     """Return the block of two blocks in a row."""
     duration = first.duration + second.duration
     weight = second.duration / duration
-    means = [a + weight * (b - a) for a, b in (
-        (first.y, second.y), (first.load, second.load), (first.friction, second.friction),
-        (first.uncertainty, second.uncertainty),
-    )]  # fmt: skip
-    return Block(duration, *means, moving=first.moving & second.moving)
+
+    def mean(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return a + weight * (b - a)
+
+    return Block(
+        duration,
+        mean(first.y, second.y),
+        mean(first.load, second.load),
+        mean(first.friction, second.friction),
+        mean(first.uncertainty, second.uncertainty),
+        first.moving & second.moving,
+    )

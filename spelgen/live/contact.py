@@ -24,7 +24,8 @@ class Contact(NamedTuple):
 class ContactObserver:
     """Low-passed momentum balance, at the rate of the samples.
 
-    Each low-passed term is a state: the torque, friction and momenta of the arm, (5, n), and the payload's regressor, (n, 10).
+    Each low-passed term is a state: the torque, friction and momenta of the arm, (5, n), and the payload's regressor,
+    (n, 10).
     """
 
     def __init__(self, levels: NoiseLevels, alarms_per_minute: float) -> None:
@@ -33,7 +34,9 @@ class ContactObserver:
 
     def restart(self) -> None:
         """Begin with the next sample."""
+        n = len(self.factor)
         self.t: float | None = None
+        self.inputs, self.load_inputs = np.zeros((5, n)), np.zeros((n, 10))
 
     def step(self, t: float, qd: np.ndarray, at: Balance, payload: Payload, scale: np.ndarray) -> Contact:
         """Use the terms of a sample; scale: friction scale minus one, (n,)."""
@@ -49,7 +52,13 @@ class ContactObserver:
         """Return the low-passed torque that model, payload and drift do not explain, and its variance, (n,)."""
         rate = TUNING.bandwidth
         inputs = np.stack(
-            [at.torque - at.friction + rate * at.momentum, at.friction, at.uncertainty, at.momentum, at.momentum]
+            [
+                at.torque - at.friction + rate * at.momentum,
+                at.friction,
+                at.uncertainty,
+                at.momentum,
+                at.momentum,
+            ]
         )
         load = at.load_torque + rate * at.load_momentum
         if self.t is None:
@@ -81,7 +90,7 @@ def tip_force(jacobian: np.ndarray, torque: np.ndarray, variance: np.ndarray) ->
     """
     weighted = jacobian / variance
     matrix = weighted @ jacobian.T
-    # directions that no joint feels have no force
+    # a force that no joint torque depends on is zero
     matrix += 1e-3 * np.trace(matrix) / 3 * np.eye(3)
     force: np.ndarray = np.linalg.solve(matrix, weighted @ torque)
     return force

@@ -1,7 +1,8 @@
-"""Noise levels of a fit: from its run folder, else found by fits that leave out a part of its logs."""
+"""Noise levels of a fit: from its run folder, else by cross-validation on its logs."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -49,9 +50,13 @@ def noise_levels(fit: Fit) -> NoiseLevels:
 
 
 def keep_levels(fit: Fit, levels: NoiseLevels | None = None) -> None:
-    """Write noise levels into the run folder of a fit; None: those that its logs show, if it is a fit to torques."""
+    """Write noise levels into the run folder of a fit; None: find them, for a fit to torques."""
     if levels is None:
-        if not isinstance(fit.config, TorqueFit) or not isinstance(fit.model, RigidBodyDynamics) or not fit.logs:
+        if (
+            not isinstance(fit.config, TorqueFit)
+            or not isinstance(fit.model, RigidBodyDynamics)
+            or not fit.logs
+        ):
             return
         levels = cross_validated_levels(fit)
     if fit.folder is not None:
@@ -67,12 +72,12 @@ def stored_levels(fit: Fit) -> NoiseLevels | None:
 
 
 def cross_validated_levels(fit: Fit) -> NoiseLevels:
-    """Return the noise levels on logs that are left out of fits in turn."""
+    """Return the noise levels by cross-validation: each fold of the logs is held out of a fit."""
     folds = [list(fit.logs[k::FOLDS]) for k in range(min(FOLDS, len(fit.logs)))]
     if len(folds) == 1:
         # thirds of one log
         (log,), ends = folds[0], np.linspace(0, len(folds[0][0]), FOLDS + 1).astype(int)
-        folds = [[log[start:stop]] for start, stop in zip(ends, ends[1:], strict=False)]
+        folds = [[log[start:stop]] for start, stop in itertools.pairwise(ends)]
     arm = None if fit.urdf is None or not fit.urdf.exists() else arm_of_model(fit.model, fit.urdf)
     tested = []
     for k, fold in enumerate(folds):
@@ -84,10 +89,11 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
 
 
 def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
-    """Return the model of a fit, fitted to other logs from its initial parameters. Raises LogError for too little motion.
+    """Return the model of a fit, fitted to other logs from its initial parameters. Raises LogError for too little
+    motion.
 
-    A part of the samples suffices to find the error on other logs, and so does a model without residual terms if the fit
-    has none.
+    A part of the samples suffices to find the error on other logs, and so does a model without residual terms if the
+    fit has none.
     """
     model = assemble(required_spec(fit.model)).double()
     if residual_terms(without_idle_residuals(fit.model)) is None:
@@ -96,15 +102,17 @@ def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
     samples = [x for x in samples if len(x.q)]
     if sum(len(x.q) for x in samples) < MIN_SAMPLES:
         raise LogError(
-            "too little motion to find noise levels of the estimator", expected=f"{MIN_SAMPLES} samples that move in two thirds of "
-            "the logs", do="record longer",
+            "too little motion to find noise levels of the estimator",
+            expected=f"{MIN_SAMPLES} samples that move in two thirds of the logs", do="record longer",
         )  # fmt: skip
     fit_torque(model, TorqueSamples.of(samples, TUNING.decimation).subsampled(MAX_SAMPLES))
-    return model.requires_grad_(False).eval()
+    fitted = model.requires_grad_(False).eval()
+    assert isinstance(fitted, RigidBodyDynamics)
+    return fitted
 
 
 def limits(arm: Arm | None, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the torque limits of a URDF, (n,), infinite if unknown, and its tip in the frame of the last body, (3,)."""
+    """Return the torque limits of an arm, (n,), infinite if unknown, and its tip in the last body's frame, (3,)."""
     if arm is None:
         return np.full(n, np.inf), np.zeros(3)
     effort = np.array([joint.effort or np.inf for joint in arm.chain.coordinates])

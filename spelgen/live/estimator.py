@@ -13,12 +13,12 @@ from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import is_stateful
 from spelgen.errors import RunError
 from spelgen.fitting.fitted import Fit
-from spelgen.live.blocks import Blocks, joined
+from spelgen.live.blocks import Block, Blocks, joined
 from spelgen.live.contact import Contact, ContactObserver
-from spelgen.live.filters import Block, DriftFilter
+from spelgen.live.cross_validation import noise_levels
+from spelgen.live.filters import DriftFilter
 from spelgen.live.hypotheses import PayloadEstimate
 from spelgen.live.intake import IGNORED, Intake, Refusal
-from spelgen.live.cross_validation import noise_levels
 from spelgen.live.momentum import Balance, balance, load_torque
 from spelgen.live.noise import NoiseLevels
 from spelgen.live.payload import NO_REPORT, Payload, find_payload
@@ -31,9 +31,9 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 class EstimatorState:
     """Result of a step; vectors are (n,).
 
-    t [s]. refusal: "used", or why the sample was not. contact: see `Contact`. payload: as reported last. load_changed: whether
-    the payload became another one in this step. friction_scale: friction of now relative to the model [1]. disturbance: slow
-    torque that neither model nor payload explains [Nm, N].
+    t [s]. refusal: "used", or why the sample was not. contact: see `Contact`. payload: as reported last.
+    load_changed: whether the payload became another one in this step. friction_scale: friction of now relative to the
+    model [1]. disturbance: slow torque that neither model nor payload explains [Nm, N].
     """
 
     t: float
@@ -48,12 +48,16 @@ class EstimatorState:
 class Estimator:
     """The estimator of a fitted arm with rigid bodies under torques.
 
-    ``step`` takes samples as they are measured; ``replay`` takes a log. Samples that are not finite, out of order or impossible are
-    refused and counted in ``refused``.
+    ``step`` takes one measured sample; ``replay`` takes a log. Samples that are not finite or out of order,
+    and jumps, are refused and counted in ``refused``.
     """
 
     def __init__(
-        self, fit: Fit, *, levels: NoiseLevels | None = None, alarms_per_minute: float = TUNING.alarms_per_minute
+        self,
+        fit: Fit,
+        *,
+        levels: NoiseLevels | None = None,
+        alarms_per_minute: float = TUNING.alarms_per_minute,
     ) -> None:
         """Take a fit; levels: default: of the fit. alarms_per_minute: rate of false alarms of contact.
 
@@ -66,7 +70,7 @@ class Estimator:
         self.reset()
 
     def reset(self) -> None:
-        """Forget payload, friction drift and friction state."""
+        """Start again: payload, friction drift and friction state are unknown."""
         n = self.model.n
         self.intake = Intake(self.levels, self.reach)
         self.blocks = Blocks(n, self.levels.rest_speed)
@@ -76,7 +80,7 @@ class Estimator:
         self.payload = NO_REPORT
         self.half: Block | None = None
         self.reported = 0.0
-        self.contact = Contact(*np.zeros((2, n)), np.zeros(n, dtype=bool), np.zeros(3))
+        self.contact = Contact(np.zeros(n), np.zeros(n), np.zeros(n, dtype=bool), np.zeros(3))
 
     @property
     def refused(self) -> dict[str, int]:
@@ -92,7 +96,9 @@ class Estimator:
         """Return the estimates along a log."""
         return list(self.steps(log.t, log.q, log.qd, log.tau))
 
-    def steps(self, t: np.ndarray, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> Iterator[EstimatorState]:
+    def steps(
+        self, t: np.ndarray, q: np.ndarray, qd: np.ndarray, tau: np.ndarray
+    ) -> Iterator[EstimatorState]:
         """Use samples, (T,) and (T, n); return their estimates."""
         checked: list[Refusal] = []
         bounds: list[tuple[np.ndarray, np.ndarray]] = []
@@ -114,7 +120,7 @@ class Estimator:
             yield EstimatorState(float(t[k]), refusal, self.contact, self.payload, changed, 1 + a, d)
 
     def _advance(self, t: float, qd: np.ndarray, at: Balance, refusal: Refusal) -> bool:
-        """Use the terms of a sample; return whether the load became another one."""
+        """Use the terms of a sample; return True if the load became another one."""
         if refusal != "used":
             self.blocks.restart()
             self.half = None
@@ -141,7 +147,10 @@ class Estimator:
         """Find the payload, and use it from the next step on; ``step`` does this after each second of motion."""
         main = self.estimate.filters[0]
         self.reported = self.estimate.moved
-        before, self.payload = self.payload, find_payload(main.x[:10], main.P[:10, :10], self.levels.load_variance)
+        before, self.payload = (
+            self.payload,
+            find_payload(main.x[:10], main.P[:10, :10], self.levels.load_variance),
+        )
         if (before.status == "payload") != (self.payload.status == "payload"):
             # torques of the load were confounded with drift
             n = self.model.n
@@ -156,7 +165,7 @@ class Estimator:
 
         Args:
             q, qd, qdd: (n,).
-            ahead: time until the motion [s]; the disturbance decays, and is left out beyond 0.3 s.
+            ahead: time until the motion [s]; the disturbance decays, and is omitted beyond 0.3 s.
         """
         at = [torch.as_tensor(x, dtype=torch.float64) for x in (q, qd, qdd)]
         z = torch.from_numpy((self.intake.low + self.intake.high) / 2)
@@ -164,8 +173,8 @@ class Estimator:
         with torch.no_grad():
             torque = self.model.inverse_dynamics(*at, *past)
             friction = self.model.friction_torque(*at[:2], *past)
-            batch = [x.unsqueeze(0) for x in at]
-            load = load_torque(self.model, *batch, torch.from_numpy(self.payload.parameters))[0]
+            q_, qd_, qdd_ = (x.unsqueeze(0) for x in at)
+            load = load_torque(self.model, q_, qd_, qdd_, torch.from_numpy(self.payload.parameters))[0]
             a, d = map(torch.from_numpy, self.drift.ahead(ahead))
             at_configuration = self.model.at(at[0])
             return (torque + self.model.input_torque(at_configuration, load + a * friction + d)).numpy()
@@ -180,6 +189,7 @@ def torque_model(fit: Fit) -> RigidBodyDynamics:
             do="build the module with --preset hybrid and fit it",
         )  # fmt: skip
     if model.servo is not None:
-        raise RunError("a fit to position commands", element="estimator", expected="a fit to measured torques")
+        raise RunError(
+            "a fit to position commands", element="estimator", expected="a fit to measured torques"
+        )
     return copy.deepcopy(model).double().cpu().requires_grad_(False).eval()
-

@@ -1,8 +1,8 @@
 """Kalman filters of the momentum balance over blocks: y = Phi theta + f a + b + d + w per joint.
 
-theta (10): payload, constant. a (n): friction scale minus one, a random walk. b (n): torque offset, constant. d (n): disturbance,
-an Ornstein-Uhlenbeck process. w: white noise. The rows of a block are used one after the other, so that a control loop can
-spread them over its samples.
+theta (10): payload, constant. a (n): friction scale minus one, a random walk. b (n): torque offset, constant. d (n):
+disturbance, an Ornstein-Uhlenbeck process. w: white noise. The rows of a block are used one after the other, so that
+a control loop can spread them over its samples.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ def huber(squared: float, variance: float) -> float:
 class LoadFilter:
     """Filter of theta, a, b and d, in this order.
 
-    x: (10 + 3 n,). P: its covariance. log_likelihood: of the rows since it was set to zero. surprise: sum of the normalised
-    squared residuals of the last block of moving joints. factor: on the standard deviation of the disturbance.
+    x: (10 + 3 n,). P: its covariance. log_likelihood: of the rows since it was set to zero. surprise: sum of the
+    normalised squared residuals of the last block of moving joints. factor: on the standard deviation of the
+    disturbance.
     """
 
     def __init__(self, noise: BlockNoise, effort: np.ndarray, factor: float = 1.0) -> None:

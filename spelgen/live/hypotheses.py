@@ -13,9 +13,10 @@ from spelgen.live.tuning import TUNING
 
 
 class PayloadEstimate:
-    """The payload filter, and the hypotheses of another load and of a contact beside it.
+    """The payload filter, and the hypotheses of another load and of a contact.
 
-    Rows of a block are used one per sample, more if samples are rare. moved: motion since the start or the last change [s].
+    Rows of a block are used one per sample, more if samples are rare. moved: motion since the start or the last
+    change [s].
     """
 
     def __init__(self, levels: NoiseLevels) -> None:
@@ -70,7 +71,9 @@ class PayloadEstimate:
                 self.changed = True
                 self.moved = self.hypotheses_moved
                 return
-            if self.hypotheses_moved >= (TUNING.changed_after if ratio < TUNING.unlikely else TUNING.dropped_after):
+            if self.hypotheses_moved >= (
+                TUNING.changed_after if ratio < TUNING.unlikely else TUNING.dropped_after
+            ):
                 self.filters = [main]
         if len(self.filters) == 1:
             # from the first second of motion on

@@ -39,19 +39,22 @@ class Intake:
         self.low, self.high = -self.limit, self.limit.copy()
 
     def accept(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> Refusal:
-        """Check a sample, q, qd, tau (n,), and update the friction state; return "used", "saturated" or "gap" if it is used."""
+        """Check a sample, q, qd, tau (n,), and update the friction state; return why it is not used."""
         refusal = self._check(t, q, qd, tau)
-        if refusal in IGNORED:
-            self.ignored += 1
-        # after some ignored samples in a row, clock or positions have changed for good
-        restarts = self.ignored >= TUNING.restart and refusal in ("reversed", "jump")
+        # after some of them in a row, clock or positions have changed for good
+        self.ignored += refusal in ("reversed", "jump")
+        restarts = self.ignored >= TUNING.restart
         if refusal == "gap" or restarts or self.t == -np.inf:
             self._unknown()
             self.path = q.copy()
         elif refusal not in IGNORED:
             step = self.levels.encoder
             path = np.clip(self.path, q - step, q + step)
-            moved = path - self.path if self.bristles.motors is None else self.bristles.motors @ (path - self.path)
+            moved = (
+                path - self.path
+                if self.bristles.motors is None
+                else self.bristles.motors @ (path - self.path)
+            )
             self.low, self.high = (
                 np.clip(z + moved[:, None], -self.limit, self.limit) for z in (self.low, self.high)
             )
@@ -73,6 +76,8 @@ class Intake:
         if t - self.t > TUNING.gap:
             return "used" if self.t == -np.inf else "gap"
         # one step of the encoder, and the speeds of a sample that a clock has late
-        if (np.abs(q - self.q) > speed * (t - self.t + TUNING.block / TUNING.jump) + self.levels.encoder).any():
+        if (
+            np.abs(q - self.q) > speed * (t - self.t + TUNING.block / TUNING.jump) + self.levels.encoder
+        ).any():
             return "jump"
         return "saturated" if (np.abs(tau) >= self.levels.effort).any() else "used"

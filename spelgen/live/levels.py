@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from spelgen.dynamics.bristles import bristle_reach, encoder_step
+from spelgen.live.blocks import Block, Blocks, joined
 from spelgen.live.contact import ContactObserver
 from spelgen.live.filters import DriftFilter, LoadFilter
 from spelgen.live.intake import IGNORED, Intake
 from spelgen.live.momentum import Balance, balance
-from spelgen.live.blocks import Block, Blocks, joined
 from spelgen.live.noise import TAIL, BlockNoise, NoiseLevels
 from spelgen.live.payload import NO_REPORT
 from spelgen.live.tuning import TUNING
@@ -69,7 +69,7 @@ def find_levels(
         observer=np.ones(n),
         peak_start=np.ones(n),
         peak_scale=np.ones(n),
-        load_variance=1.0,
+        load_variance=TUNING.variance,
         coulomb=np.mean([model.coulomb.numpy() for model, _ in folds], axis=0),
         speed=np.abs(joined_column(logs, "qd")).max(axis=0),
         encoder=np.min([encoder_step(log.q) for log in logs], axis=0),
@@ -87,10 +87,10 @@ def find_levels(
 
 
 def load_variance(segments: Sequence[Sequence[Block]], levels: NoiseLevels) -> float:
-    """Return the factor on the covariance of payloads, at least 1: none is carried, and the estimates show the error.
+    """Return the factor on the covariance of payloads: none is carried, and the estimates show the error.
 
-    Windows of blocks are independent trials. The factor is the mean squared estimate of mass and first moments, (4,), relative
-    to its covariance.
+    Windows of blocks are independent trials. The factor is the mean squared estimate of mass and first moments, (4,),
+    relative to its covariance.
     """
     squares: list[float] = []
     for blocks in segments:
@@ -101,7 +101,7 @@ def load_variance(segments: Sequence[Sequence[Block]], levels: NoiseLevels) -> f
                 for joint in range(load.n):
                     load.update(block, joint)
             squares.append(float(load.x[:4] @ np.linalg.solve(load.P[:4, :4], load.x[:4])) / 4)
-    return max(1.0, float(np.mean(squares))) if squares else 1.0
+    return max(TUNING.variance, float(np.mean(squares))) if squares else TUNING.variance
 
 
 def blocks_along(tested: HeldOut, levels: NoiseLevels) -> list[Block]:
@@ -122,13 +122,16 @@ def blocks_along(tested: HeldOut, levels: NoiseLevels) -> list[Block]:
 def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
     """Return the levels of maximum likelihood of blocks in a row of each log, over a grid; all joints at a time.
 
-    The model is y = f a + b + d + w per joint (see `live.filters`); white noise has its own scale for each point of the grid.
+    The model is y = f a + b + d + w per joint (see `live.filters`); white noise has its own scale for each point of
+    the grid.
     """
     grid = np.array(list(itertools.product(_TIME_CONSTANTS, _RATIOS)))
     n = len(segments[0][0].y)
-    scale = np.full((len(grid), n), np.median(np.abs([x.y for blocks in segments for x in blocks]), axis=0) + 1e-9)
+    scale = np.full(
+        (len(grid), n), np.median(np.abs([x.y for blocks in segments for x in blocks]), axis=0) + 1e-9
+    )
     for _ in range(3):
-        cost, squares = _likelihood(segments, grid, scale)
+        _cost, squares = _likelihood(segments, grid, scale)
         scale = scale * np.sqrt(squares)
     best = _likelihood(segments, grid, scale)[0].argmin(axis=0)
     white = scale[best, np.arange(n)]
@@ -150,7 +153,7 @@ def _likelihood(
     disturbance = np.square(scale * ratio)
     for blocks in segments:
         x = np.zeros((*scale.shape, 3))
-        P = np.zeros((*scale.shape, 3, 3))  # noqa: N806
+        P = np.zeros((*scale.shape, 3, 3))
         P[..., 0, 0] = TUNING.friction**2
         P[..., 1, 1] = np.square(4 * scale)
         P[..., 2, 2] = disturbance
@@ -195,12 +198,12 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[HeldOut]) -> NoiseLevel
             block = sums.add(t, qd, at)
             if block is not None:
                 drift.update(block, NO_REPORT.parameters)
-    t, signal, variance, moving = (np.array(column) for column in zip(*signals, strict=True))
+    times, signal, variance, moving = (np.array(column) for column in zip(*signals, strict=True))
     # of a moving joint, beyond the variances that its state explains
     excess = np.where(moving, np.square(signal) - variance, np.nan)
     observer_level = np.sqrt(np.maximum(np.nanmedian(excess, axis=0) / 0.455, 1e-4 * levels.effort**2 * 1e-2))
     ratio = np.abs(signal) / np.sqrt(variance + observer_level**2)
-    window = np.concatenate([[0], np.cumsum(np.abs(np.diff(t // TUNING.window)) > 0)])
+    window = np.concatenate([[0], np.cumsum(np.abs(np.diff(times // TUNING.window)) > 0)])
     starts = np.flatnonzero(np.diff(window, prepend=-1))
     peaks = np.maximum.reduceat(ratio, starts, axis=0)
     start = np.quantile(peaks, 1 - TAIL, axis=0)

@@ -59,7 +59,9 @@ class LoadAxes:
     def jacobian(self, point: Tensor) -> Tensor:
         """Return the Jacobian of a point (3,) of the last body [m], (T, 3, n), in root axes."""
         angular, linear = self.axes
-        return self.rotation @ (linear + _cross(angular, point.expand_as(angular))).mT @ self.ratios
+        columns = (linear + _cross(angular, point.expand_as(angular))).mT @ self.ratios
+        jacobian: Tensor = self.rotation @ columns
+        return jacobian
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
@@ -87,7 +89,8 @@ def load_axes(model: RigidBodyDynamics, q: Tensor, qd: Tensor) -> LoadAxes:
 
 
 def _projected(axes: tuple[Tensor, Tensor], twist: tuple[Tensor, Tensor]) -> Tensor:
-    """Return a . angular momentum + l . linear momentum per parameter, (T, bodies, 10), of a body that moves at a twist.
+    """Return a . angular momentum + l . linear momentum per parameter, (T, bodies, 10), of a body that moves at a
+    twist.
 
     Linear momentum is m v + w x mc, angular momentum I w + mc x v. axes: (a, l), (T, bodies, 3).
     """
@@ -104,7 +107,9 @@ def _weight(at: LoadAxes) -> Tensor:
     """Return the projection of the weight of a payload onto the axes, per parameter, (T, bodies, 10)."""
     a, l = at.axes  # noqa: E741
     gravity = at.gravity.expand_as(a)
-    return torch.cat([(l * gravity).sum(-1, True), _cross(gravity, a), torch.zeros_like(a).repeat(1, 1, 2)], -1)
+    return torch.cat(
+        [(l * gravity).sum(-1, True), _cross(gravity, a), torch.zeros_like(a).repeat(1, 1, 2)], -1
+    )
 
 
 def load_terms(at: LoadAxes) -> tuple[Tensor, Tensor]:
@@ -149,7 +154,9 @@ def balance(
     return Balance(*map(np.concatenate, zip(*blocks, strict=True)))
 
 
-def _terms(model: RigidBodyDynamics, point: Tensor, q: Tensor, qd: Tensor, tau: Tensor, *bounds: Tensor) -> list[Tensor]:
+def _terms(
+    model: RigidBodyDynamics, point: Tensor, q: Tensor, qd: Tensor, tau: Tensor, *bounds: Tensor
+) -> list[Tensor]:
     at = model.at(q, qd)
     torque = model.input_force(at, qd, tau) + model.lagrangian_gradient(at, qd)
     if is_stateful(model):

@@ -41,10 +41,11 @@ class BlockNoise(BaseModel):
 class NoiseLevels(BaseModel):
     """All that the estimator knows of an arm besides its model; vectors are (n,).
 
-    drift, load: noise of blocks of both filters. observer: standard deviation of the momentum observer of a moving joint [Nm,
-    N]. peak_start, peak_scale: exponential tail of the peaks of the normalised observer, beyond the largest fifth. load_variance: factor on the covariance of payloads. coulomb:
-    friction at low speed [Nm, N]. speed: largest of the training logs [rad/s, m/s]. encoder: step of positions [rad, m].
-    effort: torque limit [Nm, N]. minutes: duration of the training logs. point: tip in the frame of the last body, (3,) [m].
+    drift, load: noise of blocks of both filters. observer: standard deviation of the momentum observer of a moving
+    joint [Nm, N]. peak_start, peak_scale: exponential tail of the peaks of the normalised observer, beyond the
+    largest fifth. load_variance: factor on the covariance of payloads. coulomb: friction at low speed [Nm, N]. speed:
+    largest of the training logs [rad/s, m/s]. encoder: step of positions [rad, m]. effort: torque limit [Nm, N].
+    minutes: duration of the training logs. point: tip in the frame of the last body, (3,) [m].
     """
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")

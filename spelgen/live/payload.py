@@ -1,9 +1,10 @@
 """The payload from the state of the payload filter: physically consistent, or none.
 
-The likelihood of the ten inertial parameters theta is the filter's Gaussian with its prior removed. The prior of a payload is
-a Wishart distribution of its pseudo-inertia with 6 degrees of freedom, so that the negative log posterior is convex and its
-minimum is physically consistent (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018). Prior means of several masses are compared
-with "no payload" by Laplace's approximation of the evidence (MacKay, Neural Computation 4:415, 1992).
+The likelihood of the ten inertial parameters theta is the filter's Gaussian with its prior removed. The prior of a
+payload is a Wishart distribution of its pseudo-inertia with 6 degrees of freedom, so that the negative log posterior
+is convex and its minimum is physically consistent (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018). Prior means of
+several masses are compared with "no payload" by Laplace's approximation of the evidence (MacKay, Neural Computation
+4:415, 1992).
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ LOAD_PRIOR = np.array([TUNING.load_mass] + 3 * [TUNING.load_moment] + 6 * [TUNIN
 _DEGREES = 6  # of freedom of the Wishart distribution
 ITERATIONS = 40
 WEIGHTS = 12  # weights of the likelihood below one, powers of 1/4
-# Constant of the log evidence: of the Wishart density, with |dJ/dtheta| = 1/2, and of the Gaussian of Laplace's approximation.
+# Constant of the log evidence: of the Wishart density, with |dJ/dtheta| = 1/2, and of the Gaussian of Laplace's
+# approximation.
 _LOG_GAMMA = 3 * math.log(math.pi) + sum(math.lgamma((_DEGREES - k) / 2) for k in range(4))
 EVIDENCE = -2 * _DEGREES * math.log(2) - _LOG_GAMMA - math.log(2) + 5 * math.log(2 * math.pi)
 _NORMAL = 1.96  # standard deviations of a 95 % interval
@@ -35,12 +37,12 @@ _INERTIA = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """What the last body carries in addition to the arm, in the frame of the last body; zero without a payload.
+    """Inertial parameters that the last body carries in addition to the arm, in its frame; zero without a payload.
 
-    status: "not yet" if the motion does not determine it. log_odds: of "no payload" against a payload. limit: upper limit of
-    the mass, 95 %, for any status [kg]. mass [kg], center (3,) [m], inertia about the centre of mass (xx, xy, xz, yy, yz,
-    zz) [kg m^2]: with lower and upper limits of 95 % intervals, (..., 2). parameters: (10,), m, m c, and the inertia about
-    the origin of the frame. covariance: of the parameters, (10, 10).
+    status: "not yet" if the motion does not determine it. log_odds: of "no payload" against a payload. limit: upper
+    limit of the mass, 95 %, for any status [kg]. mass [kg], center (3,) [m], inertia about the centre of mass (xx,
+    xy, xz, yy, yz, zz) [kg m^2]: with lower and upper limits of 95 % intervals, (..., 2). parameters: (10,), m, m c,
+    and the inertia about the origin of the frame. covariance: of the parameters, (10, 10).
     """
 
     status: Status = "not yet"
@@ -90,7 +92,7 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float) -> Pay
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse of a symmetric positive definite matrix, whose entries may differ by many orders of magnitude."""
+    """Return the inverse of a positive definite matrix, whose entries may differ by orders of magnitude."""
     root = solve_triangular(np.linalg.cholesky(matrix), np.eye(len(matrix)), lower=True)
     inverse: np.ndarray = root.T @ root
     return inverse
@@ -102,9 +104,9 @@ def _at_scale(
     """Return the MAP estimate, its covariance, and the log evidence, for a prior mean of mass ``scale``.
 
     Newton's method for weight (1/2 theta^T precision theta - linear . theta) - 1/2 log det J + 1/2 tr(W^-1 J), from
-    ``start``, or from the prior mean with an increasing weight: the likelihood may be largest far outside of the cone of
-    consistent parameters, at whose boundary Newton's method would stall (Boyd and Vandenberghe, Convex Optimization, 2004,
-    11.3). Twice the cost is self-concordant: steps damped by its decrement are feasible (9.6.4).
+    ``start``, or from the prior mean with an increasing weight: the likelihood may be largest far outside of the cone
+    of consistent parameters, at whose boundary Newton's method would stall (Boyd and Vandenberghe, Convex
+    Optimization, 2004, 11.3). Twice the cost is self-concordant: steps damped by its decrement are feasible (9.6.4).
     """
     variances = np.array([TUNING.radius**2 / 5] * 3)
     height = TUNING.distance

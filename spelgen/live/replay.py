@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from spelgen.errors import LogError
 from spelgen.fitting.fitted import Fit
+from spelgen.listing import WIDTH
 from spelgen.live.estimator import Estimator, EstimatorState
 from spelgen.live.payload import Payload
 from spelgen.live.tuning import TUNING
@@ -20,7 +22,7 @@ MERGED = 0.2  # [s] contacts closer than this are one
 
 @dataclass(frozen=True)
 class ContactEvent:
-    """A contact: begin and end [s] from the start of the log, joints, largest external torque of each [Nm, N], force [N]."""
+    """A contact: begin and end from the start of the log [s], joints, their largest torques [Nm, N], force [N]."""
 
     begin: float
     end: float
@@ -33,8 +35,9 @@ class ContactEvent:
 class LogEstimate:
     """The estimates along a log.
 
-    states: of each sample. payload: at the end. since: time of its first report [s], None without one. changes: times of
-    changed loads [s]. drift: friction at the end relative to the model, per joint [%]. refused: counts of samples by reason.
+    states: of each sample. payload: at the end. since: time of its first report [s], None without one. changes: times
+    of changed loads [s]. drift: friction at the end relative to the model, per joint [%]. refused: counts of samples
+    by reason.
     """
 
     log: Trajectory
@@ -70,7 +73,8 @@ class LogEstimate:
             pairs = zip(contact.joints, contact.torques, strict=True)
             torques = ", ".join(f"{joint} {torque:+.3g}" for joint, torque in pairs)
             lines.append(
-                f"  contact at {contact.begin:.2f} to {contact.end:.2f} s: {torques} Nm, N; {contact.force:.3g} N at the tip"
+                f"  contact at {contact.begin:.2f} to {contact.end:.2f} s: {torques} Nm, N; "
+                f"{contact.force:.3g} N at the tip"
             )
         if not self.contacts:
             lines.append("  no contact")
@@ -79,7 +83,7 @@ class LogEstimate:
         if self.refused:
             refused = ", ".join(f"{count} {reason}" for reason, count in self.refused.items())
             lines.append(f"  samples that were not used, or only in part: {refused}")
-        return "\n".join(lines)
+        return "\n".join(textwrap.fill(line, WIDTH, subsequent_indent="    ") for line in lines)
 
 
 def payload_content(payload: Payload) -> dict[str, Any]:
@@ -112,7 +116,7 @@ def payload_sentence(payload: Payload) -> str:
 
 
 def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None = None) -> list[LogEstimate]:
-    """Return the estimates along logs, each of which starts anew.
+    """Return the estimates along logs, each from its start.
 
     Args:
         fit: of an arm under torques.
@@ -120,12 +124,13 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
         alarms_per_minute: rate of false alarms of contact; None: default.
     """
     require_torques(logs)
-    options = {} if alarms_per_minute is None else {"alarms_per_minute": alarms_per_minute}
-    estimator = Estimator(fit, **options)
+    estimator = Estimator(fit, alarms_per_minute=alarms_per_minute or TUNING.alarms_per_minute)
     results = []
     for log in logs:
         if log.q.shape[1] != fit.model.n:
-            raise LogError(f"{log.q.shape[1]} joints", file=log.file, expected=f"{fit.model.n}, as the model has")
+            raise LogError(
+                f"{log.q.shape[1]} joints", file=log.file, expected=f"{fit.model.n}, as the model has"
+            )
         estimator.reset()
         results.append(_along(estimator, log, fit.model.joint_names))
     return results

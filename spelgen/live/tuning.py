@@ -1,4 +1,4 @@
-"""Constants of the estimator; those of an arm are found from its training logs (`live.levels`)."""
+"""Constants of the estimator; noise levels are found from the training logs (`live.levels`)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ class LiveTuning:
     block: float = 0.1
     # [s] Longest time between two samples of a block; a gap makes the friction state unknown.
     gap: float = 0.25
-    # [1] A sample whose positions change faster than this multiple of the largest speed of the training logs is refused.
+    # [1] A sample whose positions change faster than this multiple of the largest speed of the training logs is
+    # refused.
     jump: float = 10.0
     # [1] Refused samples in a row after which the estimator restarts at the new positions.
     restart: int = 5
@@ -51,8 +52,8 @@ class LiveTuning:
     # [1] Log likelihood ratio, and [s] motion, from which on another load is accepted.
     changed: float = 30.0
     changed_after: float = 1.0
-    # [s] Motion after which the hypotheses are dropped; earlier, after `changed_after`, if the log likelihood ratio is below
-    # this.
+    # [s] Motion after which the hypotheses are dropped; earlier, after `changed_after`, if the log likelihood ratio
+    # is below this.
     unlikely: float = -8.0
     dropped_after: float = 4.0
 
