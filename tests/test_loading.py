@@ -11,7 +11,8 @@ import torch
 from emitted import built
 from planar_model import write_module
 
-from spelgen.emission.build import build, load_module
+from spelgen.emission.build import build
+from spelgen.emission.loading import load_module
 from spelgen.emission.module_file import read_spec
 from spelgen.emission.text import module_text
 from spelgen.errors import ModuleError
