@@ -14,8 +14,9 @@ from fractions import Fraction
 from flint import Ordering, fmpq, fmpq_mpoly, fmpq_mpoly_ctx
 
 from spelgen.arm.arm import Chain
+from spelgen.labels import INERTIAL_PARAMETERS
 from spelgen.structure.basis import Weights
-from spelgen.structure.recursion import PARAMETERS, Position, energies
+from spelgen.structure.recursion import Position, energies
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ def polynomials(arm: Chain, *, inertials: bool = False) -> Polynomials:
     n, bodies = len(arm.coordinates), len(arm.bodies)
     names = [f"{letter}{k + 1}" for k in range(n) for letter in "csq"]
     if not inertials:
-        names += [f"{parameter}{body + 1}" for body in range(bodies) for parameter in PARAMETERS]
+        names += [f"{parameter}{body + 1}" for body in range(bodies) for parameter in INERTIAL_PARAMETERS]
     context = fmpq_mpoly_ctx.get(names, Ordering.lex)
     variables = context.gens()
     positions = [Position(*variables[3 * k : 3 * k + 3]) for k in range(n)]

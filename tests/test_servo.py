@@ -23,9 +23,10 @@ from spelgen.files import write_json
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.servo import objective
-from spelgen.fitting.servo.report import covariance, servo_summary
+from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.servo.rollouts import ServoRollouts
 from spelgen.fitting.servo.windows import servo_windows
+from spelgen.identification.intervals import jackknife_covariance
 from spelgen.listing import number
 from spelgen.logs.commands import delayed_commands
 from spelgen.logs.preprocessing import Preprocessing
@@ -141,7 +142,7 @@ def test_intervals_count_correlated_errors_once():
         step = torch.linalg.solve(curvature.sum(dim=0), descent.sum(dim=0))
         left = (slopes.mT @ (errors.unsqueeze(-1) + slopes * step)).squeeze(-1)
         at_end = NormalEquations(curvature, -left)
-        told.append(float(covariance(at_end, torch.zeros(1).double(), torch.zeros(1).double())))
+        told.append(float(jackknife_covariance(*at_end, torch.zeros(1, 1).double())[1]))
         found.append(float(step))
     assert np.mean(told) == pytest.approx(
         np.var(found), rel=0.15
@@ -206,6 +207,7 @@ def test_reported_intervals_cover_the_truth(fitted):
     for k, joint in enumerate(told):
         for what, truth in (
             ("kd", TRUTH.kd[k] / TRUTH.kp[k]),
+            ("lag", TRUTH.kd[k] / TRUTH.kp[k] + TRUTH.delay),
             ("armature", TRUTH.armature[k] / TRUTH.kp[k]),
             ("static_error", TRUTH.coulomb[k] / TRUTH.kp[k] + TRUTH.dead_zone[k]),
         ):

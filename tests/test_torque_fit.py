@@ -616,7 +616,9 @@ def test_bodies_follow_a_torque_no_further_than_it_goes(emitted):
     samples = TorqueSamples.of([recorded(model, 6.0, 0.05)])
     jacobian = TorqueJacobian(model, samples)
     estimate = initial_fit(TorqueProblem.of(jacobian, GaussianPrior()))
-    noise = NoiseEstimator.of(jacobian).estimate(0.5 * estimate.state.residual)
+    noise = NoiseEstimator.of(jacobian, estimate.problem.correlation_time).estimate(
+        0.5 * estimate.state.residual
+    )
     estimate = replace(estimate, problem=replace(estimate.problem, noise=noise)).with_current_covariance()
     _, projection = estimate.linearize()
     for joint, slope in enumerate(projection.jacobian):

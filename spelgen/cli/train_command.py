@@ -141,9 +141,11 @@ def _report(fit: Fit, request: Request, folder: Path, format: str) -> None:
         # JSON has no infinity, the loss of a rollout that diverged
         "validation_loss": fit.best_validation if math.isfinite(fit.best_validation) else None,
         "torque_nmse": fit.torque_nmse,
+        "posterior": fit.posterior.to_dict() if fit.checkpoint.posterior else None,
         "findings": [finding.to_dict() for finding in fit.diagnostics],
     }
-    answer(format, record, *_outcome(fit), f"run folder: {folder}")
+    tables = [table.text() for table in fit.posterior.listings] if fit.checkpoint.posterior else []
+    answer(format, record, *_outcome(fit), *tables, f"run folder: {folder}")
     if fit.status == "interrupted":
         note("the best model so far is in the run folder; resume it by --resume")
         raise typer.Exit(INTERRUPTED)

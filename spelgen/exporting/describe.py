@@ -24,6 +24,7 @@ from spelgen.dynamics.tip import last_link
 from spelgen.errors import RunError
 from spelgen.exporting.description import Harmonics, Residuals, Servos, SigmoidNetwork, Tip, TrainedModel
 from spelgen.exporting.entry_points import EntryPoint, entry_points
+from spelgen.listing import Listing
 from spelgen.runtime.friction_laws import FrictionConstants
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
@@ -41,11 +42,13 @@ class Trained:
     """A trained model and its arm.
 
     entries: names of the functions to export, for formats of functions; empty: all functions except derivatives.
+    intervals: tables of the 95 % intervals of a fit, for the README.
     """
 
     model: ArmModel
     arm: Arm
     entries: tuple[str, ...] = ()
+    intervals: tuple[Listing, ...] = ()
 
     @cached_property
     def described(self) -> TrainedModel:

@@ -14,6 +14,7 @@ from spelgen.exporting.describe import Trained
 from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
 from spelgen.fitting.fitted import Fit, load_run, required_spec
 from spelgen.labels import listed
+from spelgen.listing import Listing
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
@@ -51,7 +52,10 @@ def export(
         require_fitting(to, Path(path))
     if isinstance(trained, str | Path):
         trained = load_run(trained)
+    intervals: tuple[Listing, ...] = ()
     if isinstance(trained, Fit):
+        if trained.checkpoint.posterior:
+            intervals = trained.posterior.listings
         trained, arm = trained.model, arm or trained.urdf
     exporter = EXPORTERS[to]
     if entries and not exporter.choice:
@@ -63,7 +67,9 @@ def export(
     if not isinstance(arm, Arm):
         arm = arm_of_spec(required_spec(trained), arm)
     # imported here: the packages of a format may be extras that are not installed
-    exported: Exported = pkgutil.resolve_name(exporter.function_name)(Trained(trained, arm, tuple(entries)))
+    exported: Exported = pkgutil.resolve_name(exporter.function_name)(
+        Trained(trained, arm, tuple(entries), intervals)
+    )
     if path is not None:
         exported.write(path, force=force)
     return exported

@@ -114,6 +114,9 @@ def with_readme(
     title, result = f"Dynamics of {trained.robot} {exporter.title}", f"{'; '.join(summary)}."
     name = f"{exporter.suffix}.README.md" if exporter.suffix else "README.md"
     text = readme(title, use, trained.joint_names, conventions, result)
+    for table in trained.intervals:
+        lines = map(printable, table.text().splitlines())
+        text += "\n".join(["", "```text", *lines, "```", ""]).encode()
     return Exported(to, trained.robot, {**files, name: text}, tuple(summary))
 
 

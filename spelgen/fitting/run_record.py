@@ -127,7 +127,8 @@ class Checkpoint(BaseModel):
     """The content of checkpoint.pt: the progress of a fit, and the states of its objective that it resumes from.
 
     seconds: time of the fit [s]. substeps: integrator steps per sample interval. torque_nmse: mean squared torque error
-    divided by the variance, per joint. The last three belong to fits to windows. States are checked by torch.
+    divided by the variance, per joint. posterior: see `fitting.posterior`; None
+    except for rigid bodies fitted to torques. The last three belong to fits to windows. States are checked by torch.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow")
@@ -140,6 +141,7 @@ class Checkpoint(BaseModel):
     substeps: Substeps
     best_weights: InstanceOf[dict]  # type: ignore[type-arg]
     torque_nmse: list[float] = []
+    posterior: InstanceOf[dict] | None = None  # type: ignore[type-arg]
     rollbacks: Whole = 0
     learning_rate_factor: Positive = 1.0
     momentum_done: bool = True

@@ -18,6 +18,7 @@ from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.traces import Traces
 from spelgen.evaluation.verdict import Limits, Verdict, verdict
 from spelgen.files import write_json, write_text
+from spelgen.fitting.posterior import Posterior, posterior_of
 from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.servo.report import servo_summary
@@ -115,11 +116,13 @@ def report_data(folder: Path | str) -> Content:
     """Return the data of the page for programs: assessment, evaluation, baselines and parameters."""
     run = open_run(folder)
     model = _trained(run)
+    posterior = _posterior(run, model)
     return {
         "schema": SCHEMA,
         "verdict": None if run.verdict is None else asdict(run.verdict),
         "bodies": body_parameters(model).tolist() if isinstance(model, RigidBodyDynamics) else None,
-        "tables": list(map(asdict, parameter_tables(model, run.arm, run.baselines))),
+        "tables": list(map(asdict, parameter_tables(model, run.arm, run.baselines, posterior))),
+        "posterior": None if posterior is None else posterior.to_dict(),
         "evaluation": _record(run.folder, run.folder.evaluation),
         "least_squares": run.baselines or None,
     }
@@ -128,6 +131,16 @@ def report_data(folder: Path | str) -> Content:
 def _trained(run: Run) -> ArmModel | None:
     """Return the trained model; None of a run without weights."""
     return fitted_model(run.folder).requires_grad_(False).eval() if run.folder.weights.is_file() else None
+
+
+def _posterior(run: Run, model: ArmModel | None) -> Posterior | None:
+    """Return the posterior of a trained model; None if its checkpoint has none."""
+    if model is None or run.config is None or not run.folder.checkpoint.is_file():
+        return None
+    content = run.folder.load_checkpoint().posterior
+    if content is None:
+        return None
+    return posterior_of(model, content, run.config.preprocessing.torque_delay or 0.0, run.folder.checkpoint)
 
 
 def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
@@ -180,6 +193,6 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         trained=model is not None,
         under_servos=record is not None and record.mapping.input == "position",
         summary=None if record is None else servo_summary(record.servo),
-        parameters=parameter_tables(model, run.arm, run.baselines),
+        parameters=parameter_tables(model, run.arm, run.baselines, _posterior(run, model)),
         commands=commands(run.folder, spec, run.config),
     )

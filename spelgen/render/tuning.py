@@ -34,8 +34,6 @@ class RenderTuning:
     tube_radius: float = 0.028
     # [1] Relative error that has the last colour of the scale.
     worst_error: float = 0.5
-    # [1] Standard deviations of an interval of 95 %.
-    interval: float = 2.0
 
 
 TUNING = RenderTuning()

@@ -23,9 +23,6 @@ Element = Any
 Vector = tuple[Element, Element, Element]
 Terms = tuple[tuple[int, Element], ...]
 
-PARAMETERS = ("m", "hx", "hy", "hz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
-"""Names of the ten inertial parameters of a body, in their order."""
-
 TENSOR = tuple(combinations_with_replacement(range(3), 2))
 """Order of the six tensor components of a ten-vector: Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
 

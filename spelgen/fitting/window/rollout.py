@@ -45,7 +45,7 @@ class RolloutObjective(MomentumObjective):
         if self.config.torque_first and isinstance(self.model, RigidBodyDynamics):
             samples = torque_samples(self.model, self.data)
             if samples is not None:
-                self.notes += fit_torques(self.model, samples, TorqueFit())
+                self.notes += fit_torques(self.model, samples, TorqueFit())[0]
             else:
                 message = f"no torque fit: no log that moves has {SLOWEST:g} Hz for a second; windows alone are fitted"
                 self.notes.append(Diagnostic("warning", "no-torque-fit", "logs", None, message))
