@@ -160,7 +160,7 @@ def test_loading_needs_no_symbolic_algebra(module):
         "import sys\n"
         "for name in ('sympy', 'flint', 'spelgen.structure', 'spelgen.emission.plan', 'spelgen.arm.arm'):\n"
         "    sys.modules[name] = None\n"
-        "import spelgen.emission.build as loading\n"
+        "import spelgen.emission.loading as loading\n"
         "print(loading.load_module(sys.argv[1]).n)\n"
     )
     command = [sys.executable, "-c", program, str(module)]
