@@ -9,7 +9,8 @@ from typer.testing import CliRunner
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.errors import SettingsError, SpelgenErrors
-from spelgen.excitation.design import Criterion, excite
+from spelgen.excitation.criterion import Criterion
+from spelgen.excitation.design import excite
 from spelgen.excitation.trajectory import ExcitationTrajectory, motion_bounds
 from tests.hand_built import coupled_urdf
 

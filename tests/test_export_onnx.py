@@ -6,10 +6,12 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from exported_runs import COUPLED, MOTORS, arm_of, moved_model
+from exported_runs import COUPLED, MOTORS, arm_of, moved_model, readme_results
 
 from spelgen.arm.configured_arm import load_arm
+from spelgen.dynamics.tip import tip_kinematics
 from spelgen.emission.build import build
+from spelgen.errors import RunError
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.export import export
 from spelgen.exporting.onnx_export import called_by_onnx, onnx_model, onnx_session
@@ -38,15 +40,44 @@ def exported(coupled):
     return export(model, "onnx", arm=arm)
 
 
-def test_onnx_equals_the_model(coupled, exported):
+def test_onnx_equals_the_model(coupled, exported, tmp_path):
     """Another batch size than in the check at export time."""
-    model = coupled[0]
+    model, arm = coupled
     assert "from the torch module" in exported.summary[0]
     session = onnx_session(exported.files["gravity.onnx"])
     q = torch.linspace(-1, 1, 7 * model.n, dtype=torch.float64).reshape(7, model.n)
     (gravity,) = session.run(["gravity"], {"q": q.numpy()})
     np.testing.assert_allclose(gravity, model.gravity(q).numpy(), rtol=1e-9, atol=1e-9)
-    assert len(exported.files["README.md"].decode().splitlines()) == 5
+    check_readme(exported, model, arm, tmp_path, 1e-9)
+
+
+def check_readme(found, model, arm, folder, tolerance):
+    """The lines of the README run; they make and step the friction state, and their numbers are the model's."""
+    names = readme_results(found.files, folder)
+    at = torch.ones(5, model.n, dtype=torch.float64)
+    past = [model.memory(at)] if model.elements else []
+    tau = model.inverse_dynamics(at, at, at, *past)
+    expected = {"tau": tau, "qdd": model.forward_dynamics(at, at, tau, *past)}
+    expected["pose"] = tip_kinematics(arm).pose(at)
+    if model.elements:
+        expected["z"] = model.memory_after(past[0], at).flatten(1)
+    for key, value in expected.items():
+        scale = value.abs().max()
+        np.testing.assert_allclose(names[key].reshape(value.shape) / scale, value / scale, atol=tolerance)
+    assert f"the tip is the link {tip_kinematics(arm).link};" in found.files["README.md"].decode()
+
+
+def test_onnx_in_single_precision(tmp_path):
+    arm, model = arm_of("two_link"), moved_model("two_link", "closed-form")
+    found = export(model, "onnx", arm=arm, float32=True)
+    graph = onnx.load_from_string(found.files["forward_dynamics.onnx"]).graph
+    assert {x.type.tensor_type.elem_type for x in [*graph.input, *graph.output]} == {onnx.TensorProto.FLOAT}
+    assert {x.data_type for x in graph.initializer} <= {onnx.TensorProto.FLOAT, onnx.TensorProto.INT64}
+    check_readme(found, model, arm, tmp_path, 1e-4)
+    with pytest.raises(
+        RunError, match="got float32 for --to c, expected --to onnx and torch; C has -DNAME_FLOAT"
+    ):
+        export(model, "c", arm=arm, float32=True)
 
 
 def test_the_files_are_plain_onnx_of_equal_bytes(coupled, exported):

@@ -227,5 +227,5 @@ def test_pose_and_jacobian_of_the_tip_are_pinocchios(robot, link, robots, tmp_pa
             dynamics.model, dynamics.data, at_joints, frame, pin.LOCAL_WORLD_ALIGNED
         )
         pin.framesForwardKinematics(dynamics.model, dynamics.data, at_joints)
-        np.testing.assert_allclose(found, dynamics.data.oMf[frame].homogeneous, atol=2e-6)
-        np.testing.assert_allclose(slope, by_joint @ dynamics.jacobian, atol=5e-6)
+        np.testing.assert_allclose(found, dynamics.data.oMf[frame].homogeneous, atol=1e-13)
+        np.testing.assert_allclose(slope, by_joint @ dynamics.jacobian, atol=1e-12)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -166,7 +167,7 @@ def _longest(robot: Robot) -> ChainChoice:
     if not longest:
         return ChainChoice(())
     if len(longest) == 1:
-        return ChainChoice(longest[0])
+        return ChainChoice(longest[0], _possible_gripper(robot, longest[0]))
     # two jaws form two chains of equal length
     if _is_parallel_gripper(longest):
         jaws = ", ".join(repr(chain[-1].name) for chain in longest)
@@ -178,6 +179,22 @@ def _longest(robot: Robot) -> ChainChoice:
         message = f"{len(longest)} chains of {length} joints: the only one with effort limits of all joints is taken"
         return ChainChoice(driven[0], (_remark(driven[0][-1], "warning", message),))
     raise _ambiguous(robot, longest)
+
+
+def _possible_gripper(robot: Robot, chain: Sequence[UrdfJoint]) -> tuple[Diagnostic, ...]:
+    """Return a remark if the last joint may open a gripper: it moves a link of that name, and no other joint does.
+
+    No jaw opens by half a turn: a joint with a larger range turns the gripper.
+    """
+    last = chain[-1]
+    turns = last.lower is not None and last.upper is not None and last.upper - last.lower > math.pi
+    if turns or not _GRIPPER.search(last.child) or any(map(_GRIPPER.search, robot.joint)):
+        return ()
+    message = (
+        f"moves the link {last.child!r}, as the last joint of the arm: if it opens a gripper, leave it out by "
+        f"'--tip {last.parent}', or by 'tip' in the settings"
+    )
+    return (_remark(last, "info", message),)
 
 
 def _remark(joint: UrdfJoint, severity: Severity, message: str) -> Diagnostic:

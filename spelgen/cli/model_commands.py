@@ -45,7 +45,7 @@ def init(
     # the settings file is not read: this command writes it
     arm = make_arm(read_urdf(robot), joints=options.names(joints), tip=tip)
     drives = [StarterJoint(x.name, x.joint_type, x.damping, x.friction) for x in arm.coordinates]
-    say(f"wrote {write_text(path, starter(robot.name, drives))}")
+    say(f"wrote {write_text(path, starter(robot.name, drives, arm.bodies[-1].link))}")
 
 
 def build(
@@ -123,6 +123,9 @@ def export(
             help="A function to export, for c, casadi, onnx and torch; repeatable. Default: all but derivatives.",
         ),
     ] = None,
+    float32: Annotated[
+        bool, typer.Option("--float32", help="Numbers of onnx and torch programs; otherwise float64.")
+    ] = False,
     force: Force = False,
     format: TextOrJson = "text",
 ) -> None:
@@ -141,7 +144,7 @@ def export(
     # names and free places are checked before the model is loaded, which takes seconds
     require_fitting(to, output)
     options.require_free(output, force=force)
-    result = export_run(load_run(run), to, entries=entry or ())
+    result = export_run(load_run(run), to, entries=entry or (), float32=float32)
     # all files or none: a failed parity check has raised its error before
     files = [str(path) for path in result.write(output, force=force)]
     lines = [f"wrote {path}" for path in files]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from spelgen.dynamics.equations import runge_kutta
 from spelgen.dynamics.parameters import without_idle_residuals
-from spelgen.dynamics.protocol import known_past, sliding_memory
+from spelgen.dynamics.protocol import known_past, memory_after, sliding_memory
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
@@ -32,7 +32,7 @@ class PreparedModel:
 
     q, qd, qdd and tau are (..., n); units are rad and Nm, or m and N. z, (..., n, K), is the friction state; by
     default, the steady state of motion at qd. tip: kinematics of the tip, see
-    ``tip_kinematics``. elements: bristles per joint, K.
+    ``tip_kinematics``. elements: bristles per joint, K. dtype: of parameters and states.
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class PreparedModel:
         reduced = without_idle_residuals(model)
         reduced.to(dtype=dtype).requires_grad_(False)
         self._model = reduced
-        self._weights, self._tip = reduced.prepare(), tip
+        self._weights, self._tip, self.dtype = reduced.prepare(), tip, dtype
         self.n: int = reduced.n
         self.elements: int = reduced.elements if isinstance(reduced, RigidBodyDynamics) else 0
 
@@ -65,6 +65,10 @@ class PreparedModel:
     def memory(self, qd: Tensor) -> Tensor:
         """Return the friction state z, (..., n, K), of joints that have moved at qd for a long time: zero at rest."""
         return sliding_memory(self._model, qd)
+
+    def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
+        """Return z, (..., n, K), after a monotonic displacement of the joints, (..., n) [rad, m]."""
+        return memory_after(self._model, z, displacement)
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """Return qdd, (..., n), under the input tau."""

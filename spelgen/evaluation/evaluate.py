@@ -102,10 +102,13 @@ def evaluate(
             raise LogError(
                 "baselines that take torques", expected="none: the model is one of position servos"
             )
-        return _evaluate_commands(tested, logs, notes)
+        return tested.assessed(_evaluate_commands(tested, logs, notes))
     require_torques(logs)
     used = _preprocessing(tested.fit.preprocessing if tested.fit else None, preprocessing, logs)
-    return _evaluate_torques(tested, logs, notes, used, baselines or {}, (steps, seconds), truth, progress)
+    ahead = (steps, seconds)
+    return tested.assessed(
+        _evaluate_torques(tested, logs, notes, used, baselines or {}, ahead, truth, progress)
+    )
 
 
 def _preprocessing(

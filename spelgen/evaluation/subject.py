@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -13,7 +13,9 @@ from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.baseline import LinearServoRecord, arm_of_model
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
 from spelgen.emission.assemble import ArmModel, spec_of
+from spelgen.evaluation.results import Results
 from spelgen.evaluation.tuning import TUNING
+from spelgen.evaluation.verdict import verdict
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.arm_mapping import GivenMapping
@@ -66,6 +68,19 @@ class Subject:
         if self.fit is None or self.fit.urdf is None or not self.fit.baselines:
             return None
         return arm_of_model(self.model, self.fit.urdf)
+
+    def assessed(self, results: Results) -> Results:
+        """Return the results of its evaluation with their assessment."""
+        baselines = {} if self.fit is None else self.fit.baselines
+        limits, independent = [], []
+        if self.spec is not None:
+            depends = {*self.spec.potential, *(k for entry in self.spec.entries for k in entry[3])}
+            for k, joint in enumerate(self.spec.joints):
+                bound = None if joint.lower is None or joint.upper is None else (joint.lower, joint.upper)
+                limits.append(bound)
+                if k not in depends:
+                    independent.append(joint.name)
+        return replace(results, assessment=verdict(results, baselines, limits, independent))
 
     @property
     def linear_servos(self) -> LinearServoRecord | None:

@@ -20,7 +20,7 @@ from spelgen.arm.chain import choose_chain
 from spelgen.arm.configured_arm import Arm
 from spelgen.arm.lump_links import lump_links
 from spelgen.dynamics.protocol import input_of, motors_of, residual_terms
-from spelgen.dynamics.tip import last_link
+from spelgen.dynamics.tip import last_link, tip_kinematics
 from spelgen.errors import RunError
 from spelgen.exporting.description import Harmonics, Residuals, Servos, SigmoidNetwork, Tip, TrainedModel
 from spelgen.exporting.entry_points import EntryPoint, entry_points
@@ -29,6 +29,7 @@ from spelgen.runtime.friction_laws import FrictionConstants
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
+    from spelgen.dynamics.prepared import PreparedModel
     from spelgen.emission.assemble import ArmModel
     from spelgen.runtime.encoding import JointEncoding
     from spelgen.runtime.parts import Layers
@@ -43,12 +44,14 @@ class Trained:
 
     entries: names of the functions to export, for formats of functions; empty: all functions except derivatives.
     intervals: tables of the 95 % intervals of a fit, for the README.
+    float32: numbers of ONNX and torch programs; otherwise float64.
     """
 
     model: ArmModel
     arm: Arm
     entries: tuple[str, ...] = ()
     intervals: tuple[Listing, ...] = ()
+    float32: bool = False
 
     @cached_property
     def described(self) -> TrainedModel:
@@ -69,6 +72,16 @@ class Trained:
     def joint_names(self) -> tuple[str, ...]:
         """The names of the joints in the URDF."""
         return self.arm.chain.joint_names
+
+    @property
+    def tip(self) -> str:
+        """The name of the tip link."""
+        return self.arm.tip or last_link(self.arm.robot, self.joint_names)
+
+    def prepared(self) -> PreparedModel:
+        """Return the model and the kinematics of its tip for programs of torch and ONNX."""
+        dtype = torch.float32 if self.float32 else torch.float64
+        return self.model.prepared(tip_kinematics(self.arm), dtype=dtype)
 
     @property
     def memory(self) -> int:
@@ -159,13 +172,22 @@ def tip_frame(loaded: Arm) -> Tip:
     """Return the frame of the tip link, with the unrounded angles of the URDF."""
     names = loaded.chain.joint_names
     link = loaded.tip or last_link(loaded.robot, names)
-    frame = lump_links(loaded.robot, choose_chain(loaded.robot, names, None), 0.0).frames[link]
-    pose = np.eye(4)
-    pose[:3, :3] = frame.rotation
-    pose[:3, 3] = frame.position
-    # The structure rounds angles so that zeros are exact; the tip's pose needs the angles of the file.
     bodies = make_arm(loaded.robot, joints=names, angle_tolerance=0.0).bodies
-    return Tip(link, frame.body, pose, bodies)
+    return Tip(link, *link_poses(loaded)[link], bodies)
+
+
+def link_poses(loaded: Arm) -> dict[str, tuple[int, np.ndarray]]:
+    """Return, by link, the index of the body that carries it, -1: the root link, and the pose (4, 4) in its frame.
+
+    Angles are the unrounded angles of the URDF.
+    """
+    chain = choose_chain(loaded.robot, loaded.chain.joint_names, None)
+    poses: dict[str, tuple[int, np.ndarray]] = {}
+    for link, frame in lump_links(loaded.robot, chain, 0.0).frames.items():
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = frame.rotation, frame.position
+        poses[link] = frame.body, pose
+    return poses
 
 
 def _residuals(model: ArmModel) -> Residuals:

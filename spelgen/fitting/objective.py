@@ -181,6 +181,7 @@ def new_record(request: FitRequest, prepared: PreparedLogs) -> Record:
     config, fraction = prepared.config, None
     if prepared.validation and isinstance(request.validation, float):
         fraction = request.validation
+    notes = [*prepared.notes, *request.options.notes]
     record = Record(
         schema=2,
         robot=spec.robot if spec else type(model).__name__,
@@ -199,6 +200,7 @@ def new_record(request: FitRequest, prepared: PreparedLogs) -> Record:
         mapping=request.options.mapping or LogMapping(input=input_of(model)),
         device=request.options.device,
         threads=request.options.threads,
+        warnings=[f"{note.where}: {note.message}" for note in notes if note.severity == "warning"],
     )
     if prepared.scales is None:
         return record

@@ -39,6 +39,7 @@ class Record(BaseModel):
     validation_fraction: None if validation logs were given. data_digest: SHA-256 of all numbers of the logs. training,
     validation: names of the logs. scales: of the validation loss. mapping: with which the logs were read. servo:
     parameters of position servos with intervals, when such a fit is finished. notes: messages of a fit to torques.
+    warnings: about the logs and the links of the URDF.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -63,6 +64,7 @@ class Record(BaseModel):
     threads: int = 1
     servo: Content | None = None
     notes: list[str] = []
+    warnings: list[str] = []
 
     @field_validator("config", mode="before")
     @classmethod

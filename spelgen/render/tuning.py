@@ -16,18 +16,12 @@ class RenderTuning:
     # [1] Baselines with an error beyond this multiple of the model's error are cut off, so that the others are
     # distinguishable.
     outlier: float = 100.0
+    # [1] Root mean square relative to the median from which on few starts dominate it; 1.5 for a normal distribution.
+    dominated: float = 2.0
     # [1] Quantile of the measured friction that sets the axis: outliers are cut off.
     bulk: float = 0.995
     # [1] An entry of M below this fraction of the largest entry is 0 with rounding.
     zero: float = 1e-9
-    # [bytes] Memory of the process that reads meshes.
-    mesh_memory: int = 2**30
-    # [s] Processor time of this process: imports and the simplification of fine meshes take most of it.
-    mesh_seconds: int = 30
-    # [bytes] Largest file with a mesh.
-    max_mesh_bytes: int = 50_000_000
-    # [1] Largest number of faces of a link: archives may expand without end.
-    max_mesh_faces: int = 2_000_000
     # [1] Faces of all links together, so that a page stays below 1 MB.
     faces: int = 4000
     # [1] Radius of the tube that represents a link without a mesh, relative to the extent of the arm.
