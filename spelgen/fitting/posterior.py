@@ -88,9 +88,9 @@ class Posterior:
     def mass_matrix(self, q: np.ndarray) -> Uncertain:
         """Return M (T, n, n) at q (T, n), with standard deviations."""
         position, zero = torch.as_tensor(q), torch.zeros(len(q), self.model.n).double()
-        at_rest, columns = constants_regressor(self.model, position, zero, zero), []
+        at_rest, columns = self._regressor(position, zero, zero), []
         for unit in torch.eye(self.model.n).double():
-            columns.append(constants_regressor(self.model, position, zero, unit.expand_as(zero)) - at_rest)
+            columns.append(self._regressor(position, zero, unit.expand_as(zero)) - at_rest)
         with torch.no_grad():
             return self._linear(self.model.mass_matrix(position), torch.stack(columns, dim=-2))
 
@@ -98,9 +98,7 @@ class Posterior:
         """Return gravity torques (T, n) [Nm, N] at q (T, n), with standard deviations."""
         position, zero = torch.as_tensor(q), torch.zeros(len(q), self.model.n).double()
         with torch.no_grad():
-            return self._linear(
-                self.model.gravity(position), constants_regressor(self.model, position, zero, zero)
-            )
+            return self._linear(self.model.gravity(position), self._regressor(position, zero, zero))
 
     def torque(self, *motion: np.ndarray) -> Uncertain:
         """Return the torques (T, n) [Nm, N] that would be logged, with standard deviations.
@@ -255,12 +253,15 @@ class Posterior:
 
     @cached_property
     def _base(self) -> tuple[tuple[str, ...], Tensor]:
-        return base_combinations(self.model)
+        return base_combinations(self.model.chain, motors_of(self.model))
 
     @cached_property
     def _constants(self) -> Propagated:
         """Inertial parameters of all bodies, then armatures, (10 B + n,)."""
         return self.propagate(lambda model: torch.cat([model.inertial_parameters.flatten(), model.armature]))
+
+    def _regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        return constants_regressor(self.model.chain, motors_of(self.model), q, qd, qdd)
 
     def _linear(self, value: Tensor, rows: Tensor) -> Uncertain:
         """Return a value (...) with the standard deviation of the constants' contribution, rows (..., 10 B + n)."""
