@@ -1,7 +1,7 @@
 """Exact polynomials of M(q) and V(q) in cosines and sines of angles and in sliding distances.
 
 The same recursion as everywhere, over the rational polynomials. The structure does not need them
-(``structure`` works with values alone): they are its independent proof. Closed forms are expanded one
+(``structure`` works with values only): they are its independent proof. Closed forms are expanded one
 parameter at a time (``expansion``).
 """
 
@@ -69,7 +69,7 @@ def _rational(number: Fraction) -> fmpq:
 
 
 def _reduced(polynomial: fmpq_mpoly, n: int) -> fmpq_mpoly:
-    """The same function with s^2 = 1 - c^2 applied until every sine stands to the first power at most.
+    """The same function with s^2 = 1 - c^2 applied until the power of every sine is at most one.
 
     Only arms with mimic joints need it: two bodies then turn with the same angle.
     """

@@ -13,14 +13,7 @@ import typer
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
 from spelgen.cli.options import Accept, Data, Force, MappingFile, MoreData, RobotOption, TextOrJson
-from spelgen.cli.train_settings import (
-    TIME_LIMIT,
-    Request,
-    UsageError,
-    new_run,
-    read_assignments,
-    resumed_run,
-)
+from spelgen.cli.train_settings import TIME_LIMIT, Request, UsageError, new_run, read_assignments, resumed_run
 from spelgen.errors import ModuleError, OptionError
 from spelgen.labels import counted
 from spelgen.settings.fits import Objective, Rollout, WindowConfig
@@ -41,8 +34,7 @@ TrainModule = Annotated[
 NewRun = Annotated[Path | None, options.output_option("RUN", "Run folder; default: runs/<module>.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Resume the run in the run folder.")]
 Source = Annotated[
-    Path | None,
-    typer.Option("--from", metavar="RUN", help="Adapt the model of this run; replaces MODULE."),
+    Path | None, typer.Option("--from", metavar="RUN", help="Adapt the model of this run; replaces MODULE.")
 ]
 ObjectiveName = Annotated[
     Objective | None,

@@ -142,9 +142,11 @@ class Fit:
         reach = bristle_reach(self.model)
         tau, deviation = np.full_like(trajectory.q, np.nan), np.full_like(trajectory.q, np.nan)
         for start, stop in pairwise(gap_ends(trajectory.t, self.preprocessing.gap)):
+            # One sample has no acceleration.
             if stop - start < 2:
                 continue
             piece = trajectory[start:stop]
+            # The zero-phase filter needs a few samples for its transient.
             if self.preprocessing.cutoff and len(piece) > 3:
                 piece = low_pass(piece, self.preprocessing.cutoff)
             qdd = np.gradient(piece.qd, piece.t, axis=0)
@@ -188,6 +190,7 @@ class Fit:
             run.start(spec, self.urdf, force=force)
             run.write_metrics(self.history)
             run.save(self.model.state_dict(), self.checkpoint.content)
+            # Before config.json, which marks a complete run.
             if self.baselines:
                 write_json(run.baseline, self.baselines)
             write_json(run.config, self.record.to_dict())

@@ -26,7 +26,7 @@ from spelgen.settings.messages import validated
 from spelgen.settings.values import Count, NonNegative, Positive, Whole
 
 Content = dict[str, Any]
-"""The content of a file of a run folder, by key: JSON, or what torch saves."""
+"""The content of a file of a run folder, by key: JSON, or a checkpoint of torch."""
 
 Schema = TypeVar("Schema", bound=BaseModel)
 MAY_CHANGE = ("epochs", "patience", "max_minutes")  # between a run and its resumption
@@ -35,10 +35,11 @@ MAY_CHANGE = ("epochs", "patience", "max_minutes")  # between a run and its resu
 class Record(BaseModel):
     """The record of a fit, which config.json keeps: the data, the settings as resolved, and the results.
 
-    config: the options that apply to the model; its type is that of the objective. joints: names in the order of q.
+    config: the options that apply to the model; its type depends on the objective. joints: names in the order of q.
     validation_fraction: None if validation logs were given. data_digest: SHA-256 of all numbers of the logs. training,
     validation: names of the logs. scales: of the validation loss. mapping: with which the logs were read. servo:
     parameters of position servos with intervals, when such a fit is finished. notes: messages of a fit to torques.
+    warnings: about the logs and the links of the URDF.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -63,6 +64,7 @@ class Record(BaseModel):
     threads: int = 1
     servo: Content | None = None
     notes: list[str] = []
+    warnings: list[str] = []
 
     @field_validator("config", mode="before")
     @classmethod

@@ -37,7 +37,8 @@ class LeastSquares:
     """Method of a linear identification.
 
     weights: of the squared errors of the joints: ``equal``, ``range`` (divided by the variance of a joint's torque) or
-    ``noise`` (divided by the variance of its residual, in a few iterations).
+    ``noise`` (divided by the variance of its residual, in a few iterations). friction: columns of friction;
+    ``FrictionModel(memory=True)``: dry friction with hysteresis.
     """
 
     weights: Literal["equal", "range", "noise"] = "noise"

@@ -104,6 +104,7 @@ def sum_by_block(windows: NormalEquations, numbers: torch.Tensor) -> NormalEquat
     """Return sums of normal equations, (W, k, k) and (W, k), over the windows of each block, by number (W,)."""
 
     def summed(terms: torch.Tensor) -> torch.Tensor:
+        """Return the sums of the terms per log, (logs, ...)."""
         sums = terms.new_zeros(int(numbers.max()) + 1, *terms.shape[1:])
         return sums.index_add(0, numbers, terms)
 

@@ -20,7 +20,7 @@ from spelgen.fitting.levenberg_marquardt import Termination
 from spelgen.fitting.torque.covariance import parameter_covariance
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import limit_friction
-from spelgen.fitting.torque.problem import TorqueEstimate, TorqueProblem, refine
+from spelgen.fitting.torque.problem import TorqueEstimate, TorqueProblem, refine, with_correlation_time
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.selection import SelectedTerm
 from spelgen.fitting.torque.stages import (
@@ -52,7 +52,8 @@ class TorqueSolution:
 
     rms_residual: (n,) root mean square torque residual [Nm, N]. steps, cost: of the solver, at the end. prior: standard
     deviations as estimated. covariance, torque_std: see `ParameterCovariance`. compensated: (n,) joints whose drives
-    compensate friction. selected_terms: residual terms. stages: in order.
+    compensate friction. correlation_time: (n,) of the torque errors [s]. selected_terms: residual terms. stages: in
+    order.
     """
 
     rms_residual: np.ndarray
@@ -62,6 +63,7 @@ class TorqueSolution:
     covariance: torch.Tensor
     torque_std: torch.Tensor
     compensated: np.ndarray
+    correlation_time: np.ndarray
     selected_terms: tuple[SelectedTerm, ...]
     stages: tuple[FitStage, ...]
 
@@ -103,6 +105,7 @@ def fit_torque(
         covariance=uncertainty.covariance,
         torque_std=uncertainty.torque_std,
         compensated=estimate.problem.compensated.numpy(),
+        correlation_time=estimate.problem.correlation_time.numpy(),
         selected_terms=tuple(selected),
         stages=tuple(stages),
     )
@@ -127,14 +130,13 @@ def _run_stages(
         estimate = choose_friction_state(estimate)
         done("friction state", estimate)
     if problem.adapt is None:
-        estimate = choose_friction_effects(estimate)
+        estimate = with_correlation_time(choose_friction_effects(estimate), samples)
         done("friction effects", estimate)
         if residual_terms(model) is not None:
             estimate, selected = fit_residual_terms(estimate, samples.subsampled(TUNING.residual_samples))
             done("residual terms", estimate)
-    if estimate.problem.jacobian.samples is not samples:
-        estimate = refine(estimate, samples)
-        done("final fit", estimate)
+    estimate = refine(estimate, samples)
+    done("final fit", estimate)
     return estimate, selected, stages
 
 

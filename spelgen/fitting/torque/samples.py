@@ -60,9 +60,18 @@ class TorqueSamples:
         """Number of samples."""
         return len(self.columns.q)
 
-    def correlation_length(self, correlation_time: float) -> float:
-        """Return the number of samples per independent error, at least one, for errors of a correlation time [s]."""
-        return max(1.0, correlation_time / self.interval)
+    def segment_length(self, seconds: float) -> int:
+        """Return the number of samples of a segment of this duration [s]; at most all."""
+        return min(self.count, max(1, round(seconds / self.interval)))
+
+    def segments(self, seconds: float, max_count: int) -> TorqueSamples:
+        """Return at most `max_count` samples: evenly spaced segments of this duration [s], concatenated."""
+        size = self.segment_length(seconds)
+        number = max(1, min(self.count, max_count) // size)
+        starts = torch.linspace(0, self.count - size, number).long()
+        rows = (starts.unsqueeze(-1) + torch.arange(size)).flatten()
+        columns = SampleBlock._make(None if column is None else column[rows] for column in self.columns)
+        return TorqueSamples(columns, self.original_count, self.interval)
 
     def subsampled(self, max_count: int) -> TorqueSamples:
         """Return at most `max_count` samples, evenly spaced; this object itself if it has no more."""
