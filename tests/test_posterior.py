@@ -149,13 +149,13 @@ def test_standard_deviations_are_those_of_sampled_parameters(fitted):
     rng = np.random.default_rng(0)
     q, qd, qdd = rng.uniform(-1, 1, (3, 4, 3))
     draws = []
-    vector = ParameterVector(result.model)
+    vector = ParameterVector(posterior.model)
     x = vector.flatten(vector.initial)
     for noise in torch.from_numpy(rng.normal(size=(300, len(x)))):
         values, vectors = torch.linalg.eigh(small.covariance)
         vector.write(x + vectors @ (values.clamp(min=0).sqrt() * noise))
         with torch.no_grad():
-            model, states = result.model, list(map(torch.from_numpy, (q, qd, qdd)))
+            model, states = posterior.model, list(map(torch.from_numpy, (q, qd, qdd)))
             drawn = model.mass_matrix(states[0]), model.gravity(states[0]), model.inverse_dynamics(*states)
             draws.append(torch.cat([y.flatten() for y in (*drawn, model.armature)]).numpy())
     vector.write(x)

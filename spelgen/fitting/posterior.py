@@ -6,8 +6,9 @@ function f is |df/dx R|^2 with the covariance R R^T. Torque predictions add the 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -136,17 +137,12 @@ class Posterior:
     @cached_property
     def bodies(self) -> tuple[Interval, ...]:
         """Mass [kg] and first moments [kg m] of each body that the logs can determine on their own."""
-        names, _ = self._base
-        value, root = self._constants
-        result = []
-        for index in range(10 * len(self.model.chain.parents)):
-            if (
-                index % 10 < 4 and parameter_name(index) in names
-            ):  # base parameters of several have the suffix R
-                unit, positive = ("kg", True) if index % 10 == 0 else ("kg m", False)
-                std = float(root[index].norm())
-                result.append(Interval(parameter_name(index), float(value[index]), std, unit, positive))
-        return tuple(result)
+        _, combination = self._base
+        alone = (combination.count_nonzero(dim=1) == 1).tolist()
+        pairs = zip(self.base_parameters, alone, strict=True)
+        return tuple(
+            replace(x, positive=x.name[0] == "m") for x, single in pairs if single and x.name[0] in "mh"
+        )
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
@@ -288,27 +284,21 @@ def posterior_of(
         )  # fmt: skip
     vector = ParameterVector(model)
     count = len(vector.flatten(vector.initial))
-    covariance, torque_std = (
-        _tensor(content, "covariance", (count, count)),
-        _tensor(content, "torque_std", (model.n,)),
-    )
-    delay_std = content.get("delay_std")
+    covariance = _tensor(content, "covariance", (count, count))
+    torque_std, delay_std = _tensor(content, "torque_std", (model.n,)), content.get("delay_std")
     if covariance is None or torque_std is None or not isinstance(delay_std, float):
-        raise RunError(
-            "a posterior of another model",
-            file=file,
-            element="posterior",
-            do="restore it from a copy, or fit again",
-        )
+        do = "restore it from a copy, or fit again"
+        raise RunError("a posterior of another model", file=file, element="posterior", do=do)
     late = Interval("torque delay", delay, delay_std, "s") if delay else None
+    model = copy.deepcopy(model).double().cpu().requires_grad_(False)  # a user may change the model
     return Posterior(model, covariance, torque_std.numpy(), late)
 
 
 def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | None:
-    """Return a tensor by its name; None if it is absent, has another shape or type, or is not finite."""
+    """Return a tensor by its name; None if it is absent, has another shape or type, is zero or not finite."""
     tensor = content.get(name)
     if isinstance(tensor, Tensor) and tensor.shape == shape and tensor.dtype == torch.float64:
-        return tensor if bool(tensor.isfinite().all()) else None
+        return tensor if tensor.any() and tensor.isfinite().all() else None
     return None
 
 
