@@ -124,7 +124,7 @@ def mechanisms() -> list[Mechanism]:
     """Return all mechanisms."""
     return [
         Mechanism("filter transients excluded", tuned(SAMPLES, unsettled=0.0)),
-        Mechanism("correlated errors (3 samples)", tuned(TUNING, correlation_length=1.0)),
+        Mechanism("correlated errors (0.2 s)", tuned(TUNING, correlation_time=0.02)),
         Mechanism("steps at the least-squares noise", tuned(TUNING, initial_steps=0)),
         Mechanism("noise annealing", tuned(TUNING, annealing_iterations=0)),
         Mechanism("more iterations if noise decreases", tuned(TUNING, max_extension=1)),

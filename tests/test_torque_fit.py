@@ -16,8 +16,7 @@ from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
-from spelgen.emission.build import build
-from spelgen.emission.loading import load_module
+from spelgen.emission.build import build, load_module
 from spelgen.emission.specify import generate
 from spelgen.errors import LogError
 from spelgen.fitting.fit import fit
@@ -616,7 +615,9 @@ def test_bodies_follow_a_torque_no_further_than_it_goes(emitted):
     samples = TorqueSamples.of([recorded(model, 6.0, 0.05)])
     jacobian = TorqueJacobian(model, samples)
     estimate = initial_fit(TorqueProblem.of(jacobian, GaussianPrior()))
-    noise = NoiseEstimator.of(jacobian).estimate(0.5 * estimate.state.residual)
+    noise = NoiseEstimator.of(jacobian, estimate.problem.correlation_time).estimate(
+        0.5 * estimate.state.residual
+    )
     estimate = replace(estimate, problem=replace(estimate.problem, noise=noise)).with_current_covariance()
     _, projection = estimate.linearize()
     for joint, slope in enumerate(projection.jacobian):

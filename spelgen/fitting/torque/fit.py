@@ -17,9 +17,10 @@ import torch
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.levenberg_marquardt import Termination
+from spelgen.fitting.torque.covariance import parameter_covariance
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import limit_friction
-from spelgen.fitting.torque.problem import TorqueEstimate, TorqueProblem, refine
+from spelgen.fitting.torque.problem import TorqueEstimate, TorqueProblem, refine, with_correlation_time
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.selection import SelectedTerm
 from spelgen.fitting.torque.stages import (
@@ -50,8 +51,9 @@ class TorqueSolution:
     """Result of a fit.
 
     rms_residual: (n,) root mean square torque residual [Nm, N]. steps, cost: of the solver, at the end. prior: standard
-    deviations as estimated. covariance: (K, K) posterior covariance of the parameters, zero for fixed ones.
-    compensated: (n,) joints whose drives compensate friction. selected_terms: residual terms. stages: in order.
+    deviations as estimated. covariance, torque_std: see `ParameterCovariance`. compensated: (n,) joints whose drives
+    compensate friction. correlation_time: (n,) of the torque errors [s]. selected_terms: residual terms. stages: in
+    order.
     """
 
     rms_residual: np.ndarray
@@ -59,7 +61,9 @@ class TorqueSolution:
     cost: float
     prior: GaussianPrior
     covariance: torch.Tensor
+    torque_std: torch.Tensor
     compensated: np.ndarray
+    correlation_time: np.ndarray
     selected_terms: tuple[SelectedTerm, ...]
     stages: tuple[FitStage, ...]
 
@@ -91,14 +95,17 @@ def fit_torque(
     estimate, selected, stages = _run_stages(problem, samples)
     state, jacobian = estimate.state, estimate.problem.jacobian
     jacobian.rigid.write(state.x)
+    uncertainty = parameter_covariance(estimate)
     rms = (state.residual / samples.count).sqrt() / jacobian.logged_scale(state.x)
     return TorqueSolution(
         rms_residual=rms.numpy(),
         steps=state.steps,
         cost=state.cost,
         prior=estimate.problem.prior.widths,
-        covariance=estimate.covariance,
+        covariance=uncertainty.covariance,
+        torque_std=uncertainty.torque_std,
         compensated=estimate.problem.compensated.numpy(),
+        correlation_time=estimate.problem.correlation_time.numpy(),
         selected_terms=tuple(selected),
         stages=tuple(stages),
     )
@@ -123,14 +130,13 @@ def _run_stages(
         estimate = choose_friction_state(estimate)
         done("friction state", estimate)
     if problem.adapt is None:
-        estimate = choose_friction_effects(estimate)
+        estimate = with_correlation_time(choose_friction_effects(estimate), samples)
         done("friction effects", estimate)
         if residual_terms(model) is not None:
             estimate, selected = fit_residual_terms(estimate, samples.subsampled(TUNING.residual_samples))
             done("residual terms", estimate)
-    if estimate.problem.jacobian.samples is not samples:
-        estimate = refine(estimate, samples)
-        done("final fit", estimate)
+    estimate = refine(estimate, samples)
+    done("final fit", estimate)
     return estimate, selected, stages
 
 

@@ -126,7 +126,7 @@ def refit_terms(
     samples: ResidualSamples,
     projection: RigidProjection,
     selected: Collection[TermKey],
-    correlation_length: float,
+    correlation_length: torch.Tensor,
 ) -> ProjectedTerms:
     """Refit the selected terms to the current torque residual, one after the other.
 
@@ -138,7 +138,7 @@ def refit_terms(
         samples: torque residual of the model with its current terms.
         projection: of the rigid-body and friction model.
         selected: terms to refit.
-        correlation_length: number of samples per independent error.
+        correlation_length: (n,) number of samples per independent error.
     """
     residual, noise = samples.torque_residual, rms_per_joint(samples.torque_residual)
     terms: dict[int, LinearTerms] = {}
@@ -146,7 +146,7 @@ def refit_terms(
     for candidate in joint_functions(model, samples, projection, selected):
         current = (candidate.features @ candidate.read(model.residuals)).unsqueeze(-1) * candidate.direction
         target = candidate.target(residual + current, noise)
-        fit = candidate.fit(target, correlation_length)
+        fit = candidate.fit(target, float(correlation_length[candidate.joint]))
         weights = fit.coef
         changed = (candidate.features @ weights).unsqueeze(-1) * candidate.direction
         residual = residual + current - changed

@@ -76,6 +76,21 @@ class RigidProjection(NamedTuple):
         jacobian = self.jacobian[joint]
         return torque - jacobian @ (self.posterior_gain[joint] @ (jacobian.mT @ torque))
 
+    def errors(self, residual: torch.Tensor, size: int) -> torch.Tensor:
+        """Return the errors of the torque per segment, (S, size, n) [Nm, N], from the residual (S size, n) of a fit.
+
+        The errors of a segment are (1 - H)^(-1/2) residual, with its block H of the hat matrix: the covariance of
+        independent errors is then that of the noise, however many parameters were fitted (Bell and McCaffrey, Survey
+        Methodology 28:169, 2002).
+        """
+        errors: torch.Tensor = residual.unflatten(0, (-1, size)).clone()
+        for joint, (jacobian, gain) in enumerate(zip(self.jacobian, self.posterior_gain, strict=True)):
+            rows = jacobian.unflatten(0, (-1, size))
+            values, vectors = torch.linalg.eigh(torch.eye(size).double() - rows @ gain @ rows.mT)
+            scale = values.clamp(min=TUNING.min_error_fraction).rsqrt().unsqueeze(-1)
+            errors[..., joint] = (vectors @ (scale * (vectors.mT @ errors[..., joint : joint + 1])))[..., 0]
+        return errors
+
 
 def concatenate_blocks(rows: Iterable[JointRows], joints: int) -> list[JointRows]:
     """Return the rows of each joint, concatenated over the blocks of samples."""

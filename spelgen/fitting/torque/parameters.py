@@ -228,7 +228,7 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
     MacKay, Bayesian Interpolation, Neural Computation 4:415 (1992): the fixed point s^2 = |x - mean|^2 / gamma, with
     the effective number of parameters gamma = k - tr(covariance) / s^2 of the group's k parameters, maximizes the
     marginal likelihood in Laplace's approximation. Here s^2 has a scaled inverse chi-squared hyperprior about its
-    initial value s0^2, with c degrees of freedom: s^2 = (|x - mean|^2 + c s0^2) / (gamma + c).
+    initial value s0^2, with c degrees of freedom: s^2 = (|x - mean|^2 + c s0^2) / (gamma + c). It is bounded.
 
     Args:
         prior: current prior.
@@ -249,7 +249,8 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
         spread = centring @ covariance[mask][:, mask] @ centring
         gamma = float(centring.trace() - spread.trace() / current[group] ** 2)
         squares = float((centring @ deviation[mask]).square().sum()) + freedom * initial[group] ** 2
-        updated[group] = (squares / (max(gamma, 0.0) + freedom)) ** 0.5
+        width = (squares / (max(gamma, 0.0) + freedom)) ** 0.5
+        updated[group] = min(width, max(TUNING.max_width, initial[group]))
     return replace(prior, widths=prior.widths.model_copy(update=updated))
 
 

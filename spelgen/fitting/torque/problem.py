@@ -12,7 +12,6 @@ are estimated from the data: outer iterations alternate Levenberg-Marquardt step
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -36,6 +35,7 @@ from spelgen.fitting.torque.linearization import (
 from spelgen.fitting.torque.parameters import ParameterPrior, update_widths
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
+from spelgen.identification.least_squares import correlation_time
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 State = SolverState[torch.Tensor]
@@ -46,27 +46,32 @@ State = SolverState[torch.Tensor]
 class NoiseEstimator:
     """Estimator of the torque noise s (n,) from the squared residual of `count` samples.
 
-    Errors of filtered samples are correlated. `correlation_length` samples count as one independent error: s^2 is the
-    mean squared residual times this length, so that sums over all samples have the weight of independent errors.
+    Errors of filtered samples are correlated. `correlation_length` (n,) samples count as one independent error: s^2 is
+    the mean squared residual times this length, so that sums over all samples have the weight of independent errors.
 
     torque_std: (n,) standard deviation of the torque [Nm, N].
     """
 
     count: int
-    correlation_length: float
+    correlation_length: torch.Tensor
     torque_std: torch.Tensor
 
     @classmethod
-    def of(cls, jacobian: TorqueJacobian) -> NoiseEstimator:
-        """Return the estimator for the samples of a Jacobian."""
-        correlation_length = max(1.0, TUNING.correlation_length / jacobian.samples.stride)
+    def of(cls, jacobian: TorqueJacobian, correlation_time: torch.Tensor) -> NoiseEstimator:
+        """Return the estimator for the samples of a Jacobian and the correlation times (n,) [s] of their errors."""
+        correlation_length = (correlation_time / jacobian.samples.interval).clamp(min=1.0)
         # a joint of constant torque has a standard deviation of zero, by which nothing can be divided
         torque_std = torch.maximum(jacobian.torque_std, 1e-3 * jacobian.torque_std.max())
         return cls(jacobian.samples.count, correlation_length, torque_std)
 
+    @property
+    def errors(self) -> torch.Tensor:
+        """Number of independent errors, (n,)."""
+        return self.count / self.correlation_length
+
     def upper_bound(self) -> torch.Tensor:
         """Return the noise (n,) [Nm, N] of a model that explains nothing."""
-        return self.torque_std * math.sqrt(self.correlation_length)
+        return self.torque_std * self.correlation_length.sqrt()
 
     def estimate(
         self, squared_residual: torch.Tensor, effective_parameters: torch.Tensor | float = 0.0
@@ -78,10 +83,9 @@ class NoiseEstimator:
             effective_parameters: number of parameters that each joint's torque determines, (n,): each reduces the
                 degrees of freedom of the residual by one independent error.
         """
-        errors = self.count / self.correlation_length
-        fraction = torch.as_tensor(1.0 - effective_parameters / errors).clamp(min=TUNING.min_error_fraction)
+        fraction = (1.0 - effective_parameters / self.errors).clamp(min=TUNING.min_error_fraction)
         rms = (squared_residual / self.count / fraction).sqrt()
-        return torch.maximum(rms, TUNING.min_noise * self.torque_std) * math.sqrt(self.correlation_length)
+        return torch.maximum(rms, TUNING.min_noise * self.torque_std) * self.correlation_length.sqrt()
 
     def annealed(self, squared_residual: torch.Tensor) -> torch.Tensor:
         """Return the noise (n,) [Nm, N] of an early iteration: a fraction of its residual (n,) [Nm^2, N^2]."""
@@ -93,7 +97,8 @@ class TorqueProblem:
     """Negative log posterior of x (K,) for a given noise and prior: a `LeastSquaresProblem`.
 
     noise: (n,) standard deviations, scaled as if the errors of all samples were independent. adapt: see `TorqueFit`.
-    compensated: (n,) joints whose drives compensate friction (see `stages.find_compensation`).
+    compensated: (n,) joints whose drives compensate friction (see `stages.find_compensation`). correlation_time: (n,)
+    of the errors [s].
     """
 
     jacobian: TorqueJacobian
@@ -101,25 +106,29 @@ class TorqueProblem:
     prior: ParameterPrior
     adapt: Adaptation | None
     compensated: torch.Tensor
+    correlation_time: torch.Tensor
 
     @classmethod
     def of(
         cls, jacobian: TorqueJacobian, widths: GaussianPrior, adapt: Adaptation | None = None
     ) -> TorqueProblem:
         """Return the problem whose prior mean is the current x of the model."""
-        rigid, noise = jacobian.rigid, NoiseEstimator.of(jacobian).upper_bound()
+        rigid = jacobian.rigid
+        correlation_time = torch.full_like(jacobian.torque_std, TUNING.correlation_time)
+        noise = NoiseEstimator.of(jacobian, correlation_time).upper_bound()
         prior = ParameterPrior(rigid, widths, widths, rigid.flatten(rigid.initial))
-        return cls(jacobian, noise, prior, adapt, rigid.initial[rigid.compensation] != 0)
+        compensated = rigid.initial[rigid.compensation] != 0
+        return cls(jacobian, noise, prior, adapt, compensated, correlation_time)
 
     @cached_property
     def free(self) -> torch.Tensor:
         """Mask (K,) of the estimated parameters."""
         return self.jacobian.rigid.free_mask(self.adapt, self.compensated)
 
-    @property
-    def selection_correlation_length(self) -> float:
-        """Samples per independent error in the choice of friction models and residual terms."""
-        return max(1.0, TUNING.selection_correlation_length / self.jacobian.samples.stride)
+    @cached_property
+    def noise_estimator(self) -> NoiseEstimator:
+        """Estimator of the noise of these samples."""
+        return NoiseEstimator.of(self.jacobian, self.correlation_time)
 
     def with_least_squares_noise(self, x: torch.Tensor) -> TorqueProblem:
         """Return the problem under the noise of unconstrained least squares, linearized at x (K,).
@@ -128,7 +137,7 @@ class TorqueProblem:
         bound of the noise. An estimate from the residual of a poor initial guess would be too large, and the fit would
         stop early.
         """
-        estimator = NoiseEstimator.of(self.jacobian)
+        estimator = self.noise_estimator
         noise, rows = estimator.upper_bound(), list(self.jacobian.joint_rows(x))
         # iterated: the noise is the weight of the joints, whose torques have common parameters
         for _ in range(TUNING.final_iterations):
@@ -182,7 +191,7 @@ class TorqueProblem:
         """
         free, joints = self.free, len(state.residual)
         gamma = float(free.sum() - (covariance * self.prior.precision)[free][:, free].sum())
-        noise = NoiseEstimator.of(self.jacobian).estimate(state.residual, gamma / joints)
+        noise = self.noise_estimator.estimate(state.residual, gamma / joints)
         # one body is too little data for the widths of a load
         prior = self.prior if self.adapt == "load" else update_widths(self.prior, state.x, covariance)
         return replace(self, noise=noise, prior=prior)
@@ -239,7 +248,33 @@ def refine(
     estimate: TorqueEstimate, samples: TorqueSamples, terms: Mapping[int, LinearTerms] = NO_TERMS
 ) -> TorqueEstimate:
     """Return the estimate for other samples or residual terms, with the former one as warm start."""
-    jacobian = TorqueJacobian(estimate.problem.jacobian.model, samples, terms)
-    estimate = estimate.with_jacobian(jacobian)
-    noise = NoiseEstimator.of(jacobian).estimate(estimate.state.residual)
+    estimate = estimate.with_jacobian(TorqueJacobian(estimate.problem.jacobian.model, samples, terms))
+    noise = estimate.problem.noise_estimator.estimate(estimate.state.residual)
     return alternate(replace(estimate.problem, noise=noise), estimate.state, TUNING.final_iterations)
+
+
+def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> TorqueEstimate:
+    """Return the estimate with the correlation times (n,) of its errors on segments of samples.
+
+    The error of a torque is white noise, correlated over 0.06 s after the filter, and the error of the model, which
+    lasts for tenths of a second to seconds. The integrated correlation time of their sum is estimated from the residual
+    corrected for the fit (`RigidProjection.errors`): the residual itself is less correlated the more parameters are
+    fitted to it. The estimate is averaged with its prior mean, weighted by the numbers of independent errors.
+
+    It is estimated once, after friction was chosen. In the outer iterations it would drive itself up: a joint with a
+    long correlation time has a small weight, and its residual grows. Friction without history has errors of its own.
+    """
+    problem, x = estimate.problem, estimate.state.x
+    segments = samples.segments(TUNING.segment, TUNING.initial_samples)
+    jacobian = TorqueJacobian(problem.jacobian.model, segments)
+    current, prior_mean = NoiseEstimator.of(jacobian, problem.correlation_time), TUNING.correlation_time
+    scale = (current.correlation_length / problem.noise_estimator.correlation_length).sqrt()
+    covariance = estimate.with_current_covariance().covariance
+    projection = jacobian.rigid_projection(x, scale * problem.noise, covariance)
+    residual = jacobian.residual_samples(x).torque_residual
+    errors = projection.errors(residual, segments.segment_length(TUNING.segment))
+    observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * segments.interval
+    weight = segments.count * segments.interval / prior_mean / TUNING.correlation_weight
+    mean = (weight * observed + prior_mean) / (weight + 1)
+    noise = problem.noise * (mean / problem.correlation_time).sqrt()
+    return replace(estimate, problem=replace(problem, noise=noise, correlation_time=mean))

@@ -12,12 +12,13 @@ from torch.autograd.functional import jacobian
 from spelgen.dynamics.parameters import idle_residuals
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.emission.assemble import ArmModel
-from spelgen.errors import Diagnostic
+from spelgen.errors import Diagnostic, Severity
 from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.torque.fit import TorqueSolution
 from spelgen.fitting.torque.parameters import ParameterVector
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
+from spelgen.identification.intervals import QUANTILE
 from spelgen.runtime.inputs import MotorInputs
 
 TERM_NAMES = {
@@ -35,13 +36,23 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
     # the log-Cholesky parameters of a body are logarithms of its mass and radii
     factor = float(np.exp(solution.prior.bodies))
     message = f"prior standard deviation of URDF masses: factor {factor:.2g}"
-    if factor > TUNING.wrong_urdf:
+    if solution.prior.bodies >= TUNING.max_width:
+        message += (
+            ", its upper bound: the masses of the URDF are wrong by more, or the torques are not in Nm (N); "
+            "`spelgen logs` tests their units"
+        )
+    elif factor > TUNING.wrong_urdf:
         message += (
             "; check the masses and centres of mass of the URDF, `spelgen logs` names links that are far off"
         )
-        yield Diagnostic("warning", "urdf-prior", "bodies", None, message)
-    else:
-        yield Diagnostic("info", "urdf-prior", "bodies", None, message)
+    severity: Severity = "warning" if factor > TUNING.wrong_urdf else "info"
+    yield Diagnostic(severity, "urdf-prior", "bodies", None, message)
+    if solution.prior.offset >= TUNING.max_width:
+        message = (
+            "the torque offsets exceed three times the friction that is expected of drives of this effort; check the "
+            "effort limits of the URDF, the zeros of the torques and their unit"
+        )
+        yield Diagnostic("warning", "offset-prior", "logs", None, message)
     if isinstance(model.inputs, MotorInputs) and len(model.inputs.gain_rows):
         yield _trained_gains(model, model.inputs, solution, names)
     if solution.compensated.any():
@@ -74,7 +85,10 @@ def _trained_gains(
     rows = inputs.gain_rows.numpy()
     parts = []
     for name, gain, factor in zip(
-        names[rows], inputs.gains().detach().numpy()[rows].sum(axis=1), np.exp(1.96 * deviation), strict=True
+        names[rows],
+        inputs.gains().detach().numpy()[rows].sum(axis=1),
+        np.exp(QUANTILE * deviation),
+        strict=True,
     ):
         parts.append(f"{name} {gain:.4g} ({gain / factor:.4g} to {gain * factor:.4g})")
     message = f"joint torque per logged torque, with 95 % intervals: {', '.join(parts)}"

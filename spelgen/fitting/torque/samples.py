@@ -35,31 +35,43 @@ class SampleBlock(NamedTuple):
 class TorqueSamples:
     """Samples of all trajectories, concatenated.
 
-    original_count: number of samples before decimation and subsampling. stride: between successive samples, in samples
-    of the decimated trajectories.
+    original_count: number of samples before decimation and subsampling. interval: between successive samples [s].
     """
 
     columns: SampleBlock
     original_count: int
-    stride: int = 1
+    interval: float
 
     @classmethod
     def of(cls, trajectories: Iterable[DynamicsSamples], decimation: int = 1) -> TorqueSamples:
         """Return every `decimation`-th sample of each trajectory."""
-        decimated, count = [], 0
+        decimated, count, interval = [], 0, 0.0
         for x in trajectories:
             columns = (x.q, x.qd, x.qdd, x.tau, x.z, x.direction)
             # copies: a view would keep all samples in memory
             decimated.append(
                 [None if column is None else np.ascontiguousarray(column[::decimation]) for column in columns]
             )
-            count += len(x.q)
-        return cls(SampleBlock._make(map(_concatenated, zip(*decimated, strict=True))), count)
+            count, interval = count + len(x.q), decimation / x.rate
+        return cls(SampleBlock._make(map(_concatenated, zip(*decimated, strict=True))), count, interval)
 
     @property
     def count(self) -> int:
         """Number of samples."""
         return len(self.columns.q)
+
+    def segment_length(self, seconds: float) -> int:
+        """Return the number of samples of a segment of this duration [s]; at most all."""
+        return min(self.count, max(1, round(seconds / self.interval)))
+
+    def segments(self, seconds: float, max_count: int) -> TorqueSamples:
+        """Return at most `max_count` samples: evenly spaced segments of this duration [s], concatenated."""
+        size = self.segment_length(seconds)
+        number = max(1, min(self.count, max_count) // size)
+        starts = torch.linspace(0, self.count - size, number).long()
+        rows = (starts.unsqueeze(-1) + torch.arange(size)).flatten()
+        columns = SampleBlock._make(None if column is None else column[rows] for column in self.columns)
+        return TorqueSamples(columns, self.original_count, self.interval)
 
     def subsampled(self, max_count: int) -> TorqueSamples:
         """Return at most `max_count` samples, evenly spaced; this object itself if it has no more."""
@@ -67,11 +79,11 @@ class TorqueSamples:
         if step <= 1:
             return self
         columns = self.columns.select(slice(None, None, step))
-        return TorqueSamples(columns, self.original_count, step * self.stride)
+        return TorqueSamples(columns, self.original_count, step * self.interval)
 
     def select(self, rows: slice) -> TorqueSamples:
         """Return the samples of these rows."""
-        return TorqueSamples(self.columns.select(rows), self.original_count, self.stride)
+        return TorqueSamples(self.columns.select(rows), self.original_count, self.interval)
 
     def blocks(self, size: int) -> Iterator[SampleBlock]:
         """Yield all samples in order, at most `size` at a time."""

@@ -63,7 +63,7 @@ def select_functions(
     samples: ResidualSamples,
     projection: RigidProjection,
     selected: Collection[TermKey],
-    correlation_length: float,
+    correlation_length: torch.Tensor,
 ) -> list[SelectedTerm]:
     """Return the term selected per joint, for joints with an accepted candidate.
 
@@ -72,14 +72,17 @@ def select_functions(
         samples: torque residual of the model with its current terms.
         projection: of the rigid-body and friction model.
         selected: terms that the model has already.
-        correlation_length: number of samples per independent error.
+        correlation_length: (n,) number of samples per independent error.
     """
     noise, joints = rms_per_joint(samples.torque_residual), range(samples.q.shape[1])
     candidates: list[list[JointFunction]] = [[] for _ in joints]
     for candidate in joint_functions(model, samples, projection):
         if (candidate.parameter, candidate.joint) not in selected:
             candidates[candidate.joint].append(candidate)
-    best = (_best(of_joint, samples.torque_residual, noise, correlation_length) for of_joint in candidates)
+    best = (
+        _best(of_joint, samples.torque_residual, noise, float(length))
+        for of_joint, length in zip(candidates, correlation_length, strict=True)
+    )
     return [term for term in best if term is not None]
 
 
@@ -169,5 +172,5 @@ def significant_reduction(before: torch.Tensor, after: torch.Tensor) -> float | 
     if not g.isfinite().all() or g.mean() <= SELECTION.standard_errors * standard_error:
         return None
     mean = float(g.mean())
-    reduction = 2 * mean / (1 + mean)  # (before - after) / before of a block with the mean g
+    reduction = 2 * mean / (1 + mean)  # g = (b - a) / (b + a) solved for (b - a) / b, at the mean g
     return reduction if reduction > SELECTION.min_reduction else None

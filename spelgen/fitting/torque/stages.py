@@ -14,7 +14,6 @@ from spelgen.fitting.torque.joint_functions import TermKey, clear_terms, refit_t
 from spelgen.fitting.torque.networks import select_networks
 from spelgen.fitting.torque.parameters import NEGLIGIBLE
 from spelgen.fitting.torque.problem import (
-    NoiseEstimator,
     State,
     TorqueEstimate,
     TorqueProblem,
@@ -55,7 +54,7 @@ def _annealed_fit(problem: TorqueProblem, steps: int) -> tuple[TorqueProblem, St
     with larger steps: start from a fraction of the current residual, and lower the noise with it to the least-squares
     level.
     """
-    estimator, mean = NoiseEstimator.of(problem.jacobian), problem.prior.mean
+    estimator, mean = problem.noise_estimator, problem.prior.mean
     problem = problem.with_least_squares_noise(mean)
     min_noise = problem.noise
     state = initial_state(problem, mean, steps=steps)
@@ -83,13 +82,12 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     causes a negative slope, too, but a smaller one.
     """
     samples = problem.jacobian.residual_samples(x)
-    residual, estimator = samples.torque_residual, NoiseEstimator.of(problem.jacobian)
+    residual, estimator = samples.torque_residual, problem.noise_estimator
     products = (residual * samples.qd).sum(dim=0)
     slope = products / samples.qd.square().sum(dim=0).clamp(min=1e-300)
     # share of the squared residual that the regression line explains (coefficient of determination)
     explained = slope * products / residual.square().sum(dim=0).clamp(min=1e-300)
-    errors = estimator.count / estimator.correlation_length
-    significant = explained * errors > TUNING.min_significance**2 * (1 - explained)
+    significant = explained * estimator.errors > TUNING.min_significance**2 * (1 - explained)
     amplitude = (slope * products / estimator.count).sqrt()
     visible = amplitude > TUNING.min_compensation * estimator.torque_std
     decreasing = (slope < 0) & (explained > TUNING.min_explained) & visible
@@ -144,7 +142,8 @@ def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
 
 def log_likelihood_ratio(estimate: TorqueEstimate, other: TorqueEstimate) -> torch.Tensor:
     """Return twice the log likelihood ratio of two estimates per joint (n,), with the noise maximized out."""
-    errors = estimate.problem.jacobian.samples.count / estimate.problem.selection_correlation_length
+    samples = estimate.problem.jacobian.samples
+    errors = samples.count * min(1.0, samples.interval / TUNING.reversal_correlation_time)
     return errors * (other.state.residual / estimate.state.residual).log()
 
 
@@ -184,8 +183,8 @@ def fit_residual_terms(
     if samples is not estimate.problem.jacobian.samples:
         estimate = refine(estimate, samples)
     estimate.problem.jacobian.rigid.write(estimate.state.x)
-    correlation_length = estimate.problem.selection_correlation_length
-    if not can_split(samples.count, correlation_length):
+    correlation_length = estimate.problem.noise_estimator.correlation_length
+    if not can_split(samples.count, float(correlation_length.max())):
         return estimate, []
     rigid_only = estimate
     selected: list[SelectedTerm] = []
@@ -196,7 +195,7 @@ def fit_residual_terms(
     if selected:
         estimate, selected = _without_losing_joints(rigid_only, estimate, selected)
     residual_samples = estimate.problem.jacobian.residual_samples(estimate.state.x)
-    selected += select_networks(model, residual_samples, correlation_length)
+    selected += select_networks(model, residual_samples, float(correlation_length.max()))
     for _ in range(TUNING.alternations if selected else 0):
         estimate = _refit(estimate.with_current_covariance(), samples, selected)
     return estimate, selected
@@ -206,7 +205,10 @@ def _refit(
     estimate: TorqueEstimate, samples: TorqueSamples, selected: Sequence[SelectedTerm]
 ) -> TorqueEstimate:
     """Refit the selected single-joint terms and the rigid-body parameters, with torques of position eliminated."""
-    model, correlation_length = estimate.problem.jacobian.model, estimate.problem.selection_correlation_length
+    model, correlation_length = (
+        estimate.problem.jacobian.model,
+        estimate.problem.noise_estimator.correlation_length,
+    )
     projected = refit_terms(model, *estimate.linearize(), _keys(selected), correlation_length)
     estimate = refine(estimate, samples, projected.terms)
     jacobian, x = estimate.problem.jacobian, estimate.state.x
@@ -238,9 +240,14 @@ def _losing_joints(
     rigid_only: TorqueEstimate, estimate: TorqueEstimate, selected: Sequence[SelectedTerm]
 ) -> list[int]:
     """Return the joints at which the terms do not lower the error on the last half, after fits to the first half."""
-    jacobian, correlation_length = estimate.problem.jacobian, estimate.problem.selection_correlation_length
+    jacobian, correlation_length = (
+        estimate.problem.jacobian,
+        estimate.problem.noise_estimator.correlation_length,
+    )
     model, samples = jacobian.model, jacobian.samples
-    first, last = (samples.select(rows) for rows in split_halves(samples.count, correlation_length))
+    first, last = (
+        samples.select(rows) for rows in split_halves(samples.count, float(correlation_length.max()))
+    )
     terms = copy.deepcopy(model.residuals.state_dict())
 
     def fit_first(

@@ -25,22 +25,25 @@ class TorqueTuning:
 
     # [1] Stride of the samples at 100 Hz: after the filter at 8 Hz every second one contains all information.
     decimation: int = 2
-    # [1] Residual correlation length after the filter, in samples of 20 ms (0.06 s): so many consecutive errors count
-    # as one. White noise has this length after the filter. With 5, M(q) of the arms of `benchmarks/truth.py` is 5 %
-    # worse, and three seconds of the UR10e of `benchmarks/ablation.py` are better (torque nMSE 0.0080 -> 0.0062).
-    # Lengths estimated from the residual are unstable: a joint with a large residual gets a small weight, and its
-    # residual grows (Panda: 0.0015 -> 0.0030).
-    correlation_length: float = 3.1
-    # [1] The same for comparisons of friction models and for the selection of residual terms, in samples of 20 ms
-    # (0.1 s).
-    selection_correlation_length: float = 5.0
+    # [s] Prior mean of the correlation time of torque errors: errors of recorded arms. The samples within it count as
+    # one independent error.
+    correlation_time: float = 0.2
+    # [s] The same for the comparison of friction models, which differ at reversals.
+    reversal_correlation_time: float = 0.1
+    # [1] Weight of this prior mean, as a number of independent errors.
+    correlation_weight: float = 30.0
+    # [s] Segments from which the correlation time is estimated.
+    segment: float = 1.0
+    # [1] Largest estimated prior width: masses and armatures are known to a factor of 20, torque offsets to three times
+    # the typical friction. Logs that need a wider prior are not those of the URDF, or not in Nm.
+    max_width: float = 3.0
     # [1] Outer iterations of noise and prior after the initial fit.
     iterations: int = 5
     # [1] Twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773,
     # 1995).
     strong_evidence: float = 6.0
-    # [1] The same for the Stribeck effect, saturation and load dependence of a joint (2 per parameter: Akaike, IEEE
-    # Trans. Autom. Control 19:716, 1974).
+    # [1] Twice the log likelihood ratio that adds the Stribeck effect, saturation or load dependence to a joint: 2 per
+    # parameter (Akaike, IEEE Trans. Autom. Control 19:716, 1974).
     effects_evidence: float = 2.0
     # [1] Largest number of steps before noise and prior are estimated.
     initial_steps: int = 60
@@ -119,9 +122,8 @@ class ResidualTuning:
 
     # [1] Contiguous blocks of samples, each held out once.
     folds: int = 10
-    # [1] Correlation lengths that are left out between fitted and held-out samples: 0.5 s with
-    # `TorqueTuning.selection_correlation_length`.
-    gap: float = 5.0
+    # [1] Correlation times that are left out between fitted and held-out samples.
+    gap: float = 2.5
     # [1] Standard errors that the mean error reduction over the blocks must exceed: p = 0.01 of Student's t with nine
     # degrees of freedom.
     standard_errors: float = 2.82
