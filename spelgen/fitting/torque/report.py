@@ -99,7 +99,7 @@ def _trained_gains(
 
 def _compensation(model: ArmModel, solution: TorqueSolution, names: np.ndarray) -> Diagnostic:
     value = model.friction_compensation.detach().numpy()
-    joints = ", ".join(f"{names[k]} {value[k]:.3g}" for k in np.flatnonzero(solution.compensated))
+    joints = ", ".join(f"{names[k]} {value[k]:.3g}" for k in np.flatnonzero(solution.compensated & (value > 0)))
     message = (
         "the measured torque decreases with velocity, as if the drive compensated friction: "
         f"{joints} Nm s/rad (N s/m) are added; check the torques' signs and what the controller subtracts"
