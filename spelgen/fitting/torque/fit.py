@@ -19,7 +19,13 @@ from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.levenberg_marquardt import Termination
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import limit_friction
-from spelgen.fitting.torque.problem import TorqueEstimate, TorqueProblem, refine, with_correlation_time
+from spelgen.fitting.torque.problem import (
+    TorqueEstimate,
+    TorqueProblem,
+    held_out_nmse,
+    refine,
+    with_correlation_time,
+)
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.selection import SelectedTerm
 from spelgen.fitting.torque.stages import (
@@ -52,6 +58,7 @@ class TorqueSolution:
     rms_residual: (n,) root mean square torque residual [Nm, N]. steps, cost: of the solver, at the end. prior: standard
     deviations as estimated. covariance: (K, K) posterior covariance of the parameters, zero for fixed ones.
     compensated: (n,) joints whose drives compensate friction. correlation_time: (n,) of the torque errors [s].
+    held_out_nmse: (n,) mean squared error of held-out segments, divided by the variance of the torque.
     selected_terms: residual terms. stages: in order.
     """
 
@@ -62,6 +69,7 @@ class TorqueSolution:
     covariance: torch.Tensor
     compensated: np.ndarray
     correlation_time: np.ndarray
+    held_out_nmse: np.ndarray
     selected_terms: tuple[SelectedTerm, ...]
     stages: tuple[FitStage, ...]
 
@@ -102,6 +110,7 @@ def fit_torque(
         covariance=estimate.covariance,
         compensated=estimate.problem.compensated.numpy(),
         correlation_time=estimate.problem.correlation_time.numpy(),
+        held_out_nmse=held_out_nmse(estimate, samples).numpy(),
         selected_terms=tuple(selected),
         stages=tuple(stages),
     )

@@ -97,6 +97,8 @@ class TorqueTuning:
     # [1] Relative standard deviation above which logs do not determine a motor gain: its 95 % interval then reaches
     # 20 % to either side, as the difference of two datasheets does.
     undetermined_gain: float = 0.1
+    # [1] nMSE of held-out seconds above which logs do not support the fit at a joint.
+    unsupported: float = 0.5
     # [1] Factor of the prior standard deviation of URDF masses above which the URDF is wrong.
     wrong_urdf: float = 5.0
     # [1] Torque residual divided by the inertial torque of a joint, above which the predicted motion is unreliable.
