@@ -4,10 +4,8 @@
 
 FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. nMSE: mean squared torque
 error by the torque's variance, mean of the joints, pauses included. The presets are fitted as `spelgen train` does,
-everything else to the same samples. Networks have two hidden layers of 64 units: one of q, qd and qdd; the same for
-what least squares leaves; and a Deep Lagrangian network (Lutter, Ritter and Peters, ICLR 2019: a factor of M, and V)
-with viscous and Coulomb friction of each joint beside it. They are stopped, and the ridge is chosen, by a fifth of
-those samples, as a careful user would. States 0.1, 0.5 and 1 s ahead: error relative to the motion, as `spelgen
+everything else to the same samples. The networks are the ones of `rivals.py`; `+ network` is a network for the torque
+residual of least squares. States 0.1, 0.5 and 1 s ahead: error relative to the motion, as `spelgen
 evaluate` has it, open loop and with the disturbance held that a momentum observer finds.
 """
 
@@ -15,7 +13,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,25 +24,18 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+from leaderboard import cross_validated_ridge, folds
 from motions import smooth_motion
 from real_logs import (
-    RIDGES,
-    TESTS,
-    TRAINING,
     Torque,
-    after,
-    first,
     least_squares_torque,
     mean,
-    read,
-    ridge,
     samples_of,
     torque_of,
     trained,
 )
-from recordings import folder_of, panda_urdf
-from torch import Tensor, nn
-from torch.func import grad, jvp
+from recordings import folder_of
+from rivals import deep_lagrangian, network
 
 import spelgen
 from spelgen.arm.arm import Chain
@@ -75,10 +66,7 @@ class Case:
 
 
 AHEAD = (0.1, 0.5, 1.0)  # s
-SMOOTHING = 0.02  # rad/s, of the Deep Lagrangian network's Coulomb friction
 
-SPLITS = {"xmate3": 12.0, "ar5": 36.0}  # s of training
-WIDTH, EPOCHS, PATIENCE, BATCH = 64, 400, 30, 512
 ROBOT = Path(__file__).parents[1] / "robots" / "ur10e.urdf"
 EFFECTS = {
     "spring": "a spring of 120 Nm at joint 2 and of 8 Nm/rad at joint 1",
@@ -118,7 +106,7 @@ def table(cases: Iterator[Case]) -> None:
             of_the_urdf(case.urdf, arm),
             network(training),
             deep_lagrangian(training),
-            best_ridge(arm, training),
+            cross_validated_ridge(arm, training),
             plain,
             network(training, plain),
             least_squares_torque(arm, training, FrictionModel(memory=True)),
@@ -143,24 +131,11 @@ def states_ahead(folder: Path) -> None:
 
 
 def splits(folder: Path) -> Iterator[Split]:
-    """The arms of the reference logs, with the splits that its README gives."""
-    urdf = folder / "ur10e" / "ur10e.urdf"
-    arm = load_arm(urdf).chain
-    logs = {x: read(folder / "ur10e" / f"{x}.parquet", arm) for x in (*TRAINING, *TESTS)}
-    yield "UR10e, nine", urdf, [logs[x] for x in TRAINING], [logs[x] for x in TESTS]
-    urdf = panda_urdf(folder)
-    whole = read(folder / "panda" / "exciting_traj1.parquet", load_arm(urdf).chain)
-    yield "Panda", urdf, [first(whole, 12.0)], [after(whole, 12.0)]
-    for name, seconds in SPLITS.items():
-        urdf = folder / name / f"{name}.urdf"
-        (log,) = (folder / name).glob("*.parquet")
-        whole = read(log, load_arm(urdf).chain)
-        yield name, urdf, [first(whole, seconds)], [after(whole, seconds)]
-    urdf = folder / "shanghai" / "shanghai.urdf"
-    arm = load_arm(urdf).chain
-    each = [read(log, arm) for log in sorted((folder / "shanghai").glob("*.parquet"))]
-    for k, test in enumerate(each):
-        yield f"shanghai {k + 1}", urdf, [x for x in each if x is not test], [test]
+    """Yield the documented splits of the recordings."""
+    for fold in folds(folder):
+        if "/split" in fold.name:
+            tests = next(iter(fold.tests.values()))
+            yield fold.name.removesuffix("/split"), fold.urdf, list(fold.training), list(tests)
 
 
 def real(folder: Path) -> Iterator[Case]:
@@ -225,120 +200,6 @@ def of_the_urdf(urdf: Path, arm: Chain) -> Torque:
     names = [x.name for x in arm.coordinates]
     dynamics = urdf_dynamics(urdf, names, drives=drives_known(urdf, names))
     return torque_of(dynamics)
-
-
-def best_ridge(arm: Chain, training: Sequence[DynamicsSamples]) -> Torque:
-    """Least squares with the penalty that meets held-out blocks best."""
-    seen, held = ([part(x, out) for x in training] for out in (False, True))
-
-    def missed(size: float) -> float:
-        return mean(ridge(arm, seen, size), held)
-
-    return ridge(arm, training, min(RIDGES, key=missed))
-
-
-def part(x: DynamicsSamples, out: bool) -> DynamicsSamples:
-    """The samples of one trajectory that are held out, or the others."""
-    rows = held_out(len(x.q)) == out
-    return DynamicsSamples(x.name, *(column[rows] for column in (x.q, x.qd, x.qdd, x.tau)))
-
-
-def held_out(count: int) -> np.ndarray:
-    """Every fifth of blocks of time, for samples beside one another are alike."""
-    return np.arange(count) * 10 // count % 5 == 4
-
-
-def network(training: Sequence[DynamicsSamples], beside: Torque | None = None) -> Torque:
-    """A network of q, qd and qdd, fitted to torques, or to what another predictor leaves of them."""
-    inputs = [np.concatenate([s.q, s.qd, s.qdd], axis=-1) for s in training]
-    moved, scale = np.concatenate(inputs).mean(0), np.concatenate(inputs).std(0) + 1e-9
-    known = [0 * s.tau if beside is None else beside(s) for s in training]
-    torch.manual_seed(0)
-    layers = mlp(len(moved), training[0].q.shape[1], nn.Tanh)
-
-    def model(q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        x = (torch.cat([q, qd, qdd], dim=-1) - torch.from_numpy(moved)) / torch.from_numpy(scale)
-        return layers(x)
-
-    learned = fitted(model, layers, training, [s.tau - k for s, k in zip(training, known, strict=True)])
-    if beside is None:
-        return learned
-    return lambda x: learned(x) + beside(x)
-
-
-class DeepLagrangian(nn.Module):
-    """M = L L^T + a little, and V, by networks of cos q and sin q; friction of each joint beside them."""
-
-    def __init__(self, joints: int) -> None:
-        super().__init__()
-        rows, columns = torch.tril_indices(joints, joints)
-        places = torch.eye(joints * joints).double()[rows * joints + columns]  # of the entries of L
-        self.places = places.unflatten(-1, (joints, joints))
-        self.factor = mlp(2 * joints, joints * (joints + 1) // 2, nn.Softplus)
-        self.potential = mlp(2 * joints, 1, nn.Softplus)
-        self.viscous, self.coulomb = (nn.Parameter(torch.zeros(joints).double()) for _ in range(2))
-
-    def mass(self, q: Tensor) -> Tensor:
-        entries = self.factor(torch.cat([q.cos(), q.sin()], dim=-1))
-        lower = torch.tensordot(entries, self.places, dims=1)
-        return lower @ lower.mT + 1e-3 * torch.eye(q.shape[-1]).double()
-
-    def forward(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        def lagrangian(x: Tensor) -> Tensor:
-            kinetic = 0.5 * torch.einsum("...i,...ij,...j->...", qd, self.mass(x), qd)
-            return (kinetic - self.potential(torch.cat([x.cos(), x.sin()], dim=-1))[..., 0]).sum()
-
-        change = jvp(lambda x: torch.einsum("...ij,...j->...i", self.mass(x), qd), (q,), (qd,))[1]
-        inertia = torch.einsum("...ij,...j->...i", self.mass(q), qdd)
-        friction = self.viscous * qd + self.coulomb * torch.tanh(qd / SMOOTHING)
-        return inertia + change - grad(lagrangian)(q) + friction
-
-
-def deep_lagrangian(training: Sequence[DynamicsSamples]) -> Torque:
-    torch.manual_seed(0)
-    model = DeepLagrangian(training[0].q.shape[1])
-    return fitted(model, model, training, [s.tau for s in training])
-
-
-def mlp(inputs: int, outputs: int, activation: type[nn.Module]) -> nn.Sequential:
-    layers = [nn.Linear(inputs, WIDTH), activation(), nn.Linear(WIDTH, WIDTH), activation()]
-    return nn.Sequential(*layers, nn.Linear(WIDTH, outputs)).double()
-
-
-def fitted(
-    model: Callable[..., Tensor],
-    weights: nn.Module,
-    training: Sequence[DynamicsSamples],
-    torques: Sequence[np.ndarray],
-) -> Torque:
-    """The model, whose weights these are, fitted to torques in units of their deviations by AdamW, and stopped."""
-    states = [np.concatenate([getattr(s, k) for s in training]) for k in ("q", "qd", "qdd")]
-    y = np.concatenate(torques)
-    moved, scale = y.mean(0), y.std(0) + 1e-9
-    out = held_out(len(y))
-    seen, held = ([torch.from_numpy(x[rows]) for x in (*states, (y - moved) / scale)] for rows in (~out, out))
-    optimizer = torch.optim.AdamW(weights.parameters(), lr=1e-3)
-    best, kept, waits = np.inf, weights.state_dict(), 0
-    for _ in range(EPOCHS):
-        for batch in torch.randperm(len(seen[0])).split(BATCH):
-            optimizer.zero_grad()
-            *given, target = (x[batch] for x in seen)
-            (model(*given) - target).square().mean().backward()
-            optimizer.step()
-        with torch.no_grad():
-            loss = float((model(*held[:3]) - held[3]).square().mean())
-        waits = 0 if loss < best else waits + 1
-        if loss < best:
-            best, kept = loss, {name: value.clone() for name, value in weights.state_dict().items()}
-        if waits > PATIENCE:
-            break
-    weights.load_state_dict(kept)
-
-    def torque(x: DynamicsSamples) -> np.ndarray:
-        with torch.no_grad():
-            return model(*map(torch.from_numpy, (x.q, x.qd, x.qdd))).numpy() * scale + moved
-
-    return torque
 
 
 if __name__ == "__main__":

@@ -36,7 +36,6 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines.predictor import Solver
 from spelgen.dynamics.bristles import bristle_reach, reach_of
 from spelgen.dynamics.friction import FrictionModel
-from spelgen.dynamics.regressor_dynamics import regressor
 from spelgen.emission.build import build
 from spelgen.errors import LogError
 from spelgen.evaluation.horizons import end_errors
@@ -60,8 +59,6 @@ TESTS = (
 )  # fmt: skip
 OUTSIDE = "20_01_17_ptp_10_points"
 LOADED = ("20_01_13_load_2600", "20_01_31_load", "20_02_19_14harm50secLoad")
-SECONDS = (2, 3, 5, 10, 20)
-RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 AHEAD = {"0.1 s": 10, "0.5 s": 47}  # samples at 94 Hz
 WINDOWS = 60  # of each trajectory
 SUBSTEPS = 4
@@ -100,7 +97,6 @@ def ur10e(folder: Path) -> None:
     rollouts(fit.model, baseline, [logs[name] for name in TESTS])
     payload(fit, logs)
     other_days(fit, logs)
-    few(urdf, arm, logs[TRAINING[0]], [logs[name] for name in TESTS])
 
 
 def table(
@@ -113,39 +109,6 @@ def table(
     for name, row in rows:
         print(f"{name:26}" + "".join(f"{x:15.5f}" for x in row))
     print()
-
-
-def few(urdf: Path, arm: Chain, long: Trajectory, tests: Sequence[Trajectory]) -> None:
-    print(f"Trained on the first seconds of {long.name}: mean nMSE of the nine, pauses included\n")
-    head = ("best ridge", "closed-form", "(moving)")
-    print(f"{'seconds':26}" + "".join(f"{x:>15}" for x in head))
-    for seconds in SECONDS:
-        fit = trained(urdf, [first(long, seconds)])
-        samples, judged = samples_of(fit, [first(long, seconds)]), samples_of(fit, tests, pauses=True)
-        # by the tests themselves: in its favour
-        best = min(mean(ridge(arm, samples, x), judged) for x in RIDGES)
-        moving = mean(torque_of(fit.model), samples_of(fit, tests))
-        row = (best, mean(torque_of(fit.model), judged), moving)
-        print(f"{seconds:<26}" + "".join(f"{x:15.5f}" for x in row))
-    print()
-
-
-def ridge(arm: Chain, samples: Sequence[DynamicsSamples], size: float) -> Torque:
-    """Return the torque of least squares with a penalty: so many times the squared length of each column."""
-    friction = FrictionModel()
-
-    def rows(q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        return np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd)], axis=2)
-
-    tau = np.concatenate([x.tau for x in samples])
-    blocks = [rows(x.q, x.qd, x.qdd) for x in samples]
-    columns = (np.concatenate(blocks) / tau.std(axis=0)[:, None]).reshape(tau.size, -1)
-    length = np.linalg.norm(columns, axis=0)
-    length[length == 0] = 1.0
-    penalised = np.vstack([columns / length, np.sqrt(size) * np.eye(len(length))])
-    target = np.append((tau / tau.std(axis=0)).ravel(), np.zeros(len(length)))
-    parameters = np.linalg.lstsq(penalised, target, rcond=None)[0] / length
-    return lambda x: rows(x.q, x.qd, x.qdd) @ parameters
 
 
 def payload(fit: Fit, logs: dict[str, Trajectory]) -> None:

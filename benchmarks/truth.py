@@ -1,18 +1,26 @@
-"""Fit arms whose truth is known, and measure how far each method ends from it.
+"""Fit simulated arms whose truth is known, and measure the errors of each method.
 
     python benchmarks/truth.py [--arms 100] [--first 0] [--jobs 2] [--out runs/truth.jsonl] [--panda]
+                               [--recordings FOLDER]
 
-Every case is drawn from its number alone: an arm (a real URDF or a random chain), the error of the given URDF,
-friction of one of six kinds, armature, offsets, springs, a motion, a sample rate, noise and a delay of the
-torques. Fitted to the same samples are the default preset, `hybrid`, least squares without and with friction's
-memory, and figaroh's weighted least squares where it is installed. Results are appended to a file of JSON lines as
-they come, so that a run goes on where it stopped. `--panda` adds a simulated Panda with 40 s of logs at 200 Hz and
-3 % noise.
+A case is random, with its number as seed: an arm (a real URDF or a random chain), the error of the given URDF,
+friction of one of six kinds, armature, offsets, springs, a motion, a sample rate, noise and a delay of the torques.
+From number 10,000 on, half of the cases have the errors of real arms in addition (`real_errors.py`). The default
+preset, `hybrid`, least squares with Coulomb friction and with bristle states, and figaroh's weighted least squares if
+it is installed, are fitted to the same samples. Results are appended to a file of JSON lines; a run continues where it
+stopped. `--panda` adds a simulated Panda with 40 s of logs at 200 Hz and 3 % noise.
 
-M error: mean over positions of |M - M*| / |M*| (Frobenius norm), and the largest relative error of a diagonal
-entry; g error: root mean square relative to that of g*; error of the base parameters: likewise, each by the torque
-that it makes along the test motion; friction error: likewise, without offsets; torque nMSE on another motion without
-noise, raw and after a low-pass of 8 Hz.
+M error: mean over positions of |M - M*| / |M*| (Frobenius norm), and the largest relative error of a diagonal entry;
+g error: root mean square divided by the one of g*; base parameters: likewise, each multiplied by its root mean square
+torque along the test motion; friction error: likewise, without offsets; torque nMSE on another motion without noise,
+unfiltered and after a low-pass of 8 Hz.
+
+Truth is what the sensors show without noise: with errors of units and zeros, M*, g* and the torque are the ones of the
+logged torques at the logged positions, and the true base parameters are the least-squares solution for the rigid torque
+of the test motion (the pseudo-true parameters of a misspecified model; White, Econometrica 50:1, 1982).
+
+Intervals: 95 % intervals of the default preset, see `intervals.py`. Residuals: correlation and spectrum, compared with
+the ones of recordings if their folder is given.
 """
 
 from __future__ import annotations
@@ -27,7 +35,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +47,17 @@ from scipy.signal import butter, sosfiltfilt
 sys.path.insert(0, str(Path(__file__).parent))
 
 from figaroh_identification import figaroh_dynamics
+from intervals import SteadySliding, TrueValues, Uncertain, interval_ratios, propagated
+from real_errors import ErrorProcess, RealErrors, draw_errors, play
+from residual_statistics import residual_statistics
+from truth_summary import summary
 
 import spelgen
-from spelgen.dynamics.bristles import bristle_reach
-from spelgen.dynamics.protocol import memory_along
+from spelgen.dynamics.bristles import bristle_reach, reach_of
+from spelgen.dynamics.protocol import is_stateful, memory_along
 from spelgen.dynamics.regressor_dynamics import regressor
 from spelgen.errors import SpelgenError
+from spelgen.evaluation.torque import predicted_torques
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.objective import torque_delay
 from spelgen.identification.base_parameters import base_parameters
@@ -56,6 +69,13 @@ FINE = 1000.0  # Hz: the grid on which truth is computed; logs take samples of i
 POSITION_NOISE = 1e-5  # rad, m: of an encoder of 18 bits
 SHARE = (0.03, 0.15)  # Coulomb friction by the deviation of the rigid torque, drawn log-uniformly
 TINY = 1e-9
+FIRST_REALISTIC = 10_000
+UNEXCITED = 1e-3  # squared length of a direction, relative to a base parameter's column
+BRISTLES = np.geomspace(2e-4, 3e-2, 6)[
+    :, None
+]  # [rad, m] break-away displacements: not the ones of fitted models
+Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""q, qd and qdd, each (T, n)."""
 
 
 @dataclass(frozen=True)
@@ -74,13 +94,14 @@ class Case:
     sample_rate: float
     noise: float
     delay: float  # s
+    errors: RealErrors | None = None
 
 
 def draw_case(number: int, arms: Sequence[str]) -> Case:
     """Draw the case of this number."""
     rng = np.random.default_rng(number)
     random_arm = rng.random() < 0.2 or not arms
-    return Case(
+    case = Case(
         number=number,
         arm="random" if random_arm else str(rng.choice(arms)),
         urdf_error=float(rng.choice([0.0, 0.1, 0.25, 0.5, np.inf])),
@@ -94,10 +115,13 @@ def draw_case(number: int, arms: Sequence[str]) -> Case:
         noise=float(rng.choice([0.005, 0.01, 0.03, 0.1])),
         delay=float(rng.choice([0.0, 0.0, 0.002, 0.005])),
     )
+    if number >= FIRST_REALISTIC and rng.random() < 0.5:
+        case = replace(case, errors=draw_errors(rng))
+    return case
 
 
 class Truth:
-    """The arm as it is: rigid bodies of its URDF, and what this benchmark adds to them."""
+    """The simulated arm: rigid bodies of its URDF, and friction, drives, springs and errors of this benchmark."""
 
     def __init__(self, case: Case, urdf: Path, rng: np.random.Generator) -> None:
         self.case = case
@@ -113,77 +137,119 @@ class Truth:
             self.nominal = self.bodies.armature.numpy()
             mass = self._rigid_mass(middle).mean(0)
             gravity = self.bodies.gravity(middle).numpy()
+        self.inertia = np.diag(mass)
         share = np.exp(rng.uniform(*np.log(SHARE), n))
-        size = np.sqrt(gravity.var(axis=0) + (np.diag(mass) * 2.0) ** 2)
+        size = np.sqrt(gravity.var(axis=0) + (self.inertia * 2.0) ** 2)
         self.coulomb = share * size * (case.friction != "none")
         self.viscous = rng.uniform(0.3, 1.5, n) * share * size / self.speed * (case.friction != "none")
-        self.armature = rng.uniform(0.05, 0.5, n) * np.diag(mass) * case.armature
+        self.armature = rng.uniform(0.05, 0.5, n) * self.inertia * case.armature
         self.offset = 0.3 * self.coulomb * rng.normal(size=n) * case.offsets
         self.spring = np.zeros(n)
         if case.springs:
             self.spring[rng.integers(n)] = 0.3 * size.max()
         self.asymmetry = 0.3 * rng.normal(size=n) * (case.friction == "asymmetric")
+        self.load = np.abs(gravity + self.spring * np.sin(middle.numpy())).mean(axis=0)
+        own_rng = np.random.default_rng([case.number, 2])
+        self.process = ErrorProcess(case.errors or RealErrors(), share * size, own_rng)
 
     def _rigid_mass(self, q: torch.Tensor) -> np.ndarray:
         return self.bodies.mass_matrix(q).detach().numpy() - np.diag(self.nominal)
 
+    def _rigid_torque(self, motion: Motion) -> np.ndarray:
+        """Return the torque of the rigid bodies at the links, (T, n)."""
+        q, qd, qdd = motion
+        with torch.no_grad():
+            bias = self.bodies.nonlinear_effects(torch.from_numpy(q), torch.from_numpy(qd)).numpy()
+        return np.einsum("tij,tj->ti", self._rigid_mass(torch.from_numpy(q)), qdd) + bias
+
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
-        """M, (T, n, n), with armature."""
-        return self._rigid_mass(torch.from_numpy(q)) + np.diag(self.armature)
+        """Return M, (T, n, n), with armature, of logged torques at logged positions."""
+        mass = self._rigid_mass(torch.from_numpy(q - self.process.zero)) + np.diag(self.armature)
+        return self.process.gain[:, None] * mass
 
     def gravity(self, q: np.ndarray) -> np.ndarray:
-        """Torque of gravity and springs, (T, n)."""
+        """Return the logged torque of gravity and springs at logged positions, (T, n)."""
+        return self.process.gain * self._gravity(q - self.process.zero)
+
+    def _gravity(self, q: np.ndarray) -> np.ndarray:
         own = self.bodies.gravity(torch.from_numpy(q)).detach().numpy()
         return own + self.spring * np.sin(q)
 
     def friction_torque(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-        """Friction along a motion (T, n) on the fine grid."""
-        sign = np.tanh(qd / 1e-3)
-        dry = self.coulomb * sign
+        """Return friction along a motion of the motors, (T, n) on the fine grid."""
+        if self.case.friction == "bristles":
+            return self._friction(q, qd, play(q, BRISTLES))
+        return self._friction(q, qd, np.tanh(qd / 1e-3))
+
+    def _friction(self, q: np.ndarray, qd: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Return friction (T, n); direction: (T, n) in -1..1, of dry friction."""
+        dry = self.coulomb * direction * self.process.friction_factor(q)
         if self.case.friction == "stribeck":
             dry = dry * (1 + 0.6 * np.exp(-((qd / 0.1) ** 2)))
-        elif self.case.friction == "bristles":
-            dry = _maxwell_slip(q, self.coulomb)
         elif self.case.friction == "load":
-            gravity = np.abs(self.gravity(q))
-            dry = dry * (0.6 + 0.8 * gravity / (gravity.mean(axis=0) + TINY))
-        return self.viscous * qd + dry * (1 + self.asymmetry * sign)
+            dry = dry * (0.6 + 0.8 * np.abs(self._gravity(q)) / (self.load + TINY))
+        return self.viscous * qd + dry * (1 + self.asymmetry * direction)
 
-    def base_error(self, fitted: Fitted, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> float:
-        """How far base parameters of bodies and armatures are off, by the torques that they make along a motion."""
+    def sliding_friction(self, sliding: SteadySliding) -> np.ndarray:
+        """Return the logged friction of steady sliding, (speeds, n): see `SteadySliding`."""
+        q = sliding.q - self.process.zero
+        rows = []
+        for speed in sliding.speeds:
+            qd, direction = np.broadcast_to(speed, q.shape), np.ones_like(q)
+            both = self._friction(q, qd, direction) - self._friction(q, -qd, -direction)
+            rows.append(self.process.gain * (both.mean(axis=0) / 2 + self.process.cable))
+        return np.stack(rows)
+
+    def sensed(
+        self, motion: Motion, temperature: np.ndarray | float = 1.0
+    ) -> tuple[Motion, np.ndarray, np.ndarray]:
+        """Return the motion, the torque and its friction (T, n) that ideal sensors show at the motors.
+
+        Args:
+            motion: of the links, on the fine grid.
+            temperature: factor of friction.
+        """
+        q, qd, qdd = motion
+        link = self._rigid_torque(motion) + self.spring * np.sin(q)
+        if self.case.errors:
+            # motors move relative to the links; velocities and accelerations of this motion are differences
+            twist = self.process.deflection(link, self.inertia)
+            rate = np.gradient(twist, 1 / FINE, axis=0)
+            q, qd, qdd = q + twist, qd + rate, qdd + np.gradient(rate, 1 / FINE, axis=0)
+        friction = self.friction_torque(q, qd) * temperature + self.process.hysteresis(q)
+        torque = link + self.armature * qdd + friction + self.offset + self.process.ripple(q)
+        gain = self.process.gain
+        return (q + self.process.zero, qd, qdd), gain * torque, gain * friction
+
+    def inertial_columns(self, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+        """Return the base parameters of bodies and armatures as combinations (r, K), and their columns (T, n, r)."""
+        q, qd, qdd = motion
         base = base_parameters(self.arm, spelgen.FrictionModel())
         count = 10 * len(self.arm.bodies) + len(self.armature)
         columns = np.concatenate(
             [regressor(self.arm, q, qd, qdd), qdd[:, None] * np.eye(len(self.armature))], axis=2
         )
-        inertial = base.columns < count  # those of friction and offsets follow
-        size = np.sqrt(np.square(columns[:, :, base.columns[inertial]]).mean(axis=(0, 1)))
-        combination = size[:, None] * base.combination[inertial, :count]
-        truth = np.concatenate([self.bodies.inertial_parameters.detach().numpy().ravel(), self.armature])
-        error = np.concatenate([fitted.bodies.ravel(), fitted.armature]) - truth
-        return float(np.linalg.norm(combination @ error) / np.linalg.norm(combination @ truth))
+        inertial = base.columns < count  # the ones of friction and offsets are omitted
+        return base.combination[inertial, :count], columns[:, :, base.columns[inertial]]
 
-    def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        """Joint torques along a motion (T, n) on the fine grid."""
-        with torch.no_grad():
-            bias = self.bodies.nonlinear_effects(torch.from_numpy(q), torch.from_numpy(qd)).numpy()
-        inertial = np.einsum("tij,tj->ti", self.mass_matrix(q), qdd)
-        return inertial + bias + self.spring * np.sin(q) + self.friction_torque(q, qd) + self.offset
+    def base_parameters(self, motion: Motion, combination: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Return the true base parameters (r,); pseudo-true ones if units or zeros are wrong.
 
-
-def _maxwell_slip(q: np.ndarray, coulomb: np.ndarray) -> np.ndarray:
-    """Return friction of six elements in parallel that stick up to their own reach and then slip.
-
-    The generalised Maxwell-slip model (Al-Bender et al., IEEE TAC 50:1883, 2005), with other reaches than those
-    of the fitted models.
-    """
-    reaches = np.geomspace(2e-4, 3e-2, 6)
-    z = np.zeros((len(reaches), q.shape[1]))
-    dry = np.zeros_like(q)
-    for k in range(1, len(q)):
-        z = np.clip(z + (q[k] - q[k - 1]), -reaches[:, None], reaches[:, None])
-        dry[k] = (z / reaches[:, None]).mean(axis=0)
-    return coulomb * dry
+        motion: of the links. combination, columns: `inertial_columns` of the logged motion.
+        """
+        bodies = self.bodies.inertial_parameters.detach().numpy().ravel()
+        exact = combination @ np.concatenate([bodies, self.armature])
+        if self.case.errors is None:
+            return np.asarray(exact)
+        torque = self.process.gain * (self._rigid_torque(motion) + self.armature * motion[2])
+        scale = torque.std(axis=0) + TINY
+        rows = (columns / scale[:, None]).reshape(-1, columns.shape[2])
+        length = np.linalg.norm(rows, axis=0) + TINY
+        # directions that the test motion does not excite keep the exact values
+        rows = np.vstack([rows / length, np.sqrt(UNEXCITED) * np.eye(len(length))])
+        residual = ((torque - columns @ exact) / scale).ravel()
+        change = np.linalg.lstsq(rows, np.append(residual, np.zeros(len(length))), rcond=None)[0]
+        return np.asarray(exact + change / length)
 
 
 def _limit(value: float | None, default: float) -> float:
@@ -191,8 +257,8 @@ def _limit(value: float | None, default: float) -> float:
     return default if value is None else float(np.clip(value, -2.5, 2.5))
 
 
-def fourier_motion(truth: Truth, seconds: float, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """q, qd and qdd (T, n) of five harmonics a joint, within the joints' ranges and speeds."""
+def fourier_motion(truth: Truth, seconds: float, rng: np.random.Generator) -> Motion:
+    """Return five harmonics per joint, within the ranges and speeds of the joints."""
     t = np.arange(0.0, seconds, 1.0 / FINE)[:, None, None]
     n = len(truth.lower)
     omega = 2 * np.pi * np.sort(rng.uniform(0.05, 0.6, (5, n)), axis=0)
@@ -206,8 +272,8 @@ def fourier_motion(truth: Truth, seconds: float, rng: np.random.Generator) -> tu
     return (truth.lower + truth.upper) / 2 + scale * q, scale * qd, scale * qdd
 
 
-def pick_and_place(truth: Truth, seconds: float, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """q, qd and qdd (T, n) of quintic moves between random positions, with pauses."""
+def pick_and_place(truth: Truth, seconds: float, rng: np.random.Generator) -> Motion:
+    """Return quintic motions between random positions, with pauses."""
     parts: list[tuple[np.ndarray, ...]] = []
     count, at = 0, rng.uniform(truth.lower, truth.upper)
     while count < seconds * FINE:
@@ -220,28 +286,31 @@ def pick_and_place(truth: Truth, seconds: float, rng: np.random.Generator) -> tu
         pause = np.zeros((int(rng.uniform(0.2, 0.8) * FINE), len(at)))
         parts += [move, (pause + goal, pause, pause)]
         count, at = count + len(s) + len(pause), goal
-    return tuple(np.concatenate(x)[: round(seconds * FINE)] for x in zip(*parts, strict=True))
+    q, qd, qdd = (np.concatenate(x)[: round(seconds * FINE)] for x in zip(*parts, strict=True))
+    return q, qd, qdd
 
 
 def record_log(truth: Truth, case: Case, rng: np.random.Generator) -> list[spelgen.Trajectory]:
-    """Logs of two motions, as an arm gives them: noisy positions, their differences as velocities, noisy torques."""
-    logs = []
+    """Return logs of two motions: noisy positions, their differences as velocities, noisy torques."""
+    logs, own_rng, process = [], np.random.default_rng([case.number, 3]), truth.process
     for name in ("first", "second"):
         make = fourier_motion if case.motion == "excitation" else pick_and_place
-        q, qd, qdd = make(truth, case.seconds / 2, rng)
-        tau = truth.torque(q, qd, qdd)
+        motion = make(truth, case.seconds / 2, rng)
+        warmth = process.temperature_factor(np.arange(len(motion[0])) / FINE, own_rng)
+        (q, _, _), tau, _ = truth.sensed(motion, warmth)
         shift = round(case.delay * FINE)
         tau = np.concatenate([np.repeat(tau[:1], shift, axis=0), tau[: len(tau) - shift]])
+        tau = process.sensed(tau, FINE, own_rng)
         step = round(FINE / case.sample_rate)
         t = np.arange(0, len(q), step) / FINE
-        seen = q[::step] + POSITION_NOISE * rng.normal(size=q[::step].shape)
+        seen = process.encoded(q[::step] + POSITION_NOISE * rng.normal(size=q[::step].shape))
         noisy = tau[::step] + case.noise * tau.std(axis=0) * rng.normal(size=seen.shape)
         logs.append(spelgen.Trajectory(t, seen, np.gradient(seen, t, axis=0), noisy, name))
     return logs
 
 
 def wrong_urdf(urdf: Path, error: float, rng: np.random.Generator) -> bytes:
-    """Return the URDF with inertials off by this standard deviation; infinite: one placeholder for all."""
+    """Return the URDF with random inertials of this relative standard deviation; infinite: placeholders."""
     parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
     tree = etree.ElementTree(etree.fromstring(urdf.read_bytes(), parser))
     for name in ("visual", "collision", "dynamics"):
@@ -322,67 +391,95 @@ def run_case(case: Case, folder: Path) -> dict[str, Any]:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 try:
-                    results[name] = measure(fit(given, logs), truth, test)
+                    fitted = fit(given, logs)
+                    seconds = time.process_time() - since
+                    results[name] = measure(fitted, truth, test) | {"residual": fitted.residual}
                 except SpelgenError as error:
+                    seconds = time.process_time() - since
                     results[name] = {"error": str(error)}
-            results[name]["seconds"] = round(time.process_time() - since, 2)
+            results[name]["seconds"] = round(seconds, 2)
         return asdict(case) | {"n": truth.bodies.n, "results": results}
 
 
-def measure(fitted: Fitted, truth: Truth, test: tuple[np.ndarray, ...]) -> dict[str, Any]:
-    """How far fitted dynamics are from the truth."""
+def measure(fitted: Fitted, truth: Truth, motion: Motion) -> dict[str, Any]:
+    """Return the errors of fitted dynamics along a test motion of the links."""
     every, dynamics = round(FINE / 100.0), fitted.dynamics
-    q, qd, qdd = (x[::every] for x in test)
-    states = [torch.from_numpy(np.ascontiguousarray(x)) for x in (q, qd, qdd)]
+    sensed, true_tau, true_friction = truth.sensed(motion)
+    q, qd, qdd = (np.ascontiguousarray(x[::every]) for x in sensed)
+    true_tau, true_friction = true_tau[::every], true_friction[::every]
+    states = [torch.from_numpy(x) for x in (q, qd, qdd)]
     with torch.no_grad():
         mass = np.asarray(dynamics.mass_matrix(states[0][::10]))
         gravity = np.asarray(dynamics.gravity(states[0]))
         past: tuple[torch.Tensor, ...] = ()
-        if getattr(dynamics, "elements", 0):
+        if is_stateful(dynamics):
             past = (memory_along(dynamics, states[0][None], states[1][None])[0],)
         tau = np.asarray(dynamics.inverse_dynamics(*states, *past))
         friction = np.asarray(dynamics.friction_torque(*states[:2], *past))
     true_mass, true_gravity = truth.mass_matrix(q[::10]), truth.gravity(q)
-    true_tau, true_friction = truth.torque(*test)[::every], truth.friction_torque(*test[:2])[::every]
     norm = np.linalg.norm(mass - true_mass, axis=(1, 2)) / np.linalg.norm(true_mass, axis=(1, 2))
     diagonal = np.einsum("tii->ti", mass - true_mass).mean(0) / np.einsum("tii->ti", true_mass).mean(0)
     low_pass = butter(4, 8.0, fs=100.0, output="sos")
-    missed, slow = tau - true_tau, sosfiltfilt(low_pass, true_tau, axis=0)
+    residual, slow = tau - true_tau, sosfiltfilt(low_pass, true_tau, axis=0)
     varying = friction - friction.mean(0) - (true_friction - true_friction.mean(0))
-    nmse = (missed**2).mean(0) / true_tau.var(0)
-    filtered = (sosfiltfilt(low_pass, missed, axis=0) ** 2).mean(0) / slow.var(0)
-    return {
+    nmse = (residual**2).mean(0) / true_tau.var(0)
+    filtered = (sosfiltfilt(low_pass, residual, axis=0) ** 2).mean(0) / slow.var(0)
+    combination, columns = truth.inertial_columns((q, qd, qdd))
+    links = motion[0][::every], motion[1][::every], motion[2][::every]
+    true_base = truth.base_parameters(links, combination, columns)
+    size = np.sqrt(np.square(columns).mean(axis=(0, 1)))
+    base = combination @ np.concatenate([fitted.bodies.ravel(), fitted.armature])
+    errors: dict[str, Any] = {
         "mass": float(norm.mean()),
         "diagonal": [round(float(x), 5) for x in diagonal],
-        "base": truth.base_error(fitted, q, qd, qdd),
+        "base": float(np.linalg.norm(size * (base - true_base)) / np.linalg.norm(size * true_base)),
         "gravity": float(np.sqrt(((gravity - true_gravity) ** 2).mean() / ((true_gravity**2).mean() + TINY))),
         "friction": float(np.sqrt((varying**2).mean() / (true_friction.var(0).mean() + TINY))),
         "nmse": float(nmse.mean()),
         "nmse_filtered": float(filtered.mean()),
     }
+    if fitted.uncertain is not None:
+        sliding = SteadySliding(q[::100], np.quantile(np.abs(qd), (0.5, 0.9), axis=0))
+        values = TrueValues(
+            combination, true_base, truth.sliding_friction(sliding), true_mass[::20], true_gravity[::200]
+        )
+        errors["intervals"] = interval_ratios(fitted.uncertain, values, sliding, q[::200])
+    return errors
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Hold fitted dynamics, and their constants: bodies (B, 10) about the joints' frames, armatures (n,)."""
+    """Fitted dynamics, and their parameters.
+
+    bodies: (B, 10) in the frames of the joints. armature: (n,). uncertain: gives intervals of the default preset.
+    residual: correlation and spectrum of the torque residual, of one method.
+    """
 
     dynamics: Any
     bodies: np.ndarray
     armature: np.ndarray
+    uncertain: Uncertain | None = None
+    residual: list[float] | None = None
 
 
 def fit_hybrid(urdf: Path, logs: list[spelgen.Trajectory]) -> Fitted:
-    """The default model, fitted to torques as `spelgen train` does, without its measurement of windows."""
+    """Fit the default model to torques as `spelgen train` does, without its evaluation on windows."""
     model = spelgen.build(urdf, "hybrid")
-    late = torque_delay(model, logs, spelgen.Preprocessing())
-    moved = spelgen.Preprocessing(torque_delay=late.delay)
-    fit_torque(model, dynamics_samples(logs, preprocessing=moved, reach=bristle_reach(model)))
+    delay = torque_delay(model, logs, spelgen.Preprocessing()).delay
+    preprocessing = spelgen.Preprocessing(torque_delay=delay)
+    samples = dynamics_samples(logs, preprocessing=preprocessing, reach=bristle_reach(model))
+    solution = fit_torque(model, samples)
     with torch.no_grad():
-        return Fitted(model, model.inertial_parameters.numpy(), model.armature.numpy())
+        return Fitted(
+            model,
+            model.inertial_parameters.numpy(),
+            model.armature.numpy(),
+            propagated(model, solution.covariance),
+        )
 
 
 def fit_least_squares(memory: bool) -> Callable[[Path, list[spelgen.Trajectory]], Fitted]:
-    """A function that identifies the arm by least squares."""
+    """Return a function that identifies the arm by least squares."""
 
     def fit(urdf: Path, logs: list[spelgen.Trajectory]) -> Fitted:
         method = spelgen.LeastSquares(friction=spelgen.FrictionModel(memory=memory))
@@ -390,13 +487,28 @@ def fit_least_squares(memory: bool) -> Callable[[Path, list[spelgen.Trajectory]]
         bodies, armature, _ = np.split(
             result.parameters, np.cumsum([10 * len(result.arm.bodies), len(result.arm.coordinates)])
         )
-        return Fitted(result.dynamics, bodies, armature)
+        return Fitted(result.dynamics, bodies, armature, residual=residual_of(result, logs))
 
     return fit
 
 
+def residual_of(result: spelgen.Identification, logs: list[spelgen.Trajectory]) -> list[float] | None:
+    """Return the columns of `residual_statistics` of an identification with bristle states, in its own logs."""
+    if not result.method.friction.memory:
+        return None
+    samples = dynamics_samples(
+        logs,
+        pauses=True,
+        preprocessing=spelgen.Preprocessing(torque_delay=result.torque_delay.delay),
+        reach=reach_of(result.arm.joint_types),
+    )
+    residuals = [predicted_torques(result.dynamics, x) - x.tau for x in samples]
+    statistics = residual_statistics(residuals, [x.tau for x in samples])
+    return None if statistics is None else statistics.columns()
+
+
 def fit_figaroh(urdf: Path, logs: list[spelgen.Trajectory]) -> Fitted:
-    """Identify the arm by figaroh, from samples moved by the delay that `identify` finds."""
+    """Identify the arm with figaroh, from samples shifted by the delay that `identify` finds."""
     loaded = spelgen.load_arm(urdf)
     delay = spelgen.identify(loaded, logs).torque_delay.delay
     samples = dynamics_samples(logs, preprocessing=spelgen.Preprocessing(torque_delay=delay))
@@ -409,7 +521,6 @@ METHODS = {
     "identify": fit_least_squares(memory=False),
     "identify --memory": fit_least_squares(memory=True),
 }
-OURS = tuple(METHODS)
 if importlib.util.find_spec("figaroh"):
     METHODS["figaroh"] = fit_figaroh
 
@@ -423,47 +534,6 @@ def usable_arms(folder: Path) -> list[str]:
         if len(masses) >= 4 and min(masses[1:]) > 1e-3 and len({round(x, 9) for x in masses}) > 2:
             names.append(path.stem)
     return names
-
-
-def summary(rows: Sequence[dict[str, Any]]) -> str:
-    """Medians by method, and how often the default is near the better least squares."""
-    lines = [
-        f"{'':20}{'M':>10}{'g':>10}{'base':>10}{'friction':>10}"
-        f"{'nMSE':>12}{'filtered':>12}{'worst Mjj':>11}{'s':>7}{'arms':>7}"
-    ]
-    good = [row for row in rows if not any("error" in row["results"][name] for name in OURS)]
-    for name in METHODS:
-        each = [row["results"][name] for row in good if "mass" in row["results"].get(name, {})]
-        columns = [np.median([x[key] for x in each]) for key in ("mass", "gravity", "base", "friction")]
-        errors = [np.median([x[key] for x in each]) for key in ("nmse", "nmse_filtered")]
-        worst = np.median([np.abs(x["diagonal"]).max() for x in each])
-        seconds = np.median([x["seconds"] for x in each])
-        lines.append(
-            f"{name:20}" + "".join(f"{x:10.4f}" for x in columns) + "".join(f"{x:12.2e}" for x in errors)
-            + f"{worst:11.4f}{seconds:7.1f}{len(each):7}"
-        )  # fmt: skip
-    for key in ("mass", "nmse"):
-        ratio = np.array([by_better_least_squares(row, key) for row in good])
-        lines.append(
-            f"{key}: hybrid by the better least squares: median {np.median(ratio):.2f}; "
-            + ", ".join(f"at most {most} on {100 * (ratio <= most).mean():.0f} %" for most in (1.2, 1.02, 1))
-            + f" of {len(good)}"
-        )
-        for cause in ("urdf_error", "friction", "motion", "seconds", "sample_rate", "noise"):
-            values = [row[cause] for row in good]
-            medians = [
-                f"{value}: {np.median(ratio[[x == value for x in values]]):.2f}"
-                for value in sorted(set(values))
-            ]
-            lines.append(f"    median by {cause}: " + ", ".join(medians))
-    failed = len(rows) - len(good)
-    return "\n".join([*lines, f"{failed} cases with an error"])
-
-
-def by_better_least_squares(row: dict[str, Any], key: str) -> float:
-    """Return an error of the default model, by the error of the better of both least squares."""
-    errors = {name: row["results"][name][key] for name in OURS}
-    return float(errors["hybrid"] / min(errors["identify"], errors["identify --memory"]))
 
 
 PANDA = Case(
@@ -486,6 +556,7 @@ def main() -> None:
         "--arms-folder", type=Path, default=ARMS, help="URDFs; without them all arms are random"
     )
     parser.add_argument("--panda", action="store_true")
+    parser.add_argument("--recordings", type=Path, help="folder of recordings, to compare residuals with")
     options = parser.parse_args()
     rows = [json.loads(x) for x in options.out.read_text().splitlines()] if options.out.exists() else []
     names = usable_arms(options.arms_folder) if options.arms_folder.is_dir() else []
@@ -500,7 +571,7 @@ def main() -> None:
             file.write(json.dumps(row) + "\n")
             file.flush()
     numbers = {case.number for case in cases}
-    print(summary([row for row in rows if row["number"] in numbers]))
+    print(summary([row for row in rows if row["number"] in numbers], list(METHODS), options.recordings))
     for row in rows:
         if row["number"] == PANDA.number and options.panda:
             print(json.dumps(row["results"], indent=1))

@@ -46,6 +46,7 @@ def read_bytes(
         do: advice for a file that is too large.
     """
     try:
+        # The size is read first: a sparse file of many gigabytes takes no space.
         size = path.stat().st_size
         require_regular_file(path, error, kind)
         if size <= largest:
@@ -79,6 +80,7 @@ def limited_memory(size: int) -> Iterator[None]:
     try:
         import resource
 
+        # The limit of Linux is on the whole address space: the current size of the process is added.
         pages = int(Path("/proc/self/statm").read_text().split()[0])
     except (ImportError, OSError):
         yield
@@ -104,6 +106,7 @@ def replacing(path: Path | str) -> Iterator[Path]:
     path = Path(path)
     with naming(path):
         path.parent.mkdir(parents=True, exist_ok=True)
+        # In the same folder: a file is renamed atomically only within a file system.
         unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         try:
             yield unfinished
@@ -223,7 +226,9 @@ def reached(address: str) -> Iterator[tuple[Any, str]]:
 def _fetch(address: str) -> Path:
     """Copy the file or folder at an address into a new temporary folder; return the path of the copy."""
     folder = Path(tempfile.mkdtemp(prefix="spelgen-"))
+    # Copies live as long as the process: results are sent when they are written.
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    # The copy has the name of the original, whose suffix decides how it is read.
     copy = _inside(folder, address.rpartition("/")[2], address)
     with reached(address) as (system, remote):
         if system.isdir(remote):

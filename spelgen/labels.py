@@ -22,6 +22,18 @@ UNITS = {"revolute": Units("rad", "rad/s", "Nm", "kg m²"), "prismatic": Units("
 """Units per joint type."""
 
 
+INERTIAL_PARAMETERS = ("m", "hx", "hy", "hz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
+"""Ten per body: mass, first moment, tensor about the origin of the joint's frame."""
+# The first parameter of a group of regrouped parameters names the group. Iyy, hz and m come last, because those
+# parameters of a body with a revolute joint can always be regrouped into others.
+BASE_ORDER = ("Izz", "Ixx", "Ixy", "Ixz", "Iyz", "hx", "hy", "m", "Iyy", "hz")
+
+
+def parameter_name(index: int) -> str:
+    """Return the name of an inertial parameter: ``Izz2`` is the tensor component zz of the second body."""
+    return f"{INERTIAL_PARAMETERS[index % 10]}{index // 10 + 1}"
+
+
 @dataclass(frozen=True)
 class NamedJoint:
     """The name of a joint and its units."""

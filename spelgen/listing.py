@@ -93,6 +93,7 @@ def _fitted(columns: Sequence[Sequence[str]]) -> list[Sequence[str]]:
 
 def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
     """Return the columns in groups, each of which fits into the width together with the names of rows."""
+    # Names of rows are wrapped first, since they can be; numbers cannot.
     words = [word for name in columns[0][1:] for word in SEPARATOR.split(name)]
     room = WIDTH - 2 - max(MIN_NAME, _width(words))
     groups: list[list[int]] = [[]]
@@ -133,6 +134,7 @@ def number(value: float | None) -> str:
         return "-"
     if isinstance(value, int):
         return f"{value:,}"
+    # Plain decimals in the range in which three digits need no exponent.
     if value == 0 or 1e-3 <= abs(value) < 1e3:
         return f"{value:.3g}"
     if 1e3 <= abs(value) < 1e6:

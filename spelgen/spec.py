@@ -174,6 +174,8 @@ class ModelSpec:
     """Of joints whose inputs are commanded positions."""
 
     def __post_init__(self) -> None:
+        # A specification from a file is untrusted: an index beyond its table would fail in the middle of the
+        # assembly.
         n, links = len(self.joints), self.links
         joints = [*self.potential, *(x.joint for x in links), *(j for x in self.outputs for j in x.joints)]
         bases = [x.basis for x in self.outputs] + [x.basis for x in self.constants]
@@ -204,6 +206,7 @@ class ModelSpec:
 
     def to_json(self) -> str:
         """Return the canonical JSON, in one line of ASCII."""
+        # Sorted keys and no blanks: equal specifications have equal digests.
         plain = {"format": SPEC_FORMAT, **asdict(self)}
         return json.dumps(plain, sort_keys=True, ensure_ascii=True, separators=(",", ":"))
 
@@ -219,6 +222,7 @@ def spec_from_json(text: str, file: Path | None = None) -> ModelSpec:
 
     try:
         content = json.loads(text, parse_constant=_no_number)
+        # The format is compared before the keys, so that the error of an older file is clear.
         version = content.pop("format") if isinstance(content, dict) and "format" in content else None
         if version != SPEC_FORMAT:
             raise ModuleError(
@@ -226,6 +230,7 @@ def spec_from_json(text: str, file: Path | None = None) -> ModelSpec:
                 do="build the module again with `spelgen build`, and train it again",
             )  # fmt: skip
         spec = TypeAdapter(ModelSpec).validate_python(content)
+        # Written again it must be the same: pydantic converts numbers and ignores keys.
         if json.loads(spec.to_json()) == {"format": version, **content}:
             return spec
         reason = "keys or values of other types"

@@ -56,6 +56,7 @@ def workers(jobs: int, address: str | None = None) -> Iterator[RunTasks]:
     A single job at a time does not need Ray. address: of a running Ray cluster, "auto" for the one of this machine.
     Raises RunError if Ray is not installed, and if no cluster answers.
     """
+    # In this process: no second interpreter, and errors keep their traceback.
     if jobs == 1 and address is None:
         yield run_here
         return
@@ -73,6 +74,7 @@ def workers(jobs: int, address: str | None = None) -> Iterator[RunTasks]:
 
     cluster: dict[str, Any] = {"address": address}
     if address is None:
+        # Without the dashboard, which opens a port.
         cluster = {"num_cpus": jobs, "include_dashboard": False, "object_store_memory": OBJECT_STORE}
     try:
         ray.init(**cluster, log_to_driver=False, logging_level=logging.ERROR)

@@ -1,9 +1,7 @@
-"""Shared by all tests: one thread for tiny matrices, the order of files, tests with bounds of time, common fixtures."""
+"""Shared by all tests: one thread for tiny matrices, the order of files, common fixtures."""
 
-import fcntl
 import gc
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,14 +13,14 @@ ROOT = Path(__file__).parents[1]
 # The files that take longest. Workers of pytest-xdist take whole files in this order, so the longest start first.
 LONGEST_FILES = (
     "test_types",
+    "test_export_onnx",
     "test_torque_fit",
     "test_servo",
-    "test_contracts",
-    "test_workflow",
-    "test_coupled_motors",
-    "test_export_onnx",
-    "test_training",
     "test_meshes",
+    "test_workflow",
+    "test_training",
+    "test_coupled_motors",
+    "test_contracts",
     "test_docs",
     "test_evaluation",
     "test_selection",
@@ -31,52 +29,9 @@ LONGEST_FILES = (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the longest files first, so that no worker is left with one of them when the others are done."""
+    """Run the longest files first, so that none of them runs at the end while the other workers are idle."""
     order = {name: index for index, name in enumerate(LONGEST_FILES)}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))  # stable: others keep their order
-
-
-class WorkerLock:
-    """A readers-writer lock between the workers of pytest-xdist, on two files of the checkout.
-
-    Every test locks ``running``, a timed one exclusively. To do so it locks ``entry`` first, so that no other test
-    starts while a timed one waits for those that are running.
-    """
-
-    def __init__(self) -> None:
-        self.running = os.open(ROOT / "tests" / "conftest.py", os.O_RDONLY)
-        self.exclusive = False
-
-    def acquire(self, exclusive: bool) -> None:
-        with open(ROOT / "pyproject.toml") as entry:
-            fcntl.flock(entry, fcntl.LOCK_EX)
-            fcntl.flock(self.running, fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH)
-        self.exclusive = exclusive
-
-    def release(self) -> None:
-        fcntl.flock(self.running, fcntl.LOCK_UN)
-        self.exclusive = False
-
-
-LOCK = WorkerLock()
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[object]:
-    """Run tests marked ``timed`` while no other worker runs a test, which would slow them down.
-
-    Consecutive timed tests keep the lock: other workers wait for them only once.
-    """
-    timed, timed_next = (
-        x is not None and x.get_closest_marker("timed") is not None for x in (item, nextitem)
-    )
-    if not (timed and LOCK.exclusive):
-        LOCK.acquire(exclusive=timed)
-    try:
-        return (yield)
-    finally:
-        if not (timed and timed_next):
-            LOCK.release()
 
 
 def pytest_collection_finish() -> None:
@@ -103,7 +58,7 @@ def shared() -> Path:
 
 @pytest.fixture
 def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Epochs of few windows take four steps: for tests of what stands around a fit."""
+    """Epochs of few windows take four steps, for tests of files, commands and messages of a fit."""
     from spelgen.fitting.tuning import FittingTuning
 
     monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", FittingTuning(epoch_steps=4))
@@ -111,7 +66,7 @@ def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def short_torque_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fits to torques take two steps a round and few rounds: for tests of what stands around a fit."""
+    """Torque fits take two steps in few outer iterations, for tests of files, commands and messages."""
     from spelgen.fitting.torque.tuning import TorqueTuning
 
     tuning = TorqueTuning(

@@ -1,5 +1,7 @@
 """Models and run folders for export tests; their parameters are random, so that no term is zero."""
 
+import contextlib
+import re
 from pathlib import Path
 
 import torch
@@ -48,6 +50,19 @@ def moved_model(robot, preset, size=0.2):
 def arm_of(robot):
     """The arm of one of the project's robots."""
     return load_arm(ROBOTS / f"{robot}.urdf")
+
+
+def readme_results(files, folder: Path):
+    """The variables after the lines of a README have run in a folder with the exported files, with inputs of one."""
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    (code,) = re.findall(r"```python\n(.*?)```", files["README.md"].decode(), re.DOTALL)
+    names = {}
+    with contextlib.chdir(folder):
+        exec(
+            re.sub(r"(?<=^q = qd = qdd = tau = dq = )(np|torch)\.zeros", r"\1.ones", code, flags=re.M), names
+        )
+    return names
 
 
 def saved_run(model, urdf, folder: Path) -> RunFolder:

@@ -26,7 +26,7 @@ MINUTES = float(
 TESTS = 7  # tests that share these minutes
 FEW = 12  # examples of a test in `make test`
 SECONDS = 10
-MEMORY = 1_000_000  # kB in addition to what the process had before
+MEMORY = 1_000_000  # kB in addition to the memory before the example
 
 
 def fuzz(draw: st.SearchStrategy, examples: int, use: Callable[[Any], Any]) -> None:
@@ -56,7 +56,7 @@ def fuzz(draw: st.SearchStrategy, examples: int, use: Callable[[Any], Any]) -> N
 
 
 def answered(use: Callable[[], Any]) -> bool:
-    """Return whether ``use`` gave a result; check that otherwise it raised an error with a text."""
+    """True if ``use`` returns a result; else check that it raises an error with a text."""
     for each in (signal.SIGALRM, signal.SIGPROF):
         signal.signal(each, _late)
     seconds = SECONDS * _slowness()

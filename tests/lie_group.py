@@ -1,6 +1,6 @@
 """The paper's equations on SO(3)^k x R^3^l: rotation matrices in, rates of all three axes of each joint out.
 
-The emitted module integrates one number for each joint. Here the same equations stand as the paper has them
+The emitted module integrates one number for each joint. These are the equations of the paper
 (Wang, Chen, Ding, Sci Rep 15:33179, 2025), to compare with models that are trained so and to show that nothing
 is lost.
 """
@@ -14,7 +14,7 @@ import torch
 
 
 def to_group(joint_types: Sequence[str], q: torch.Tensor) -> list[torch.Tensor]:
-    """Return, by joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3) [m], if prismatic, of q, (..., n)."""
+    """Return, per joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3) [m], if prismatic, of q, (..., n)."""
     zero, one = torch.zeros_like(q), torch.ones_like(q)
     rows = [q.cos(), -q.sin(), zero, q.sin(), q.cos(), zero, zero, zero, one]
     rotations = torch.stack(rows, dim=-1).reshape(*q.shape, 3, 3)

@@ -1,7 +1,7 @@
 """Exact polynomials of M(q) and V(q) in cosines and sines of angles and in sliding distances.
 
 The same recursion as everywhere, over the rational polynomials. The structure does not need them
-(``structure`` works with values alone): they are its independent proof. Closed forms are expanded one
+(``structure`` works with values only): they are its independent proof. Closed forms are expanded one
 parameter at a time (``expansion``).
 """
 
@@ -14,8 +14,9 @@ from fractions import Fraction
 from flint import Ordering, fmpq, fmpq_mpoly, fmpq_mpoly_ctx
 
 from spelgen.arm.arm import Chain
+from spelgen.labels import INERTIAL_PARAMETERS
 from spelgen.structure.basis import Weights
-from spelgen.structure.recursion import PARAMETERS, Position, energies
+from spelgen.structure.recursion import Position, energies
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ def polynomials(arm: Chain, *, inertials: bool = False) -> Polynomials:
     n, bodies = len(arm.coordinates), len(arm.bodies)
     names = [f"{letter}{k + 1}" for k in range(n) for letter in "csq"]
     if not inertials:
-        names += [f"{parameter}{body + 1}" for body in range(bodies) for parameter in PARAMETERS]
+        names += [f"{parameter}{body + 1}" for body in range(bodies) for parameter in INERTIAL_PARAMETERS]
     context = fmpq_mpoly_ctx.get(names, Ordering.lex)
     variables = context.gens()
     positions = [Position(*variables[3 * k : 3 * k + 3]) for k in range(n)]
@@ -68,7 +69,7 @@ def _rational(number: Fraction) -> fmpq:
 
 
 def _reduced(polynomial: fmpq_mpoly, n: int) -> fmpq_mpoly:
-    """The same function with s^2 = 1 - c^2 applied until every sine stands to the first power at most.
+    """The same function with s^2 = 1 - c^2 applied until the power of every sine is at most one.
 
     Only arms with mimic joints need it: two bodies then turn with the same angle.
     """

@@ -67,7 +67,7 @@ STYLES = {
 def arms(draw: Any) -> DrawnArm:
     """An arm of 2 to 6 joints; at times a plate is fixed between, something branches off, a joint follows.
 
-    Hypothesis draws what kind of arm it is, and the seed of the many numbers in it.
+    Hypothesis draws the kind of the arm, and the seed of its numbers.
     """
     style = STYLES[draw(st.sampled_from(tuple(STYLES)))]
     kinds = draw(st.lists(st.sampled_from(TYPES), min_size=2, max_size=6))
@@ -120,7 +120,7 @@ class _Writer:
 
     def link(self, name: str) -> str:
         """A link with the inertia of a box somewhere in it."""
-        # second moments of mass [1e-3 kg m2]; their sums two by two are what a body can have
+        # second moments of mass [1e-3 kg m2]; sums of two of them are the principal moments of a body
         a, b, c = (self.random.randint(2, 60) for _ in range(3))
         tensor = f'ixx="{(b + c) / 1000:g}" iyy="{(a + c) / 1000:g}" izz="{(a + b) / 1000:g}"'
         mass = f'<mass value="{self.random.randint(1, 80) / 10:g}"/>'

@@ -20,7 +20,7 @@ GRAVITY, STEP, STRIBECK_VELOCITY = 9.81, 5e-4, 0.2
 
 @dataclass(frozen=True)
 class Servos:
-    """What is to be found of both joints: kp, kd, armature, dry friction, what more of it there is at rest and falls as
+    """True parameters of both joints: kp, kd, armature, Coulomb friction, additional friction at rest that falls as
     exp(-qd^2 / STRIBECK_VELOCITY^2), half the dead zone; and the delay [s].
     """
 

@@ -189,7 +189,7 @@ class TestModule:
         coupled[1].forward_dynamics(q, qd, tau).square().sum().backward()
         assert coupled[1].inputs.raw_gains.grad.abs().min() > 0
 
-    def test_a_passive_joint_gets_nothing(self, tmp_path):
+    def test_a_passive_joint_has_no_input(self, tmp_path):
         path = urdf(tmp_path, sidecar=MOTOR + "joints: {j1: {gear: 9}, roll: {actuated: false}}")
         model = import_source(generate(path), tmp_path / "passive_spel.py").Model(seed=1)
         q, qd, _, tau = states()

@@ -87,6 +87,17 @@ class TestChain:
         jaws = joint("gripper_left", "1", "l", "prismatic"), joint("my_finger", "1", "r", "prismatic")
         assert names(make_arm(robot(joint("a", "0", "1"), *jaws))) == ["a"]
 
+    def test_a_last_joint_that_may_open_a_gripper_is_stated_with_the_tip_that_leaves_it_out(self, robot):
+        """Only its link has the name of a gripper; no joint with such a name was left out."""
+        arm = robot(joint("a", "0", "1"), joint("b", "1", "gripper_moving_part"))
+        assert names(make_arm(arm)) == ["a", "b"]
+        (remark,) = [x for x in make_arm(arm).diagnostics if x.code == "ambiguous-chain"]
+        assert "'--tip 1'" in remark.message
+        assert names(make_arm(arm, tip="1")) == ["a"]
+        assert "ambiguous-chain" not in codes(make_arm(arm, joints=["a", "b"]))
+        jaw = joint("a", "0", "1"), joint("b", "1", "gripper"), joint("jaw", "gripper", "2")
+        assert "ambiguous-chain" not in codes(make_arm(robot(*jaw)))
+
     def test_a_finger_robot_keeps_its_joints(self, robot):
         assert names(make_arm(robot(joint("finger_1", "0", "1"), joint("finger_2", "1", "2")))) == [
             "finger_1",
@@ -304,7 +315,7 @@ class TestExactness:
                 joint("b", "3", "4", xyz="0 0 1"),
             )
         )
-        # "b" stands one metre along the z axis of joint "a", seen from the tilted slider
+        # "b" is one metre along the z axis of joint "a", seen from the tilted slider
         slider, last = arm.bodies[1:]
         assert last.translation == slider.rotation[2]
         assert (exact(slider) @ exact(last) == IDENTITY).all()

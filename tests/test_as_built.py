@@ -32,7 +32,7 @@ ROBOTS = ("two_link", "rpr", "scara", "six_dof", "panda", "ur10e")
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_every_robot_here_has_an_arm_as_built(name, robots, tmp_path):
-    """Its bodies are physically consistent and about 30 % off; drives have what the URDF has not; logs follow."""
+    """Bodies are physically consistent and about 30 % off; drives have friction and armature that the URDF lacks."""
     given = spelgen.load_arm(robots / f"{name}.urdf")
     true = spelgen.as_built(given, 3, tmp_path / "as_built.urdf")
     assert true.chain.joint_names == given.chain.joint_names
@@ -165,7 +165,7 @@ class TestHysteresis:
         second, third = work[4000] - work[2000], work[6000] - work[4000]
         assert second > 0
         assert third == pytest.approx(second, rel=1e-6)
-        # at most that of friction without presliding: 0.1 m up against 2 and down against 1
+        # at most the torque of friction without presliding: 0.1 m up against 2 and down against 1
         assert second < 0.1 * (2.0 + 1.0)
 
     def test_sliding_joints_build_up_over_a_tenth(self):
@@ -301,7 +301,7 @@ class TestDemo:
         assert lines[-1].startswith(f"wrote {folder / 'run' / 'report.html'}")
         assert max(map(len, lines[:-1])) <= 80
 
-    def test_nothing_is_replaced_without_force(self, demo, robots):
+    def test_files_are_replaced_only_with_force(self, demo, robots):
         folder, _ = demo
         arguments = ["simulate", str(robots / "rpr.urdf"), "--as-built", "1", "-o", str(folder / "logs")]
         done = CliRunner().invoke(app, arguments)

@@ -91,7 +91,10 @@ def test_if_only_motion_fails_its_joint_is_named(nmse, worst):
 
 
 def test_a_terminal_shows_the_assessment_first():
-    text, judged = evaluation(0.7).text(), verdict(evaluation(0.7))
+    judged = verdict(evaluation(0.7))
+    results = replace(evaluation(0.7), assessment=judged)
+    assert Results.from_dict(results.to_dict()).assessment == judged
+    text = results.text()
     assert " ".join(text.split("\n\n")[0].split()) == f"{judged.sentence} {judged.because}"
     assert max(map(len, text.splitlines())) <= 80
 
@@ -132,6 +135,17 @@ def test_recommended_recordings_follow_from_the_coverage_of_logs():
     narrow = verdict(inside, {"coverage": ranges(1.0)}, [(0.0, 1.2), (0.0, 4.0)])
     assert "Next, record wider motion of b." in narrow.because and "25 % of its range" in narrow.because
     assert "record" not in verdict(inside, {"coverage": ranges(1.0)}, [None, None]).because
+
+
+def test_no_positions_are_recommended_of_a_joint_that_the_dynamics_do_not_depend_on():
+    def ranges(high):
+        return {"q": [{"low": 0.0, "high": high}] * 2, "qd": [{"low": -1.0, "high": 1.0}] * 2}
+
+    tested = evaluation(traces={"coverage": ranges(2.0)})
+    arguments = {"coverage": ranges(1.0)}, [(0.0, 9.0), (0.0, 9.0)]
+    because = verdict(tested, *arguments, independent=["a"]).because
+    assert "positions of b" in because and "positions of a" not in because
+    assert "record" not in verdict(tested, *arguments, independent=["a", "b"]).because
 
 
 @pytest.mark.parametrize("errors", [(0.05, 0.004), (0.9, 0.2), (0.2, 0.03)])

@@ -1,4 +1,4 @@
-"""Baselines: integrated as accurately as they need, whatever the model needs, and identified from the same logs."""
+"""Baselines: integrated with steps of their own, and identified from the same logs."""
 
 import hashlib
 import json
@@ -51,7 +51,7 @@ class Slider:
 
 
 class Bristled(Slider):
-    """The slider with friction that remembers, stiff at standstill: 2000 N/m on 1 g, and damping of 5000 1/s."""
+    """The slider with hysteretic friction, stiff at standstill: 2000 N/m on 1 g, and damping of 5000 1/s."""
 
     elements, reach, force = 1, torch.tensor([[1e-3]], dtype=torch.float64), 2.0
 
@@ -88,10 +88,10 @@ def test_damping_far_beyond_an_explicit_step_is_integrated():
     assert (qd[:, 2:] - exact(stiff, windows)[:, 2:]).abs().max() < 1e-2
 
 
-def test_friction_that_remembers_is_integrated_however_stiff_it_is():
+def test_stiff_friction_with_a_state_is_integrated():
     stiff, windows = Bristled(1e-3, 5.0), pushed(push=1.0)  # less than the 2 N that make it slide
     q, qd = roll_out_stiff(stiff, windows, 8)
-    held = 1e-3 / 2  # z / reach = 1 / 2 where it stands
+    held = 1e-3 / 2  # z / reach = 1 / 2 at rest
     torch.testing.assert_close(q[0, -1], torch.tensor([held], dtype=torch.float64), atol=1e-7, rtol=0)
     assert qd[0, -1].abs() < 1e-5
     fast = pushed(push=6.0)  # 6 - 2 = 4 N against 5 N s/m
@@ -126,7 +126,7 @@ def test_torques_by_recursion_are_the_regressors(robots, robot):
     np.testing.assert_allclose(torque, regressor(arm, q, qd, qdd) @ parameters, rtol=1e-10, atol=1e-10)
 
 
-def test_the_urdf_stands_once_as_it_is_and_once_with_its_drives(robots):
+def test_the_urdf_is_a_baseline_without_and_with_drives(robots):
     pytest.importorskip("pinocchio")
     arm = load_arm(robots / "rpr.urdf")
     names = [coordinate.name for coordinate in arm.chain.coordinates]
@@ -150,7 +150,7 @@ def test_the_urdf_stands_once_as_it_is_and_once_with_its_drives(robots):
 
 
 def test_a_resumed_run_fits_baselines_only_if_they_are_missing(robots, tmp_path, monkeypatch):
-    """The baselines of a resumed run are those that it has, for its logs are the same."""
+    """A resumed run keeps its baselines, as its logs are the same."""
     arm = load_arm(robots / "two_link.urdf")
     bodies = RegressorDynamics(arm.chain, urdf_parameters(arm.chain), np.zeros(2), lambda qd, _: 0.5 * qd)
     t = np.arange(300) / 100
@@ -188,7 +188,7 @@ def digests(folder):
     }
 
 
-def test_least_squares_is_kept_with_a_run_and_stands_in_its_evaluation(robots, tmp_path):
+def test_least_squares_is_kept_with_a_run_and_evaluated(robots, tmp_path):
     """End to end on the command line: torques of the URDF's own bodies are explained by both, the model and it."""
     arm = load_arm(robots / "rpr.urdf")
     bodies = RegressorDynamics(arm.chain, urdf_parameters(arm.chain), np.full(3, 0.1), lambda qd, _: 0.5 * qd)

@@ -18,8 +18,7 @@ from spelgen.errors import LogError, SpelgenError, SpelgenErrors
 from spelgen.identification import drive_samples
 from spelgen.identification.drive_hints import drive_problem, find_coupling
 from spelgen.identification.drive_samples import DriveLog
-from spelgen.log_checks import check_logs as check_logs_room
-from spelgen.log_checks import robot_checks
+from spelgen.log_checks import check_torque_logs, robot_checks
 from spelgen.log_checks.check_logs import check_logs, require_sound_logs
 from spelgen.log_checks.statistics import noise_level, quantisation_step, statistics
 from spelgen.logs import checks, read, segments
@@ -323,7 +322,7 @@ def test_a_new_check_is_a_function_and_its_row(loaded, log, monkeypatch, registr
     """As docs/extending.md says: `spelgen logs` reports it, and its severity decides whether logs are refused."""
     check = checks.Check("odd-name", severity, lambda joint: "it is called odd", expected="another name")
     monkeypatch.setattr(registry, "CHECKS", [*registry.CHECKS, check])
-    monkeypatch.setattr(check_logs_room, "CHECKS", robot_checks.CHECKS)
+    monkeypatch.setattr(check_torque_logs, "CHECKS", robot_checks.CHECKS)
     report = check_logs([log], loaded)
     if severity == "error":
         assert [error.got for error in report.errors] == ["it is called odd"] * 3

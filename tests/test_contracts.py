@@ -196,7 +196,7 @@ def test_backpropagation_reaches_every_parameter(variant, dtype, random_model):
     ("variant", "robot"), [*((x, "rpr") for x in VARIANTS), ("hybrid", "six_dof"), ("closed-form", "six_dof")]
 )
 def test_transforms_of_torch_func_apply(variant, robot, random_model):
-    """No branch depends on data. The Jacobians of a batch by vmap are those of its states, except in forward mode
+    """No branch depends on data. Jacobians of a batch by vmap equal Jacobians of its states, except in forward mode
     through a solution of linear equations (see below)."""
     model = random_model(variant, robot, 1).requires_grad_(False)
     q, qd, tau = states(model.n, 5, count=3)

@@ -139,7 +139,7 @@ def test_the_fit_knows_that_a_motor_moves_both_joints(wrist):
 
 
 def test_energy_and_memory_are_those_of_the_motors(wrist):
-    """Power of friction is that of D; bristles follow the motors, in the model as along logs; M has C^T A C."""
+    """Power of friction is qd^T D qd; bristles follow the motors, in the model as along logs; M has C^T A C."""
     module, _ = wrist
     model = module.Model()
     with torch.no_grad():

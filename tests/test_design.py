@@ -10,8 +10,7 @@ import torch
 from spelgen.arm.configured_arm import load_arm
 from spelgen.certificate.module_check import check
 from spelgen.design import CHOICES, PRESETS, Design, Preset, load_design
-from spelgen.emission.build import build
-from spelgen.emission.loading import load_module
+from spelgen.emission.build import build, load_module
 from spelgen.emission.specify import generate
 from spelgen.errors import SettingsError, SpelgenError
 
@@ -40,7 +39,7 @@ def test_what_is_refused_names_the_two_options():
             second = rest.partition(";")[0]
             named = dict(part.split(": ") for part in (first, second))
             assert len(named) == 2 and named.items() <= values.items()
-    # 96 of networks alone; rigid bodies with friction state and without, with residual networks and without
+    # 96 of networks only; rigid bodies with friction state and without, with residual networks and without
     assert len(COMBINATIONS) - len(refused) == 96 + 2 * 2
 
 
@@ -95,7 +94,7 @@ def test_a_preset_of_your_own(rpr, robots, tmp_path, monkeypatch):
         ),
     ],
 )
-def test_a_wrong_preset_is_told_with_its_place(tmp_path, monkeypatch, change, message):
+def test_a_wrong_preset_is_reported_with_its_line(tmp_path, monkeypatch, change, message):
     monkeypatch.chdir(tmp_path)
     values = asdict(load_design("hybrid")) | change
     text = "".join(f"{key}: {'null' if value is None else value}\n" for key, value in values.items())

@@ -1,7 +1,7 @@
-"""Console and Python blocks of each documentation page run in order and print what the page shows.
+"""Console and Python blocks of each documentation page run in order and print the outputs on the page.
 
-In a ```console block a line `$ COMMAND` is followed by what it prints, and an ```output block follows the Python block
-that prints it; `pytest --update` writes both anew. ```text blocks and indented ones are not run: they show long runs,
+In a ```console block a line `$ COMMAND` is followed by its output, and an ```output block follows the Python block
+that prints it; `pytest --update` rewrites both. ```text blocks and indented ones are not run: they show long runs,
 or no commands. A tutorial is a notebook as well, of the same cells.
 """
 
@@ -38,22 +38,33 @@ TUTORIALS = sorted((ROOT / "docs").glob("tutorial_*.md"))
 @pytest.mark.parametrize("page", RUN, ids=lambda page: page.name)
 def test_examples(page, tmp_path, monkeypatch, request):
     shutil.copytree(ROOT / "robots", tmp_path / "robots")
+    if page in TUTORIALS:  # as a notebook that is opened in docs/
+        shutil.copytree(ROOT / "docs", tmp_path / "docs")
+    folder = tmp_path / "docs" if page in TUTORIALS else tmp_path
+    files = tree(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     text, names = page.read_text(encoding="utf-8"), {"__name__": "example"}
     happened = text
     for language, block in BLOCK.findall(text):
         if language == "console":
-            happened = happened.replace(block, run_commands(block, tmp_path))
+            happened = happened.replace(block, run_commands(block, folder))
         else:
             printed = io.StringIO()
-            with contextlib.chdir(tmp_path), contextlib.redirect_stdout(printed):
+            with contextlib.chdir(folder), contextlib.redirect_stdout(printed):
                 exec(compile(block, str(page), "exec"), names)
             if page in TUTORIALS:
                 happened = happened.replace(cell(text, block), cell("", block, printed.getvalue()))
+    if page in TUTORIALS:
+        assert tree(tmp_path) == files
     if request.config.getoption("--update"):
         page.write_text(happened, encoding="utf-8")
     else:
         assert text == happened
+
+
+def tree(folder: Path) -> dict[Path, bytes]:
+    """The files in a folder with their contents."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def cell(text: str, block: str, output: str = "") -> str:

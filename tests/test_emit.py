@@ -22,7 +22,7 @@ GOLDEN = Path(__file__).parent / "golden"
 PRESETS = get_args(Preset)
 FORMS = pytest.mark.parametrize("standalone", [False, True], ids=["thin", "standalone"])
 
-# What emitted modules use of torch: reading the whole of it takes mypy many times as long, for the same types.
+# The part of torch that emitted modules use: all of it would take mypy many times as long, for the same types.
 MYPY = """[mypy]
 strict = True
 [mypy-torch.*,numpy.*,sympy.*]
@@ -162,7 +162,7 @@ def test_no_text_of_the_urdf_becomes_code(tmp_path, standalone):
     assert read_spec(path).robot == HOSTILE[0]
 
 
-def test_check_tells_a_changed_urdf_from_a_fresh_one(tmp_path):
+def test_check_detects_a_changed_urdf(tmp_path):
     urdf = tmp_path / "rpr.urdf"
     shutil.copy(ROOT / "robots" / "rpr.urdf", urdf)
     shutil.copy(ROOT / "robots" / "rpr.yaml", tmp_path)

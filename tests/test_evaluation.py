@@ -1,4 +1,4 @@
-"""Errors of an evaluation equal those of exact solutions; baselines are exact; results are valid JSON."""
+"""Errors of an evaluation equal the errors of exact solutions; baselines are exact; results are valid JSON."""
 
 import json
 from dataclasses import replace
@@ -19,8 +19,7 @@ from spelgen.cli import evaluate_command
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.pinocchio_dynamics import urdf_dynamics
 from spelgen.dynamics.tip import tip_kinematics
-from spelgen.emission.build import build
-from spelgen.emission.loading import load_module
+from spelgen.emission.build import build, load_module
 from spelgen.emission.specify import generate
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.evaluation.evaluate import evaluate
@@ -95,7 +94,7 @@ def test_pinocchios_configurations_of_any_batch_are_those_of_each_state(cart):
     assert dynamics.configuration(q[:0]).shape == (0, 4, 3)
 
 
-def test_the_urdf_baseline_follows_the_order_of_joints_asked_for(cart):
+def test_the_urdf_baseline_has_the_requested_order_of_joints(cart):
     q, qd, qdd = draw(20, 2), draw(20, 2, seed=1), draw(20, 2, seed=2)
     turned = urdf_dynamics(cart, ("swing", "slide"))
     tau = turned.inverse_dynamics(q.flip(-1), qd.flip(-1), qdd.flip(-1))
@@ -129,7 +128,7 @@ def test_the_tip_is_the_end_of_the_fixed_links(cart):
         tip_kinematics(cart, "cart", joints=("slide", "swing"))
 
 
-def test_a_constant_velocity_is_exact_where_nothing_accelerates():
+def test_constant_velocity_is_exact_without_acceleration():
     dt = 0.1 + 0.05 * torch.rand(4, 3, dtype=torch.float64)
     qd = draw(4, 1, 2)
     t = torch.cat([torch.zeros(4, 1), dt.cumsum(dim=1)], dim=1)
@@ -212,7 +211,7 @@ def test_the_same_run_and_logs_give_the_same_file(run):
     assert files[0] == files[1]
     assert "planar on 4 test trajectories; * marks the best of a row" in shown.stdout
     found = json.loads(files[0], parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
-    assert found["schema"] == 10
+    assert found["schema"] == 11
     shown = found["traces"]["trajectories"]
     assert [x["which"] for x in shown] == ["typical", "worst"]
     assert len(shown[0]["q"]) == len(shown[0]["t"]) == 21 and len(shown[0]["q"][0]) == 2
@@ -279,7 +278,7 @@ def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
 
 
 def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
-    """No run, no file of logs: an arm, arrays, and whatever else predicts; the filter reaches torques too."""
+    """No run, no file of logs: an arm, arrays, and other dynamics; the filter reaches torques too."""
     arm = load_arm(cart)
     model, dynamics = build(arm, preset="closed-form"), urdf_dynamics(cart, ["slide", "swing"])
     logs = motions(dynamics, count=2, samples=130, rate=100.0)
@@ -343,7 +342,7 @@ def moving(samples=600, rate=100.0, still=0) -> Trajectory:
 
 
 class Torques:
-    """Dynamics that have torques alone."""
+    """Dynamics that have torques only."""
 
     def __init__(self, inverse_dynamics):
         self.inverse_dynamics = inverse_dynamics
@@ -371,7 +370,7 @@ def test_torque_errors_are_pooled_over_samples_with_pauses_and_without():
     samples = []
     for name, count, size in (("long", 400, 10.0), ("short", 50, 0.1)):
         motion = random.standard_normal((count, 2))
-        motion[: count // 5] = 0.001  # stands still
+        motion[: count // 5] = 0.001  # at rest
         tau = size * random.standard_normal((count, 2))
         samples.append(DynamicsSamples(name, motion, motion, motion, tau))
     found = torque_errors(Torques(lambda q, qd, qdd: torch.zeros_like(q) + 0.2), samples)

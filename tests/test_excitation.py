@@ -9,7 +9,8 @@ from typer.testing import CliRunner
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.errors import SettingsError, SpelgenErrors
-from spelgen.excitation.design import Criterion, excite
+from spelgen.excitation.criterion import Criterion
+from spelgen.excitation.design import excite
 from spelgen.excitation.trajectory import ExcitationTrajectory, motion_bounds
 from tests.hand_built import coupled_urdf
 
@@ -73,7 +74,7 @@ def test_the_optimised_motion_is_more_informative(loaded, found):
 
 
 def test_the_condition_number_is_that_of_the_regressor(arm, found):
-    """By Pinocchio's regressor: no column of friction or rotor, rigid bodies alone, by numerical rank."""
+    """By Pinocchio's regressor: no column of friction or rotors, rigid bodies only, by numerical rank."""
     pin = pytest.importorskip("pinocchio")
     from spelgen.dynamics.pinocchio_arm import pinocchio_model
     from spelgen.settings.settings import Settings

@@ -65,7 +65,7 @@ def test_closed_form_bodies_go_back_exactly(robot, tmp_path):
     assert not [x for x in loaded.robot.diagnostics if x.severity == "warning"]
 
 
-def test_friction_goes_back_as_the_urdf_can_say_it(tmp_path):
+def test_exported_friction_in_the_urdf(tmp_path):
     run, model = run_of("rpr", tmp_path, "closed-form", heavier)
     loaded, _ = exported(run, tmp_path / "learned.urdf")
     for index, name in enumerate(model.joint_names):
@@ -105,7 +105,7 @@ def test_networks_go_back_as_the_nearest_bodies(tmp_path):
     run, model = run_of("two_link", tmp_path, "spel")
     loaded, told = exported(run, tmp_path / "learned.urdf")
     mass, load_torque = differences(model, loaded)
-    assert mass > 0.1  # that of an untrained spel is no body's
+    assert mass > 0.1  # the mass matrix of an untrained spel is no rigid body's
     assert load_torque < 1e-8
     assert "bodies are the rigid bodies nearest to the model; M differs by" in told
 

@@ -62,7 +62,7 @@ def test_c_equals_the_model(case, program, flags, compiled):
     options = [f"-D{model.name.upper()}_FLOAT"] if flags else []
     source = folder / f"{model.name}.c"
     library = compile_library(source, program, *options)
-    library = library.rename(folder / f"{program}{len(flags)}.so")  # ctypes keeps what it has loaded by name
+    library = library.rename(folder / f"{program}{len(flags)}.so")  # ctypes caches libraries by name
     kind, tolerance = (np.float32, 1e-5) if flags else (np.float64, 1e-12)
     called = called_by_c(library, c_functions(model, trained.entry_points), kind)
     found = check_parity(called, trained, NAMES, tolerance, dtype=kind)
@@ -244,7 +244,7 @@ def test_bristles_follow_their_law_along_a_displacement():
 
 @needs_gcc
 def test_c_carries_frictions_memory(tmp_path):
-    """Two elements a joint: z turns dry friction, and long sliding bends it fully. NZ says how many numbers."""
+    """Two elements a joint: z turns dry friction, and long sliding bends it fully. NZ is the number of values."""
     model = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
     model = replace(model, breakaway=REACH, friction=model.friction._replace(bristle_fractions=FRACTIONS))
     functions = c_functions(model, ENTRIES)

@@ -1,14 +1,18 @@
 """MuJoCo loads the exported MJCF and computes the same M, bias forces and forward dynamics."""
 
+import io
 import re
 import shutil
 
+import casadi
 import mujoco
 import numpy as np
 import pytest
 import torch
+import trimesh
 from emitted import ROBOTS
 from exported_runs import COUPLED, MOTORS, arm_of, moved_model, run_folder
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
@@ -35,7 +39,7 @@ def test_closed_form_bodies_go_to_mujoco_exactly(robot):
     mujoco.mj_fullM(simulated, data, full)
     np.testing.assert_allclose(full, model.mass_matrix(q).numpy(), rtol=1e-9, atol=1e-12)
     tip = tip_kinematics(arm)
-    np.testing.assert_allclose(data.site(tip.link).xpos, tip.position(q).numpy(), atol=1e-6)
+    np.testing.assert_allclose(data.site(tip.link).xpos, tip.position(q).numpy(), atol=1e-12)
     np.testing.assert_allclose(simulated.dof_armature, model.armature.numpy())
     lower = [each.lower for each in arm.chain.coordinates if not each.continuous]
     np.testing.assert_allclose(simulated.jnt_range[simulated.jnt_limited == 1][:, 0], lower)
@@ -126,3 +130,93 @@ def test_other_bodies_are_noticed():
     other = rigid_body_projection(build(arm, "closed-form"), arm)
     with pytest.raises(RunError, match="mass_matrix differs from the model"):
         check_mjcf(text, other)
+
+
+ROUNDED = """<robot name="rounded"><link name="base"/>
+<link name="upper">{0}<inertial><origin xyz="0.1 0 0.2"/><mass value="2"/>
+<inertia ixx="0.1" iyy="0.2" izz="0.15" ixy="0.01" ixz="0" iyz="0"/></inertial></link>
+<link name="lower">{1}<inertial><origin xyz="0 0.1 0.1"/><mass value="1"/>
+<inertia ixx="0.02" iyy="0.03" izz="0.02" ixy="0" ixz="0" iyz="0.001"/></inertial></link><link name="tool">{2}</link>
+<joint name="j1" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.3" rpy="1.5708 0 0"/>
+<axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="7" velocity="2"/></joint>
+<joint name="j2" type="revolute"><parent link="upper"/><child link="lower"/>
+<origin xyz="0.4 0.1 0" rpy="0 0.7854 3.1416"/>
+<axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="5" velocity="2"/></joint>
+<joint name="fixed" type="fixed"><parent link="lower"/><child link="tool"/>
+<origin xyz="0.1 0.2 0.3" rpy="0 -1.571 0.2"/>
+</joint></robot>"""
+
+
+def test_all_targets_agree_on_the_tip(tmp_path):
+    """Angles of five digits, which the model rounds: the tip is where Pinocchio has it, to 1e-12 in each target."""
+    pin = pytest.importorskip("pinocchio")
+    (tmp_path / "arm.urdf").write_text(ROUNDED.format("", "", ""))
+    arm = load_arm(tmp_path / "arm.urdf")
+    model, q = build(arm, "closed-form").requires_grad_(False), np.array([0.3, -0.9])
+    tip = tip_kinematics(arm)
+    poses = {"torch": tip.pose(torch.from_numpy(q)).numpy()}
+    export(model, "urdf", tmp_path / "learned.urdf", arm=arm)
+    for file in ("arm.urdf", "learned.urdf"):
+        read = pin.buildModelFromUrdf(str(tmp_path / file))
+        data = read.createData()
+        pin.framesForwardKinematics(read, data, q)
+        poses[file] = data.oMf[read.getFrameId("tool")].homogeneous
+    export(model, "casadi", tmp_path / "casadi", arm=arm, entries=["tip_pose"])
+    poses["casadi"] = casadi.Function.load(str(tmp_path / "casadi" / "tip_pose.casadi"))(q).full()
+    programs = export(model, "torch", arm=arm, entries=["tip_pose"]).files
+    program = torch.export.load(io.BytesIO(programs["tip_pose.pt2"])).module()
+    poses["program"] = program(torch.from_numpy(q).repeat(3, 1))[0].numpy()
+    simulated = mujoco.MjModel.from_xml_string(export(model, "mjcf", arm=arm).files[".xml"].decode())
+    data = mujoco.MjData(simulated)
+    data.qpos[:] = q
+    mujoco.mj_forward(simulated, data)
+    site = np.eye(4)
+    site[:3, :3], site[:3, 3] = data.site("tool").xmat.reshape(3, 3), data.site("tool").xpos
+    poses["mujoco"] = site
+    for name, pose in poses.items():
+        np.testing.assert_allclose(pose, poses["arm.urdf"], atol=1e-12, err_msg=name)
+    assert tip.link == "tool" and "the tip is the link tool;" in programs["README.md"].decode()
+
+
+def test_shapes_and_effort_limits_go_along(tmp_path):
+    """Shapes are where the URDF has them and have no mass; a missing mesh is named; motors stop at the effort limit."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
+    ball.apply_translation([0.2, 0.1, 0.0])
+    ball.export(tmp_path / "ball.stl")
+    shapes = (
+        '<visual><origin xyz="0.1 0 0" rpy="0 0 0.5"/><geometry><box size="0.1 0.2 0.3"/></geometry></visual>'
+        '<collision><origin xyz="0 0.1 0"/><geometry><cylinder radius="0.05" length="0.3"/></geometry></collision>',
+        '<visual><geometry><mesh filename="ball.stl" scale="1 2 1"/></geometry></visual>',
+        '<visual><geometry><mesh filename="gone.stl"/></geometry></visual>'
+        '<collision><geometry><sphere radius="0.04"/></geometry></collision>',
+    )
+    (tmp_path / "arm.urdf").write_text(ROUNDED.format(*shapes))
+    arm = load_arm(tmp_path / "arm.urdf")
+    model, q = build(arm, "closed-form").requires_grad_(False), np.array([0.3, -0.9])
+    found = export(model, "mjcf", arm=arm)
+    assert "shapes omitted, since they cannot be read or are flat: tool" in found.summary
+    simulated = mujoco.MjModel.from_xml_string(found.files[".xml"].decode())
+    data = mujoco.MjData(simulated)
+    data.qpos[:], data.ctrl[:] = q, [1e3, -1e3]
+    mujoco.mj_forward(simulated, data)
+    np.testing.assert_allclose(data.qfrc_actuator, [7, -5])
+    assert simulated.body_mass.sum() == pytest.approx(3)
+    links = {name: tip_kinematics(arm, name).pose(torch.from_numpy(q)).numpy() for name in ("lower", "tool")}
+    links["upper"] = np.eye(4)
+    links["upper"][:3, :3] = (
+        Rotation.from_euler("x", 1.5708).as_matrix() @ Rotation.from_euler("y", 0.3).as_matrix()
+    )
+    links["upper"][:3, 3] = [0, 0, 0.3]
+    expected = [  # by type: centre in the link, half sizes, whether it touches anything
+        (mujoco.mjtGeom.mjGEOM_BOX, "upper", [0.1, 0, 0], [0.05, 0.1, 0.15], 0),
+        (mujoco.mjtGeom.mjGEOM_MESH, "lower", [0.2, 0.2, 0.0], None, 0),
+        (mujoco.mjtGeom.mjGEOM_CYLINDER, "upper", [0, 0.1, 0], [0.05, 0.15, 0], 1),
+        (mujoco.mjtGeom.mjGEOM_SPHERE, "tool", [0, 0, 0], [0.04, 0, 0], 1),
+    ]
+    assert simulated.ngeom == len(expected)
+    for kind, link, centre, size, contact in expected:
+        (index,) = np.flatnonzero(simulated.geom_type == kind)
+        pose = links[link]
+        np.testing.assert_allclose(data.geom_xpos[index], pose[:3, :3] @ centre + pose[:3, 3], atol=1e-6)
+        assert size is None or simulated.geom_size[index].tolist() == size
+        assert (simulated.geom_contype[index], simulated.geom_conaffinity[index]) == (contact, 0)

@@ -6,19 +6,22 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from exported_runs import COUPLED, MOTORS, arm_of, moved_model
+from exported_runs import COUPLED, MOTORS, arm_of, moved_model, readme_results
 
 from spelgen.arm.configured_arm import load_arm
+from spelgen.dynamics.tip import tip_kinematics
 from spelgen.emission.build import build
+from spelgen.errors import RunError
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.export import export
 from spelgen.exporting.onnx_export import called_by_onnx, onnx_model, onnx_session
 from spelgen.exporting.parity import check_parity
 
 
-def coupled_model(folder):
+@pytest.fixture(scope="module")
+def coupled(tmp_path_factory):
     """An arm with a follower, motors and a passive joint, and its hybrid, every weight of which has moved."""
-    urdf = folder / "coupled.urdf"
+    urdf = tmp_path_factory.mktemp("coupled") / "coupled.urdf"
     urdf.write_text(COUPLED)
     urdf.with_suffix(".yaml").write_text(MOTORS)
     arm = load_arm(urdf)
@@ -30,31 +33,65 @@ def coupled_model(folder):
     return model.requires_grad_(False), arm
 
 
-def test_onnx_equals_the_model(tmp_path):
-    """The check at export time compares every file with the model to 1e-10; here another batch size, by hand."""
-    model, arm = coupled_model(tmp_path)
-    found = export(model, "onnx", arm=arm)
-    assert "from the torch module" in found.summary[0]
-    session = onnx_session(found.files["gravity.onnx"])
+@pytest.fixture(scope="module")
+def exported(coupled):
+    """All entry points; the export has compared every file with the model to 1e-10."""
+    model, arm = coupled
+    return export(model, "onnx", arm=arm)
+
+
+def test_onnx_equals_the_model(coupled, exported, tmp_path):
+    """Another batch size than in the check at export time."""
+    model, arm = coupled
+    assert "from the torch module" in exported.summary[0]
+    session = onnx_session(exported.files["gravity.onnx"])
     q = torch.linspace(-1, 1, 7 * model.n, dtype=torch.float64).reshape(7, model.n)
     (gravity,) = session.run(["gravity"], {"q": q.numpy()})
     np.testing.assert_allclose(gravity, model.gravity(q).numpy(), rtol=1e-9, atol=1e-9)
-    assert len(found.files["README.md"].decode().splitlines()) == 5
+    check_readme(exported, model, arm, tmp_path, 1e-9)
 
 
-def test_the_files_are_plain_onnx_of_equal_bytes():
+def check_readme(found, model, arm, folder, tolerance):
+    """The lines of the README run; they make and step the friction state, and their numbers are the model's."""
+    names = readme_results(found.files, folder)
+    at = torch.ones(5, model.n, dtype=torch.float64)
+    past = [model.memory(at)] if model.elements else []
+    tau = model.inverse_dynamics(at, at, at, *past)
+    expected = {"tau": tau, "qdd": model.forward_dynamics(at, at, tau, *past)}
+    expected["pose"] = tip_kinematics(arm).pose(at)
+    if model.elements:
+        expected["z"] = model.memory_after(past[0], at).flatten(1)
+    for key, value in expected.items():
+        scale = value.abs().max()
+        np.testing.assert_allclose(names[key].reshape(value.shape) / scale, value / scale, atol=tolerance)
+    assert f"the tip is the link {tip_kinematics(arm).link};" in found.files["README.md"].decode()
+
+
+def test_onnx_in_single_precision(tmp_path):
+    arm, model = arm_of("two_link"), moved_model("two_link", "closed-form")
+    found = export(model, "onnx", arm=arm, float32=True)
+    graph = onnx.load_from_string(found.files["forward_dynamics.onnx"]).graph
+    assert {x.type.tensor_type.elem_type for x in [*graph.input, *graph.output]} == {onnx.TensorProto.FLOAT}
+    assert {x.data_type for x in graph.initializer} <= {onnx.TensorProto.FLOAT, onnx.TensorProto.INT64}
+    check_readme(found, model, arm, tmp_path, 1e-4)
+    with pytest.raises(
+        RunError, match="got float32 for --to c, expected --to onnx and torch; C has -DNAME_FLOAT"
+    ):
+        export(model, "c", arm=arm, float32=True)
+
+
+def test_the_files_are_plain_onnx_of_equal_bytes(coupled, exported):
     """Only standard operators, no traces of the machine, the same bytes twice; z is flat."""
-    trained = Trained(moved_model("two_link", "closed-form"), arm_of("two_link"))
-    prepared = trained.model.prepared()
-    content = onnx_model(prepared, "forward_dynamics")
-    check_parity(called_by_onnx({"forward_dynamics": content}), trained, ["forward_dynamics"], 1e-10)
-    assert content == onnx_model(prepared, "forward_dynamics")
-    graph = onnx.load_from_string(content)
-    onnx.checker.check_model(graph)
-    assert {node.domain for node in graph.graph.node} == {""}
-    assert not any(node.metadata_props for node in graph.graph.node)
+    files = {name: content for name, content in exported.files.items() if name.endswith(".onnx")}
+    assert files["gravity.onnx"] == onnx_model(coupled[0].prepared(), "gravity")
+    for content in files.values():
+        graph = onnx.load_from_string(content)
+        onnx.checker.check_model(graph)
+        assert {node.domain for node in graph.graph.node} == {""}
+        assert not any(node.metadata_props for node in graph.graph.node)
     assert logging.getLogger("torch.onnx").level == logging.NOTSET
-    shapes = {x.name: len(x.type.tensor_type.shape.dim) for x in graph.graph.input}
+    inputs = onnx.load_from_string(files["forward_dynamics.onnx"]).graph.input
+    shapes = {x.name: len(x.type.tensor_type.shape.dim) for x in inputs}
     assert shapes == {"q": 2, "qd": 2, "tau": 2, "z": 2}
 
 

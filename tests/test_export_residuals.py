@@ -55,7 +55,7 @@ def c_library(model, folder):
 
 
 def test_zero_terms_are_omitted():
-    """C of a fit without residuals is that of closed-form, byte for byte."""
+    """C of a fit without residuals equals C of closed-form, byte for byte."""
     model = with_parts("rpr")
     ours = describe(model, arm_of("rpr"))
     other = describe(closed_form(model, "rpr"), arm_of("rpr"))

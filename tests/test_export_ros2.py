@@ -98,7 +98,7 @@ def test_the_plugin_equals_the_model(package, tmp_path):
         *model.mass_matrix(q),
         model.nonlinear_effects(q, qd) - model.gravity(q),
         model.gravity(q),
-        # the first call has no history: its friction states are those of sliding joints
+        # the first call has no history: its friction states are the states of sliding joints
         model.friction_torque(torch.zeros_like(q), qd, model.memory(qd)),
         model.inverse_dynamics(q, qd, qdd, model.memory(qd)),
         # against the direction in which the first velocity deflected the bristles

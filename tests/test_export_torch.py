@@ -2,10 +2,12 @@
 
 import io
 
+import pytest
 import torch
-from exported_runs import arm_of, moved_model
+from exported_runs import arm_of, moved_model, readme_results
 from safetensors.torch import load
 
+from spelgen.dynamics.tip import tip_kinematics
 from spelgen.exporting.export import export
 
 
@@ -18,4 +20,21 @@ def test_programs_are_self_contained():
     torch.testing.assert_close(program(*states), model.forward_dynamics(*states))
     weights = load(found.files["model.safetensors"])
     assert weights.keys() == model.state_dict().keys()
-    assert len(found.files["README.md"].decode().splitlines()) == 5
+
+
+@pytest.mark.parametrize("float32", [False, True])
+def test_the_lines_of_the_readme_run(tmp_path, float32):
+    """They make and step the friction state; their numbers are the model's, also in single precision."""
+    model, arm = moved_model("two_link", "closed-form"), arm_of("two_link")
+    found = export(model, "torch", arm=arm, float32=float32)
+    names, at = readme_results(found.files, tmp_path), torch.ones(5, model.n, dtype=torch.float64)
+    z = model.memory(at)
+    tau = model.inverse_dynamics(at, at, at, z)
+    expected = {"tau": tau, "qdd": model.forward_dynamics(at, at, tau, z), "z": model.memory_after(z, at)}
+    expected["jacobian"] = tip_kinematics(arm).jacobian(at)
+    for key, value in expected.items():
+        assert names[key].dtype == (torch.float32 if float32 else torch.float64)
+        torch.testing.assert_close(
+            names[key].double(), value, rtol=1e-4 if float32 else 1e-10, atol=1e-5 * float32
+        )
+    assert f"the tip is the link {tip_kinematics(arm).link};" in found.files["README.md"].decode()

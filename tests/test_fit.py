@@ -96,7 +96,7 @@ def test_a_saved_fit_is_loaded_as_it_was(tmp_path):
     assert same(spelgen.load_run(folder).model, found.model)
 
 
-def test_what_was_used_is_recorded_and_nothing_else(tmp_path):
+def test_the_record_has_the_used_options_only(tmp_path):
     found = spelgen.fit(Model(), motions(), Rollout(epochs=1, momentum_steps=0))
     assert found.record.objective == "rollout"
     assert found.record.options == {
@@ -115,13 +115,13 @@ def test_validation_may_be_given():
     assert found.record.validation_fraction is None
 
 
-def test_one_trajectory_alone_is_enough():
+def test_one_trajectory_is_enough():
     (log,) = motions(count=1, samples=60)
     found = spelgen.fit(Model(), log, quick(epochs=1))
     assert found.record.training == ["motion_0"]
 
 
-def test_logs_that_cannot_be_fitted_are_told():
+def test_logs_that_cannot_be_fitted_are_reported():
     model = Model()
     with pytest.raises(LogError, match="got no logs, expected a trajectory or more"):
         spelgen.fit(model, [])
@@ -177,13 +177,13 @@ def test_the_filter_reaches_torques():
 def test_predictions_at_gaps_are_not_numbers():
     log = swings(0)
     t = log.t.copy()
-    t[1:] += 1.0  # the first sample stands alone
+    t[1:] += 1.0  # the first sample is a segment by itself
     found = spelgen.fit(Model(), [swings(1), swings(2)], TorqueFit(evaluations=20))
     tau = found.predict(Trajectory(t, log.q, log.qd, log.tau, "gap"))
     assert np.isnan(tau[0]).all() and np.isfinite(tau[1:]).all()
 
 
-def test_a_fit_tells_what_it_is():
+def test_representation_of_a_fit():
     found = spelgen.fit(Model(), motions(), MomentumFit(momentum_steps=20))
     told = (
         f"<Fit of 'Model' to momentum: finished after 0 epochs, validation loss {found.best_validation:.3g}>"
@@ -192,7 +192,7 @@ def test_a_fit_tells_what_it_is():
     assert "momentum steps" in found._repr_html_()
 
 
-def test_a_fit_to_torques_tells_their_error(tmp_path):
+def test_a_torque_fit_states_its_error(tmp_path):
     log = swings(1)
     found = spelgen.fit(spelgen.load_module(write_module(tmp_path)), log, TorqueFit(evaluations=20))
     nmse = found.torque_nmse
@@ -206,7 +206,7 @@ def test_a_fit_to_torques_tells_their_error(tmp_path):
 
 @pytest.mark.parametrize("samples, preset", [(4, "spel"), (4, "closed-form"), (22, "phnode")])
 def test_both_solvers_agree(tmp_path, samples, preset, monkeypatch):
-    """In what they predict and in its gradient."""
+    """Equal predictions and equal gradients."""
     # where bristles begin to slide steps of 1e-7 have gradients of 1e-3
     monkeypatch.setitem(SOLVER, "rtol", 1e-9)
     monkeypatch.setitem(SOLVER, "atol", 1e-11)

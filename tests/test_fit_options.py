@@ -40,7 +40,7 @@ def test_every_option_has_a_value_here_and_a_place_in_the_settings():
 @pytest.mark.parametrize("rigid_bodies", [False, True])
 @pytest.mark.parametrize("objective", ["torque", "momentum", "rollout"])
 @pytest.mark.parametrize("option", VALUES)
-def test_an_option_applies_or_is_told_where_it_belongs(option, objective, rigid_bodies):
+def test_an_option_applies_or_the_error_names_its_objective(option, objective, rigid_bodies):
     make = lambda: fit_config(objective, rigid_bodies=rigid_bodies, options={option: VALUES[option]})  # noqa: E731
     owners = [x for x in ("torque", "momentum", "rollout") if option in CONFIGS[x].model_fields]
     if objective not in owners:
@@ -87,7 +87,7 @@ def test_from_python_too():
             Preprocessing(**wrong)
 
 
-def test_what_a_robot_settles_for_another_objective_is_left_out():
+def test_settings_of_another_objective_are_omitted():
     settled = {"window": 9, "batch": 8, "substeps": 4, "weight_decay": 0.3, "prior": {"bodies": 1.0}}
     make = lambda objective, **chosen: fit_config(  # noqa: E731
         objective, rigid_bodies=False, options=chosen, defaults=settled
@@ -181,7 +181,7 @@ def test_a_run_goes_on_with_its_own_options(tmp_path):
     assert "objective momentum instead of rollout" in done.stderr
 
 
-def test_a_name_in_place_of_a_configuration_is_told(robots):
+def test_a_name_in_place_of_a_configuration_is_reported(robots):
     model = build(robots / "two_link.urdf", "closed-form")
     with pytest.raises(
         SettingsError, match=r"got 'torque' as the configuration of a fit, expected spelgen\.Torq"

@@ -105,7 +105,7 @@ def test_either_triangle_and_only_the_parameters_in_the_entry(robots, spelgen):
 
 
 def test_zeros_of_the_inertials_shorten(robots):
-    """The SCARA-like wrist of ur10e: five of six axes do not feel joint 6 turn about its own centre."""
+    """The SCARA-like wrist of ur10e: joint 6 has no effect on five of six axes when it turns about its own centre."""
     told = inspect(robots / "ur10e.urdf", assume="inertials").closed_forms()
     rows = {row["name"]: row["expression"] for row in to_dict(told)["entries"]}
     assert (rows["M62"], rows["M63"], rows["M64"], rows["M65"]) == (*3 * ["Izz6*cos(q5)"], "0")

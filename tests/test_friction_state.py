@@ -16,17 +16,15 @@ from spelgen.dynamics.bristles import (
     reach_of,
 )
 from spelgen.dynamics.friction import FrictionModel
-from spelgen.emission.build import build
-from spelgen.emission.loading import load_module
+from spelgen.emission.build import build, load_module
 from spelgen.fitting.rollout import loss_scales, momentum_loss, roll_out
 from spelgen.identification.identification import LeastSquares
 from spelgen.identification.identify import least_squares
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import Windows, cut_windows
-from spelgen.runtime.friction_laws import FrictionLaws
+from spelgen.runtime.friction_laws import FrictionLaws, SlidingFriction
 from spelgen.runtime.rows import Joint
-from spelgen.runtime.sliding_friction import SlidingFriction
 
 REACH = [[3e-4, 3e-3, 3e-2], [3e-5, 3e-4, 3e-3]]
 JOINTS = (

@@ -78,13 +78,13 @@ def test_base_parameters_are_those_of_inspect(robots, robot):
 
 
 def columns(arm, friction, q, qd, qdd):
-    """The whole regressor: the bodies' columns, then those of friction and drives."""
+    """The whole regressor: the bodies' columns, then the columns of friction and drives."""
     return np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd)], axis=2)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_base_parameters_make_the_torque(robots, robot):
-    """The regressor's columns that they stand for, times their combinations, are the whole regressor."""
+    """The regressor is the product of the base parameters' columns and their combinations."""
     arm, friction = load_arm(robots / f"{robot}.urdf").chain, FrictionModel(stribeck=True)
     base = base_parameters(arm, friction)
     states = np.random.default_rng(5).uniform(-2, 2, (3, 60, len(arm.coordinates)))
@@ -267,7 +267,7 @@ def test_ur10e_gives_the_published_figures(shared):
 
 @pytest.mark.parametrize("cutoff", [1.0, 8.0, 45.0, 160.0])
 def test_samples_omit_the_transients_of_the_filter(cutoff):
-    """A log that begins and ends in motion; no filter above 50 Hz leaves nothing to leave out."""
+    """A log that begins and ends in motion; without a filter, above 50 Hz, no sample is omitted."""
     t = np.arange(0.0, 10.0, 1e-3)
     q = np.column_stack([1.5 * np.sin(t)])
     log = Trajectory(t, q, 1.5 * np.column_stack([np.cos(t)]), -q, "swing")

@@ -29,7 +29,7 @@ def test_the_page_states_the_same_as_the_text(robots, robot):
     assert shown.links == ["data:,", "#top"]
 
 
-def test_formulas_and_proof_only_where_asked(robots, tmp_path, monkeypatch):
+def test_formulas_and_proof_only_on_request(robots, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = CliRunner().invoke(
         app, ["inspect", str(robots / "rpr.urdf"), "--formulas", "--verify", "-o", "rpr.html"]

@@ -62,7 +62,7 @@ def test_a_fit_is_resumed_from_any_of_its_states():
 
 
 def test_an_ascent_direction_ends_the_solver():
-    """With the sign of the step wrong no damping lowers the cost, until it is so large that no step is left."""
+    """With the sign of the step wrong no damping lowers the cost, until the step is negligible."""
 
     class Ascending(Rosenbrock):
         def candidates(self, x, step):

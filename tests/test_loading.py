@@ -11,8 +11,7 @@ import torch
 from emitted import built
 from planar_model import write_module
 
-from spelgen.emission.build import build
-from spelgen.emission.loading import load_module
+from spelgen.emission.build import build, load_module
 from spelgen.emission.module_file import read_spec
 from spelgen.emission.text import module_text
 from spelgen.errors import ModuleError
@@ -123,7 +122,7 @@ def test_what_is_no_module_is_refused(tmp_path):
     assert refusal(path).startswith(f"{path}: got no specification of spelgen in it (UnicodeDecodeError)")
 
 
-def test_a_module_of_an_earlier_version_is_refused_with_what_to_do(module, tmp_path):
+def test_a_module_of_an_earlier_version_is_refused_with_a_remedy(module, tmp_path):
     """Modules had their facts, and a runtime, where the specification is now; formats have numbers."""
     old = tmp_path / "old.py"
     old.write_text(f'open({str(tmp_path / "mark")!r}, "w")\nFACTS = """{{"format": 8}}"""\n')
@@ -143,7 +142,7 @@ def test_a_module_of_an_earlier_version_is_refused_with_what_to_do(module, tmp_p
 
 
 def test_a_specification_is_checked_like_any_file(module):
-    """Also if the rest of the module is the text of what it states."""
+    """Even if the rest of the module is the text of its specification."""
     spec = read_spec(module)
     joint = replace(spec.joints[0], armature=float("nan"))
     module.write_text(module_text(replace(spec, joints=(joint, *spec.joints[1:]))), encoding="utf-8")
@@ -160,7 +159,7 @@ def test_loading_needs_no_symbolic_algebra(module):
         "import sys\n"
         "for name in ('sympy', 'flint', 'spelgen.structure', 'spelgen.emission.plan', 'spelgen.arm.arm'):\n"
         "    sys.modules[name] = None\n"
-        "import spelgen.emission.loading as loading\n"
+        "import spelgen.emission.build as loading\n"
         "print(loading.load_module(sys.argv[1]).n)\n"
     )
     command = [sys.executable, "-c", program, str(module)]

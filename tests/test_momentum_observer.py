@@ -23,7 +23,7 @@ UNFILTERED = Preprocessing(cutoff=0, decimation=1)
 
 
 def motions(count=4, seconds=3.0, offset=OFFSET, after=0.0) -> list[Trajectory]:
-    """Simulate the stand-in under smooth torques, and from a time on [s] an offset that is not logged."""
+    """Simulate the substitute under smooth torques, and from a time on [s] an offset that is not logged."""
     model = Model()
     generator = torch.Generator().manual_seed(0)
     t = torch.arange(round(seconds * RATE) + 1) / RATE

@@ -50,7 +50,7 @@ def pages(run, robots, tmp_path):  # noqa: F811
 
 @pytest.mark.parametrize("width", [400, 1400])
 @pytest.mark.parametrize("dark", [False, True])
-def test_pages_say_nothing_ask_for_nothing_and_stay_within_their_width(browser, pages, width, dark):
+def test_pages_have_no_console_messages_requests_or_overflow(browser, pages, width, dark):
     for path in pages:
         browser.open(path, width=width, dark=dark)
         assert browser.run("document.documentElement.scrollWidth") <= width, path

@@ -74,7 +74,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Facts:
-    """What is compared."""
+    """The compared quantities."""
 
     entries: tuple[tuple[str, tuple[int, ...]], ...]
     potential: tuple[int, ...]

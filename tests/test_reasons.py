@@ -21,33 +21,42 @@ from spelgen.structure.structure import Structure, derive
 from spelgen.urdf.read import read_urdf
 
 LAST = (
-    "M{n}{n} is constant: joint {n} is the last, so the inertia about its axis stays the same. "
-    "It needs a number, no network."
+    "M{n}{n} is constant: joint {n} is the last and carries one rigid body. "
+    "It needs one parameter and no network."
 )
-ROOT = "M does not depend on joint 1: it moves the whole arm as one piece. No network of M reads it."
-UPRIGHT = "V does not depend on joint 1: turning about the vertical lifts nothing. The network of V does not read it."
+ROOT = (
+    "M does not depend on joint 1: it moves the whole arm as one rigid body. "
+    "It is not an input of the networks of M."
+)
+UPRIGHT = (
+    "V does not depend on joint 1: gravity does no work in a rotation about an axis parallel to it. "
+    "It is not an input of the network of V."
+)
 SIX_AXES = [LAST.format(n=6), ROOT, UPRIGHT]
 WORDS = {
     "two_link": [LAST.format(n=2), ROOT],
     "rpr": [
-        "M32 is always zero: joint 2 slides along the axis of joint 3, and what turns about an axis never moves "
-        "along it. Nothing is learned for it.",
-        "M22 is constant: for a sliding joint the entry is the mass that it carries. It needs a number, no network.",
+        "M32 is always zero: prismatic joint 2 is parallel to the axis of joint 3, and a rotation has no velocity "
+        "along its axis. Nothing is learned for it.",
+        "M22 is constant: the diagonal entry of a prismatic joint is the mass that it carries. "
+        "It needs one parameter and no network.",
         LAST.format(n=3),
         ROOT,
         UPRIGHT,
-        "V does not depend on joint 2: sliding level lifts nothing. The network of V does not read it.",
+        "V does not depend on joint 2: gravity does no work in a translation orthogonal to it. "
+        "It is not an input of the network of V.",
     ],
     "scara": [
-        "M31, M32 and M43 are always zero: joint 3 slides along the axes of joints 1, 2 and 4, and what turns about an "
-        "axis never moves along it. Nothing is learned for them.",
-        "M33 is constant: for a sliding joint the entry is the mass that it carries. It needs a number, no network.",
+        "M31, M32 and M43 are always zero: prismatic joint 3 is parallel to the axes of joints 1, 2 and 4, and a "
+        "rotation has no velocity along its axis. Nothing is learned for them.",
+        "M33 is constant: the diagonal entry of a prismatic joint is the mass that it carries. "
+        "It needs one parameter and no network.",
         LAST.format(n=4),
         ROOT,
-        "M does not depend on joint 3: it does not move the axes of joints 1 and 2, as if it moved the whole arm. "
-        "No network of M reads it.",
-        "V does not depend on joints 1, 2 and 4: turning about the vertical lifts nothing. "
-        "The network of V does not read them.",
+        "M does not depend on joint 3: its motion commutes with joints 1 and 2, as if it were the first joint. "
+        "It is not an input of the networks of M.",
+        "V does not depend on joints 1, 2 and 4: gravity does no work in a rotation about an axis parallel to it. "
+        "They are not inputs of the network of V.",
     ],
     "six_dof": SIX_AXES,
     "ur10e": SIX_AXES,
@@ -65,18 +74,18 @@ def test_words_about_the_own_robots(robots, robot):
     assert " ".join(WORDS[robot]) in " ".join(found.text().split())
 
 
-def test_words_when_the_inertials_are_believed(robots):
+def test_words_with_the_inertials_of_the_file(robots):
     told = [str(fact) for fact in inspect(robots / "ur10e.urdf", assume="inertials").facts]
     assert told == [
-        "M65 is always zero: what joint 6 carries is balanced about its axis, which is always at right angles to the "
+        "M65 is always zero: the load of joint 6 is dynamically balanced about its axis, which is orthogonal to the "
         "axis of joint 5. Nothing is learned for it.",
         LAST.format(n=6),
-        "M62 = M63 = M64 always: what joint 6 carries is balanced about its axis, and joints 2, 3 and 4 are parallel. "
+        "M62 = M63 = M64 always: the load of joint 6 is dynamically balanced, and joints 2, 3 and 4 are parallel. "
         "One of them is learned.",
         ROOT,
         UPRIGHT,
-        "V does not depend on joint 6: the centre of the mass that it carries lies on its axis. "
-        "The network of V does not read it.",
+        "V does not depend on joint 6: the centre of mass of its load is on its axis. "
+        "It is not an input of the network of V.",
     ]
 
 
@@ -85,26 +94,26 @@ def test_two_turns_about_one_line():
     over = tuple(tuple(Fraction(x) for x in row) for row in ((1, 0, 0), (0, -1, 0), (0, 0, -1)))
     arm = chain([("revolute", STRAIGHT, (0, 0, 0)), ("revolute", over, (0, 0, 0.5))])
     told = {fact.statement: fact.reason for fact in facts(arm, derive(arm))}
-    assert told["M21 is constant"] == "joints 1 and 2 turn about one line, so it is -M22"
-    assert told["M21 = -M22 always"] == "joints 1 and 2 turn about one line"
-    assert told["M11 is constant"] == "all joints after joint 1 turn about its axis or slide along it"
+    assert told["M21 is constant"] == "joints 1 and 2 are coaxial, so it equals -M22"
+    assert told["M21 = -M22 always"] == "joints 1 and 2 are coaxial"
     assert (
-        told["V is zero"]
-        == "every joint turns about gravity's direction or slides across it, which lifts nothing"
+        told["M11 is constant"]
+        == "all joints after joint 1 are coaxial revolute or parallel prismatic joints"
     )
+    assert told["V is zero"] == "every axis is parallel to gravity if revolute, orthogonal to it if prismatic"
 
 
 def test_no_gravity_no_potential():
     arm = chain([("prismatic", STRAIGHT, (0, 0, 0))], gravity=(0, 0, 0))
-    assert Fact("V is zero", "It needs no network", "so is gravity") in facts(arm, derive(arm))
+    assert Fact("V is zero", "It needs no network", "gravity is zero") in facts(arm, derive(arm))
 
 
-def test_where_bodies_share_a_coordinate_no_reason_is_sought(shared):
+def test_mimic_joints_get_no_reasons(shared):
     arm = make_arm(read_urdf(shared / "arms" / "abb_irb5400.urdf"))
     assert not is_plain(arm)
     told = facts(arm, derive(arm))
-    assert told[0] == Fact("M66 is constant", "It needs a number, no network", None)
-    assert str(told[0]) == "M66 is constant. It needs a number, no network."
+    assert told[0] == Fact("M66 is constant", "It needs one parameter and no network", None)
+    assert str(told[0]) == "M66 is constant. It needs one parameter and no network."
     assert not any(fact.reason for fact in told)
 
 
@@ -171,50 +180,50 @@ Check = Callable[[Seen, list[int], list[int]], bool]
 # A reason, # for a joint and ## for several -> whether it holds: of the joints in the statement and in it.
 # Entries count as two joints each in the statement: M32 as 3, 2.
 CHECKS: dict[str, Check] = {
-    "it moves the whole arm as one piece": lambda s, about, _: about == [1],
-    "turning about the vertical lifts nothing": lambda s, about, _: (
+    "it moves the whole arm as one rigid body": lambda s, about, _: about == [1],
+    "gravity does no work in a rotation about an axis parallel to it": lambda s, about, _: (
         s.turns(*about) and all(s.lifts_nothing(k) for k in about)
     ),
-    "sliding level lifts nothing": lambda s, about, _: (
+    "gravity does no work in a translation orthogonal to it": lambda s, about, _: (
         s.slides(*about) and all(s.lifts_nothing(k) for k in about)
     ),
-    "every joint turns about gravity's direction or slides across it, which lifts nothing": lambda s, *_: all(
+    "every axis is parallel to gravity if revolute, orthogonal to it if prismatic": lambda s, *_: all(
         s.lifts_nothing(k + 1) for k in range(s.n)
     ),
-    "joint # is the last, so the inertia about its axis stays the same": lambda s, about, named: (
+    "joint # is the last and carries one rigid body": lambda s, about, named: (
         about == [s.n, s.n] == 2 * named and s.turns(s.n)
     ),
-    "the centre of the mass that it carries lies on its axis": lambda s, about, _: (
+    "the centre of mass of its load is on its axis": lambda s, about, _: (
         about == [s.n] and s.turns(s.n) and np.abs(s.lever[:2]).max() < NOTHING
     ),
-    "what joint # carries is balanced about its axis, which is always at right angles to the ax[ie]s of ##": (
+    "the load of joint # is dynamically balanced about its axis, which is orthogonal to the ax[ie]s of ##": (
         lambda s, about, named: (
             (s.balanced and named[0] == s.n and about[::2] == [s.n] * (len(named) - 1))
             and (about[1::2] == named[1:] and np.abs(s.cosines(s.n, named[1:])).max() < NOTHING)
         )
     ),
-    "what joint # carries is balanced about its axis, which keeps its angle to the ax[ie]s of ##": (
+    "the load of joint # is dynamically balanced about its axis, which has a constant angle to the ax[ie]s of ##": (
         lambda s, about, named: (
             s.balanced and about == [s.n, *named[1:]] and _steady(s.cosines(s.n, named[1:]))
         )
     ),
-    "what joint # carries is balanced about its axis and has no moment of inertia about it": (
+    "the load of joint # is dynamically balanced, and its inertia about the joint axis is zero": (
         lambda s, about, named: s.balanced and set(about[::2]) == {s.n} == set(named) and s.inertia[2, 2] == 0
     ),
-    "what joint # carries is balanced about its axis, and ## are parallel": lambda s, about, named: (
+    "the load of joint # is dynamically balanced, and ## are parallel": lambda s, about, named: (
         s.balanced and named[0] == s.n and about[1::2] == named[1:] and s.parallel(*named[1:])
     ),
-    "what joint # carries is symmetric about its axis": lambda s, about, named: (
+    "the inertia of the load of joint # is symmetric about its axis": lambda s, about, named: (
         s.symmetric and named == [s.n] and about == [s.n - 1, s.n - 1]
     ),
-    "what it carries is symmetric about its axis": lambda s, about, _: s.symmetric and about == [s.n],
-    "for a sliding joint the entry is the mass that it carries": lambda s, about, _: all(
+    "the inertia of its load is symmetric about its axis": lambda s, about, _: s.symmetric and about == [s.n],
+    "the diagonal entry of a prismatic joint is the mass that it carries": lambda s, about, _: all(
         s.slides(k) and np.allclose(s.mass(k), s.mass_behind(k), rtol=1e-12) for k in about
     ),
-    "it does not move the ax[ie]s of ##, as if it moved the whole arm": lambda s, about, named: (
+    "its motion commutes with ##, as if it were the first joint": lambda s, about, named: (
         named == list(range(1, about[0])) and s.commute(about[0], named)
     ),
-    "joint # slides along the ax[ie]s of ##, and what turns about an axis never moves along it": (
+    "prismatic joint # is parallel to the ax[ie]s of ##, and a rotation has no velocity along its axis": (
         lambda s, about, named: (
             s.slides(named[0])
             and s.turns(*named[1:])
@@ -223,32 +232,32 @@ CHECKS: dict[str, Check] = {
             and all(named[0] in pair for pair in zip(about[::2], about[1::2], strict=True))
         )
     ),
-    "joint # slides at right angles to ##": lambda s, about, named: (
+    "prismatic joint # is orthogonal to prismatic ##": lambda s, about, named: (
         s.slides(*named)
         and np.abs(s.cosines(named[0], named[1:])).max() < NOTHING
         and all(named[0] in pair for pair in zip(about[::2], about[1::2], strict=True))
     ),
-    "the two slide at a fixed angle, and the mass that both move does not change": lambda s, about, _: all(
+    "both joints are prismatic, and the angle between their axes is constant": lambda s, about, _: all(
         s.slides(a, b) and _steady(s.cosines(a, [b])) for a, b in zip(about[::2], about[1::2], strict=True)
     ),
-    "the mass that joint # carries keeps its distance from the plane through the axis of joint # along its slide": (
+    "the load of joint # keeps its distance from the plane that contains the axis of joint # and is parallel to "
+    "joint #": (
         lambda s, about, named: (
-            (about == named and s.slides(named[0]) and s.turns(named[1])) and _steady(s.carried(*named))
+            (about == named[:2] and named[2] == named[0] and s.slides(named[0]) and s.turns(named[1]))
+            and _steady(s.carried(*named[:2]))
         )
     ),
-    "all joints after joint # turn about its axis or slide along it": lambda s, about, named: (
+    "all joints after joint # are coaxial revolute or parallel prismatic joints": lambda s, about, named: (
         about == 2 * named
         and all(
             s.one_line(named[0], k) if s.turns(k) else s.parallel(named[0], k)
             for k in range(named[0] + 1, s.n + 1)
         )
     ),
-    "## slide along one direction": lambda s, about, named: (
+    "prismatic ## are parallel": lambda s, about, named: (
         about[1::2] == named and s.slides(*named) and s.parallel(*named)
     ),
-    "## turn about one line": lambda s, about, named: (
-        about[1::2] == named and s.turns(*named) and s.one_line(*named)
-    ),
+    "## are coaxial": lambda s, about, named: about[1::2] == named and s.turns(*named) and s.one_line(*named),
 }
 
 

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,8 @@ from spelgen.emission.build import build
 from spelgen.emission.specify import make_spec
 from spelgen.emission.text import description
 from spelgen.errors import RunError
+from spelgen.evaluation.results import Results
+from spelgen.evaluation.verdict import verdict
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.render.report_page import render_report, write_report
 from spelgen.render.run_facts import commands
@@ -73,6 +76,7 @@ EVALUATION = {
                      "message": "<b>said</b>"}],
     "traces": traces("traj_00"),
 }  # fmt: skip
+EVALUATION["assessment"] = asdict(verdict(Results.from_dict(EVALUATION)))
 
 
 def write_model(folder: Path, model) -> None:
@@ -277,6 +281,25 @@ def test_the_report_is_available_as_json(run, robots):
     found = json.loads(write_report(run, run / "report.json").read_text(encoding="utf-8"))
     assert found["evaluation"] == EVALUATION and found["least_squares"] is None
     assert found["verdict"]["sentence"] in " ".join(Page(render_report(run)).text)
+
+
+def test_a_root_mean_square_that_few_starts_dominate_is_stated_beside_the_median(run):
+    def note(median):
+        changed = json.loads(json.dumps(EVALUATION))
+        changed["traces"]["growth"]["relative"]["model"]["median"] = [0.001, median]
+        (run / "evaluation.json").write_text(json.dumps(changed))
+        return " ".join(Page(render_report(run)).text)
+
+    rms = EVALUATION["horizons"][-1]["errors"]["model"]["mean_relative_rms"]
+    assert "After 1 s the median error is" in note(rms / 3)
+    assert "few starts dominate" not in note(rms / 1.5)
+
+
+def test_warnings_about_the_logs_are_in_the_report(run):
+    config = json.loads((run / "config.json").read_text())
+    config["warnings"] = ["link 'upper_arm': its first moment is 0.30 times the URDF's"]
+    (run / "config.json").write_text(json.dumps(config))
+    assert "link 'upper_arm': its first moment is 0.30 times" in " ".join(Page(render_report(run)).text)
 
 
 def test_meshes_are_drawn_where_the_robot_is_named(run, robots, tmp_path):

@@ -1,6 +1,6 @@
 """Hostile URDF files are refused or built by `inspect` and `build` within 10 s and 1 GB each.
 
-Seconds are those of the reference in time_bounds.py.
+Seconds refer to the reference in time_bounds.py.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from time_bounds import in_time
 ROOT = Path(__file__).parents[1]
 SECONDS, MEGABYTES = 10, 1000
 
-# One process imports what commands need, and forks one for each: its exit code and its own largest memory are the last
-# line of what it tells, its processor time is that of the fork and of the imports.
+# One process imports the modules of all commands and forks a process per command. The last line of its output has
+# exit code and largest memory; processor time includes the fork and the imports.
 SERVER = """
 import json, os, resource, signal, sys
 import spelgen.emission.specify
@@ -192,7 +192,6 @@ def server():
         process.stdin.close()
 
 
-@pytest.mark.timed
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
 @pytest.mark.parametrize("name", CASES)
 def test_is_refused_or_built_in_bounds(server, tmp_path, name):

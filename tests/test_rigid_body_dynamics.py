@@ -72,7 +72,7 @@ def test_a_telescope_moves_its_second_stage_twice():
 
 
 def test_a_mimic_elbow_is_a_pendulum_with_a_varying_inertia():
-    """Both points at length L, the elbow at -q/2 + 0.3, so that the second rod stands at b = q/2 + 0.3:
+    """Both points at length L, the elbow at -q/2 + 0.3, so that the angle of the second rod is b = q/2 + 0.3:
 
     M = L^2 (m1 + m2 (5/4 + cos(q - b))),  V = g L (m1 sin q + m2 (sin q + sin b)),  M qdd + M' qd^2/2 + V' = tau.
     """
@@ -227,5 +227,5 @@ def test_pose_and_jacobian_of_the_tip_are_pinocchios(robot, link, robots, tmp_pa
             dynamics.model, dynamics.data, at_joints, frame, pin.LOCAL_WORLD_ALIGNED
         )
         pin.framesForwardKinematics(dynamics.model, dynamics.data, at_joints)
-        np.testing.assert_allclose(found, dynamics.data.oMf[frame].homogeneous, atol=2e-6)
-        np.testing.assert_allclose(slope, by_joint @ dynamics.jacobian, atol=5e-6)
+        np.testing.assert_allclose(found, dynamics.data.oMf[frame].homogeneous, atol=1e-13)
+        np.testing.assert_allclose(slope, by_joint @ dynamics.jacobian, atol=1e-12)

@@ -55,7 +55,7 @@ def motions(count: int = 4, samples: int = 25) -> list[Trajectory]:
 
 @pytest.fixture(scope="module", autouse=True)
 def short_epochs():
-    """Two steps an epoch: what is written, and when, is the same after twenty."""
+    """Two steps per epoch: the files, and the times of writing, do not depend on the number of steps."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(momentum, "TUNING", FittingTuning(epoch_steps=2))
         yield
@@ -91,7 +91,7 @@ USES = {
 
 @pytest.mark.parametrize("use", USES)
 def test_a_module_in_a_run_folder_is_neither_read_nor_executed(plain, start, tmp_path, use):
-    """A file with a side effect, beside a valid specification."""
+    """A file with a side effect in a folder with a valid specification."""
     run, mark = copied(plain, tmp_path / "run"), tmp_path / "mark"
     (run / "module.py").write_text(f"open({str(mark)!r}, 'w').close()\n")
     if use == "export":  # needs the URDF
@@ -101,7 +101,7 @@ def test_a_module_in_a_run_folder_is_neither_read_nor_executed(plain, start, tmp
 
 
 @pytest.mark.parametrize("use", USES)
-def test_a_run_of_an_earlier_version_is_refused_with_what_to_do(plain, start, tmp_path, use):
+def test_a_run_of_an_earlier_version_is_refused_with_a_remedy(plain, start, tmp_path, use):
     """It had a module in place of the specification."""
     run, mark = copied(plain, tmp_path / "run"), tmp_path / "mark"
     (run / "spec.json").unlink()
@@ -132,7 +132,7 @@ def test_a_run_is_loaded_without_symbolic_algebra(plain):
 # ---- one training at a time
 
 
-def test_a_second_training_is_told_who_holds_the_folder(start, tmp_path):
+def test_a_second_training_names_the_holder_of_the_folder(start, tmp_path):
     with locked(tmp_path / "run"):
         with pytest.raises(RunError) as caught:
             trained(start, tmp_path / "run")
@@ -153,7 +153,7 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
     return torch.load(run / "model.pt", weights_only=True)
 
 
-def test_killed_between_any_two_writes_nothing_is_lost(start, tmp_path):
+def test_a_training_killed_between_any_two_writes_loses_nothing(start, tmp_path):
     """Every write of a training, in turn: module, robot, weights, checkpoints, config. Dead before or after it."""
     whole = weights(trained(start, tmp_path / "whole", urdf=start / "arm.urdf"))
     kills, write, resumed = 0, 1, set()
@@ -181,7 +181,7 @@ def test_an_interruption_before_the_first_checkpoint_leaves_no_run(start, tmp_pa
     trained(start, tmp_path / "run")
 
 
-def test_a_full_disk_is_told_with_the_file(start, tmp_path):
+def test_a_full_disk_is_reported_with_the_file(start, tmp_path):
     """No file may grow beyond 2000 bytes: it fails as a full disk does, while it is written."""
     run = trained(start, tmp_path / "run")
     before = weights(run)
@@ -198,7 +198,7 @@ def test_a_full_disk_is_told_with_the_file(start, tmp_path):
     assert trained(start, run, options=RunOptions(resume=True))
 
 
-# ---- what lies in it may be anything
+# ---- the folder may contain anything
 
 
 CHANGES = {
@@ -218,7 +218,7 @@ def plain(start, tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize("case", CHANGES)
-def test_a_config_that_is_none_is_told(plain, tmp_path, case):
+def test_an_invalid_config_is_reported(plain, tmp_path, case):
     change, message = CHANGES[case]
     record = json.loads((plain / "config.json").read_text())
     change(record)
@@ -233,7 +233,7 @@ def test_a_config_that_is_none_is_told(plain, tmp_path, case):
 
 @pytest.mark.parametrize("name", ["config.json", "spec.json", "model.pt", "checkpoint.pt", "metrics.jsonl"])
 @pytest.mark.parametrize("what", [b"", b"[]", b"\xff\xfe", b"[" * 100_000, None])
-def test_files_that_are_broken_or_pipes_are_told(plain, tmp_path, name, what):
+def test_broken_files_and_pipes_are_reported(plain, tmp_path, name, what):
     for path in plain.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     (tmp_path / name).unlink()
@@ -242,13 +242,13 @@ def test_files_that_are_broken_or_pipes_are_told(plain, tmp_path, name, what):
     else:
         (tmp_path / name).write_bytes(what)
     if name == "metrics.jsonl" and what not in (None, b"[]"):
-        load_run(tmp_path)  # a torn last line is left out
+        load_run(tmp_path)  # an incomplete last line is omitted
     else:
         with pytest.raises(spelgen.SpelgenError, match=r"\S"):
             load_run(tmp_path)
 
 
-def test_a_checkpoint_that_lost_a_number_is_told(plain, tmp_path):
+def test_a_checkpoint_without_a_number_is_reported(plain, tmp_path):
     for path in plain.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     state = torch.load(plain / "checkpoint.pt", weights_only=True)
@@ -285,7 +285,7 @@ def repeated(state):
         lambda run, log: train(None, [log], run.parent / "more", QUICK, source=run),
     ],
 )
-def test_weights_that_are_no_numbers_are_told(plain, start, tmp_path, change, use):
+def test_weights_that_are_no_numbers_are_reported(plain, start, tmp_path, change, use):
     run = copied(plain, tmp_path)
     torch.save(change(weights(run)), run / "model.pt")
     with pytest.raises(RunError, match=r"model\.pt: .*(got no finite numbers|weights of another model)"):
@@ -301,7 +301,7 @@ def test_a_run_whose_weights_are_no_numbers_is_not_resumed(plain, start, tmp_pat
         train("", [start / "train.parquet"], run, options=RunOptions(resume=True))
 
 
-def test_weights_that_unpack_to_gigabytes_are_told(plain, tmp_path):
+def test_weights_that_unpack_to_gigabytes_are_reported(plain, tmp_path):
     run = copied(plain, tmp_path)
     with zipfile.ZipFile(run / "model.pt", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         archive.writestr("model/data/0", bytes(600_000_000))
@@ -336,7 +336,7 @@ SPECS = {
 
 @pytest.mark.parametrize("case", SPECS)
 def test_a_specification_of_another_content_is_refused(plain, tmp_path, case):
-    """In one line that names the file or what is wrong, by whatever reads it; nothing is assembled."""
+    """Every reader reports it in one line that names the file or the defect; nothing is assembled."""
     change, message = SPECS[case]
     run = copied(plain, tmp_path)
     content = json.loads((run / "spec.json").read_text())
@@ -348,7 +348,6 @@ def test_a_specification_of_another_content_is_refused(plain, tmp_path, case):
         assert "\n" not in str(caught.value)
 
 
-@pytest.mark.timed
 def test_a_huge_file_is_not_read(plain, start, tmp_path):
     run = copied(plain, tmp_path)
     with (run / "notes.bin").open("wb") as file:

@@ -21,15 +21,14 @@ from spelgen.emission.standalone import bundle, load_runtime, names_in
 from spelgen.fitting.torque.parameters import log_cholesky_parameters, upper_cholesky
 from spelgen.runtime.derived_mass import DerivedMass
 from spelgen.runtime.encoding import JointEncoding
-from spelgen.runtime.friction_laws import turning
+from spelgen.runtime.friction_laws import SlidingFriction, turning
 from spelgen.runtime.hidden_units import hidden_units
 from spelgen.runtime.masked_kan import MaskedKAN
 from spelgen.runtime.masked_mlp import MaskedMLP
+from spelgen.runtime.parts import symmetric
 from spelgen.runtime.residual_terms import HARMONICS, SPLINES, ResidualTerms
 from spelgen.runtime.rigid_body import InertialParameters
 from spelgen.runtime.rows import Constant, Joint, Link, vector
-from spelgen.runtime.sliding_friction import SlidingFriction
-from spelgen.runtime.symmetric import symmetric
 
 NUMBERS = Path(__file__).parent / "golden" / "numbers.json"
 FIRST_STAGE = (  # friction's laws then: |gravity torque|, tanh and exp
@@ -340,7 +339,7 @@ def network_of_first_stage(network, inputs, generator):
             weight.zero_()
             for (joint, now, sign, constant), column in zip(inputs, drawn.unbind(1), strict=True):
                 if sign:
-                    # the bumps of -x are those of x in reverse
+                    # the bumps of -x are the bumps of x in reverse
                     weight[:, now] += column.flip(-1) if grid and sign < 0 else column * (1 if grid else sign)
                 elif grid:
                     bumps = torch.exp(-((constant / (2 / 3) - network.grid) ** 2))

@@ -1,4 +1,4 @@
-"""The 3D scene of a page: link poses equal those of the kinematics, and shapes are closed."""
+"""The 3D scene of a page: link poses equal the poses of the kinematics, and shapes are closed."""
 
 import json
 from itertools import pairwise
@@ -33,7 +33,7 @@ def frames(links, q):
 
 
 @pytest.mark.parametrize("robot", ["rpr", "scara", "panda", "ur10e"])
-def test_link_poses_equal_those_of_pytorch_kinematics(robots, robot):
+def test_link_poses_equal_those_of_the_tip(robots, robot):
     import torch
 
     arm = load_arm(robots / f"{robot}.urdf")
@@ -57,10 +57,12 @@ def test_the_shapes_of_the_file_are_drawn_where_all_are_there(tmp_path):
     path = tmp_path / "r.urdf"
     path.write_text(text.replace("BOX", box))
     found = scene(path, ["j"])
-    assert found.has_meshes and [len(link.shape.faces) for link in found.links] == [12, 12]
+    assert not found.tubes and [len(link.shape.faces) for link in found.links] == [12, 12]
     np.testing.assert_allclose(np.ptp(found.links[1].shape.vertices, axis=0), [0.1, 0.2, 0.3], atol=1e-3)
     path.write_text(text.replace("BOX", mesh))
-    assert not scene(path, ["j"]).has_meshes  # tubes: an arm with holes is worse
+    found = scene(path, ["j"])  # a tube for the link without its mesh, the box for the other
+    assert found.tubes == " Drawn as tubes, since meshes were not read: b (not_there.stl)."
+    assert len(found.links[0].shape.faces) == 12 and len(found.links[1].shape.faces) > 12
 
 
 def test_tubes_are_closed_and_look_outward():

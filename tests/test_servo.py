@@ -23,9 +23,10 @@ from spelgen.files import write_json
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.servo import objective
-from spelgen.fitting.servo.report import covariance, servo_summary
+from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.servo.rollouts import ServoRollouts
 from spelgen.fitting.servo.windows import servo_windows
+from spelgen.identification.intervals import jackknife_covariance
 from spelgen.listing import number
 from spelgen.logs.commands import delayed_commands
 from spelgen.logs.preprocessing import Preprocessing
@@ -91,7 +92,7 @@ def test_replay_of_another_motion_beats_the_baselines(fitted, logs, results):
     assert again.to_dict() == results.to_dict()
 
 
-def test_a_module_of_servos_stands_alone_and_says_so(arm, tmp_path):
+def test_a_standalone_module_of_servos(arm, tmp_path):
     source = spelgen.generate(arm, "closed-form", standalone=True)
     assert "stores 1/2 kp d(q - u)^2" in source
     model = import_source(source, tmp_path / "servo.py").Model()
@@ -104,7 +105,7 @@ def test_a_module_of_servos_stands_alone_and_says_so(arm, tmp_path):
     assert "in ratio to kp only" in " ".join(spelgen.inspect(arm).text().split())
 
 
-def test_within_its_dead_zone_a_servo_gives_nothing(arm):
+def test_within_its_dead_zone_a_servo_has_no_torque(arm):
     servo = spelgen.build(arm, "closed-form").servo
     servo.dead_zone[:] = torch.tensor([0.02, 0.0])
     u, still = torch.tensor([[0.015, 0.1], [0.05, 0.1]]).double(), torch.zeros(2, 2).double()
@@ -121,7 +122,7 @@ def test_joints_get_the_laws_that_they_have(fitted):
         laws = fitted.model.friction.prepare()
     assert laws.stribeck[0] < 0.15 * TRUTH.coulomb[0]
     assert float(laws.stribeck[1]) == pytest.approx(TRUTH.stribeck[1], rel=0.3)
-    # its velocity is that of another form: the curves are compared, by kp
+    # its velocity belongs to another form of the curve: the curves are compared, divided by kp
     speeds = torch.tensor([0.05, 0.1, 0.2, 0.4]).double()
     with torch.no_grad():
         dry = laws.dry(speeds[:, None].expand(-1, 2), torch.zeros(4, 2).double())
@@ -131,7 +132,7 @@ def test_joints_get_the_laws_that_they_have(fitted):
     )
 
 
-def test_intervals_count_errors_that_are_alike_once():
+def test_intervals_count_correlated_errors_once():
     rng = torch.Generator().manual_seed(0)
     found, told = [], []
     for _ in range(300):
@@ -141,14 +142,14 @@ def test_intervals_count_errors_that_are_alike_once():
         step = torch.linalg.solve(curvature.sum(dim=0), descent.sum(dim=0))
         left = (slopes.mT @ (errors.unsqueeze(-1) + slopes * step)).squeeze(-1)
         at_end = NormalEquations(curvature, -left)
-        told.append(float(covariance(at_end, torch.zeros(1).double(), torch.zeros(1).double())))
+        told.append(float(jackknife_covariance(*at_end, torch.zeros(1, 1).double())[1]))
         found.append(float(step))
     assert np.mean(told) == pytest.approx(
         np.var(found), rel=0.15
     )  # a fiftieth of it, if samples were all new
 
 
-def test_intervals_leave_out_whole_motions(logs):
+def test_blocks_of_intervals_are_whole_motions(logs):
     numbers = {}
     for count in (1, 3, 4, 5):
         windows = servo_windows(logs[:count], Preprocessing())
@@ -156,7 +157,7 @@ def test_intervals_leave_out_whole_motions(logs):
         numbers[count] = len(set(stretches))
         by_log = {(log.name, stretch) for (log, _), stretch in zip(windows.rows, stretches, strict=True)}
         assert len(by_log) == numbers[count]  # none is of two logs
-    # three logs are too few to tell how their motions differ: each is cut in two
+    # three logs are too few for the differences between motions: each is cut in two
     assert numbers == {1: 5, 3: 6, 4: 4, 5: 5}
 
 
@@ -201,19 +202,20 @@ def test_commands_are_read_and_written(tmp_path, logs, arm):
         assert again[0].tau.shape == (len(logs[0]), 0)
 
 
-def test_what_is_told_covers_the_truth(fitted):
+def test_reported_intervals_cover_the_truth(fitted):
     told = fitted.record.servo["joints"]
     for k, joint in enumerate(told):
         for what, truth in (
             ("kd", TRUTH.kd[k] / TRUTH.kp[k]),
+            ("lag", TRUTH.kd[k] / TRUTH.kp[k] + TRUTH.delay),
             ("armature", TRUTH.armature[k] / TRUTH.kp[k]),
             ("static_error", TRUTH.coulomb[k] / TRUTH.kp[k] + TRUTH.dead_zone[k]),
         ):
             assert joint[what]["determined"]
-            # friction of the simulated elbow falls as a Gaussian, that of the model from rest on
+            # friction of the simulated elbow falls as a Gaussian, friction of the model from rest on
             assert joint[what]["value"] == pytest.approx(truth, rel=0.03 if k == 0 else 0.04), what
             assert joint[what]["low"] < truth < joint[what]["high"], what
-    # the elbow's small weight does not tell dry friction from a dead zone
+    # with the elbow's small weight dry friction and a dead zone are confounded
     assert told[0]["dry"]["determined"] and "dry/kp of elbow" in servo_summary(fitted.record.servo).text
 
 
@@ -229,7 +231,7 @@ def test_what_is_told_covers_the_truth(fitted):
         ("sliders", ((0,), (1,)), {("armature", 0), ("armature", 1)}),
     ],
 )
-def test_what_servo_logs_can_tell_at_all(robots, tmp_path, robot, groups, left):
+def test_identifiable_ratios_of_servo_logs(robots, tmp_path, robot, groups, left):
     path = tmp_path / "sliders.urdf" if robot == "sliders" else robots / f"{robot}.urdf"
     if robot == "sliders":  # at right angles, of which each moves by itself
         path.write_text(SLIDERS)
@@ -299,7 +301,7 @@ def test_a_missing_column_is_named(tmp_path, logs, arm, quantity):
         spelgen.read_logs(path, arm)
 
 
-def test_what_does_not_belong_together_is_told(arm, logs, robots):
+def test_incompatible_models_and_logs_are_reported(arm, logs, robots):
     with pytest.raises(SettingsError, match="preset with bristle friction"):
         spelgen.build(arm, "spel")
     with pytest.raises(OptionError, match="input: torque' in their settings, this has 'position'"):
@@ -317,7 +319,7 @@ def moved(model, seconds, count=1):
     with torch.no_grad():
         model.raw_armature.copy_((torch.tensor(TRUTH.armature) / model.armature).log())
         model.servo.delay.fill_(TRUTH.delay)
-    t, every = np.arange(0.0, seconds, 0.0025), 8  # of which logs have one in so many
+    t, every = np.arange(0.0, seconds, 0.0025), 8  # logs have one of `every` samples
     u = np.random.default_rng(0).uniform(-0.4, 0.4, (count, int(2 * seconds), 2)).repeat(200, axis=1)
     nothing = np.zeros((len(t), 0))
     logs = [Trajectory(t, x, np.zeros_like(x), nothing, u=x) for x in u]

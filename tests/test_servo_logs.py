@@ -77,7 +77,7 @@ def test_commands_that_cannot_be_these_are_errors(arm, logs, columns, text):
 
 
 def only(column, values):
-    """A column of the commands in place of which others stand."""
+    """A mapping that names other columns for the commands."""
 
     def made(x):
         u = x.u.copy()

@@ -19,7 +19,17 @@ from spelgen.fitting.dataset import digest
 from spelgen.fitting.fit import RunOptions
 from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.run_folder import RunFolder
+from spelgen.fitting.servo import laws, objective
 from spelgen.fitting.train import train
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_steps():
+    """Outer iterations of two steps: that a resumed fit repeats the same bytes does not depend on their number."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (objective, laws):
+            patch.setattr(module, "TUNING", replace(module.TUNING, steps=2))
+        yield
 
 
 @pytest.fixture(scope="module")

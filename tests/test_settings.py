@@ -263,6 +263,9 @@ def test_a_starter_file_states_the_defaults(robots, tmp_path, name):
     (tmp_path / "arm.yaml").write_text(re.sub(r"^# ", "", text, flags=re.MULTILINE))
     said = load_arm(urdf)
     assert not said.settings.diagnostics
+    assert said.settings.moving_joints == plain.chain.joint_names
+    (tip,) = re.findall(r'tip: "(.*)"', text)
+    assert load_arm(urdf, tip=tip).chain.joint_names == plain.chain.joint_names
     assert (
         said.settings.joints.keys()
         == {x.name for x in said.chain.coordinates}

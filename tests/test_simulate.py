@@ -82,8 +82,8 @@ class TestMotion:
         ]
         np.testing.assert_allclose(energies, energies[0], atol=1e-10)
 
-    def test_what_friction_takes_and_motors_give_is_what_the_energy_gains(self, robots):
-        """dE/dt = qd (tau - friction(qd)), integrated beside the motion by another solver at other steps."""
+    def test_energy_balance_of_motors_and_friction(self, robots):
+        """dE/dt = qd (tau - friction(qd)), integrated with the motion by another solver at other steps."""
         rpr, settings = load(robots / "rpr.urdf")
         engine, friction = arm_dynamics(rpr, settings), make_friction(rpr, settings)
         tau = np.array([2.0, -1.0, 1.0])
@@ -192,7 +192,7 @@ class TestProtocol:
     @pytest.mark.parametrize(
         ("trajectories", "fraction", "tested"), [(1, 0.5, 0), (3, 0.0, 0), (5, 0.4, 2), (4, 0.99, 3)]
     )
-    def test_the_split_leaves_something_to_train_on(self, settings, trajectories, fraction, tested):
+    def test_the_split_keeps_a_trajectory_for_training(self, settings, trajectories, fraction, tested):
         changes = {"trajectories": trajectories, "test_fraction": fraction, "duration": 0.05}
         logs = random_inputs(
             slider(), settings.model_copy(update={"simulation": protocol(settings, **changes)})
@@ -217,7 +217,7 @@ class TestProtocol:
         assert 1 < np.abs(starts[:, 2]).max() <= np.pi
         assert all((each.tau == [7, 0, 0]).all() for each in logs.train)
 
-    def test_progress_is_told_after_every_trajectory(self, settings):
+    def test_progress_is_reported_after_every_trajectory(self, settings):
         told = []
         random_inputs(slider(), settings, progress=lambda done, total: told.append((done, total)))
         assert told == [(done, 6) for done in range(1, 7)]
@@ -282,7 +282,7 @@ class TestInMemory:
         again = simulate(load_arm(robots / "two_link.urdf"), trajectories=4, duration=0.2, seed=3)
         np.testing.assert_array_equal(logs[0].q, again[0].q)
 
-    def test_what_cannot_be_is_told_by_its_name(self, robots):
+    def test_invalid_settings_are_named(self, robots):
         with pytest.raises(SettingsError) as error:
             simulate(load_arm(robots / "two_link.urdf"), sample_rate=-1)
         assert str(error.value) == "simulate: sample_rate: got -1, expected greater than 0"
@@ -306,5 +306,5 @@ class TestInMemory:
             jacobian @ pin.rnea(model, data, jacobian * q + [0, -0.1], jacobian * qd, jacobian * qdd)
             for q, qd, qdd in states
         ]
-        held = (log.tau[1:-2, 0] + log.tau[:-3, 0]) / 2  # the slope at a sample is that of both intervals
+        held = (log.tau[1:-2, 0] + log.tau[:-3, 0]) / 2  # the slope at a sample is the mean of both intervals
         np.testing.assert_allclose(needed[1:-2], held, atol=0.02)

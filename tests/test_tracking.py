@@ -95,7 +95,7 @@ def test_options_of_sines_are_refused_for_excitation():
         TrackingSettings(paths="excitation", amplitude=0.2, frequency=0.5)
 
 
-def test_sines_turn_as_fast_as_they_say():
+def test_sines_have_the_stated_frequency():
     t, h = 2.2, 1e-5
     path = sines(np.array([0.5]), 0.3, 0.125, np.array([1.0]), np.array([t - h, t, t + h, t + 8.0]))
     np.testing.assert_allclose(path.qd[1], (path.q[2] - path.q[0]) / (2 * h), rtol=1e-8)

@@ -18,7 +18,7 @@ import torch
 from planar_model import JOINTS, Model, true_model, write_module
 from rich.console import Console
 
-from spelgen.emission.loading import load_module
+from spelgen.emission.build import load_module
 from spelgen.emission.module_file import read_spec
 from spelgen.errors import LogError, ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
@@ -207,7 +207,7 @@ def test_training_finds_the_true_parameters():
         torch.testing.assert_close(model.state_dict()[name], value, atol=0.05, rtol=0)
 
 
-def test_the_run_folder_tells_what_was_done(module, logs, tmp_path):
+def test_the_run_folder_records_the_training(module, logs, tmp_path):
     result = train(module, [logs], tmp_path / "run", quick(epochs=2))
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names == {
@@ -238,7 +238,9 @@ class Interrupted(TrainingProgress):
 
 
 @pytest.mark.parametrize(("optimizer", "steps"), [("adamw", 20), ("lbfgs", 3)])
-def test_resuming_repeats_what_would_have_been(module, logs, tmp_path, monkeypatch, optimizer, steps):
+def test_a_resumed_training_equals_an_uninterrupted_one(
+    module, logs, tmp_path, monkeypatch, optimizer, steps
+):
     monkeypatch.setattr("spelgen.fitting.window.momentum.TUNING", FittingTuning(epoch_steps=steps))
     config = quick(optimizer=optimizer, momentum_steps=20 if optimizer == "adamw" else 0)
     straight, broken = tmp_path / "straight", tmp_path / "broken"
@@ -356,7 +358,7 @@ def test_early_stop_and_time_limit(module, logs, tmp_path):
 
 
 def until_a_signal(module: Path, logs: Path, folder: Path) -> None:
-    """Run a training without end in a process of its own, and write to `told` how it ended."""
+    """Run a training without end in a process of its own, and write the way it ended to `told`."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever runs the tests may ignore it
     with folder.with_name("told").open("w") as told:
         os.dup2(told.fileno(), 2)
@@ -366,7 +368,7 @@ def until_a_signal(module: Path, logs: Path, folder: Path) -> None:
 
 @pytest.mark.usefixtures("short_epochs")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_leaves_a_usable_run(module, logs, tmp_path, number):
+def test_a_run_is_usable_after_a_signal(module, logs, tmp_path, number):
     folder = tmp_path / "run"
     child = multiprocessing.get_context("fork").Process(target=until_a_signal, args=(module, logs, folder))
     child.start()
@@ -478,7 +480,7 @@ def test_the_learning_rate_rises_and_falls(logs, tmp_path):
 
 
 def test_few_windows_are_taken_all_at_once():
-    """L-BFGS comes nearer in as many steps, and a weight decay of its own is what it gets."""
+    """L-BFGS has a lower loss after equally many steps, and a weight decay of its own."""
     config = Rollout(momentum_steps=0, epochs=6)
     assert config.resolved(100).record(rigid_bodies=False).keys() & {"batch", "learning_rate"} == set()
     assert (config.resolved(100).optimizer, config.resolved(100).weight_decay) == ("lbfgs", 2e-5)

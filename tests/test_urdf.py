@@ -435,7 +435,6 @@ class TestSafety:
         links = "".join(f'<link name="l{i}"/>' for i in range(2001))
         assert refusal(write(links)) == "FILE:1: <robot>: got 2001 links, expected at most 2000"
 
-    @pytest.mark.timed
     @pytest.mark.parametrize(("kind", "bodies"), [("revolute", None), ("fixed", 1)])
     def test_three_hundred_joints_are_lumped_or_refused_in_seconds(self, write, kind, bodies):
         links = "".join(f'<link name="l{i}">{INERTIAL}</link>' for i in range(301))

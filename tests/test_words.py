@@ -22,7 +22,7 @@ ALLOWED = re.compile(
     r"\b(at|from|to) rest\b|--trust|trust=True|`trust`|hold(s|ing)? the arm|leaves? out|held samples|zero-order hold"
 )
 CODE = re.compile(r"^```.*?^```$|^(?: {4}|\t)[^\n]*$|`[^`\n]*`|\]\([^)]*\)", re.MULTILINE | re.DOTALL)
-# texts for developers: what each number of a table means
+# texts for developers: the meaning of the numbers of a table
 INTERNAL = ("runtime",)
 
 
@@ -32,12 +32,12 @@ def wrong(text: str) -> list[str]:
 
 
 def documented(tree: ast.Module) -> set[ast.AST]:
-    """The constants that are docstrings, or stand below a name as its comment."""
+    """The constants that are docstrings, of modules, classes, functions and names."""
     return {x.value for x in ast.walk(tree) if isinstance(x, ast.Expr) and isinstance(x.value, ast.Constant)}
 
 
 def messages(path: Path) -> list[str]:
-    """Strings of several words in the code; values in f-strings are left as a mark."""
+    """Strings of several words in the code; values in f-strings become a mark."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     skipped = documented(tree)
     texts = []

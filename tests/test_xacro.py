@@ -91,7 +91,7 @@ class TestExpansion:
         )
         assert refusal(arm) == expected
 
-    def test_errors_of_the_arm_too_say_whose_lines_they_tell(self, arm):
+    def test_errors_of_the_arm_name_the_expanded_document(self, arm):
         arm.write_text(ARM.replace("</robot>", '<link name="x"/>' + JOINT.format("floating") + "</robot>"))
         with pytest.raises(
             SpelgenError, match=r"arm\.urdf\.xacro \(expanded\):\d+: joint 'f': got a floating joint"

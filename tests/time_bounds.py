@@ -13,7 +13,7 @@ REFERENCE = 0.04  # s
 
 
 def in_time(seconds: float, bound: float) -> bool:
-    """Return whether ``seconds`` of processor time, just measured, are below ``bound`` of the reference machine."""
+    """True if ``seconds`` of processor time, just measured, are below ``bound`` of the reference machine."""
     return seconds < bound or seconds < bound * slowness()
 
 

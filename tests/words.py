@@ -67,7 +67,7 @@ def texts(path: Path) -> list[tuple[int, str]]:
 
 
 def constructions(text: str) -> Counter[str]:
-    """Return how often each construction occurs, without those that do not."""
+    """Return the number of occurrences of each construction that occurs."""
     found = {name: len(list(pattern.finditer(text))) for name, pattern in CONSTRUCTIONS.items()}
     return Counter({name: count for name, count in found.items() if count})
 
@@ -93,7 +93,7 @@ def bounds() -> dict[str, dict[str, int]]:
 
 
 def lowered(found: dict[str, Counter[str]], old: dict[str, dict[str, int]]) -> dict[str, dict[str, int]]:
-    """Return the bounds, each lowered to the current count; those that reach zero are left out."""
+    """Return the bounds, each lowered to the current count; bounds of zero are omitted."""
     smaller = {
         package: {name: min(found.get(package, Counter())[name], count) for name, count in row.items()}
         for package, row in old.items()

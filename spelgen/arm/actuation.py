@@ -67,7 +67,7 @@ class Actuation:
         return self._matrix(self.entries)
 
     def drives(self) -> Drives:
-        """Return G (n, n) and C (n, n)."""
+        """Return the input matrix G, (n, n), and the motor speeds C per joint velocity, (n, n)."""
         torques = self.matrix()
         for coupling in self.couplings:
             torques[coupling.row] = 0.0  # the logged torque acts at the joint, not at its motors

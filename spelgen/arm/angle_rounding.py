@@ -40,6 +40,7 @@ class AngleRounding:
         """Return the exact inertia tensor (3, 3) [kg m2]; products of inertia of the order of rounding errors are 0."""
         xx, xy, xz, yy, yz, zz = inertial.tensor
         if self.tolerance:
+            # CAD programs export products of inertia of 1e-18 for symmetric parts.
             noise = TUNING.zero_noise * max(abs(xx), abs(yy), abs(zz))
             products = np.array((xy, xz, yz))
             products[np.abs(products) < noise] = 0.0
@@ -58,6 +59,7 @@ class AngleRounding:
         if self.tolerance == 0.0:
             return unit
         rounded = np.where(np.abs(unit) < TUNING.axis_noise, 0.0, unit)
+        # A unit vector again, as components below the noise were removed.
         rounded /= np.linalg.norm(rounded)
         if np.abs(rounded - unit).max() > TUNING.notable:
             message = f"{_vector_text(joint.axis)} is taken as {_vector_text(rounded)}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -88,6 +89,7 @@ def _independent(joints: Iterable[UrdfJoint]) -> tuple[UrdfJoint, ...]:
 
 def _refuse_free_joints(robot: Robot, chain: Sequence[UrdfJoint]) -> None:
     """Raise ArmError for a floating or planar joint between the chain's joints; one below the arm is held fixed."""
+    # A mobile base has such a joint below the arm: the arm is described relative to it.
     below = robot.path_to(chain[0].parent)
     for joint in robot.path_to(chain[-1].parent):
         if joint.type in ("floating", "planar") and joint not in below:
@@ -158,13 +160,14 @@ def _up_to(robot: Robot, tip: str) -> tuple[UrdfJoint, ...]:
 
 def _longest(robot: Robot) -> ChainChoice:
     """Return the longest chain. Raises ArmError for several of equal length without an unambiguous criterion."""
+    # Arms are the longest chain of a robot; hands, tools and sensors are on shorter branches.
     chains = _chains(robot)
     length = max(map(len, chains), default=0)
     longest = [chain for chain in chains if len(chain) == length]
     if not longest:
         return ChainChoice(())
     if len(longest) == 1:
-        return ChainChoice(longest[0])
+        return ChainChoice(longest[0], _possible_gripper(robot, longest[0]))
     # two jaws form two chains of equal length
     if _is_parallel_gripper(longest):
         jaws = ", ".join(repr(chain[-1].name) for chain in longest)
@@ -176,6 +179,22 @@ def _longest(robot: Robot) -> ChainChoice:
         message = f"{len(longest)} chains of {length} joints: the only one with effort limits of all joints is taken"
         return ChainChoice(driven[0], (_remark(driven[0][-1], "warning", message),))
     raise _ambiguous(robot, longest)
+
+
+def _possible_gripper(robot: Robot, chain: Sequence[UrdfJoint]) -> tuple[Diagnostic, ...]:
+    """Return a remark if the last joint may open a gripper: it moves a link of that name, and no other joint does.
+
+    No jaw opens by half a turn: a joint with a larger range turns the gripper.
+    """
+    last = chain[-1]
+    turns = last.lower is not None and last.upper is not None and last.upper - last.lower > math.pi
+    if turns or not _GRIPPER.search(last.child) or any(map(_GRIPPER.search, robot.joint)):
+        return ()
+    message = (
+        f"moves the link {last.child!r}, as the last joint of the arm: if it opens a gripper, leave it out by "
+        f"'--tip {last.parent}', or by 'tip' in the settings"
+    )
+    return (_remark(last, "info", message),)
 
 
 def _remark(joint: UrdfJoint, severity: Severity, message: str) -> Diagnostic:

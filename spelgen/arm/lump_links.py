@@ -41,6 +41,7 @@ def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> Lump
     """Return the robot with moving joints of the chain and their followers, and all other joints locked."""
     rounding = AngleRounding(angle_tolerance)
     placement = Placement(robot.root, rounding)
+    # Chains of mimic joints are resolved to the joint that leads them, with products of the multipliers.
     following = leaders(robot)
     poses: list[tuple[UrdfJoint, Pose]] = []
     locked: list[UrdfJoint] = []
@@ -72,6 +73,7 @@ def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> Lump
 
 def _lumps(robot: Robot, placement: Placement, count: int) -> list[list[UrdfLink]]:
     """Return the links with an inertial for each body; links that are fixed to the root do not move."""
+    # Links that locked joints connect move together: M and V depend on the sum of their inertias only.
     lumps: list[list[UrdfLink]] = [[] for _ in range(count)]
     for link in robot.links:
         body = placement.frames[link.name].body

@@ -69,6 +69,7 @@ class Placement:
             axis = np.array(list(map(exact, self._rounding.axis(joint).tolist())))
             frame = self._turned(frame, self._offset(frame, exact(value) * axis), None)
         elif value:
+            # A revolute joint locked off zero turns all later frames by a constant angle.
             turn = rotation_about(self._rounding.axis(joint), self._rounding.angle(value))
             frame = self._turned(frame, frame.position, turn)
         self.frames[joint.child] = frame
@@ -128,6 +129,7 @@ class Placement:
         An offset of (0.1, 0.1, 0) is parallel to an axis at 45 degrees, but not to its rational approximation.
         """
         in_own_frame = self._rounding.position(rotation.T @ position)
+        # An offset without a component along an axis may be a zero of M: it is kept if both frames agree.
         moved = self._rounding.position(rotation @ in_own_frame)
         if np.array_equal(rotation.T @ moved, in_own_frame):
             return moved

@@ -18,6 +18,8 @@ from spelgen.spec import Options
 
 FittedBaselines = dict[str, Any]
 """The content of least_squares.json: fitted baselines, and the coverage of the training logs."""
+LinearServoRecord = Mapping[str, Any]
+"""Parameters of `LinearServos` in the record of a fit, by name."""
 
 
 @dataclass(frozen=True)
@@ -52,11 +54,11 @@ class Baseline:
         return []
 
     def followers(
-        self, linear_servos: Mapping[str, Any] | None, notes: list[Diagnostic]
+        self, linear_servos: LinearServoRecord | None, notes: list[Diagnostic]
     ) -> dict[str, CommandFollower]:
         """Return the predictors under position commands, by name.
 
-        linear_servos: parameters of `LinearServos` from the record of a fit; None for a model without a record.
+        linear_servos: None for a model without a record.
         """
         return {}
 

@@ -19,7 +19,7 @@ class DelayedCommand:
     about = "the commands themselves, after the delay by which they are nearest to the positions of the training logs"
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """See `CommandFollower`."""
+        """Return the positions per part, (K, n): the delayed commands."""
         return [delayed_commands(log, rows, self.delay, 1)[:, 0] for log, rows in parts]
 
 
@@ -39,7 +39,7 @@ class LinearServos:
     about = "a linear second-order servo at each joint, fitted to windows of the training logs"
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """See `CommandFollower`."""
+        """Return the positions per part, (K, n), of second-order responses to the delayed commands."""
         frequency, damping, result = np.array(self.frequency), np.array(self.damping), []
         for start, speed, (log, rows) in zip(q, qd, parts, strict=True):
             dt = float(np.diff(log.t[rows]).mean())
@@ -65,7 +65,7 @@ def linear_response(
     Returns:
         (..., K, n) positions at the end of each interval [rad, m].
     """
-    system = np.zeros((len(frequency), 3, 3))  # of position, velocity and command
+    system = np.zeros((len(frequency), 3, 3))  # state: position, velocity, command
     system[:, 0, 1] = 1.0
     system[:, 1, 0], system[:, 1, 2] = -(frequency**2), frequency**2
     system[:, 1, 1] = -2 * damping * frequency

@@ -1,4 +1,4 @@
-"""The names of predictors, in results and wherever these are shown."""
+"""The names of predictors, in results, charts and tables."""
 
 MODEL = "model"  # the trained model
 CONSTANT_VELOCITY = "velocity stays constant"
@@ -14,5 +14,5 @@ def observed(predictor: str) -> str:
 
 
 def is_drawn(predictor: str) -> bool:
-    """Return whether charts show a predictor: of the predictors with an observer only the model."""
+    """True if charts show the predictor: with an observer only the model is shown."""
     return predictor == observed(MODEL) or not predictor.endswith(observed(""))

@@ -81,6 +81,7 @@ def _stepper(
         pose = pose_at(q)
         damping, stiffness = _friction_slopes(dynamics, pose, qd, z, width)
         h = GAMMA * step
+        # With the position eliminated the matrix is M + h D + h^2 K: one factorisation of size n serves both stages.
         factors, pivots, _ = torch.linalg.lu_factor_ex(
             pose.mass + torch.diag_embed(h * damping + h * h * stiffness)
         )
@@ -91,6 +92,7 @@ def _stepper(
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
             return velocity + h * solution, solution
 
+        # Result: u + step (3 k1 + k2) / 2 with (1 - h A) k1 = F(u), (1 - h A) k2 = F(u + step k1) - 2 k1.
         v1, a1 = solve(qd, forces(pose, qd, tau, z))
         q2, qd2 = q + step * v1, qd + step * a1
         second = pose_at(q2)
@@ -203,7 +205,7 @@ def of_dynamics(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor
 
 
 class CommandFollower(Protocol):
-    """Predictor of positions under position commands. about: what it is, and how it was fitted."""
+    """Predictor of positions under position commands. about: its name and the method of its fit."""
 
     @property
     def about(self) -> str: ...

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.baseline import Baseline, EvaluatedArm, FittedBaselines
+from spelgen.baselines.baseline import Baseline, EvaluatedArm, FittedBaselines, LinearServoRecord
 from spelgen.baselines.linear_servos import DelayedCommand, LinearServos
 from spelgen.baselines.names import (
     CONSTANT_VELOCITY,
@@ -90,7 +89,7 @@ class IdentifiedArm(Baseline):
         except (LogError, np.linalg.LinAlgError):
             return {}
         fits = {key: fit for (key, _), fit in zip(FRICTION.values(), identified, strict=True)}
-        # base parameters and intervals are those of Coulomb friction; of bristles only the parameters are kept
+        # with Coulomb friction all results are kept, with bristles only the parameters
         parameters = {key: fit.parameters.tolist() for key, fit in fits.items()}
         return {**fits["parameters"].to_dict(), **parameters}
 
@@ -110,7 +109,7 @@ class FittedServos(Baseline):
     """`LinearServos` and `DelayedCommand` with the parameters of a fit's record."""
 
     def followers(
-        self, linear_servos: Mapping[str, Any] | None, notes: list[Diagnostic]
+        self, linear_servos: LinearServoRecord | None, notes: list[Diagnostic]
     ) -> dict[str, CommandFollower]:
         """Return both; {} and a note for a model without a record."""
         if linear_servos is None:
@@ -144,7 +143,7 @@ def torque_predictors(arm: EvaluatedArm) -> list[Predictor]:
 
 
 def command_followers(
-    linear_servos: Mapping[str, Any] | None, notes: list[Diagnostic]
+    linear_servos: LinearServoRecord | None, notes: list[Diagnostic]
 ) -> dict[str, CommandFollower]:
     """Return all baselines for an arm under position commands, by name; see `Baseline.followers`."""
     followers: dict[str, CommandFollower] = {}

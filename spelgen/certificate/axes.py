@@ -31,7 +31,7 @@ class Axes:
 
     def __init__(self, arm: Chain):
         self.arm = arm
-        self.slides = [kind == "prismatic" for kind in arm.joint_types]
+        self.prismatic = [joint_type == "prismatic" for joint_type in arm.joint_types]
         generator = random.Random(0)  # reproducible reports
         # per configuration: directions (n, 3) and twists (n, 6) of the axes
         self._configurations = [_configuration(arm, generator) for _ in range(TUNING.configurations)]
@@ -65,14 +65,14 @@ class Axes:
                 return False
         return True
 
-    def keep_offset(self, slider: int, turner: int) -> bool:
+    def keep_offset(self, slider: int, hinge: int) -> bool:
         """Whether no joint moves the mass carried by ``slider`` normal to the plane of the two directions."""
-        if not all(self.slides[turner + 1 : slider]):
+        if not all(self.prismatic[hinge + 1 : slider]):
             return False  # a rotation between the two may rotate the plane
-        later = [joint for joint in range(turner + 1, len(self.slides)) if joint != slider]
+        later = [joint for joint in range(hinge + 1, len(self.prismatic)) if joint != slider]
         for axes, twists in self._configurations:
-            normal = np.cross(axes[slider], axes[turner])
-            if not all(_moves_nothing(twists[joint], normal) for joint in later):
+            normal = np.cross(axes[slider], axes[hinge])
+            if not all(_is_orthogonal(twists[joint], normal) for joint in later):
                 return False
         return True
 
@@ -106,10 +106,10 @@ class Axes:
         # For a prismatic joint no test of balance applies: ones are neither centred nor balanced.
         return (Fraction(1),) * 10
 
-    def lifts_nothing(self, joint: int) -> bool:
+    def is_weightless(self, joint: int) -> bool:
         """Whether the joint slides horizontally, or rotates about the vertical."""
         gravity = np.array(self.arm.gravity)
-        return all(_moves_nothing(twists[joint], gravity) for _, twists in self._configurations)
+        return all(_is_orthogonal(twists[joint], gravity) for _, twists in self._configurations)
 
 
 def _configuration(arm: Chain, generator: random.Random) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -143,7 +143,7 @@ def _are_parallel(a: np.ndarray, b: np.ndarray) -> bool:
     return not (products - products.T).any()
 
 
-def _moves_nothing(twist: np.ndarray, direction: np.ndarray) -> bool:
+def _is_orthogonal(twist: np.ndarray, direction: np.ndarray) -> bool:
     """Whether a joint with this twist (6,) moves no point of a body along the direction (3,)."""
     v, w = np.split(twist, 2)
     return not v @ direction and not np.cross(w, direction).any()

@@ -60,6 +60,7 @@ class PolynomialWriter:
     def reduced(self, polynomial: fmpq_mpoly) -> fmpq_mpoly:
         """Return the polynomial of the same function in which the power of every sine is at most 1."""
         for circle in self._circles:
+            # The remainder modulo s^2 + c^2 - 1, with s as the leading variable.
             polynomial %= circle
         return polynomial
 
@@ -135,6 +136,7 @@ def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
     groups: dict[tuple[tuple[Expr, fmpq], ...], dict[Expr, fmpq]] = {}
     for symbol, terms in functions:
         leading = next(iter(terms.values()))
+        # Proportional functions have the same coefficients relative to their first term.
         unit = tuple((function, value / leading) for function, value in terms.items())
         groups.setdefault(unit, {})[symbol] = leading
     total = []

@@ -45,7 +45,7 @@ def facts(arm: Chain, structure: Structure) -> tuple[Fact, ...]:
         axes = Axes(arm)
     words = _Sentences(structure, axes)
     zero = ("always zero", "Nothing is learned for it", "Nothing is learned for them")
-    constant = ("constant", "It needs a number, no network", "They need numbers, no network")
+    constant = ("constant", "It needs one parameter and no network", "They need parameters and no networks")
     return (
         *words.entries("zero", reasons.zero_reason, *zero),
         *words.entries("constant", reasons.constant_reason, *constant),
@@ -78,9 +78,9 @@ class _Sentences:
         # entries without a reason come last
         for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
             if reason is not None and self.axes is not None:
-                # The subject of a reason is the joint closer to the tip, unless the joint closer to the root slides.
-                slides = self.axes.slides
-                joints = sorted({entry.row if slides[entry.column] else entry.column for entry in group})
+                # A reason names the other joint of each entry: the one closer to the root, unless it is prismatic.
+                prismatic = self.axes.prismatic
+                joints = sorted({entry.row if prismatic[entry.column] else entry.column for entry in group})
                 reason = reason.format(axes=axes_in_words(joints), joints=joints_in_words(joints))
             names = listed([entry_name(entry.row, entry.column) for entry in group])
             if len(group) == 1:
@@ -117,7 +117,9 @@ class _Sentences:
             return  # M is constant, which other facts state
         for joint in sorted(set(range(len(self.structure.joints))) - inputs):
             reason = self._reason(reasons.idle_reason, joint)
-            yield Fact(f"M does not depend on joint {joint + 1}", "No network of M reads it", reason)
+            yield Fact(
+                f"M does not depend on joint {joint + 1}", "It is not an input of the networks of M", reason
+            )
 
     def potential(self) -> Iterator[Fact]:
         if not self.structure.potential:
@@ -129,6 +131,6 @@ class _Sentences:
             if joint not in self.structure.potential:
                 groups.setdefault(self._reason(reasons.weightless_reason, joint), []).append(joint)
         for reason, group in groups.items():
-            pronoun = "it" if len(group) == 1 else "them"
-            means = f"The network of V does not read {pronoun}"
+            inputs = "It is not an input" if len(group) == 1 else "They are not inputs"
+            means = f"{inputs} of the network of V"
             yield Fact(f"V does not depend on {joints_in_words(group)}", means, reason)

@@ -19,9 +19,9 @@ from spelgen.certificate.expressions import PolynomialWriter, coordinate, groupe
 from spelgen.certificate.printing import latex
 from spelgen.certificate.tuning import TUNING
 from spelgen.errors import SpelgenError
-from spelgen.labels import entry_name
+from spelgen.labels import entry_name, parameter_name
 from spelgen.listing import Listing
-from spelgen.structure.base_parameters import BaseParameter, base_parameters, parameter_name, rational
+from spelgen.structure.base_parameters import BaseParameter, base_parameters, rational
 from spelgen.structure.expansion import Budget, Expansion, TooLarge
 from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure

@@ -51,6 +51,8 @@ def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: 
         if random_inertials:
             drawn = with_random_inertias(arm, rng)
         dynamics = arm_dynamics(drawn, Settings())
+        # Every further row differs from the base in one coordinate: a difference of M is an effect of this
+        # coordinate.
         base, moved = _positions(arm, rng), _positions(arm, rng)
         q = np.where(np.eye(1 + n, n, -1) == 1, moved, base)  # (1 + n, n)
         mass[:, sample] = dynamics.mass_matrix(q)
@@ -59,6 +61,7 @@ def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: 
     diagonal = np.abs(np.diagonal(mass, axis1=2, axis2=3)).mean(axis=(0, 1))
     scale = np.sqrt(np.outer(diagonal, diagonal))[rows, columns]
     scale[scale == 0] = 1.0
+    # An arm without gravity has zeros, which are compared without a unit.
     largest = np.abs(gravity).max() or 1.0
     return NumericSamples(mass[:, :, rows, columns] / scale, scale, gravity / largest)
 

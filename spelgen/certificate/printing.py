@@ -13,15 +13,15 @@ from sympy.core.parameters import distribute
 from sympy.printing.latex import LatexPrinter
 from sympy.printing.str import StrPrinter
 
+from spelgen.certificate.tuning import TUNING
+
+FLOAT_DIGITS = 17  # decimals that determine a double
 _FIXED = "\N{NO-BREAK SPACE}"  # textwrap does not break lines at it
-_LONG_SUM = 20
-_DIGITS = 12
-_DOUBLE = 10**17  # has more digits than a float
 
 
 def text(expression: Expr) -> str:
     """Return an expression as plain text, with decimals of at most twelve digits."""
-    result: str = StrPrinter({"full_prec": False}).doprint(_rounded(expression, 1, _DIGITS))
+    result: str = StrPrinter({"full_prec": False}).doprint(_rounded(expression, 1, TUNING.digits))
     return result
 
 
@@ -29,13 +29,15 @@ def latex(expression: Expr) -> str:
     r"""Return an expression in LaTeX, with \bigl( in place of \left(, which cannot span lines."""
     names = {symbol: _latex_name(symbol.name) for symbol in expression.free_symbols}
     printer = LatexPrinter({"full_prec": False, "mul_symbol": r" \, ", "symbol_names": names})
-    formula: str = printer.doprint(_rounded(expression, 1, _DIGITS))
+    formula: str = printer.doprint(_rounded(expression, 1, TUNING.digits))
     return formula.replace(r"\left(", r"\bigl(").replace(r"\right)", r"\bigr)")
 
 
 def python(expression: Expr) -> str:
     """Return an expression in Python for SymPy: exact, except fractions with more digits than a float."""
-    result: str = _PythonPrinter({"sympy_integers": True}).doprint(_rounded(expression, _DOUBLE, 17))
+    result: str = _PythonPrinter({"sympy_integers": True}).doprint(
+        _rounded(expression, 10**FLOAT_DIGITS, FLOAT_DIGITS)
+    )
     return result
 
 
@@ -58,7 +60,7 @@ def lines(formula: str, start: str, width: int, end: str = "") -> list[str]:
 class _PythonPrinter(StrPrinter):  # type: ignore[misc]  # SymPy has no types
     def _print_Add(self, expression: Add, order: str | None = None) -> str:
         """Print a long sum as one call, because Python cannot nest thousands of additions."""
-        if len(expression.args) <= _LONG_SUM:
+        if len(expression.args) <= TUNING.nested_terms:
             result: str = super()._print_Add(expression, order)
             return result
         return f"Add({', '.join(map(self._print, expression.args))})"

@@ -17,11 +17,12 @@ from spelgen.structure.structure import MassEntry, Structure
 def zero_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str | None:
     """Return the reason for a zero entry."""
     later, earlier = entry.row, entry.column
-    slider = later if axes.slides[later] else earlier
-    if axes.slides[later] != axes.slides[earlier] and axes.parallel(later, earlier):
-        return f"joint {slider + 1} slides along {{axes}}, and what turns about an axis never moves along it"
-    if axes.slides[later] and axes.slides[earlier] and axes.perpendicular(later, earlier):
-        return f"joint {earlier + 1} slides at right angles to {{joints}}"
+    slider = later if axes.prismatic[later] else earlier
+    if axes.prismatic[later] != axes.prismatic[earlier] and axes.parallel(later, earlier):
+        parallel = f"prismatic joint {slider + 1} is parallel to {{axes}}"
+        return f"{parallel}, and a rotation has no velocity along its axis"
+    if axes.prismatic[later] and axes.prismatic[earlier] and axes.perpendicular(later, earlier):
+        return f"prismatic joint {earlier + 1} is orthogonal to prismatic {{joints}}"
     return balance_reason(axes, structure, entry)
 
 
@@ -30,33 +31,33 @@ def constant_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str |
     later, earlier = entry.row, entry.column
     if later == earlier:
         return _diagonal_reason(axes, structure, later)
-    if axes.slides[later] and axes.slides[earlier] and axes.fixed_angle(later, earlier):
-        return "the two slide at a fixed angle, and the mass that both move does not change"
-    if axes.slides[later] and not axes.slides[earlier] and axes.keep_offset(later, earlier):
+    if axes.prismatic[later] and axes.prismatic[earlier] and axes.fixed_angle(later, earlier):
+        return "both joints are prismatic, and the angle between their axes is constant"
+    if axes.prismatic[later] and not axes.prismatic[earlier] and axes.keep_offset(later, earlier):
         return (
-            f"the mass that joint {later + 1} carries keeps its distance from the plane through "
-            f"{axes_in_words([earlier])} along its slide"
+            f"the load of joint {later + 1} keeps its distance from the plane that contains "
+            f"{axes_in_words([earlier])} and is parallel to joint {later + 1}"
         )
-    turn = not axes.slides[later] and not axes.slides[earlier]
-    if turn and axes.same_twist(later, earlier) and _diagonal_reason(axes, structure, later):
+    revolute = not axes.prismatic[later] and not axes.prismatic[earlier]
+    if revolute and axes.same_twist(later, earlier) and _diagonal_reason(axes, structure, later):
         same = entry_name(later, later)
         if axes.opposed(later, earlier):
             same = f"-{same}"
-        return f"{joints_in_words([earlier, later])} turn about one line, so it is {same}"
+        return f"{joints_in_words([earlier, later])} are coaxial, so it equals {same}"
     return balance_reason(axes, structure, entry)
 
 
 def _diagonal_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
     # Joints before this one move its load as a rigid body: they do not change the inertia about its axis.
-    behind = range(joint + 1, len(axes.slides))
-    if axes.slides[joint]:
-        return "for a sliding joint the entry is the mass that it carries"
+    behind = range(joint + 1, len(axes.prismatic))
+    if axes.prismatic[joint]:
+        return "the diagonal entry of a prismatic joint is the mass that it carries"
     if not behind:
-        return f"joint {joint + 1} is the last, so the inertia about its axis stays the same"
+        return f"joint {joint + 1} is the last and carries one rigid body"
     if all(axes.commute(joint, later) for later in behind):
-        return f"all joints after joint {joint + 1} turn about its axis or slide along it"
+        return f"all joints after joint {joint + 1} are coaxial revolute or parallel prismatic joints"
     if len(behind) == 1 and structure.assume == "inertials" and axes.symmetric:
-        return f"what joint {joint + 2} carries is symmetric about its axis"
+        return f"the inertia of the load of joint {joint + 2} is symmetric about its axis"
     return None
 
 
@@ -66,15 +67,15 @@ def balance_reason(axes: Axes, structure: Structure, entry: MassEntry) -> str | 
     if structure.assume != "inertials" or not axes.balanced or entry.row != last:
         return None
     # Rotation about a principal axis through the centre of mass has angular momentum along this axis only.
-    balanced = f"what joint {last + 1} carries is balanced about its axis"
+    balanced = f"the load of joint {last + 1} is dynamically balanced"
     if axes.without_inertia:
-        return f"{balanced} and has no moment of inertia about it"
-    if axes.slides[earlier]:
-        return f"{balanced}, so turning it shifts no mass"
+        return f"{balanced}, and its inertia about the joint axis is zero"
+    if axes.prismatic[earlier]:
+        return f"{balanced}, so its rotation does not move its centre of mass"
     if axes.perpendicular(last, earlier):
-        return f"{balanced}, which is always at right angles to {{axes}}"
+        return f"{balanced} about its axis, which is orthogonal to {{axes}}"
     if axes.fixed_angle(last, earlier):
-        return f"{balanced}, which keeps its angle to {{axes}}"
+        return f"{balanced} about its axis, which has a constant angle to {{axes}}"
     return None
 
 
@@ -85,14 +86,14 @@ def equality_reason(axes: Axes, structure: Structure, entries: Sequence[tuple[in
     if rows[0] != rows[-1]:
         return None
     if all(axes.same_twist(columns[0], column) for column in columns[1:]):
-        if axes.slides[columns[0]]:
-            return f"{joints_in_words(columns)} slide along one direction"
-        return f"{joints_in_words(columns)} turn about one line"
+        if axes.prismatic[columns[0]]:
+            return f"prismatic {joints_in_words(columns)} are parallel"
+        return f"{joints_in_words(columns)} are coaxial"
     last = len(structure.joints) - 1
     if entries[0][0] == last and structure.assume == "inertials" and axes.balanced:
-        turn = not any(axes.slides[column] for column in columns)
-        if turn and all(axes.parallel(columns[0], column) for column in columns[1:]):
-            balanced = f"what joint {last + 1} carries is balanced about its axis"
+        revolute = not any(axes.prismatic[column] for column in columns)
+        if revolute and all(axes.parallel(columns[0], column) for column in columns[1:]):
+            balanced = f"the load of joint {last + 1} is dynamically balanced"
             return f"{balanced}, and {joints_in_words(columns)} are parallel"
     return None
 
@@ -100,32 +101,32 @@ def equality_reason(axes: Axes, structure: Structure, entries: Sequence[tuple[in
 def idle_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
     """Return the reason for M not to depend on ``joint``."""
     if joint == 0:
-        return "it moves the whole arm as one piece"
+        return "it moves the whole arm as one rigid body"
     # M does not depend on the pose of the base: a joint that commutes with all joints before it acts as the first.
     nearer = list(range(joint))
     if all(axes.commute(joint, earlier) for earlier in nearer):
-        return f"it does not move {axes_in_words(nearer)}, as if it moved the whole arm"
-    if joint == len(axes.slides) - 1 and structure.assume == "inertials" and axes.symmetric:
-        return "what it carries is symmetric about its axis"
+        return f"its motion commutes with {joints_in_words(nearer)}, as if it were the first joint"
+    if joint == len(axes.prismatic) - 1 and structure.assume == "inertials" and axes.symmetric:
+        return "the inertia of its load is symmetric about its axis"
     return None
 
 
 def weightless_reason(axes: Axes, structure: Structure, joint: int) -> str | None:
     """Return the reason for V not to depend on ``joint``."""
-    if axes.lifts_nothing(joint):
-        if axes.slides[joint]:
-            return "sliding level lifts nothing"
-        return "turning about the vertical lifts nothing"
-    last = joint == len(axes.slides) - 1
+    if axes.is_weightless(joint):
+        if axes.prismatic[joint]:
+            return "gravity does no work in a translation orthogonal to it"
+        return "gravity does no work in a rotation about an axis parallel to it"
+    last = joint == len(axes.prismatic) - 1
     if last and structure.assume == "inertials" and axes.centred:
-        return "the centre of the mass that it carries lies on its axis"
+        return "the centre of mass of its load is on its axis"
     return None
 
 
 def potential_reason(axes: Axes, structure: Structure) -> str | None:
     """Return the reason for V = 0."""
     if not any(axes.arm.gravity):
-        return "so is gravity"
-    if all(axes.lifts_nothing(joint) for joint in range(len(structure.joints))):
-        return "every joint turns about gravity's direction or slides across it, which lifts nothing"
+        return "gravity is zero"
+    if all(axes.is_weightless(joint) for joint in range(len(structure.joints))):
+        return "every axis is parallel to gravity if revolute, orthogonal to it if prismatic"
     return None

@@ -11,6 +11,10 @@ class CertificateTuning:
 
     # [1] Terms of an entry that is printed among others: three lines of a terminal.
     readable_terms: int = 40
+    # [1] Digits of decimals in formulas that are read.
+    digits: int = 12
+    # [1] Terms of a sum in Python that are added by operators; longer sums are one call, as parsers nest operators.
+    nested_terms: int = 20
     # [1] Terms of an entry that a program reads, or that is requested by itself.
     writable_terms: int = 3000
     # [1] Multiplications of terms for all entries of an arm, about 2 s.

@@ -26,7 +26,7 @@ from spelgen.urdf.robot import Robot
 
 @dataclass(frozen=True)
 class _Magnitude:
-    """A number relative to its scale; is_nonzero: whether it exceeds rounding errors according to the derivation."""
+    """A number relative to its scale; is_nonzero: whether the derivation states that it differs from zero."""
 
     name: str
     value: float
@@ -43,7 +43,7 @@ class _DerivedFact:
     rounding: float = TUNING.rounding
 
     def check(self, is_fine: bool) -> FactCheck:
-        """Return the result of the check. is_fine: nonzero numbers of this arm may vanish in rounding errors."""
+        """Return the result of the check. is_fine: products of small dimensions may be below rounding errors."""
         unexpected, unseen = [], []
         for number in self.magnitudes:
             if number.is_nonzero and number.value <= self.rounding:

@@ -15,6 +15,13 @@ from spelgen.cli.train_settings import UsageError
 if TYPE_CHECKING:
     from spelgen.comparison.arms import Comparison
 
+Jobs = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Number of parallel runs, one core each, by Ray; default: all cores if Ray is installed."
+    ),
+]
+
 
 def compare(
     target: Annotated[
@@ -46,13 +53,7 @@ def compare(
             "--ablation", help="Compare designs from phnode to hybrid that differ by one change each."
         ),
     ] = False,
-    jobs: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Number of parallel runs, one core each, by Ray; default: all cores if Ray is installed.",
-        ),
-    ] = None,
+    jobs: Jobs = None,
     address: Address = None,
 ) -> None:
     """Train presets on the same logs and rank them.

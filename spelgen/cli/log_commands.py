@@ -28,6 +28,32 @@ from spelgen.files import write_text
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
 
+Acceleration = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X|X,X,X", help="Largest acceleration, of all joints or per joint [rad/s^2, m/s^2]."
+    ),
+]
+Start = Annotated[
+    str | None,
+    typer.Option(
+        "--from",
+        metavar="X,X,X",
+        help="Position before the motion [rad, m]. Default: zero, or the middle of a range without zero.",
+    ),
+]
+SurroundingsFile = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.yaml", help="Floor, boxes and clearance, which the motion respects."),
+]
+TrajectoryFile = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Also write approach and motion as a JointTrajectory of ROS 2, in JSON or YAML.",
+    ),
+]
+
 
 def excite(
     robot: Robot,
@@ -47,6 +73,13 @@ def excite(
     speed: Annotated[
         float, typer.Option(min=0.05, max=1.0, help="Fraction of the velocity limits to use.")
     ] = 0.7,
+    acceleration: Acceleration = None,
+    start: Start = None,
+    surroundings: SurroundingsFile = None,
+    trajectory: TrajectoryFile = None,
+    html: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Also write a page that shows the motion.")
+    ] = None,
     trials: Annotated[int, typer.Option(min=1, help="Candidates of the search, after random ones.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
     force: Force = False,
@@ -54,11 +87,13 @@ def excite(
 ) -> None:
     """Propose an excitation trajectory for identification.
 
-    Collisions are not checked.
+    Collisions with itself and the surroundings are avoided if the URDF has collision geometry.
     """
     from spelgen.excitation.design import excite as design_motion
 
-    options.require_free(output, force=force)  # before minutes of search
+    for path in (output, trajectory, html):
+        if path is not None:
+            options.require_free(path, force=force)  # checked first: the search takes minutes
     arm = options.load(robot, joints, tip, angle_tolerance)
     with progress_bar("searching") as progress:
         motion = design_motion(
@@ -68,12 +103,23 @@ def excite(
             harmonics=harmonics,
             reach=reach,
             speed=speed,
+            acceleration=options.numbers(acceleration, "--acceleration"),
+            start=options.numbers(start, "--from"),
+            surroundings=surroundings,
             trials=trials,
             seed=seed,
             progress=progress,
         )
-    path = write_text(output, motion.csv())
-    answer(format, {"wrote": str(path)} | motion.to_dict(), motion.text(), f"wrote {path}")
+    written = [str(write_text(output, motion.csv()))]
+    if trajectory is not None:
+        written.append(str(write_text(trajectory, motion.joint_trajectory())))
+    if html is not None:
+        # imported here: pages need packages that take long to import
+        from spelgen.render.motion_page import page
+
+        written.append(str(write_text(html, page(motion, arm))))
+    lines = [f"wrote {path}" for path in written]
+    answer(format, {"files": written} | motion.to_dict(), motion.text(), *lines)
 
 
 def simulate(
@@ -141,8 +187,7 @@ def logs(
         Path | None, typer.Option(metavar="FILE", help="Also write an HTML page with plots.")
     ] = None,
     suggest: Annotated[
-        Path | None,
-        typer.Option(help="Write a mapping drafted from the column names of the first log."),
+        Path | None, typer.Option(help="Write a mapping drafted from the column names of the first log.")
     ] = None,
     force: Force = False,
     accept: Accept = None,

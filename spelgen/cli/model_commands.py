@@ -31,8 +31,7 @@ def init(
     joints: Joints = None,
     tip: Tip = None,
     output: Annotated[
-        Path | None,
-        options.output_option("FILE.yaml", "Output file; default: ROBOT.yaml beside the URDF."),
+        Path | None, options.output_option("FILE.yaml", "Output file; default: ROBOT.yaml beside the URDF.")
     ] = None,
     force: Force = False,
 ) -> None:
@@ -43,10 +42,10 @@ def init(
 
     path = output or robot.with_suffix(".yaml")
     options.require_free(path, force=force)
-    # without the settings file, which this command writes
+    # the settings file is not read: this command writes it
     arm = make_arm(read_urdf(robot), joints=options.names(joints), tip=tip)
     drives = [StarterJoint(x.name, x.joint_type, x.damping, x.friction) for x in arm.coordinates]
-    say(f"wrote {write_text(path, starter(robot.name, drives))}")
+    say(f"wrote {write_text(path, starter(robot.name, drives, arm.bodies[-1].link))}")
 
 
 def build(
@@ -74,7 +73,7 @@ def build(
     format: TextOrJson = "text",
 ) -> None:
     """Write the PyTorch module tailored to an arm."""
-    # before the URDF is read, which takes time
+    # checked before the URDF is read, which takes time
     if preset not in PRESET_NAMES and Path(preset).suffix not in (".yaml", ".yml"):
         message = f"{preset!r} is none of {', '.join(PRESET_NAMES)}, nor a YAML file"
         raise typer.BadParameter(message, param_hint="'--preset'")
@@ -124,6 +123,9 @@ def export(
             help="A function to export, for c, casadi, onnx and torch; repeatable. Default: all but derivatives.",
         ),
     ] = None,
+    float32: Annotated[
+        bool, typer.Option("--float32", help="Numbers of onnx and torch programs; otherwise float64.")
+    ] = False,
     force: Force = False,
     format: TextOrJson = "text",
 ) -> None:
@@ -142,7 +144,7 @@ def export(
     # names and free places are checked before the model is loaded, which takes seconds
     require_fitting(to, output)
     options.require_free(output, force=force)
-    result = export_run(load_run(run), to, entries=entry or ())
+    result = export_run(load_run(run), to, entries=entry or (), float32=float32)
     # all files or none: a failed parity check has raised its error before
     files = [str(path) for path in result.write(output, force=force)]
     lines = [f"wrote {path}" for path in files]

@@ -147,6 +147,14 @@ def names(text: str | None) -> list[str] | None:
     return [name.strip() for name in cells]
 
 
+def numbers(text: str | None, option: str) -> list[float] | None:
+    """Return `0, 1.5` as two numbers, and None as None. Raises a usage error for any other text."""
+    try:
+        return None if text is None else [float(number) for number in text.split(",")]
+    except ValueError:
+        raise typer.BadParameter("write numbers with commas between them", param_hint=f"'{option}'") from None
+
+
 def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
     """Return `3,2` as (3, 2), `V` as "V" and None as None. Raises a usage error for any other text."""
     if text is None:

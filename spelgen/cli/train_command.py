@@ -13,14 +13,7 @@ import typer
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
 from spelgen.cli.options import Accept, Data, Force, MappingFile, MoreData, RobotOption, TextOrJson
-from spelgen.cli.train_settings import (
-    TIME_LIMIT,
-    Request,
-    UsageError,
-    new_run,
-    read_assignments,
-    resumed_run,
-)
+from spelgen.cli.train_settings import TIME_LIMIT, Request, UsageError, new_run, read_assignments, resumed_run
 from spelgen.errors import ModuleError, OptionError
 from spelgen.labels import counted
 from spelgen.settings.fits import Objective, Rollout, WindowConfig
@@ -41,8 +34,7 @@ TrainModule = Annotated[
 NewRun = Annotated[Path | None, options.output_option("RUN", "Run folder; default: runs/<module>.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Resume the run in the run folder.")]
 Source = Annotated[
-    Path | None,
-    typer.Option("--from", metavar="RUN", help="Adapt the model of this run; replaces MODULE."),
+    Path | None, typer.Option("--from", metavar="RUN", help="Adapt the model of this run; replaces MODULE.")
 ]
 ObjectiveName = Annotated[
     Objective | None,
@@ -149,9 +141,11 @@ def _report(fit: Fit, request: Request, folder: Path, format: str) -> None:
         # JSON has no infinity, the loss of a rollout that diverged
         "validation_loss": fit.best_validation if math.isfinite(fit.best_validation) else None,
         "torque_nmse": fit.torque_nmse,
+        "posterior": fit.posterior.to_dict() if fit.checkpoint.posterior else None,
         "findings": [finding.to_dict() for finding in fit.diagnostics],
     }
-    answer(format, record, *_outcome(fit), f"run folder: {folder}")
+    tables = [table.text() for table in fit.posterior.listings] if fit.checkpoint.posterior else []
+    answer(format, record, *_outcome(fit), *tables, f"run folder: {folder}")
     if fit.status == "interrupted":
         note("the best model so far is in the run folder; resume it by --resume")
         raise typer.Exit(INTERRUPTED)

@@ -23,7 +23,7 @@ Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,6
 class ComparedArm(Group):
     """An arm: its URDF and logs. Without logs the arm is simulated by the protocol of its settings.
 
-    data: log files and folders. mapping: YAML file with columns and units of the logs; default: the settings beside
+    data: log files and folders. mapping: YAML file with columns and units of the logs; default: the settings of
     the URDF. joints, tip: as for `spelgen build`.
     """
 

@@ -110,6 +110,7 @@ def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, d
     """Return the median time of the loss of a batch and its gradient, without the optimizer [s]."""
     windows = spread_windows(logs, config.window, decimation)[: config.batch or DEFAULTS.batch]
     scales = loss_scales(windows, model.joint_types)
+    # Loaded models are frozen; a training step needs gradients.
     model.requires_grad_(True)
     durations = []
     for _ in range(TUNING.timed_steps):
@@ -122,6 +123,7 @@ def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, d
 
 def spread_windows(logs: Sequence[Trajectory], samples: int, decimation: int) -> Windows:
     """Return about `TUNING.windows` windows at most, evenly spread, that start a multiple of `decimation` apart."""
+    # The stride is a multiple of the decimation, at whose samples the controller changes its torque.
     starts = sum(max(0, len(log) - (samples - 1) * decimation) for log in logs)
     stride = -(-max(1, -(-starts // TUNING.windows)) // decimation) * decimation
     return cut_windows(logs, samples, stride, decimation, measured=False)

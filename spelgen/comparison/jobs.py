@@ -103,6 +103,7 @@ class Job(Group):
         """Return a digest of all that the result depends on; the places of files are not part of it."""
         protocol = self.protocol.model_dump_json(exclude={"seeds", "published"})
         options = self.model_dump_json(exclude={"design", "inputs", "protocol", "folder"})
+        # The content of the design, not its name: a YAML file may have changed.
         sources = (__version__, load_design(self.named_design), self.inputs.digest, protocol, options)
         return hashlib.sha256(repr(sources).encode()).hexdigest()[:16]
 

@@ -80,6 +80,7 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
     An arm whose inputs cannot be prepared is a failure. Raises SettingsError for a preset that does not exist,
     RunError if no arm can be used, and the error of a single arm.
     """
+    # A misspelt preset is an error before logs are simulated.
     for preset in set(comparison.presets or ()) - ablation_designs().keys():
         load_design(preset)
     jobs: list[Job] = []
@@ -95,6 +96,7 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
     if not jobs:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in failures.items())
         raise RunError(f"no arm that can be compared ({reasons})")
+    # A result counts only if its key is equal: other options or sources mean another run.
     finished = {job.name: job.result() for job in jobs}
     results = {name: result for name, result in finished.items() if result is not None}
     estimates: dict[str, float] = {}
@@ -118,6 +120,7 @@ def run_study(study: Study, run_tasks: RunTasks, note: Callable[[str], None]) ->
     results, failures = dict(study.results), dict(study.failures)
     start, done, total = time.monotonic(), 0.0, sum(study.estimates.values())
     for count, (job, outcome) in enumerate(run_tasks(run_job, waiting), start=1):
+        # Progress in estimated seconds and not in runs, as presets differ in cost.
         done += study.estimates[job.name]
         if isinstance(outcome, Exception):
             failures[job.name] = _reason(outcome)

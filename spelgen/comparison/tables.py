@@ -70,6 +70,7 @@ def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFi
     figures = {
         name: [run.simulated for run in of_preset if run.simulated] for name, of_preset in runs.items()
     }
+    # Logs of the user have no truth: only errors on test logs can be ranked.
     if not all(figures.values()):
         return [_ranking(runs)]
     losses: dict[str, Numbers] = {}
@@ -126,6 +127,7 @@ def comparison_sentence(sections: Sequence[ArmResults]) -> str:
     wins: dict[str, int] = {}
     for section in sections:
         runs, measure = _by_preset(section.results), next(iter(section.results[0].errors))
+        # Medians are sorted: the first name that is a model and not a baseline.
         best = next(name for name in _medians(runs, measure) if name in runs)
         wins[best] = wins.get(best, 0) + 1
     best_first = sorted(wins.items(), key=lambda item: -item[1])

@@ -1,1 +1,1 @@
-"""What has rigid-body dynamics, under one protocol: Pinocchio's view of an arm, the regressor; and the tip."""
+"""Rigid-body dynamics under one protocol: by Pinocchio, by the regressor, of trained models; tip kinematics."""

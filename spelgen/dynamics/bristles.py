@@ -37,7 +37,7 @@ BLOCK = 2**14
 
 
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
-    """Return the typical break-away displacements of joints of these types."""
+    """Return the typical break-away displacements, (n, K) [rad, m], of joints of these types; motors: C, (n, n)."""
     return BristleReach(np.array([BREAKAWAY[kind] for kind in kinds]), motors)
 
 
@@ -52,7 +52,13 @@ def bristle_reach(model: PortHamiltonian) -> BristleReach:
 
 
 def moved_bristles(z: torch.Tensor, displacement: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
-    """Return z after a monotonic displacement of the drives: exact; shapes as z, or broadcast to it."""
+    """Return the deflections after a monotonic displacement of the drives, exactly.
+
+    Args:
+        z: (..., n, K) deflections of the bristles [rad, m].
+        displacement: (..., n, 1) displacement of the drives [rad, m].
+        reach: (n, K) break-away displacements [rad, m].
+    """
     return (z + displacement).clamp(-reach, reach)
 
 
@@ -69,6 +75,7 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     drives, reach = np.arange(path.shape[1]), torch.from_numpy(bristles.values)
     turned_at = np.take_along_axis(path, corners, axis=0)
     at_corners = [torch.zeros_like(reach)]
+    # Few reversals, one after the other; all samples between them are independent given the last reversal.
     for displacement in torch.from_numpy(np.diff(turned_at, axis=0)):
         at_corners.append(moved_bristles(at_corners[-1], displacement[:, None], reach))
     turned_with, z = torch.stack(at_corners), np.empty((*q.shape, bristles.elements))
@@ -86,7 +93,7 @@ def turning_points(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     The second array is the index of the latest reversal at each sample, (T, n).
     """
     steps = np.diff(path, axis=0, prepend=path[:1])
-    # at rest, the direction is that of the motion before
+    # at rest, the direction of the last motion remains
     moving = np.where(steps != 0, np.arange(len(path))[:, None], 0)
     direction = np.sign(np.take_along_axis(steps, np.maximum.accumulate(moving, axis=0), axis=0))
     turns = np.zeros(path.shape, dtype=bool)
@@ -113,6 +120,7 @@ def encoded(q: np.ndarray) -> np.ndarray:
     if not step.any():
         return q
     # the composition of two clamps is a clamp: log2(T) passes over all samples in place of T
+    # Backlash of one step: the output follows the input only beyond it, out[k] = clip(out[k-1], low[k], high[k]).
     low, high = q - step, q + step
     shift = 1
     while shift < len(q):
@@ -127,6 +135,7 @@ def encoder_step(q: np.ndarray) -> np.ndarray:
     """Return the encoder step (n,) of positions (T, n); 0 if they are not quantised."""
     steps = np.zeros(q.shape[1])
     for joint, values in enumerate(q.T):
+        # Floating-point positions do not repeat; steps of an encoder do.
         levels = np.unique(values)
         if len(levels) > 1 and len(levels) < len(values) / 4:  # repeated values
             steps[joint] = np.diff(levels).min()

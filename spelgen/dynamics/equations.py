@@ -53,9 +53,11 @@ def _of_model(model: PortHamiltonian, prepared: object, q: Tensor) -> MotionEqua
     pose = model.configuration(q, prepared)
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
+        """Return the friction torque, (W, n) [Nm, N]."""
         return model.friction_torque(pose, qd, *known_past(model, z))
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
+        """Return the force M qdd, (W, n) [Nm, N]."""
         return model.input_force(pose, qd, tau) - model.nonlinear_effects(pose, qd) - friction(qd, z)
 
     return MotionEquations(pose.mass, force, friction)
@@ -66,9 +68,12 @@ def _of_any(dynamics: Any, q: Tensor) -> MotionEquations:
     mass = torch.as_tensor(dynamics.mass_matrix(q))
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
+        """Return the friction torque, (W, n) [Nm, N]."""
         return torch.as_tensor(dynamics.friction_torque(q, qd, *known_past(dynamics, z)))
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
+        """Return the force M qdd, (W, n) [Nm, N]."""
+        # Other dynamics state no bias torque of their own: M times the acceleration contains it.
         qdd = torch.as_tensor(dynamics.forward_dynamics(q, qd, tau, *known_past(dynamics, z)))
         return (mass @ qdd.unsqueeze(-1)).squeeze(-1)
 
@@ -94,6 +99,8 @@ def runge_kutta(
     # position of each stage in the step, and its weight
     for fraction, weight in ((0.0, 1), (0.5, 2), (0.5, 2), (1.0, 1)):
         stage = fraction * step
+        # The bristles of a stage start at z, the state at the start of the step, and move by the stage's
+        # displacement.
         qd, pd = rhs(q + stage * qd, p + stage * pd, memory_after(dynamics, z, stage * qd))
         if fraction == 0:
             qd1 = qd
@@ -114,6 +121,7 @@ def mass_as_learned(model: nn.Module) -> Iterator[None]:
     if not isinstance(mass, DerivedMass):
         yield
         return
+    # An attribute of the instance hides the method of its class.
     vars(mass)["fraction"] = unbounded
     try:
         yield

@@ -39,7 +39,7 @@ class DriveFriction:
     speeds: np.ndarray | None = None
 
     def __call__(self, qd: np.ndarray) -> np.ndarray:
-        """Return the friction torque at the joints, (..., n), at velocities qd (..., n): C^T times that of the drives,
+        """Return the joint friction torque, (..., n), at velocities qd (..., n): C^T times the drives' torque
 
             viscous v + s (forward - backward)/2 + s^2 (forward + backward)/2,    s = tanh(v / smoothing_velocity)
 
@@ -52,9 +52,10 @@ class DriveFriction:
     def torque(self, qd: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return the joint torque (..., n) at velocity qd (..., n), with the direction of dry friction given.
 
-        direction: (..., n) in [-1, 1], of the drives: s in the formula of `__call__`, or that of a friction state.
+        direction: (..., n) in [-1, 1], of the drives: s of `__call__`, or the direction of a friction state.
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
+        # s (f - b) / 2 + s^2 (f + b) / 2 is f at s = 1, b at s = -1, and has no jump between them.
         odd, even = self.forward - self.backward, self.forward + self.backward
         torque: np.ndarray = self.viscous * v + 0.5 * direction * (odd + direction * even)
         return torque if self.speeds is None else torque @ self.speeds
@@ -68,7 +69,7 @@ def joint_friction(
 ) -> DriveFriction:
     """Return the friction of joints: from the settings of a drive, or from <dynamics> of the URDF if there are none.
 
-    joints: of a URDF, or the coordinates of an arm. speeds: see ``DriveFriction``.
+    joints: of a URDF, or the coordinates of an arm. speeds: C, (n, n), see ``DriveFriction``.
     """
     losses = []
     for joint in joints:
@@ -77,6 +78,7 @@ def joint_friction(
             losses.append((drive.viscous, *drive.coulomb))
         else:
             losses.append((joint.damping, joint.friction, -joint.friction))
+    # Without coupling two products with C are saved in each step of an integration.
     if speeds is not None and np.array_equal(speeds, np.eye(len(speeds))):
         speeds = None
     viscous, forward, backward = np.array(losses).T
@@ -129,13 +131,14 @@ class FrictionModel:
         """
         motors = np.eye(qd.shape[-1]) if motors is None else motors
         effects = self._effects(qd @ motors.T, qdd @ motors.T, bent)
+        # The torque of drive j acts on joint i by C_ji.
         columns: np.ndarray = effects[..., None, :, :] * motors.T[:, None]
         return columns.reshape(*qd.shape, -1)
 
     def torque(
         self, constants: np.ndarray, qd: np.ndarray, bent: np.ndarray | None, motors: np.ndarray
     ) -> np.ndarray:
-        """Return the torque without that of the armature, (..., n) [Nm, N], for ``constants`` (effects, n)."""
+        """Return the torque without the armature's contribution, (..., n) [Nm, N], for ``constants`` (effects, n)."""
         speed = qd @ motors.T
         torque: np.ndarray = (self._effects(speed, np.zeros_like(speed), bent) * constants).sum(
             axis=-2

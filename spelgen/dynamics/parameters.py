@@ -1,4 +1,4 @@
-"""Parameters of a model: meaning and number; its residual terms, and the model without residual terms."""
+"""Group, unit and number of a model's trained parameters; removal of its residual terms."""
 
 from __future__ import annotations
 
@@ -35,12 +35,14 @@ NETWORK = ParameterInfo("network", "1")
 
 
 def parameter_table(model: nn.Module) -> dict[str, ParameterInfo]:
-    """Return the meaning of the parameters of a model, by name, and of the buffers that a fit may set.
+    """Return the group and unit of each parameter of a model, by name, and of each buffer that a fit may set.
 
-    Such buffers are those that a part declares: quantities that only some logs determine, as a friction compensation.
+    Parts of the model declare such buffers for quantities that only some logs determine, for example a friction
+    compensation.
     """
     table = {name: NETWORK for name, _ in model.named_parameters()}
     for path, module in model.named_modules():
+        # A subclass adds groups to its base classes' groups.
         for declared in type(module).__mro__:
             for name, kind, unit, *_ in vars(declared).get("parameter_groups", ()):
                 weight = module._parameters.get(name, module._buffers.get(name))
@@ -90,6 +92,7 @@ def without_residuals(model: Model) -> Model:
 
 def without_idle_residuals(model: Model) -> Model:
     """Return a copy of the model without residual terms that are zero, for constant parameters."""
+    # The caller's model may be trained further.
     reduced = copy.deepcopy(model)
     if isinstance(reduced, ResidualDynamics) and reduced.residuals is not None:
         terms = reduced.residuals
@@ -104,6 +107,7 @@ def _is_idle(network: Network | None) -> bool:
     """Return whether a network is zero for all inputs; a network that does not exist is."""
     if not isinstance(network, MaskedMLP):
         return network is None
+    # Only the last layer counts: hidden layers start at random weights.
     return not (network.weights[-1].any() or network.biases[-1].any())
 
 

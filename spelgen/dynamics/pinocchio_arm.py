@@ -17,17 +17,24 @@ from spelgen.settings.settings import Settings
 def arm_dynamics(
     arm: Chain, settings: Settings, friction: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> PinocchioDynamics:
-    """Return the dynamics of the arm with joint torques as inputs. Raises ArmError if a body has no inertial."""
+    """Return the dynamics of the arm with joint torques as inputs. Raises ArmError if a body has no inertial.
+
+    friction: function of qd, (..., n), that returns the friction torque, (..., n) [Nm, N].
+    """
+    return PinocchioDynamics(pinocchio_model(arm, settings), body_constraint(arm), friction)
+
+
+def body_constraint(arm: Chain) -> Constraint:
+    """Return the positions of the joints of all bodies, mimic joints included, as functions of the coordinates."""
     jacobian = np.zeros((len(arm.bodies), len(arm.coordinates)))
     for row, body in enumerate(arm.bodies):
         jacobian[row, body.coordinate] = float(body.multiplier)
     offset = np.array([body.offset for body in arm.bodies], dtype=float)
-    names = tuple(body.name for body in arm.bodies)
-    return PinocchioDynamics(pinocchio_model(arm, settings), Constraint(names, jacobian, offset), friction)
+    return Constraint(tuple(body.name for body in arm.bodies), jacobian, offset)
 
 
 def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
-    """Return a model with a joint about or along z for each body, in the order of the bodies.
+    """Return ``kinematic_model`` with the inertia of each body.
 
     The rotor inertia on the joint side is the armature of the model. Raises ArmError if a body has no inertial.
     """
@@ -41,17 +48,24 @@ def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
             expected = "mass, center of mass and inertia of each moving body"
             errors.append(ArmError(got, element=f"joint {body.name!r}", expected=expected, do=do))
     collect(errors)
+    model = kinematic_model(arm)
+    for index, body in enumerate(arm.bodies, start=1):
+        model.appendBodyToJoint(index, _inertia(np.array(body.inertia, dtype=float)), pin.SE3.Identity())
+    # a mimic joint has no motor of its own
+    rotors = {name: settings.joint(name).armature for name in arm.joint_names}
+    model.armature = np.array([rotors.get(body.name, 0.0) for body in arm.bodies])
+    return model
+
+
+def kinematic_model(arm: Chain) -> pin.Model:
+    """Return a model with a joint about or along z for each body, in the order of the bodies, without inertia."""
     model = pin.Model()
     model.name = arm.name
     model.gravity.linear = np.array(arm.gravity, dtype=float)
     for body in arm.bodies:
         joint = pin.JointModelPZ() if body.joint_type == "prismatic" else pin.JointModelRZ()
         placement = pin.SE3(np.array(body.rotation, dtype=float), np.array(body.translation, dtype=float))
-        index = model.addJoint(body.parent + 1, joint, placement, body.name)
-        model.appendBodyToJoint(index, _inertia(np.array(body.inertia, dtype=float)), pin.SE3.Identity())
-    # a mimic joint has no motor of its own
-    rotors = {name: settings.joint(name).armature for name in arm.joint_names}
-    model.armature = np.array([rotors.get(body.name, 0.0) for body in arm.bodies])
+        model.addJoint(body.parent + 1, joint, placement, body.name)
     return model
 
 

@@ -97,6 +97,7 @@ class PinocchioDynamics:
         force = tau @ self.inputs.T - self.friction(qd)
         if self._same:  # a copy: Pinocchio overwrites its result in the next call
             return np.array(self._by_joint(pin.aba, self.configuration(q), qd, force))
+        # Mimic joints constrain the model of all b joints: J^T M J qdd = force, which `aba` cannot solve.
         force = force - self.nonlinear_effects(q, qd)
         return np.linalg.solve(self.mass_matrix(q), force[..., None])[..., 0]
 
@@ -141,9 +142,9 @@ COULOMB_SMOOTHING_VELOCITY = 0.05
 def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) -> PinocchioDynamics:
     """Return the dynamics of these joints of a URDF and of their mimic joints; all other joints are locked at zero.
 
-    Inertials, damping and friction are those of the URDF; gravity and inputs those of the settings. drives: with rotors
-    of the settings, and their friction, if there is any, in place of that of the URDF. Raises the errors of Pinocchio
-    if it cannot read the file.
+    The URDF defines inertials, damping and friction; the settings define gravity and inputs. drives: with rotors of the
+    settings; if the settings have friction, it replaces the friction of the URDF. Raises the errors of Pinocchio if it
+    cannot read the file.
     """
     robot, settings = read_urdf(urdf), load_settings(urdf)
     model = pin.buildModelFromXML(urdf_bytes(urdf).decode(errors="replace"))

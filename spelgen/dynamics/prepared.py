@@ -11,7 +11,7 @@ from torch import Tensor
 
 from spelgen.dynamics.equations import runge_kutta
 from spelgen.dynamics.parameters import without_idle_residuals
-from spelgen.dynamics.protocol import known_past, sliding_memory
+from spelgen.dynamics.protocol import known_past, memory_after, sliding_memory
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
@@ -30,23 +30,19 @@ class State(NamedTuple):
 class PreparedModel:
     """A copy of a model with constant parameters.
 
-    q, qd, qdd and tau are (..., n); units are rad and Nm, or m and N. z, (..., n, K), is the friction state; without it
-    friction is that of joints that have moved at qd for a long time. tip: kinematics of the tip, see
-    ``tip_kinematics``. elements: bristles per joint, K.
+    q, qd, qdd and tau are (..., n); units are rad and Nm, or m and N. z, (..., n, K), is the friction state; by
+    default, the steady state of motion at qd. tip: kinematics of the tip, see
+    ``tip_kinematics``. elements: bristles per joint, K. dtype: of parameters and states.
     """
 
     def __init__(
-        self,
-        model: PortHamiltonian,
-        tip: TipKinematics | None = None,
-        *,
-        dtype: torch.dtype = torch.float64,
+        self, model: PortHamiltonian, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
     ) -> None:
         # networks that are zero would take most of the time
         reduced = without_idle_residuals(model)
         reduced.to(dtype=dtype).requires_grad_(False)
         self._model = reduced
-        self._weights, self._tip = reduced.prepare(), tip
+        self._weights, self._tip, self.dtype = reduced.prepare(), tip, dtype
         self.n: int = reduced.n
         self.elements: int = reduced.elements if isinstance(reduced, RigidBodyDynamics) else 0
 
@@ -69,6 +65,10 @@ class PreparedModel:
     def memory(self, qd: Tensor) -> Tensor:
         """Return the friction state z, (..., n, K), of joints that have moved at qd for a long time: zero at rest."""
         return sliding_memory(self._model, qd)
+
+    def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
+        """Return z, (..., n, K), after a monotonic displacement of the joints, (..., n) [rad, m]."""
+        return memory_after(self._model, z, displacement)
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """Return qdd, (..., n), under the input tau."""
@@ -93,11 +93,12 @@ class PreparedModel:
     ) -> State:
         """Return q, qd and z after dt [s] under a constant tau, by ``substeps`` steps of the classical Runge-Kutta.
 
-        z is exact in the displacements; its initial value is ``memory(qd)`` by default.
+        q, qd, tau: (..., n). z: (..., n, K), ``memory(qd)`` by default; its update is exact in the displacements.
         """
         z = self.memory(qd) if z is None else z
 
         def rhs(q: Tensor, speed: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+            """Return qd and qdd, (..., n) each."""
             return speed, self.forward_dynamics(q, speed, tau, z)
 
         for _ in range(substeps):
@@ -126,7 +127,7 @@ class PreparedModel:
     ) -> tuple[Tensor, Tensor]:
         """Return A, (..., 2 n, 2 n), and B, (..., 2 n, n): derivatives with respect to (q, qd) and tau.
 
-        They are those of the rate (qd, qdd) for constant z; with dt [s], those of the result of ``step``.
+        Without dt of the rate (qd, qdd) for constant z; with dt [s] of the result of ``step``.
         """
         n = self.n
         z = self.memory(qd) if z is None else z
@@ -135,6 +136,7 @@ class PreparedModel:
         vars(plain).pop("forward_dynamics", None)
 
         def function(state: Tensor, tau: Tensor, z: Tensor) -> Tensor:
+            """Return the rate of the state (q, qd), or the state after dt, (2 n,)."""
             position, speed = state.split(n)
             if dt is None:
                 return torch.cat([speed, plain.forward_dynamics(position, speed, tau, z)])
@@ -174,7 +176,7 @@ class PreparedModel:
 
 
 def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: Tensor) -> tuple[Tensor, ...]:
-    """Return the derivatives of a function with respect to its first ``variables`` inputs, for a batch of states."""
+    """Return the Jacobians, (batch, m, n) each, of a function with respect to its first ``variables`` inputs."""
     if not torch.is_grad_enabled():
         states = tuple(x.detach() for x in states)
     # torch 2.13: vmap of a derivative of linalg.solve is wrong in forward mode, or without autograd

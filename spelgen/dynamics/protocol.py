@@ -130,15 +130,15 @@ class VelocityState:
         """Return None: there is no parameter cache."""
 
     def at(self, q: Tensor, prepared: None = None) -> Tensor:
-        """Return q: there is no configuration cache."""
+        """Return q, (..., n): there is no configuration cache."""
         return q
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Return qd."""
+        """Return qd, (..., n), in place of momenta."""
         return qd
 
     def velocity(self, q: Tensor, p: Tensor) -> Tensor:
-        """Return qd."""
+        """Return qd, (..., n): p is a velocity here."""
         return p
 
     def port_hamiltonian_rhs(

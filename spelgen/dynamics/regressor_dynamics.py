@@ -118,6 +118,8 @@ class RegressorDynamics:
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """Return the inputs, (..., n), that give qdd; of a passive joint, the torque that it lacks."""
         passive = (self.inputs == 0).all(dim=1).double()
+        # A passive joint has a zero row in G: a one on the diagonal makes G invertible, and its result is
+        # the torque that is missing.
         inverse: Tensor = torch.linalg.inv(self.inputs + torch.diag(passive))
         return self.joint_torque(q, qd, qdd, z) @ inverse.mT
 
@@ -131,9 +133,11 @@ class RegressorDynamics:
         chain, momenta = self._bodies(q)
 
         def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
+            """Return the force M qdd, (T, n) [Nm, N]."""
             bias = applied(momenta, self.chain.accelerations(chain, qd))
             return tau @ self.inputs.mT - bias - self.friction_torque(q, qd, z)
 
+        # Kinetic energy of the rotors: 1/2 (C qd)^T diag(armature) C qd.
         rotors = self.motors.mT @ torch.diag(self.armature) @ self.motors
         mass = momenta @ chain.jacobian.mT @ self.chain.ratios + rotors
         return MotionEquations(mass, force, partial(self.friction_torque, q))

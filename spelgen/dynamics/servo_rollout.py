@@ -64,14 +64,17 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
     constants = model.friction.prepare()
     reach = constants.bristle_reach.T.contiguous()
     steepness = (constants.bristle_fractions / constants.bristle_reach).movedim(-1, 0).contiguous()
-    batch = steepness.shape[1:-1] or (1,)  # of constants
+    batch = steepness.shape[1:-1] or (1,)  # batch of the constants
     shape = len(reach), *[1] * len(batch), model.n
     steepness = steepness.reshape(len(reach), *batch, model.n)
     return ServoDrives(model.servo.prepare(), constants, model.torque_offset, reach.view(shape), steepness)
 
 
 def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
-    """Return the state at rest, or of steady motion, in which friction balances the other torques as far as it can."""
+    """Return the state at rest, or of steady motion, in which friction balances the other torques as far as it can.
+
+    q, qd, u: positions, velocities and commands, (..., n) [rad, m].
+    """
     servo = drives.servo
     torque = servo.kp * beyond(u - q, servo.dead_zone) - servo.kd * qd
     torque = torque.clamp(-servo.limit, servo.limit) - drives.offset
@@ -140,7 +143,8 @@ def replayed(model: PortHamiltonian, q: Tensor, qd: Tensor, commands: Tensor, dt
         for now, interval in zip(commands.unbind(1), dt.unbind(1), strict=True):
             pose = model.configuration(q, prepared)
             bias = middle_bias = model.nonlinear_effects(pose, qd)
-            if previous_bias is not None:  # of the interval's middle
+            # extrapolated to the middle of the interval: the bias is known at its start only
+            if previous_bias is not None:
                 middle_bias = bias + (bias - previous_bias) / 2
             previous_bias = bias
             load = Load(pose.mass, middle_bias, model.gravity(pose), coupled=True)

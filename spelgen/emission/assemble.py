@@ -56,6 +56,7 @@ def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
     """
     assembly = model_parts(spec)
     names: dict[str, object] = {"generator": torch.Generator().manual_seed(seed)}
+    # In place of the function that the text of a module defines: the same operations in the same order.
     names["mass_entries"] = MassEntries(entry_sums(spec))
     try:
         for name, rows in assembly.rows.items():
@@ -63,6 +64,7 @@ def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
         arguments = {str(name): _value(item, names) for name, item in assembly.model.arguments}
         model = _model_class(base_class(spec))(**arguments)
     except (RuntimeError, ValueError, ArithmeticError, LookupError, TypeError) as problem:
+        # A specification may be edited by hand: any failure of a constructor is an error of its numbers.
         reason = " ".join(str(problem).split())[:200]
         raise ModuleError(f"a specification of no model ({reason})", do="build it again") from problem
     model.spec = spec
@@ -81,7 +83,7 @@ class MassEntries:
         self.rows = rows
 
     def __call__(self, *terms: Tensor) -> Tensor:
-        """Return the symmetric matrix (..., n, n) of these functions and constants, each (...,)."""
+        """Return M, (..., n, n): its entries are linear in the terms, functions of q and constants of shape (...,)."""
         return runtime.symmetric(*([_sum(sums, terms) for sums in row] for row in self.rows))
 
 
@@ -100,6 +102,7 @@ def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
 @cache
 def _model_class(base: str) -> Callable[..., ArmModel]:
     """Return the class ``Model`` of models whose dynamics are a class of the runtime."""
+    # One class per class of the runtime: models of a kind have the same type.
     return cast("Callable[..., ArmModel]", type("Model", (ArmModel, vars(runtime)[base]), {}))
 
 

@@ -21,6 +21,7 @@ def link_specs(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tu
         arm: the arm.
         inertias: (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of each body about the origin of its joint's frame, (10,).
     """
+    # Missing masses are small relative to the heaviest link, so that they do not dominate M.
     heaviest = max(float(ten[0]) for ten in inertias)
     names = _unique([body.link for body in arm.bodies])
     specs = []
@@ -53,6 +54,7 @@ def _consistent(
     arm: Chain, index: int, ten: Sequence[Fraction | float], heaviest: float
 ) -> Sequence[Fraction | float]:
     """Return physically consistent inertial parameters, (10,)."""
+    # A link without mass needs one: its log-Cholesky parameters are logarithms.
     if ten[0] <= 0:
         ten = _light_ball(_length(arm, index), TUNING.default_mass * heaviest)
     factor, is_consistent = reference_factor(np.array(ten, dtype=float))
@@ -63,6 +65,7 @@ def _consistent(
     moments = pseudo[:3, :3] - mass * np.outer(center, center)
     # With smaller moments, rounding of the digits could make the body inconsistent.
     values, vectors = np.linalg.eigh(moments)
+    # The principal directions are kept; only moments below the bound are raised.
     raised = np.maximum(values, 2 * TUNING.min_second_moment * values[-1])
     pseudo[:3, :3] += (vectors * (raised - values)) @ vectors.T
     return _rounded(parameters_of(pseudo))

@@ -45,6 +45,7 @@ def model_parts(spec: ModelSpec) -> ModelParts:
     if spec.links:
         rows["LINKS"] = tuple(_link(spec, link) for link in spec.links)
     is_residual = bool(spec.links)
+    # Rigid bodies have functions of M only for their residual, which starts at zero and needs no mean.
     if spec.design.mass == "derived" or (is_residual and spec.design.net != "none"):
         if spec.outputs:
             rows["FUNCTIONS"] = tuple(
@@ -66,6 +67,7 @@ def model_parts(spec: ModelSpec) -> ModelParts:
 def _inputs(spec: ModelSpec) -> Call:
     n = range(len(spec.joints))
     values = {(x.joint, x.motor): x.value for x in spec.inputs}
+    # Trained gains are a mask, so that the values of known gears are constants.
     trained = {(x.joint, x.motor) for x in spec.inputs if x.trained}
     matrix = tuple(tuple(values.get((joint, motor), 0.0) for motor in n) for joint in n)
     if not trained:
@@ -94,6 +96,7 @@ def _names(value: object, name: Code) -> bool:
 def _joint(joint: JointSpec) -> Call:
     fields: dict[str, object] = {"lower": joint.lower, "upper": joint.upper, "speed": joint.speed}
     fields |= {"friction": joint.friction, "armature": joint.armature}
+    # Default values are omitted: a row shows in which respect its joint is special.
     if joint.gear != 1:
         fields["gear"] = joint.gear
     if (joint.center, joint.half_range) != _range_of_limits(joint):
@@ -191,6 +194,7 @@ def _mass(spec: ModelSpec) -> Call:
     if spec.design.mass == "dense-3n":
         rows = 3 * len(spec.joints)
         outputs = (spec.joint_names,) * (rows * (rows + 1) // 2)
+        # The nominal mean of M, by its lower triangle: M is symmetric.
         mean = mean_mass(len(spec.joints), spec.outputs, spec.constants)
         triangle = tuple(tuple(row[: k + 1]) for k, row in enumerate(mean.tolist()))
         return call("DenseMass", JOINTS, mean=triangle, network=_network(spec, outputs, _mass_scales(spec)))
@@ -210,6 +214,7 @@ def _mass(spec: ModelSpec) -> Call:
 
 def _mass_network(spec: ModelSpec) -> Call:
     """Return the network of the functions of M."""
+    # A unit of a KAN has a function per edge: fewer units suffice.
     min_units = TUNING.min_kan_units if spec.design.net == "kan" else TUNING.min_units
     return _network(spec, call("joints_of", FUNCTIONS), _mass_scales(spec), min_units=min_units)
 
@@ -221,6 +226,7 @@ def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
 
 def _potential(spec: ModelSpec) -> Call:
     scales = (tuple(joint.potential_sensitivity for joint in spec.joints),) * 2
+    # V is one output, M has many: a part of the units is enough.
     width = max(TUNING.min_units, round(TUNING.potential_fraction * units(spec)))
     return _network(spec, (_joint_names(spec, spec.potential),), scales, width=width)
 
@@ -230,6 +236,7 @@ def _friction(spec: ModelSpec) -> Call:
     scale, ones = (TUNING.position_sensitivity,) * n, (1.0,) * n
     if spec.design.dissipation == "per-joint":
         outputs = tuple((name,) for name in spec.joint_names)
+        # Velocities in units of the typical speed; qd / |qd| is scaled already.
         speeds = tuple(float(f"{1 / joint.speed:.4g}") for joint in spec.joints)
         width = TUNING.friction_units * n
         network = _network(spec, outputs, (scale, scale, speeds, ones), width=width, depth=1)

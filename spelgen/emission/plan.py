@@ -46,6 +46,7 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
             expected="a preset with bristle friction, which position servos need", do="--preset closed-form",
         )  # fmt: skip
     structure = derive(arm.chain, options.assume)
+    # Magnitudes of M, V and torques for the URDF's inertials, or for nominal ones: scales of networks and friction.
     sizes = nominal(arm.chain, structure)
     joints, servos = [], []
     for index, coordinate in enumerate(arm.chain.coordinates):
@@ -56,6 +57,7 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
     links: tuple[LinkSpec, ...] = ()
     outputs, constants = _outputs(structure, sizes, design), _constants(structure, sizes)
     if design.mass == "closed-form":
+        # Links need physically consistent inertials, which a URDF may not have.
         links = link_specs(arm.chain, exact_inertias(arm.chain, sizes.from_urdf))
         joints = _with_armature(joints, np.diagonal(mean_mass(len(joints), outputs, constants)))
     x, y, z = map(float, arm.chain.gravity)
@@ -72,6 +74,7 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
         constants=constants,
         potential=tuple(range(len(joints))) if design.potential == "dense" else structure.potential,
         potential_scale=sizes.potential_scale,
+        # One digit: a bound need not change with rounding errors of the nominal values.
         margin=float(f"{max(TUNING.margin * sizes.min_eigenvalue, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
         links=links,
@@ -94,6 +97,7 @@ def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[Outp
     outputs = []
     for output, mean, scale in zip(structure.outputs, sizes.output_means, sizes.output_scales, strict=True):
         joints = output.joints
+        # The paper's encoding has all joints as inputs of every function.
         if design.encoding == "lie-group":
             joints = tuple(range(len(sizes.mass_sensitivities)))
         outputs.append(OutputSpec(joints, _floats(output.basis), mean, scale))
@@ -109,6 +113,7 @@ def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]
 def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
     """Return C, with which the motors rotate at C qd; empty if each motor moves its own joint only."""
     speeds = actuation.drives().speeds
+    # Uncoupled motors, as on most arms: the module has no matrix.
     if np.array_equal(speeds, np.eye(actuation.joints)):
         return ()
     return tuple(map(tuple, speeds.tolist()))
@@ -120,6 +125,7 @@ def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSetti
     if coordinate.continuous:
         lower = upper = None
     lower, upper = (None if x is None or not isfinite(x) else float(f"{x:.6g}") for x in (lower, upper))
+    # Exporters write 0 or 1e16 for an unknown speed.
     if not speed or speed > TUNING.largest_speed:
         speed = TUNING.angular_speed if coordinate.joint_type == "revolute" else TUNING.linear_speed
     return JointSpec(

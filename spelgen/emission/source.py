@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 WIDTH = 110
 _FEW = 3  # equal items that are written one by one
-_STEP = 4  # of the indentation
-SKIP = "  # fmt: skip"  # for ruff: numbers are read by the row
+_STEP = 4  # blanks per level of indentation
+SKIP = "  # fmt: skip"  # for ruff: numbers are read row by row
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,7 @@ def make_spec(
     """Return the specification of the model tailored to an arm; arguments and errors as for ``generate``."""
     arm = arm if isinstance(arm, Arm) else load_arm(arm)
     name, design = str(preset), None
+    # A design of the user is part of the options, so that the module can be made again without its file.
     if preset not in PRESET_NAMES:
         name = "own" if isinstance(preset, Design) else Path(preset).stem
         design = load_design(preset)
@@ -61,6 +62,7 @@ def make_spec(
         depth=depth,
     )
     spec = derive_spec(arm, options)
+    # Relative paths, so that a project with its URDF can be moved.
     return spec if module is None else replace(spec, urdf=_path_of_urdf(module, arm.robot.path))
 
 

@@ -58,7 +58,9 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
     context = {"title": title, "header": header(spec), "arm": arm, "model": model, "spec": spec.to_json()}
     if standalone:
         return render("standalone.py.jinja", **bundle(arm, model)._asdict(), **context)
+    # The names that the texts use: a module imports no more than it needs.
     used = set(re.findall(r"\w+", f"{arm}\n{model}")) & load_runtime().public
+    # As ruff sorts members: classes first.
     ordered = sorted(used, key=lambda name: (not name[0].isupper(), name))
     return render("module.py.jinja", names=ordered, has_tensor=assembly.uses_mass_entries, **context)
 
@@ -82,6 +84,7 @@ def _functions(spec: ModelSpec) -> str:
 
 def header(spec: ModelSpec) -> str:
     """Return the documentation of the module: the arm, an example, the structure of M, and the joints."""
+    # A docstring of the module: names from the URDF are JSON strings in it, see `_quoted`.
     example = _EXAMPLE.format(module=module_name(spec), n=len(spec.joints))
     about = fill(description(spec), WIDTH, break_long_words=False, break_on_hyphens=False)
     return "\n\n".join([about, example, _picture(spec), _joint_table(spec)])
@@ -165,6 +168,7 @@ def _term_descriptions(spec: ModelSpec) -> dict[str, str]:
     for name, basis in zip(term_names(spec), bases, strict=True):
         entries = [entry_name(row, column) for row, column, _ in basis]
         row, column, _ = basis[0]
+        # An entry of two revolute joints has kg m^2; each prismatic joint divides by m.
         slides = [spec.joints[joint].joint_type for joint in (row, column)].count("prismatic")
         suffix = f" and {len(entries) - 2} more" if len(entries) > 2 else ""
         descriptions[name] = f"{', '.join(entries[:2])}{suffix} [{('kg m^2', 'kg m', 'kg')[slides]}]"
@@ -187,6 +191,7 @@ def _mass_entries(spec: ModelSpec, assembly: ModelParts) -> str:
     for row, cells in enumerate(entry_sums(spec)):
         texts = [_sum(sums, names) for sums in cells]
         for column, text in enumerate(texts):
+            # A single term is used in place; sums get a name, so that a row of M fits on a line.
             if " " in text or text.startswith("-"):
                 texts[column] = entry_name(row, column).lower().replace(",", "_")
                 body.append(f"    {texts[column]} = {text}")
@@ -212,5 +217,6 @@ def _sum(sums: Sums, names: list[str]) -> str:
 
 def _number(value: float) -> str:
     """Return the shortest text of a number."""
+    # Six digits if they are exact: URDFs have few digits.
     short = f"{value:g}"
     return short if float(short) == value else repr(value)

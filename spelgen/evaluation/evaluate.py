@@ -102,20 +102,25 @@ def evaluate(
             raise LogError(
                 "baselines that take torques", expected="none: the model is one of position servos"
             )
-        return _evaluate_commands(tested, logs, notes)
+        return tested.assessed(_evaluate_commands(tested, logs, notes))
     require_torques(logs)
     used = _preprocessing(tested.fit.preprocessing if tested.fit else None, preprocessing, logs)
-    return _evaluate_torques(tested, logs, notes, used, baselines or {}, (steps, seconds), truth, progress)
+    ahead = (steps, seconds)
+    return tested.assessed(
+        _evaluate_torques(tested, logs, notes, used, baselines or {}, ahead, truth, progress)
+    )
 
 
 def _preprocessing(
     used: Preprocessing | None, chosen: Preprocessing | None, logs: Sequence[Trajectory]
 ) -> Preprocessing:
-    """Return the preprocessing of test logs: the given one, else that of the fit, else the default."""
+    """Return the preprocessing of test logs: the given one, or the fit's, or the default."""
     if chosen is None and used is not None:
         return used
     preprocessing = chosen or Preprocessing()
-    if used is not None and preprocessing.torque_delay is None:  # of the logger, whatever the filter
+    if (
+        used is not None and preprocessing.torque_delay is None
+    ):  # a property of the logger, independent of the filter
         preprocessing = replace(preprocessing, torque_delay=used.torque_delay)
     return preprocessing.resolved([trajectory.sample_rate for trajectory in logs])
 
@@ -151,7 +156,7 @@ def _evaluate_torques(
             progress(len(horizons), len(lengths), f"predicting {name} ahead")
         horizon, predictions = predict(name, k, tests, predictors, tip, notes)
         horizons.append(horizon)
-        # the curves of the longest horizon contain those of the shorter ones
+        # the curves of the longest horizon contain the shorter ones
         if k == max(lengths.values()):
             longest = predictions
     all_dynamics: dict[str, RigidDynamics] = {}

@@ -64,7 +64,7 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
     residual = p.diff(dim=1) / dt - (at_start[:, :-1] + at_end[:, 1:]) / 2  # d in each interval, (W, past, n)
     gain = 1 - torch.exp(-dt / TUNING.observer_time_constant)
     r = torch.zeros_like(residual[:, 0])
-    response = torch.zeros_like(gain[:, 0])  # of the filter to d = 1
+    response = torch.zeros_like(gain[:, 0])  # response of the filter to d = 1
     for k in range(past):
         r = r + gain[:, k] * (residual[:, k] - r)
         response = response + gain[:, k] * (1 - response)
@@ -73,7 +73,7 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
 
 
 def without_past(windows: Windows, past: int) -> Windows:
-    """Return the windows without their first `past` steps; z stays that of the first sample."""
+    """Return the windows without their first `past` steps; z remains the state at the first sample."""
     return Windows(
         windows.dt[:, past:], windows.q[:, past:], windows.qd[:, past:], windows.tau[:, past:], windows.z
     )

@@ -15,7 +15,15 @@ from spelgen.evaluation.replay import Replay
 from spelgen.evaluation.torque import TorqueErrors
 from spelgen.evaluation.traces import Traces
 
-SCHEMA = 10
+SCHEMA = 11
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """An assessment. sentence: uses, failures, motions to record. because: the figures behind it."""
+
+    sentence: str
+    because: str
 
 
 @dataclass(frozen=True, repr=False)
@@ -26,7 +34,7 @@ class Measurements:
     horizon. cutoff: of the filter of the test logs [Hz], None without one. substeps: integrator steps of the model per
     sample interval. torque: errors by predictor, empty if the logs are too sparse for accelerations. torque_steps: see
     `coarse_torques`. replays: of the commands of an arm under position servos. mass_errors: relative errors of M by
-    predictor, if the truth is known.
+    predictor, if the truth is known. assessment: of the model, with the coverage of its training logs; None before it.
     """
 
     robot: str
@@ -43,6 +51,7 @@ class Measurements:
     torque_steps: dict[str, float] = field(default_factory=dict)
     replays: tuple[Replay, ...] = ()
     mass_errors: dict[str, float] = field(default_factory=dict)
+    assessment: Verdict | None = None
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON form, versioned by `schema`."""

@@ -18,14 +18,14 @@ def number(value: float) -> float | None:
 
 
 def listed(values: np.ndarray) -> object:
-    """Return an array as nested lists of numbers."""
+    """Return an array (...,) as nested lists of numbers."""
     if values.ndim == 0:
         return number(values.item())
     return list(map(listed, values))
 
 
 def array(values: object) -> np.ndarray:
-    """Return the array of nested lists of `listed`; NaN for None."""
+    """Return the array (...,) of nested lists of `listed`; NaN for None."""
     return np.array(values, dtype=float)
 
 
@@ -35,10 +35,9 @@ Curve = Annotated[np.ndarray, PlainValidator(array), PlainSerializer(listed)]
 
 def record(value: object) -> dict[str, Any]:
     """Return the JSON form of a dataclass with numbers and curves."""
-    fields: dict[str, Any] = TypeAdapter(type(value)).dump_python(value)
-    return fields
+    return dict(TypeAdapter(type(value)).dump_python(value))
 
 
 def finite(values: np.ndarray | torch.Tensor) -> tuple[float | None, ...]:
-    """Return the numbers of (T,) unrounded; None for those that are not finite."""
+    """Return the numbers of (T,) unrounded; None for nan and inf."""
     return tuple(x if math.isfinite(x) else None for x in values.tolist())

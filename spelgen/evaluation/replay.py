@@ -34,7 +34,7 @@ class ReplayErrors:
 
 @dataclass(frozen=True)
 class Replay:
-    """The errors of a replay by predictor. name: the parts of the logs that were replayed."""
+    """Errors of replayed commands per predictor. name: the replayed segments, for example whole logs."""
 
     name: str
     errors: dict[str, ReplayErrors]
@@ -53,7 +53,7 @@ class ServoModel:
         self._model = without_idle_residuals(model)
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """See `CommandFollower`. All parts run in one batch, in which shorter ones are padded."""
+        """Return the positions per part, (K, n). All parts run in one batch, in which shorter ones are padded."""
         steps = max(steps_between(log) for log, _ in parts)
         lengths = [rows.stop - rows.start - 1 for _, rows in parts]
         commands, intervals = [], []
@@ -105,7 +105,7 @@ def replays(
 def _replay(
     name: str, predictors: Mapping[str, CommandFollower], parts: Sequence[LogRows], qd: np.ndarray
 ) -> tuple[Replay, list[np.ndarray]]:
-    """Return the errors of each predictor from initial velocities qd (parts, n), and those of the model (K, n)."""
+    """Return the errors of each predictor from initial velocities qd (parts, n), and the errors of the model (K, n)."""
     q = np.stack([log.q[rows.start] for log, rows in parts])
     errors: dict[str, list[np.ndarray]] = {}
     for predictor, follower in predictors.items():

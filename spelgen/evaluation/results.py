@@ -9,7 +9,6 @@ from html import escape
 from spelgen.baselines.names import MODEL
 from spelgen.evaluation.measurements import Measurements
 from spelgen.evaluation.tables import result_tables
-from spelgen.evaluation.verdict import verdict
 from spelgen.labels import counted
 from spelgen.listing import WIDTH
 
@@ -20,12 +19,12 @@ class Results(Measurements):
 
     def text(self) -> str:
         """Return the assessment, then every table, in which the best of each row is starred."""
-        assessment = verdict(self)
-        paragraph = textwrap.fill(
-            f"{assessment.sentence} {assessment.because}", WIDTH, break_on_hyphens=False
-        )
-        tables = [table.text() for table in result_tables(self)]
-        return "\n\n".join([paragraph, f"{self._heading()}; * marks the best of a row", *tables])
+        paragraphs = [f"{self._heading()}; * marks the best of a row"]
+        paragraphs += [table.text() for table in result_tables(self)]
+        if self.assessment is not None:
+            words = f"{self.assessment.sentence} {self.assessment.because}"
+            paragraphs.insert(0, textwrap.fill(words, WIDTH, break_on_hyphens=False))
+        return "\n\n".join(paragraphs)
 
     def __repr__(self) -> str:
         heading = self._heading()
@@ -38,7 +37,8 @@ class Results(Measurements):
 
     def _repr_html_(self) -> str:
         tables = [table.listing().html() for table in result_tables(self)]
-        return "".join([f"<p>{escape(verdict(self).sentence)}</p>", *tables])
+        sentence = "" if self.assessment is None else self.assessment.sentence
+        return "".join([f"<p>{escape(sentence)}</p>", *tables])
 
     def _heading(self) -> str:
         return f"{self.robot} on {counted(len(self.trajectories), 'test trajectory')}"

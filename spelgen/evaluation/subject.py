@@ -1,20 +1,21 @@
-"""The model that is evaluated, with its fit and its arm as far as they are known."""
+"""The model that is evaluated, with its fit and its arm if they are known."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.baseline import arm_of_model
+from spelgen.baselines.baseline import LinearServoRecord, arm_of_model
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
 from spelgen.emission.assemble import ArmModel, spec_of
+from spelgen.evaluation.results import Results
 from spelgen.evaluation.tuning import TUNING
+from spelgen.evaluation.verdict import verdict
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.arm_mapping import GivenMapping
@@ -68,11 +69,24 @@ class Subject:
             return None
         return arm_of_model(self.model, self.fit.urdf)
 
+    def assessed(self, results: Results) -> Results:
+        """Return the results of its evaluation with their assessment."""
+        baselines = {} if self.fit is None else self.fit.baselines
+        limits, independent = [], []
+        if self.spec is not None:
+            depends = {*self.spec.potential, *(k for entry in self.spec.entries for k in entry[3])}
+            for k, joint in enumerate(self.spec.joints):
+                bound = None if joint.lower is None or joint.upper is None else (joint.lower, joint.upper)
+                limits.append(bound)
+                if k not in depends:
+                    independent.append(joint.name)
+        return replace(results, assessment=verdict(results, baselines, limits, independent))
+
     @property
-    def linear_servos(self) -> Mapping[str, Any] | None:
+    def linear_servos(self) -> LinearServoRecord | None:
         """Parameters of the linear servos that were fitted with it."""
         servo = None if self.fit is None else self.fit.record.servo
-        linear: Mapping[str, Any] | None = None if servo is None else servo["linear"]
+        linear: LinearServoRecord | None = None if servo is None else servo["linear"]
         return linear
 
 
@@ -85,7 +99,9 @@ def subject(tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None = 
     if arm is not None:
         urdf = Path(arm) if isinstance(arm, str | Path) else arm.robot.path
     weights = next(model.parameters(), None)
-    if weights is not None and (weights.dtype != torch.float64 or not weights.is_cpu):  # as logs are
+    if weights is not None and (
+        weights.dtype != torch.float64 or not weights.is_cpu
+    ):  # logs are float64 on the CPU
         model = copy.deepcopy(model).double().cpu()
     return Subject(model, model.joint_names, urdf, fit)
 

@@ -21,7 +21,7 @@ OBSERVER = (
 )
 
 Numbers = Mapping[str, float | None]
-"""By column; None for an unknown number."""
+"""Numbers per column; None: unknown."""
 JointErrors = Sequence[float | None]
 Errors = TypeVar("Errors")
 Value = TypeVar("Value")
@@ -34,7 +34,7 @@ LIMITS = ("torque.nmse", "joint.nmse", "rollout.rms")
 
 @dataclass(frozen=True)
 class Row:
-    """One quantity by column. ranked: whether the smallest number is best."""
+    """One quantity per column. ranked: whether the smallest number is best."""
 
     label: str
     values: Numbers
@@ -91,7 +91,7 @@ def table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Table:
 
 
 def result_tables(results: Measurements) -> list[Table]:
-    """Return the tables of an evaluation: replays, errors by horizon and by joint, torques."""
+    """Return the tables of an evaluation: replays, errors per horizon and per joint, torques."""
     tables = [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
     if results.mass_errors:
         tables.append(table(MASS_TITLE, {"M(q)": results.mass_errors}))
@@ -210,7 +210,7 @@ def _torque_tables(results: Measurements) -> list[Table]:
 
 
 def _replay_tables(results: Measurements) -> list[Table]:
-    """Return the tables of replayed commands: by trajectory and by joint."""
+    """Return the tables of replayed commands: per trajectory and per joint."""
     tables, unit = [], thousandths(results.joint_types)
     for replay in results.replays:
         rows: dict[str, Numbers] = {}
@@ -244,7 +244,7 @@ def _by_joint(
 
 
 def _joint_rows(labels: Sequence[str], errors: Mapping[str, JointErrors]) -> dict[str, Numbers]:
-    """Return the errors of all predictors by joint."""
+    """Return the errors of all predictors per joint."""
     rows: dict[str, Numbers] = {}
     for k, label in enumerate(labels):
         rows[label] = {name: values[k] for name, values in errors.items()}

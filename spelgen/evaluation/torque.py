@@ -46,7 +46,7 @@ class TorqueErrors:
 
 
 def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueErrors:
-    """Return the torque errors on these samples; those of pauses are in `nmse_with_pauses` only."""
+    """Return the torque errors on these samples; pauses count in `nmse_with_pauses` only."""
     residuals, torques, moving, by_trajectory = [], [], [], {}
     for sample in samples:
         residual, rows = predicted_torques(dynamics, sample) - sample.tau, is_moving(sample.qd)
@@ -74,7 +74,7 @@ def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
 
 
 def friction_past(dynamics: Any, samples: DynamicsSamples) -> tuple[Tensor, ...]:
-    """Return the arguments for the friction state on these samples, see `known_past`."""
+    """Return z, (T, n, K), and the direction, (T, n), of these samples as arguments, see `known_past`."""
     z = None if samples.z is None else torch.from_numpy(samples.z)
     direction = None if samples.direction is None else torch.from_numpy(samples.direction)
     return known_past(dynamics, z, direction)
@@ -109,7 +109,7 @@ def _mean(nmse: np.ndarray) -> float | None:
 def coarse_torques(
     logs: Sequence[Trajectory], joints: Sequence[str], notes: list[Diagnostic]
 ) -> dict[str, float]:
-    """Return the quantisation step [Nm, N] by joint, for torques not much larger than it, and note them."""
+    """Return the quantisation step [Nm, N] per joint, for torques not much larger than it, and note them."""
     steps = {}
     for k, joint in enumerate(joints):
         # infinite for a log that is not quantised; the median: most of the logs are quantised

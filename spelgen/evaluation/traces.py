@@ -54,7 +54,7 @@ class Growth:
 
 @dataclass(frozen=True, eq=False)
 class MassCurves:
-    """The lower triangle of M, row by row, along a trajectory, (entries, T)."""
+    """The lower triangle of M, rows in sequence, along a trajectory, (entries, T)."""
 
     entries: Curve
 

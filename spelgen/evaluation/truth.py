@@ -19,7 +19,7 @@ def true_mass(robot: Arm | Path | str, q: Tensor, joints: Sequence[str] | None =
     Args:
         robot: The true arm, or the path of its URDF.
         q: Positions (T, n) [rad; m].
-        joints: Names of the n joints in the order of q; None: those of the settings, or the longest chain.
+        joints: Names of the n joints in the order of q; None: from the settings, or the longest chain.
     """
     from spelgen.dynamics.pinocchio_arm import arm_dynamics
 

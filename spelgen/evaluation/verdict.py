@@ -1,9 +1,9 @@
-"""The assessment of an evaluation in words: what the model is good enough for, where it fails, what to record next."""
+"""The assessment of an evaluation in words: suitable uses, failures, and the motions to record next."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Any
@@ -13,10 +13,11 @@ import numpy as np
 from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.errors import shortened
 from spelgen.evaluation.horizons import StateErrors
-from spelgen.evaluation.measurements import Measurements
+from spelgen.evaluation.measurements import Measurements, Verdict
 from spelgen.evaluation.tuning import TUNING
 from spelgen.labels import listed, share, thousandths
 from spelgen.listing import number
+from spelgen.logs.checks import ELASTIC
 
 SEEN = "tested-on-training-data"
 STANDSTILL = " near standstill"
@@ -31,14 +32,6 @@ Limits = Sequence[tuple[float, float] | None]
 """Lower and upper position of each joint [rad, m]; None without limits."""
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """An assessment. sentence: uses, failures, what to record next. because: the figures behind it."""
-
-    sentence: str
-    because: str
-
-
 @dataclass
 class _Uses:
     """The uses that a model is good enough for, the uses that it is not, and the figures that prove both."""
@@ -49,11 +42,15 @@ class _Uses:
 
 
 def verdict(
-    results: Measurements, identified: Mapping[str, Any] | None = None, limits: Limits = ()
+    results: Measurements,
+    identified: Mapping[str, Any] | None = None,
+    limits: Limits = (),
+    independent: Collection[str] = (),
 ) -> Verdict:
     """Return the assessment of an evaluation.
 
     identified: content of least_squares.json, for the coverage of the training logs. limits: of the joints.
+    independent: names of joints on whose position the dynamics do not depend, as of a vertical first axis.
     """
     uses = _Uses()
     _assess_torques(results, uses)
@@ -64,16 +61,19 @@ def verdict(
     sentence = f"Good enough for {listed(uses.good)}" if uses.good else "Not accurate enough yet"
     if any(diagnostic.code == SEEN for diagnostic in results.diagnostics):
         sentence = f"Evaluated on training logs: {sentence[0].lower()}{sentence[1:]}"
+    elastic = next((x for x in results.diagnostics if x.code == ELASTIC), None)
+    if elastic is not None:
+        sentence = f"Below the resonance of an elastic joint only: {sentence[0].lower()}{sentence[1:]}"
     if uses.good and uses.bad:
         sentence += f", not for {listed(uses.bad)}"
     joint, speed, proof = _worst_joint(results)
-    recommendations = _recommendations(results, identified or {}, limits, joint, speed)
+    recommendations = _recommendations(results, identified or {}, limits, independent, joint, speed)
     details = []
     if joint:
         details.append(f"worst at {joint}{speed}")
     if recommendations:
         details.append(f"next, record {next(iter(recommendations))}")
-    because = []
+    because = [] if elastic is None else [f"{elastic.where}: {elastic.message}."]
     for detail in details:
         # longer details follow the first sentence
         if len(f"{sentence}; {detail}".split()) <= TUNING.headline:
@@ -205,7 +205,7 @@ def _worst_joint(results: Measurements) -> tuple[str, str, str]:
 def _worst_motion(results: Measurements) -> tuple[str, float]:
     """Return the joint of the largest error in the longest rollouts, divided by its motion, and this error."""
     for last in results.horizons[-1:]:
-        errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # NaN of None
+        errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # None becomes NaN
         if np.isfinite(errors).all():
             return results.joints[errors.argmax()], errors.max()
     return "", math.inf
@@ -231,7 +231,12 @@ def _slow_or_fast(results: Measurements, k: int) -> str:
 
 
 def _recommendations(
-    results: Measurements, identified: Mapping[str, Any], limits: Limits, worst: str, speed: str
+    results: Measurements,
+    identified: Mapping[str, Any],
+    limits: Limits,
+    independent: Collection[str],
+    worst: str,
+    speed: str,
 ) -> dict[str, str]:
     """Return motions to record, the most useful first, with reasons. worst: the worst joint, at `speed`."""
     recommendations = {}
@@ -240,7 +245,7 @@ def _recommendations(
     if unseen:
         reason = f"The training logs do not excite {unseen} directions of the base parameters."
         recommendations["a richer motion (as spelgen excite proposes)"] = reason
-    outside = _outside(trained, results.traces.coverage, results.joints)
+    outside = _outside(trained, results.traces.coverage, results.joints, independent)
     if outside:
         reason = f"The test logs exceed the range of the training logs: {shortened(outside, 3)}."
         recommendations[f"motion with the {outside[0]} that the test logs have"] = reason
@@ -248,7 +253,7 @@ def _recommendations(
         recommendations[f"slow reversals of {worst}"] = "Dry friction is learned from slow reversals."
     fractions = {}
     for joint, covered, bound in zip(results.joints, trained.get("q", ()), limits, strict=False):
-        if bound is not None and bound[1] > bound[0]:
+        if bound is not None and bound[1] > bound[0] and joint not in independent:
             # one revolution covers the range of a continuous joint
             fractions[joint] = (covered["high"] - covered["low"]) / min(bound[1] - bound[0], 2 * math.pi)
     if fractions:
@@ -259,12 +264,16 @@ def _recommendations(
     return recommendations
 
 
-def _outside(trained: Mapping[str, Any], tested: Mapping[str, Any], joints: Sequence[str]) -> list[str]:
-    """Return the quantities whose range in the test logs exceeds that of the training logs by a tenth."""
+def _outside(
+    trained: Mapping[str, Any], tested: Mapping[str, Any], joints: Sequence[str], independent: Collection[str]
+) -> list[str]:
+    """Return the quantities whose range in the test logs exceeds their range in the training logs by a tenth."""
     exceeded = []
     for quantity, word in (("q", "positions"), ("qd", "velocities")):
         ranges = zip(joints, trained.get(quantity, ()), tested.get(quantity, ()), strict=False)
         for name, inner, outer in ranges:
+            if quantity == "q" and name in independent:
+                continue
             room = 0.1 * (inner["high"] - inner["low"])
             if outer["low"] < inner["low"] - room or outer["high"] > inner["high"] + room:
                 exceeded.append(f"{word} of {name}")

@@ -1,105 +1,29 @@
-"""Design of exciting motions: the best of random motions, improved by L-BFGS.
-
-The criterion is the logarithm of the condition number of the base regressor with columns of unit length (Swevers et
-al., IEEE T-RA 13:730, 1997), plus penalties on violated effort limits and on reduced amplitudes. Unit columns do not
-depend on the amplitude of the motion, but the signal-to-noise ratio of the torque does.
-"""
+"""Design of exciting motions: the best of random motions, improved by L-BFGS, until one has no contact."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import inf, isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from scipy.optimize import minimize
-from torch import Tensor
 
 from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm
-from spelgen.dynamics.body_regressor import regressor_of
-from spelgen.dynamics.friction import FrictionModel
-from spelgen.dynamics.regressor_dynamics import body_chain, urdf_parameters
-from spelgen.errors import SettingsError
+from spelgen.errors import ArmError, SettingsError
+from spelgen.excitation.approach import approach
+from spelgen.excitation.criterion import Criterion
 from spelgen.excitation.excitation import Excitation
-from spelgen.excitation.trajectory import ExcitationTrajectory, motion_bounds
+from spelgen.excitation.surroundings import Surroundings, read_surroundings
+from spelgen.excitation.trajectory import ExcitationTrajectory, Motion, MotionBounds, motion_bounds
 from spelgen.excitation.tuning import TUNING
-from spelgen.identification.base_parameters import base_parameters
 
-FRICTION = FrictionModel()
-
-
-class Criterion:
-    """Criterion to be minimized over the parameters of an `ExcitationTrajectory`."""
-
-    def __init__(self, arm: Chain, trajectory: ExcitationTrajectory) -> None:
-        self.trajectory, self.chain = trajectory, body_chain(arm)
-        self.columns = torch.from_numpy(base_parameters(arm, FRICTION).columns)
-        count = TUNING.samples_per_harmonic * trajectory.harmonics + 1
-        self.times = torch.linspace(0.0, trajectory.duration, count, dtype=torch.float64)
-        self.inertial = torch.from_numpy(urdf_parameters(arm))
-        # without inertials the torque is unknown, and effort limits are ignored
-        is_known = all(body.inertia for body in arm.bodies)
-        efforts = [(is_known and coordinate.effort) or torch.inf for coordinate in arm.coordinates]
-        self.limits = torch.tensor(efforts, dtype=torch.float64)
-
-    def states(self, parameters: np.ndarray) -> Tensor:
-        """Return q, qd and qdd at the samples of the criterion, (3, T, n), for parameters (size,)."""
-        return self.trajectory.states(torch.from_numpy(parameters), self.times)
-
-    def condition(self, states: Tensor) -> float:
-        """Return the condition number of the base regressor with unit columns, for states (3, T, n).
-
-        It is infinite if a column is zero.
-        """
-        return float(self._log_condition(self._rows(states)).exp())
-
-    def efforts(self, states: Tensor) -> np.ndarray:
-        """Return rigid-body torques divided by the effort limits, (T, n), for states (3, T, n); NaN without a limit."""
-        efforts = torch.where(self.limits.isinf(), torch.nan, self._efforts(self._rows(states)))
-        return np.asarray(efforts.numpy())
-
-    def value(self, parameters: np.ndarray) -> float:
-        """Return the criterion for parameters (size,)."""
-        return float(self._value(torch.from_numpy(parameters)))
-
-    def value_and_gradient(self, parameters: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the criterion and its gradient (size,) for parameters (size,) with a finite criterion."""
-        variables = torch.from_numpy(parameters).requires_grad_()
-        value = self._value(variables)
-        (gradient,) = torch.autograd.grad(value, variables)
-        return value.item(), gradient.numpy()
-
-    def _value(self, parameters: Tensor) -> Tensor:
-        """Return the criterion, (), for parameters (size,)."""
-        rows = self._rows(self.trajectory.states(parameters, self.times))
-        overrun = (self._efforts(rows).abs() - TUNING.effort).clamp(min=0.0)
-        penalties = (
-            TUNING.penalty * overrun.square().sum() + self.trajectory.amplitude_reduction(parameters).sum()
-        )
-        return self._log_condition(rows) + penalties
-
-    def _rows(self, states: Tensor) -> Tensor:
-        """Return the regressor (T, n, K) of bodies, then armature and friction in the order of `FRICTION.columns`."""
-        q, qd, qdd = states
-        direction = (qd / FRICTION.coulomb_smoothing_velocity).tanh()
-        effects = torch.stack([qdd, qd, direction, torch.ones_like(qd)])
-        drives = torch.diag_embed(effects).permute(1, 2, 0, 3).flatten(2)
-        return torch.cat([regressor_of(self.chain, q, qd, qdd), drives], dim=2)
-
-    def _efforts(self, rows: Tensor) -> Tensor:
-        """Return rigid-body torques divided by the effort limits, (T, n), from the regressor (T, n, K)."""
-        return rows[:, :, : len(self.inertial)] @ self.inertial / self.limits
-
-    def _log_condition(self, rows: Tensor) -> Tensor:
-        """Return the logarithm of the condition number, (), from the regressor (T, n, K)."""
-        columns = rows[:, :, self.columns].flatten(0, 1)
-        length = columns.norm(dim=0)
-        # a parameter that the motion does not excite
-        if not length.all():
-            return torch.tensor(torch.inf, dtype=torch.float64)
-        condition: Tensor = torch.linalg.cond(columns / length)
-        return condition.log()
+if TYPE_CHECKING:
+    from spelgen.excitation.collisions import Collisions
 
 
 def excite(
@@ -110,6 +34,9 @@ def excite(
     harmonics: int | None = None,
     reach: float = 0.9,
     speed: float = 0.7,
+    acceleration: float | Sequence[float] | None = None,
+    start: Sequence[float] | None = None,
+    surroundings: Surroundings | Path | str | None = None,
     trials: int = 100,
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -117,7 +44,8 @@ def excite(
     """Return an exciting motion, which starts and ends at rest; the same arguments give the same motion.
 
     The motion keeps effort limits too if the URDF has limits and inertials, and if any motion that was found keeps
-    them. <mimic> joints keep their own limits. Collisions are not checked.
+    them. <mimic> joints keep their own limits. If the URDF has collision geometry and Pinocchio is installed, the
+    motion and the approach to it keep a clearance between links, and to the surroundings.
 
     Args:
         arm: configured arm.
@@ -126,12 +54,89 @@ def excite(
         harmonics: number of harmonics; default: 0.4 per second, at least 5.
         reach: fraction of the position ranges that is used.
         speed: fraction of the velocity limits that is used.
+        acceleration: largest acceleration of all joints or per joint [rad/s^2, m/s^2]; default: unlimited in the
+            motion; in the approach, the acceleration that reaches the used speed in one second.
+        start: position from which the approach starts, (n,) [rad, m]; default: zero if the limits allow it, per joint,
+            otherwise the middle of the range.
+        surroundings: floor, boxes and clearance, or the path of a YAML file with these; default: no floor, no boxes,
+            10 mm.
         trials: evaluations of the criterion by the optimizer, in addition to 40 random motions.
         seed: of the random motions.
         progress: is called with the numbers of finished and of all trials.
 
-    Raises SettingsError for an invalid value, ArmError for a joint whose limits are not increasing.
+    Raises SettingsError for an invalid value, ArmError for a joint whose limits are not increasing and if no motion
+    without a contact was found.
     """
+    harmonics = _checked_harmonics(duration, sample_rate, harmonics, reach, speed)
+    ranges = arm.robot.joint, arm.settings.simulation.positions
+    limits = motion_bounds(arm.chain, 1.0, 1.0, *ranges)
+    bounds = motion_bounds(arm.chain, reach, speed, *ranges)
+    strongest = bounds.speed  # divided by one second
+    if acceleration is not None:
+        strongest = _joint_values("acceleration", acceleration, arm.chain, positive=True)
+        bounds = replace(bounds, acceleration=strongest)
+    if not isinstance(surroundings, Surroundings):
+        surroundings = Surroundings() if surroundings is None else read_surroundings(Path(surroundings))
+    collisions, statement = _collisions(arm, surroundings, limits)
+    beginning = _start(start, arm.chain, limits, collisions)
+    contacts: list[str] = []
+    for attempt in range(TUNING.attempts):
+        fraction = TUNING.range_factor**attempt
+        trajectory = ExcitationTrajectory(duration, harmonics, bounds.narrowed(fraction))
+        criterion = Criterion(arm.chain, trajectory, collisions)
+        starts = np.random.default_rng(seed + attempt).standard_normal((TUNING.starts, trajectory.size))
+        best = _improved(criterion, min(starts, key=criterion.value), trials, progress)
+        motion = trajectory.motion(best, np.linspace(0.0, duration, round(duration * sample_rate) + 1))
+        to_motion = approach(beginning, motion.q[0], bounds.speed, strongest, sample_rate)
+        contact = None if collisions is None else collisions.contact(to_motion.then(motion))
+        if contact is None:
+            if contacts:
+                statement += (
+                    f" Designs with seeds {seed} to {seed + attempt - 1} had contacts; this one has seed "
+                    f"{seed + attempt} and {reach * fraction:.0%} of the ranges."
+                )
+            return _excitation(arm.chain, criterion, (starts[0], best), (to_motion, motion), statement)
+        contacts.append(str(contact))
+    do = "use less of the ranges (--reach), begin elsewhere (--from), or lower the clearance"
+    raise ArmError(f"no motion without a contact: {'; '.join(contacts)}", element="excite", do=do)
+
+
+def _excitation(
+    arm: Chain,
+    criterion: Criterion,
+    parameters: tuple[np.ndarray, np.ndarray],
+    motions: tuple[Motion, Motion],
+    statement: str,
+) -> Excitation:
+    """Return a motion with its quality.
+
+    Args:
+        arm: with n joints.
+        criterion: of the motion.
+        parameters: of the first random motion and of the best one, (size,).
+        motions: approach and motion.
+        statement: of collisions.
+    """
+    first, best = map(criterion.states, parameters)
+    motion = motions[1]
+    states = torch.from_numpy(np.stack([motion.q, motion.qd, motion.qdd]))
+    return Excitation(
+        arm=arm,
+        motion=motion,
+        approach=motions[0],
+        collisions=statement,
+        parameters=len(criterion.columns),
+        first=criterion.condition(first),
+        condition=criterion.condition(best),
+        efforts=np.abs(criterion.efforts(states)).max(axis=0),
+        first_efforts=np.abs(criterion.efforts(first)).max(axis=0),
+    )
+
+
+def _checked_harmonics(
+    duration: float, sample_rate: float, harmonics: int | None, reach: float, speed: float
+) -> int:
+    """Return the number of harmonics of a motion. Raises SettingsError for an invalid argument of ``excite``."""
     positive = {"duration": duration, "sample_rate": sample_rate, "reach": reach, "speed": speed}
     for name, value in positive.items():
         is_fraction = name in ("reach", "speed")
@@ -139,25 +144,65 @@ def excite(
             expected = "more than 0, at most 1" if is_fraction else "a positive number"
             raise SettingsError(repr(value), element=f"excite: {name}", expected=expected)
     if harmonics is None:
-        harmonics = max(TUNING.min_harmonics, round(TUNING.harmonics_per_second * duration))
-    elif harmonics < 2:
+        return max(TUNING.min_harmonics, round(TUNING.harmonics_per_second * duration))
+    if harmonics < 2:
         raise SettingsError(repr(harmonics), element="excite: harmonics", expected="2 or more")
-    bounds = motion_bounds(arm.chain, reach, speed, arm.robot.joint, arm.settings.simulation.positions)
-    trajectory = ExcitationTrajectory(duration, harmonics, bounds)
-    criterion = Criterion(arm.chain, trajectory)
-    starts = np.random.default_rng(seed).standard_normal((TUNING.starts, trajectory.size))
-    best = _improved(criterion, min(starts, key=criterion.value), trials, progress)
-    motion = trajectory.motion(best, np.linspace(0.0, duration, round(duration * sample_rate) + 1))
-    first, states = criterion.states(starts[0]), torch.from_numpy(np.stack([motion.q, motion.qd, motion.qdd]))
-    return Excitation(
-        arm=arm.chain,
-        motion=motion,
-        parameters=len(criterion.columns),
-        first=criterion.condition(first),
-        condition=criterion.condition(criterion.states(best)),
-        efforts=np.abs(criterion.efforts(states)).max(axis=0),
-        first_efforts=np.abs(criterion.efforts(first)).max(axis=0),
-    )
+    return harmonics
+
+
+def _joint_values(name: str, values: float | Sequence[float], arm: Chain, *, positive: bool) -> np.ndarray:
+    """Return one number per joint, (n,). Raises SettingsError."""
+    array = np.atleast_1d(np.array(values, dtype=float))
+    if positive and array.shape == (1,):
+        array = np.repeat(array, len(arm.coordinates))
+    if (
+        array.shape != (len(arm.coordinates),)
+        or not np.isfinite(array).all()
+        or (positive and array.min() <= 0)
+    ):
+        joints = ", ".join(arm.joint_names)
+        expected = f"one {'positive ' if positive else ''}number per joint: {joints}"
+        raise SettingsError(repr(values), element=f"excite: {name}", expected=expected)
+    return array
+
+
+def _collisions(arm: Arm, surroundings: Surroundings, limits: MotionBounds) -> tuple[Collisions | None, str]:
+    """Return distances of links and surroundings, None if they are unknown, and a statement of what is checked."""
+    try:
+        # imported here: Pinocchio is an extra
+        from spelgen.excitation.collisions import Collisions
+
+        collisions = Collisions(arm, surroundings, limits)
+    except ModuleNotFoundError as error:
+        return (
+            None,
+            f"Not checked: collisions (pip install 'spelgen[simulate]' for the package {error.name}).",
+        )
+    except LookupError as error:
+        return None, f"Not checked: collisions ({error.args[0]})."
+    return collisions, collisions.statement
+
+
+def _start(
+    start: Sequence[float] | None, arm: Chain, limits: MotionBounds, collisions: Collisions | None
+) -> np.ndarray:
+    """Return the position from which the approach starts, (n,). Raises SettingsError, ArmError for a contact."""
+    middle = (limits.low + limits.high) / 2
+    if start is None:
+        position = np.where((limits.low <= 0) & (limits.high >= 0), 0.0, middle)
+        if collisions is not None and collisions.contact_at(position):
+            position = middle
+    else:
+        position = _joint_values("start", start, arm, positive=False)
+    for joint, value, low, high in zip(arm.joint_names, position, limits.low, limits.high, strict=True):
+        if not low <= value <= high:
+            element = f"excite: start of {joint!r}"
+            raise SettingsError(f"{value:g}", element=element, expected=f"{low:.6g} .. {high:.6g}")
+    contact = None if collisions is None else collisions.contact_at(position)
+    if contact is not None:
+        element, do = "excite: start", "name a free position by --from, or lower the clearance"
+        raise ArmError(f"a contact at the start: {contact}", element=element, do=do)
+    return position
 
 
 def _improved(

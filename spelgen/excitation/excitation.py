@@ -1,9 +1,10 @@
-"""A proposed motion and its quality: for a terminal, a notebook, and as CSV for a controller."""
+"""A proposed motion and its quality: for a terminal, a notebook, as CSV, and as a message for ROS 2 controllers."""
 
 from __future__ import annotations
 
 import csv
 import io
+import json
 import textwrap
 from dataclasses import dataclass
 
@@ -13,23 +14,23 @@ from spelgen.arm.arm import Chain
 from spelgen.excitation.trajectory import Motion
 from spelgen.listing import WIDTH, Listing
 
-WARNING = (
-    "Not checked: collisions of the arm with itself, its load and its surroundings. View the motion, then run it "
-    "slowly. Move the arm to the first position before. The motion starts and ends at rest."
-)
+ADVICE = "View the motion, then run it slowly: a load, cables and anything else around the arm are unknown."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Excitation:
     """A proposed motion and its quality.
 
-    parameters: number of base parameters, friction and armature included. condition: condition number of their
+    The motion starts and ends at rest. approach: motion to its first position. collisions: what is checked, and what is
+    not. parameters: number of base parameters, friction and armature included. condition: condition number of their
     regressor with unit columns; first: of the first random motion. efforts: (n,) largest torque of the URDF's bodies,
     divided by the effort limit; NaN without limit or inertials. first_efforts: of the first random motion.
     """
 
     arm: Chain
     motion: Motion
+    approach: Motion
+    collisions: str
     parameters: int
     first: float
     condition: float
@@ -64,6 +65,9 @@ class Excitation:
             "parameters": self.parameters,
             "condition": self.condition,
             "random_condition": self.first,
+            "approach": float(self.approach.t[-1]),
+            "start": self.approach.q[0].tolist(),
+            "collisions": self.collisions,
             "efforts": efforts,
         }
 
@@ -81,7 +85,10 @@ class Excitation:
                 "-" if np.isnan(self.efforts[k]) else f"{self.efforts[k]:.0%}",
             ))  # fmt: skip
         head = ("joint", "q", "qd", "of limit", "qdd", "effort")
-        return Listing("Ranges [rad or m, s]; effort by the URDF's inertials", head, tuple(rows), WARNING)
+        start = ", ".join(f"{x:.3g}" for x in self.approach.q[0])
+        moved = f"Approach of {self.approach.t[-1]:.3g} s from {start}."
+        note = f"{moved} The motion starts and ends at rest. {self.collisions} {ADVICE}"
+        return Listing("Ranges [rad or m, s]; effort by the URDF's inertials", head, tuple(rows), note)
 
     def csv(self) -> str:
         """Return the columns t, q_<joint>, qd_<joint> and qdd_<joint> with nine decimals."""
@@ -94,9 +101,33 @@ class Excitation:
         np.savetxt(file, np.round(rows, 9) + 0.0, "%.9f", ",")  # adding zero turns -0 into 0
         return file.getvalue()
 
+    def joint_trajectory(self) -> str:
+        """Return a message of ROS 2, trajectory_msgs/JointTrajectory, with the approach and then the motion.
+
+        The text is valid JSON and YAML, with a line per point.
+        """
+        motion = self.approach.then(self.motion)
+        points = []
+        for t, q, qd, qdd in zip(motion.t, motion.q, motion.qd, motion.qdd, strict=True):
+            nanoseconds = round(1e9 * t)
+            stamp = f'{{"sec": {nanoseconds // 10**9}, "nanosec": {nanoseconds % 10**9}}}'
+            points.append(
+                f'{{"positions": {_numbers(q)}, "velocities": {_numbers(qd)}, "accelerations": {_numbers(qdd)}, '
+                f'"effort": [], "time_from_start": {stamp}}}'
+            )
+        names = json.dumps(self.arm.joint_names, ensure_ascii=False)
+        head = '{"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},'
+        rows = ",\n".join(points)
+        return f'{head}\n"joint_names": {names},\n"points": [\n{rows}\n]}}\n'
+
     def __repr__(self) -> str:
         summary = f"{self.motion.t[-1]:g} s, condition number {self.condition:.3g}"
         return f"<Excitation of {self.arm.name!r}: {summary} of {self.parameters} base parameters>"
 
     def _repr_html_(self) -> str:
         return self.listing().html()
+
+
+def _numbers(values: np.ndarray) -> str:
+    """Return a list of numbers (n,) with nine decimals and no exponent, which YAML would read as text."""
+    return f"[{', '.join(f'{x:.9f}' for x in np.round(values, 9) + 0.0)}]"  # adding zero turns -0 into 0

@@ -6,7 +6,7 @@ Swevers et al., Optimal robot excitation and identification, IEEE T-RA 13:730 (1
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, nan, pi
 
 import numpy as np
@@ -26,11 +26,17 @@ SPEEDS = {"revolute": TUNING.revolute_speed, "prismatic": TUNING.prismatic_speed
 
 @dataclass(frozen=True, eq=False)
 class MotionBounds:
-    """Bounds of a motion, (n,) each: lowest and highest position [rad, m], speed [rad/s, m/s]."""
+    """Bounds of a motion, (n,) each: lowest and highest position [rad, m], speed, acceleration (by default none)."""
 
     low: np.ndarray
     high: np.ndarray
     speed: np.ndarray
+    acceleration: np.ndarray | None = None
+
+    def narrowed(self, factor: float) -> MotionBounds:
+        """Return bounds with a fraction of the position ranges about the same middle."""
+        middle, half = (self.low + self.high) / 2, factor * (self.high - self.low) / 2
+        return replace(self, low=middle - half, high=middle + half)
 
 
 def motion_bounds(
@@ -89,6 +95,16 @@ class Motion:
     qd: np.ndarray
     qdd: np.ndarray
 
+    def then(self, later: Motion) -> Motion:
+        """Return this motion and a later one, which begins at the last position of this one."""
+        columns = [
+            (self.t, self.t[-1] + later.t),
+            (self.q, later.q),
+            (self.qd, later.qd),
+            (self.qdd, later.qdd),
+        ]
+        return Motion(*(np.concatenate([first, second[1:]]) for first, second in columns))
+
 
 @dataclass(frozen=True, eq=False)
 class ExcitationTrajectory:
@@ -96,7 +112,7 @@ class ExcitationTrajectory:
 
     Any parameters (size,) are valid, so the design needs no constraints. The parameters of each joint are H sine and
     H cosine coefficients, of which only the ratios count, the offset of the motion in the range, and the reduction of
-    the amplitude from the largest one that range and speed allow. Velocity and acceleration are zero at both ends: sine
+    the amplitude from the largest one that the bounds allow. Velocity and acceleration are zero at both ends: sine
     coefficients are projected to be orthogonal to (1, 2, ..., H), cosine coefficients to (1, 4, ..., H^2).
     """
 
@@ -127,13 +143,16 @@ class ExcitationTrajectory:
         """
         coefficients, offsets = self._coefficients(parameters)
         points = torch.linspace(0.0, self.duration, TUNING.grid * self.harmonics + 1, dtype=torch.float64)
-        positions, velocities, _ = self._signals(coefficients, points)
+        positions, velocities, accelerations = self._signals(coefficients, points)
         highest, lowest = positions.amax(dim=0), positions.amin(dim=0)
         middle, half = (highest + lowest) / 2, (highest - lowest) / 2 / GRID_RATIO
         fastest = velocities.abs().amax(dim=0) / GRID_RATIO
         low, speed = torch.from_numpy(self.bounds.low), torch.from_numpy(self.bounds.speed)
         room = torch.from_numpy(self.bounds.high) - low
         largest = torch.minimum(room / (2 * half), speed / fastest)
+        if self.bounds.acceleration is not None:
+            strongest = accelerations.abs().amax(dim=0) / GRID_RATIO
+            largest = torch.minimum(largest, torch.from_numpy(self.bounds.acceleration) / strongest)
         amplitude = largest * (-self.amplitude_reduction(parameters)).exp()
         free = room - 2 * amplitude * half  # range of the offset
         offset = low - amplitude * (middle - half) + free * (1 + offsets.tanh()) / 2

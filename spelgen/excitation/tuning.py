@@ -30,6 +30,22 @@ class ExcitationTuning:
     grid: int = 40
     # [m/s] Speed limit of prismatic joints without a velocity limit.
     prismatic_speed: float = 0.25
+    # [1] Triangles of all collision meshes together, of which the convex hulls are made.
+    faces: int = 20_000
+    # [1] Random positions at which pairs of links are tested for a permanent overlap.
+    positions: int = 200
+    # [1] Share of these positions from which on a pair of links counts as overlapping permanently, as in MoveIt's setup
+    # assistant.
+    overlap: float = 0.95
+    # [1] Margin of the penalty, relative to the clearance: positions between the samples come closer.
+    margin: float = 2.0
+    # [1] Weight of the squared violation of the margin by a pair of links at a sample. With 36 shapes of a Panda, 10
+    # gives a condition number of 368, 1 of 34, 0.1 of 18, all without a contact.
+    collision_penalty: float = 0.1
+    # [1] Designs, with other seeds and smaller ranges, until one has no contact.
+    attempts: int = 5
+    # [1] Factor on the range for each further design.
+    range_factor: float = 0.85
 
 
 TUNING = ExcitationTuning()

@@ -20,14 +20,16 @@ from spelgen.arm.chain import choose_chain
 from spelgen.arm.configured_arm import Arm
 from spelgen.arm.lump_links import lump_links
 from spelgen.dynamics.protocol import input_of, motors_of, residual_terms
-from spelgen.dynamics.tip import last_link
+from spelgen.dynamics.tip import last_link, tip_kinematics
 from spelgen.errors import RunError
 from spelgen.exporting.description import Harmonics, Residuals, Servos, SigmoidNetwork, Tip, TrainedModel
 from spelgen.exporting.entry_points import EntryPoint, entry_points
+from spelgen.listing import Listing
 from spelgen.runtime.friction_laws import FrictionConstants
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 if TYPE_CHECKING:
+    from spelgen.dynamics.prepared import PreparedModel
     from spelgen.emission.assemble import ArmModel
     from spelgen.runtime.encoding import JointEncoding
     from spelgen.runtime.parts import Layers
@@ -41,11 +43,15 @@ class Trained:
     """A trained model and its arm.
 
     entries: names of the functions to export, for formats of functions; empty: all functions except derivatives.
+    intervals: tables of the 95 % intervals of a fit, for the README.
+    float32: numbers of ONNX and torch programs; otherwise float64.
     """
 
     model: ArmModel
     arm: Arm
     entries: tuple[str, ...] = ()
+    intervals: tuple[Listing, ...] = ()
+    float32: bool = False
 
     @cached_property
     def described(self) -> TrainedModel:
@@ -68,6 +74,16 @@ class Trained:
         return self.arm.chain.joint_names
 
     @property
+    def tip(self) -> str:
+        """The name of the tip link."""
+        return self.arm.tip or last_link(self.arm.robot, self.joint_names)
+
+    def prepared(self) -> PreparedModel:
+        """Return the model and the kinematics of its tip for programs of torch and ONNX."""
+        dtype = torch.float32 if self.float32 else torch.float64
+        return self.model.prepared(tip_kinematics(self.arm), dtype=dtype)
+
+    @property
     def memory(self) -> int:
         """Size of the friction state z of all joints."""
         model = self.model
@@ -76,6 +92,7 @@ class Trained:
 
 def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
     """Return the description of a trained model. Raises RunError for a preset without rigid bodies."""
+    # In double precision: the model may be in single precision or on another device.
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
     if not isinstance(exact, RigidBodyDynamics):
         preset = model.spec.options.preset
@@ -126,6 +143,7 @@ def unique_identifiers(names: Sequence[str]) -> tuple[str, ...]:
         if not plain or keyword.iskeyword(plain) or keyword.issoftkeyword(plain) or plain[0].isdigit():
             plain = f"joint_{plain or number}"
         unique, count = plain, 2
+        # Two names may differ only in characters that identifiers cannot have.
         while unique in identifiers:
             unique, count = f"{plain}_{count}", count + 1
         identifiers.append(unique)
@@ -154,18 +172,29 @@ def tip_frame(loaded: Arm) -> Tip:
     """Return the frame of the tip link, with the unrounded angles of the URDF."""
     names = loaded.chain.joint_names
     link = loaded.tip or last_link(loaded.robot, names)
-    frame = lump_links(loaded.robot, choose_chain(loaded.robot, names, None), 0.0).frames[link]
-    pose = np.eye(4)
-    pose[:3, :3] = frame.rotation
-    pose[:3, 3] = frame.position
     bodies = make_arm(loaded.robot, joints=names, angle_tolerance=0.0).bodies
-    return Tip(link, frame.body, pose, bodies)
+    return Tip(link, *link_poses(loaded)[link], bodies)
+
+
+def link_poses(loaded: Arm) -> dict[str, tuple[int, np.ndarray]]:
+    """Return, by link, the index of the body that carries it, -1: the root link, and the pose (4, 4) in its frame.
+
+    Angles are the unrounded angles of the URDF.
+    """
+    chain = choose_chain(loaded.robot, loaded.chain.joint_names, None)
+    poses: dict[str, tuple[int, np.ndarray]] = {}
+    for link, frame in lump_links(loaded.robot, chain, 0.0).frames.items():
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = frame.rotation, frame.position
+        poses[link] = frame.body, pose
+    return poses
 
 
 def _residuals(model: ArmModel) -> Residuals:
     """Return the residual terms that are not zero."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
+    # Only entries of the lower triangle that any function contributes to.
     entries: np.ndarray = np.argwhere(np.tril(functions.any(axis=0).reshape(model.n, model.n)))
     mass = _network(weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
     if mass is None:
@@ -208,6 +237,7 @@ def _network(
         weights.append(functions.T)
         biases.append(np.zeros(functions.shape[1]))
     for k in range(1, len(weights)):
+        # tanh(x) = 2 sigmoid(2 x) - 1: twice the layer before, and twice minus the sum in the layer after.
         weights[k - 1], biases[k - 1] = 2 * weights[k - 1], 2 * biases[k - 1]
         weights[k], biases[k] = 2 * weights[k], biases[k] - weights[k].sum(axis=1)
     return SigmoidNetwork(tuple(weights), tuple(biases))

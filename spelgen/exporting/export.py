@@ -14,6 +14,7 @@ from spelgen.exporting.describe import Trained
 from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
 from spelgen.fitting.fitted import Fit, load_run, required_spec
 from spelgen.labels import listed
+from spelgen.listing import Listing
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
@@ -27,6 +28,7 @@ def export(
     arm: Arm | Path | str | None = None,
     force: bool = False,
     entries: Sequence[str] = (),
+    float32: bool = False,
 ) -> Exported:
     """Return a trained model in the format of another tool, after a comparison with the model.
 
@@ -39,6 +41,7 @@ def export(
         arm: from ``load_arm``, or the path of a URDF; default: the arm of the fit.
         force: replace existing files.
         entries: names of the functions for c, casadi, onnx and torch; default: all except derivatives.
+        float32: numbers of onnx and torch programs, for accelerators; default: float64.
 
     Raises RunError without an arm, for a preset or a path that the format does not allow, if the comparison fails, and
     if a file exists without ``force``.
@@ -51,19 +54,27 @@ def export(
         require_fitting(to, Path(path))
     if isinstance(trained, str | Path):
         trained = load_run(trained)
+    intervals: tuple[Listing, ...] = ()
     if isinstance(trained, Fit):
+        if trained.checkpoint.posterior:
+            intervals = trained.posterior.listings
         trained, arm = trained.model, arm or trained.urdf
     exporter = EXPORTERS[to]
     if entries and not exporter.choice:
         formats = [name for name, row in EXPORTERS.items() if row.choice]
         raise RunError(f"functions for --to {to}", expected=f"--to {listed(formats)}, which have a choice")
+    if float32 and not exporter.float32:
+        formats = [name for name, row in EXPORTERS.items() if row.float32]
+        raise RunError(f"float32 for --to {to}", expected=f"--to {listed(formats)}; C has -DNAME_FLOAT")
     if arm is None:
         expected = "a run of `spelgen train --robot FILE.urdf`, or an arm"
         raise RunError("no robot.urdf", element="export", expected=expected)
     if not isinstance(arm, Arm):
         arm = arm_of_spec(required_spec(trained), arm)
     # imported here: the packages of a format may be extras that are not installed
-    exported: Exported = pkgutil.resolve_name(exporter.function_name)(Trained(trained, arm, tuple(entries)))
+    exported: Exported = pkgutil.resolve_name(exporter.function_name)(
+        Trained(trained, arm, tuple(entries), intervals, float32)
+    )
     if path is not None:
         exported.write(path, force=force)
     return exported

@@ -23,13 +23,14 @@ class Exporter:
 
     function_name: module and name of a function from ``Trained`` to ``Exported``, imported on use, because most formats
     need packages that are extras. title: end of the title of the README. suffix: of the file; empty for a format that
-    is a folder. choice: whether the functions can be selected.
+    is a folder. choice: whether the functions can be selected. float32: whether numbers can be float32.
     """
 
     function_name: str
     title: str = ""
     suffix: str = ""
     choice: bool = False
+    float32: bool = False
 
 
 EXPORTERS = {
@@ -37,8 +38,8 @@ EXPORTERS = {
     "mjcf": Exporter("spelgen.exporting.mjcf_export:export_mjcf", "for MuJoCo", suffix=".xml"),
     "c": Exporter("spelgen.exporting.c_export:export_c", "in C99", choice=True),
     "casadi": Exporter("spelgen.exporting.casadi_export:export_casadi", "in CasADi", choice=True),
-    "onnx": Exporter("spelgen.exporting.onnx_export:export_onnx", "in ONNX", choice=True),
-    "torch": Exporter("spelgen.exporting.torch_export:export_torch", "in torch", choice=True),
+    "onnx": Exporter("spelgen.exporting.onnx_export:export_onnx", "in ONNX", choice=True, float32=True),
+    "torch": Exporter("spelgen.exporting.torch_export:export_torch", "in torch", choice=True, float32=True),
     "ros2": Exporter("spelgen.exporting.ros2_export:export_ros2", "for ROS 2"),
 }
 """The formats, by the values of --to."""
@@ -107,13 +108,35 @@ def require_fitting(to: str, path: Path) -> None:
 
 
 def with_readme(
-    trained: Trained, to: str, files: Mapping[str, bytes], *, use: str, about: str, summary: Sequence[str]
+    trained: Trained,
+    to: str,
+    files: Mapping[str, bytes],
+    *,
+    use: str,
+    about: str,
+    summary: Sequence[str],
+    example: Sequence[str] = (),
 ) -> Exported:
-    """Return an export with a README. about: follows the units in its conventions. summary: without full stops."""
-    exporter, conventions = EXPORTERS[to], f"{UNITS}; {about}"
+    """Return an export with a README.
+
+    Args:
+        trained: model and arm.
+        to: format.
+        files: contents by name.
+        use: first line after the title.
+        about: follows the units and the tip in the conventions.
+        summary: sentences without full stops.
+        example: lines of Python that run in the folder of the README.
+    """
+    exporter, conventions = EXPORTERS[to], f"{UNITS}; the tip is the link {trained.tip}; {about}"
     title, result = f"Dynamics of {trained.robot} {exporter.title}", f"{'; '.join(summary)}."
     name = f"{exporter.suffix}.README.md" if exporter.suffix else "README.md"
     text = readme(title, use, trained.joint_names, conventions, result)
+    if example:
+        text += "\n".join(["", "```python", *example, "```", ""]).encode()
+    for table in trained.intervals:
+        lines = map(printable, table.text().splitlines())
+        text += "\n".join(["", "```text", *lines, "```", ""]).encode()
     return Exported(to, trained.robot, {**files, name: text}, tuple(summary))
 
 

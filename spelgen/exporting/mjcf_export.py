@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 import torch
 from lxml import etree
 
-from spelgen.arm.arm import Chain, Coordinate
+from spelgen.arm.arm import Chain, Coordinate, make_arm
 from spelgen.dynamics.body_regressor import about_center, quaternion
+from spelgen.emission.build import build
 from spelgen.exporting.describe import Trained, tip_frame
 from spelgen.exporting.description import Servos
 from spelgen.exporting.exported import Exported, with_readme
+from spelgen.exporting.mjcf_shapes import add_shapes
 from spelgen.exporting.parity import Parity, Values, random_inputs, relative, require_parity
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection, rigid_body_projection
 from spelgen.exporting.tuning import TUNING
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
+
+if TYPE_CHECKING:
+    from spelgen.emission.assemble import ArmModel
 
 SECTIONS = ("worldbody", "equality", "tendon", "actuator")
 
@@ -27,7 +36,7 @@ def export_mjcf(trained: Trained) -> Exported:
     Raises RunError if M, bias and forward dynamics of these bodies differ in MuJoCo.
     """
     projection = rigid_body_projection(trained.model, trained.arm)
-    text = mjcf_text(projection)
+    text, omitted = mjcf_text(projection)
     parity = check_mjcf(text, projection)
     checked = f"Checked when exported, by MuJoCo {mujoco.__version__}, friction apart: {parity.summary}"
     actuators = "a motor for each input."
@@ -42,8 +51,12 @@ def export_mjcf(trained: Trained) -> Exported:
         "mujoco.MjModel.from_xml_path(FILE.xml): bodies by the names of the links that their joints move, armature, "
         f"viscous friction as damping and Coulomb friction as frictionloss, {actuators}"
     )
-    about = "a body's frame has its joint's axis as z; torque offsets of the sensors are left out."
-    summary = [*projection.summary, checked]
+    about = (
+        "a body's frame has its joint's axis as z; the tip is a site; links touch other things, not each other; torque "
+        "offsets of the sensors are left out."
+    )
+    shapes = [f"shapes omitted, since they cannot be read or are flat: {omitted}"] if omitted else []
+    summary = [*projection.summary, *shapes, checked]
     return with_readme(trained, "mjcf", {".xml": text}, use=use, about=about, summary=summary)
 
 
@@ -61,14 +74,28 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
         torques = servos.kp * (controls - random["q"]) - servos.kd * random["qd"]
         torques = np.clip(torques, -servos.limit, servos.limit)
     q = torch.from_numpy(random["q"])
-    mass = projection.bodies.mass_matrix(q)
-    bias = projection.bodies.nonlinear_effects(q, torch.from_numpy(random["qd"]))
+    bodies = _with_exact_angles(projection)
+    mass = bodies.mass_matrix(q)
+    bias = bodies.nonlinear_effects(q, torch.from_numpy(random["qd"]))
     force = torch.from_numpy(torques @ projection.inputs.T) - bias
     expected = {"mass_matrix": mass, "bias": bias, "forward_dynamics": torch.linalg.solve(mass, force)}
     differences: dict[str, float] = {}
     for name, values in _simulated(text, arm, random["q"], random["qd"], controls).items():
         differences[name] = relative(values, expected[name].numpy())
     return require_parity(differences, TUNING.mujoco_tolerance, states)
+
+
+def _with_exact_angles(projection: RigidBodyProjection) -> ArmModel:
+    """Return the rigid bodies with the unrounded angles of the URDF, which the file has."""
+    arm, bodies = projection.arm, copy.deepcopy(projection.bodies)
+    chain = make_arm(
+        arm.robot, joints=arm.chain.joint_names, angle_tolerance=0.0, gravity=arm.settings.gravity
+    )
+    if chain.bodies != arm.chain.bodies and isinstance(bodies, RigidBodyDynamics):
+        exact = build(replace(arm, chain=chain, angle_tolerance=0.0), "closed-form")
+        assert isinstance(exact, RigidBodyDynamics)
+        bodies.chain = exact.chain
+    return bodies
 
 
 def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls: np.ndarray) -> Values:
@@ -81,7 +108,8 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
         controls: inputs of the actuators, (states, n).
     """
     model = mujoco.MjModel.from_xml_string(text.decode())
-    # without friction, which has another form in MuJoCo
+    # without limits of torques, and without friction, which has another form in MuJoCo
+    model.jnt_actfrclimited[:] = 0
     model.dof_damping[:] = 0.0
     model.dof_frictionloss[:] = 0.0
     # positions and velocities of all joints, mimic joints included, from the coordinates
@@ -110,10 +138,11 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
     return {name: np.array(rows) for name, rows in values.items()}
 
 
-def mjcf_text(projection: RigidBodyProjection) -> bytes:
-    """Return the MJCF of a projection.
+def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
+    """Return the MJCF of a projection, and the links whose shapes are omitted.
 
-    Actuators are motors, one per nonzero column of G, or a position actuator per joint with a position servo.
+    Angles are the unrounded angles of the URDF, so that the tip is where other readers of the file have it. Actuators
+    are motors, one per nonzero column of G, or a position actuator per joint with a position servo.
     """
     arm = projection.arm.chain
     root = etree.Element("mujoco", model=arm.name)
@@ -122,8 +151,8 @@ def mjcf_text(projection: RigidBodyProjection) -> bytes:
     _add(root, "option", gravity=arm.gravity)
     world, equality, tendons, actuators = (etree.SubElement(root, tag) for tag in SECTIONS)
     is_coupled = np.count_nonzero(projection.motors, axis=1) > 1
-    elements = [world]
-    for body, inertia in zip(arm.bodies, projection.inertias, strict=True):
+    elements, tip = [world], tip_frame(projection.arm)
+    for body, inertia in zip(tip.bodies, projection.inertias, strict=True):
         name = projection.arm.robot.joint[body.name].child
         pose = {"pos": body.translation, "quat": quaternion(body.rotation)}
         element = _add(elements[body.parent + 1], "body", name=name, **pose)
@@ -143,7 +172,6 @@ def mjcf_text(projection: RigidBodyProjection) -> bytes:
         _add(element, "joint", **joint)
         polynomial = body.offset, body.multiplier, 0, 0, 0
         _add(equality, "joint", joint1=body.name, joint2=leader.name, polycoef=polynomial)
-    tip = tip_frame(projection.arm)
     pose = {"pos": tip.pose[:3, 3], "quat": quaternion(tip.pose[:3, :3])}
     _add(elements[tip.carrier + 1], "site", name=tip.link, **pose)
     for k in np.flatnonzero(is_coupled).tolist():
@@ -156,22 +184,26 @@ def mjcf_text(projection: RigidBodyProjection) -> bytes:
     for section in (equality, tendons):
         if not len(section):
             root.remove(section)
+    omitted = add_shapes(root, elements, projection.arm)
     # indented for people
     etree.indent(root)
     text: bytes = etree.tostring(root, xml_declaration=True, encoding="utf-8")
-    return text + b"\n"
+    return text + b"\n", omitted
 
 
 def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> dict[str, object]:
     """Return motor and friction attributes of joint k, which is no mimic joint; is_coupled: (n,)."""
-    friction = projection.friction
+    friction, joint = projection.friction, projection.arm.chain.coordinates[k]
+    # position servos have the learned limit of their torque
+    effort = joint.effort if projection.servos is None else None
     return {
         # the rotor of a motor that several joints rotate is the armature of a tendon
         "armature": 0.0 if is_coupled[k] else projection.armature[k],
         "damping": friction.viscous[k],
         "frictionloss": friction.coulomb[k],
         "solimpfriction": " ".join(f"{number:g}" for number in TUNING.friction_impedance),
-        "range": projection.arm.chain.coordinates[k].limits,
+        "range": joint.limits,
+        "actuatorfrcrange": None if effort is None else (-effort, effort),
     }
 
 

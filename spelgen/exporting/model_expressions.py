@@ -75,7 +75,7 @@ def _expressions(
     motors = constant(model.motors)
     frames = body_frames(model.arm.bodies, q)
     rigid_mass, rigid_potential = mass_and_potential(model, q)
-    # of motors and residual terms
+    # M of the motors' rotors and of the residual terms
     added_mass = constant(model.constant_mass) + symmetric(model, residuals["mass"])
     mass = rigid_mass + added_mass
     rigid_gravity = rigid_torque(model, frames, standstill, standstill)
@@ -83,6 +83,7 @@ def _expressions(
     if model.residuals.mass is not None:
         added_bias = added_gravity + coriolis(model, residuals, qd, derivatives=derivatives)
     bias = rigid_torque(model, frames, qd, standstill) + added_bias
+    # Power is equal on both sides of the gears: C^T drive_load = joint_load.
     load = constant(np.linalg.inv(model.motors).T) @ rigid_gravity
     drive_friction = friction_torque(model, motors @ qd, load, z)
     for k, joint in enumerate(model.residuals.friction):
@@ -92,6 +93,7 @@ def _expressions(
     # one recursive Newton-Euler pass; M qdd + h would take two
     force = rigid_torque(model, frames, qd, qdd) + added_mass @ qdd + added_bias + friction - compensation
     applied = constant(model.inputs) @ (tau - model.torque_offset)
+    # Half of qd times it is the kinetic energy: M is used once.
     momentum = mass @ qd
     potential = rigid_potential + residuals["energy"] + residuals["torque_energy"]
     pose, jacobian = tip_kinematics(model, q)
@@ -205,6 +207,7 @@ def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Ou
         symbols.append(symbol)
         jacobians.append(jacobian)
     by_position = ca.jtimes(force, ca.vertcat(*symbols), ca.vertcat(*jacobians))
+    # Residual terms of M enter through their coriolis terms, which are explicit in qd.
     by_velocity = ca.jacobian(force, inputs["qd"])
     right = ca.horzcat(-by_position, -by_velocity, constant(model.inputs))
     # at the accelerations of the forward dynamics
@@ -230,6 +233,7 @@ def _solve(matrix: ca.SX, right: ca.SX) -> ca.SX:
         inverse = 1 / matrix[k, k]
         row = matrix[k, k + 1 :]
         factor = inverse * row
+        # Schur complement of the pivot; M is positive definite, so no pivoting is needed.
         matrix[k + 1 :, k + 1 :] -= factor.T @ row
         right[k + 1 :, :] -= factor.T @ right[k, :]
         right[k, :] *= inverse

@@ -1,4 +1,4 @@
-"""--to onnx: programs of torch.export as ONNX files in float64, for any batch size."""
+"""--to onnx: programs of torch.export as ONNX files in float64 or float32, for any batch size."""
 
 from __future__ import annotations
 
@@ -18,30 +18,40 @@ from torch.overrides import TorchFunctionMode
 
 from spelgen.dynamics.prepared import PreparedModel
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.entry_points import select_names
 from spelgen.exporting.exported import Exported, with_readme
-from spelgen.exporting.parity import Called, Values, check_parity
-from spelgen.exporting.torch_export import PROGRAMS, export_program, program_inputs, program_output
+from spelgen.exporting.parity import Called, Values
+from spelgen.exporting.torch_export import (
+    calls,
+    check_programs,
+    export_program,
+    number_type,
+    program_inputs,
+    program_names,
+    program_output,
+)
 from spelgen.exporting.tuning import TUNING
 
 
 def export_onnx(trained: Trained) -> Exported:
     """Return an .onnx file for each entry point. Raises RunError if ONNX Runtime and the model differ."""
-    model = trained.model.prepared()
+    model = trained.prepared()
     models, files = {}, {}
-    for name in select_names(trained.entries, PROGRAMS):
+    for name in program_names(trained):
         models[name] = files[f"{name}.onnx"] = onnx_model(model, name)
-    parity = check_parity(called_by_onnx(models), trained, list(models), TUNING.onnx_tolerance)
+    parity = check_programs(called_by_onnx(models), trained, list(models), TUNING.onnx_tolerance)
     checked = f"Checked when exported, by ONNX Runtime {onnxruntime.__version__}: {parity.summary}"
-    use = (
-        "onnxruntime.InferenceSession('forward_dynamics.onnx').run(['qdd'], {'q': q, 'qd': qd, 'tau': tau}), "
-        "float64 (batch, n), any batch."
-    )
+    use = f"ONNX files for any runtime, {number_type(model)} (batch, n), any batch."
     size = model.n * model.elements
     about = f"one file per entry point: {', '.join(models)}."
     if size:
         about = f"z, the friction state, is (batch, {size}); {about}"
-    return with_readme(trained, "onnx", files, use=use, about=about, summary=[checked])
+    example = ["import numpy as np", "import onnxruntime", "", "", "def run(name, **inputs):"]
+    example += ['    return onnxruntime.InferenceSession(f"{name}.onnx").run(None, inputs)[0]', "", ""]
+    number = f"np.{number_type(model)}"
+    example += calls(
+        model, list(models), f"np.zeros((5, {model.n}), {number})", f"np.zeros((5, {size}), {number})"
+    )
+    return with_readme(trained, "onnx", files, use=use, about=about, summary=[checked], example=example)
 
 
 def onnx_model(model: PreparedModel, name: str) -> bytes:
@@ -166,7 +176,9 @@ def called_by_onnx(files: Mapping[str, bytes]) -> Called:
 
     def called(name: str, inputs: Values) -> Values:
         session = sessions[name]
-        (output,) = session.run(None, {node.name: inputs[node.name] for node in session.get_inputs()})
+        types = {"tensor(float)": np.float32, "tensor(double)": np.float64}
+        arrays = {node.name: inputs[node.name].astype(types[node.type]) for node in session.get_inputs()}
+        (output,) = session.run(None, arrays)
         return {program_output(name): output}
 
     return called

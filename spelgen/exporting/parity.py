@@ -65,23 +65,18 @@ class Parity:
 
 def require_parity(differences: dict[str, float], tolerance: float, states: int) -> Parity:
     """Return the parity of differences by entry point. Raises RunError if a difference is above the tolerance."""
-    # the reference of the tip rounds to float32
-    tolerances = {
-        name: max(tolerance, TUNING.tip_tolerance) if name.startswith("tip_") else tolerance
-        for name in differences
-    }
     for name, difference in differences.items():
-        if not difference <= tolerances[name]:  # also true for NaN
+        if not difference <= tolerance:  # also true for NaN
             raise RunError(
                 f"{name} differs from the model by {difference:.1e}",
                 element="parity check",
-                expected=f"at most {tolerances[name]:.0e} of the largest value",
+                expected=f"at most {tolerance:.0e} of the largest value",
                 do="nothing was written; please report this with the run folder",
             )
-    worst = max(differences, key=lambda name: differences[name] / tolerances[name])
+    worst = max(differences, key=differences.__getitem__)
     summary = (
         f"{states} random states: at most {differences[worst]:.1e} ({worst}) from the torch module, "
-        f"relative to the largest value; {tolerances[worst]:.0e} is allowed"
+        f"relative to the largest value; {tolerance:.0e} is allowed"
     )
     return Parity(differences, summary)
 

@@ -125,6 +125,7 @@ def _nearest_bodies(model: ArmModel, arm: Arm, q: Tensor) -> ArmModel:
     load = gravity.square().mean().sqrt().clamp(min=1e-9)
 
     def distance() -> Tensor:
+        """Return the cost with its ridge, ()."""
         mass_error = whitening @ bodies.mass_matrix(q) @ whitening.mT - mass
         gravity_error = (bodies.gravity(q) - gravity) / load
         # parameters of zero are the URDF's bodies

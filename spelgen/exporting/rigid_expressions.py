@@ -59,6 +59,7 @@ def rigid_torque(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.
         ratio = float(body.multiplier)
         speed = ratio * qd[body.coordinate]
         added = ratio * qdd[body.coordinate]
+        # Everything is in the frame of the body: constants of the body need no rotation.
         acceleration = rotation.T @ (acceleration + spin @ position)
         w, rate = rotation.T @ w, rotation.T @ rate
         turning = ca.cross(w, _Z) * speed
@@ -97,6 +98,7 @@ def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return M, (n, n), and V, (1, 1) [J], of the rigid bodies at q (n, 1), by the recursion of `structure`."""
     positions = []
     for joint, base in enumerate(base_denominators(model.arm)):
+        # Angles of mimic joints are integer multiples of the base angle.
         angle = q[joint] / base
         positions.append(Position(ca.cos(angle), ca.sin(angle), q[joint]))
     result = energies(model.arm, positions, model.inertias.tolist(), float)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 from safetensors.torch import save
 from torch import Tensor, nn
@@ -14,7 +15,7 @@ from spelgen.dynamics.prepared import PreparedModel
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.entry_points import ENTRY_POINTS, select_names
 from spelgen.exporting.exported import Exported, with_readme
-from spelgen.exporting.parity import Called, Values, check_parity
+from spelgen.exporting.parity import Called, Parity, Values, check_parity
 from spelgen.exporting.tuning import TUNING
 
 PROGRAMS: dict[str, Callable[..., Tensor]] = {
@@ -24,28 +25,74 @@ PROGRAMS: dict[str, Callable[..., Tensor]] = {
     "bias": PreparedModel.bias,
     "gravity": PreparedModel.gravity,
     "friction": PreparedModel.friction_torque,
+    "friction_step": PreparedModel.memory_after,
+    "friction_memory": PreparedModel.memory,
+    "tip_pose": PreparedModel.pose,
+    "tip_jacobian": PreparedModel.jacobian,
 }
 """The entry points with a program, and the methods that compute them."""
+FRICTION_STATE = ("friction_step", "friction_memory")
+"""The entry points of models with a friction state."""
 
 
 def export_torch(trained: Trained) -> Exported:
     """Return a .pt2 file per entry point and model.safetensors. Raises RunError if a program differs from the model."""
-    model = trained.model.prepared()
+    model = trained.prepared()
     programs, files = {}, {}
-    for name in select_names(trained.entries, PROGRAMS):
+    for name in program_names(trained):
         programs[name] = files[f"{name}.pt2"] = _saved(export_program(model, name))
-    parity = check_parity(_called_by_torch(programs, model), trained, list(programs), TUNING.tolerance)
+    parity = check_programs(_called_by_torch(programs, model), trained, list(programs), TUNING.tolerance)
     checked = f"Checked when exported, by torch {torch.__version__}: {parity.summary}"
     # clones, since safetensors refuses shared memory
     parameters = {key: x.cpu().contiguous().clone() for key, x in trained.model.state_dict().items()}
-    use = (
-        "qdd = torch.export.load('forward_dynamics.pt2').module()(q, qd, tau), float64 (batch, n), any batch, then z, "
-        "(batch, n, K), if there is a friction state; "
-        "model.safetensors contains the trained parameters by the names of the emitted module."
-    )
+    shapes = f"{number_type(model)} (batch, n), any batch"
+    if model.elements:
+        shapes += f"; z, the friction state, is (batch, n, {model.elements})"
+    use = f"Programs of torch.export, {shapes}. model.safetensors has the trained parameters by the module's names."
     about = "the programs have no gradients with respect to parameters."
+    example = ["import torch", "", "", "def run(name, **inputs):"]
+    example += ['    return torch.export.load(f"{name}.pt2").module()(*inputs.values())', "", ""]
+    zeros = f"torch.zeros(5, {model.n}, dtype=torch.{number_type(model)})"
+    example += calls(model, list(programs), zeros, f"torch.zeros(5, {model.n}, {model.elements}).to(q)")
     files["model.safetensors"] = save(parameters)
-    return with_readme(trained, "torch", files, use=use, about=about, summary=[checked])
+    return with_readme(trained, "torch", files, use=use, about=about, summary=[checked], example=example)
+
+
+def program_names(trained: Trained) -> list[str]:
+    """Return the names of the programs to export. Raises RunError for unknown names."""
+    available = [name for name in PROGRAMS if trained.memory or name not in FRICTION_STATE]
+    return select_names(trained.entries, available)
+
+
+def check_programs(called: Called, trained: Trained, names: Sequence[str], tolerance: float) -> Parity:
+    """Compare programs with the torch model; programs in float32 have their own tolerance. Raises RunError."""
+    if trained.float32:
+        return check_parity(called, trained, names, TUNING.float32_tolerance, dtype=np.float32)
+    return check_parity(called, trained, names, tolerance)
+
+
+def number_type(model: PreparedModel) -> str:
+    """Return float32 or float64."""
+    return str(model.dtype).removeprefix("torch.")
+
+
+def calls(model: PreparedModel, names: Sequence[str], zeros: str, no_state: str) -> list[str]:
+    """Return lines of Python that call ``run`` for all programs, friction_memory first and friction_step last.
+
+    Args:
+        model: of the programs.
+        names: of the programs.
+        zeros: expression for q, (5, n).
+        no_state: expression for z without friction_memory.
+    """
+    lines = [f"q = qd = qdd = tau = dq = {zeros}  # a batch of 5; dq: change of q since the last step"]
+    if model.elements and "friction_memory" not in names:
+        lines.append(f"z = {no_state}")
+    for name in sorted(names, key=lambda name: (name == "friction_step") - (name == "friction_memory")):
+        output = {"friction_memory": "z", "friction_step": "z"}.get(name, program_output(name))
+        inputs = ", ".join(f"{key}={key}" for key in program_inputs(model, name))
+        lines.append(f'{output} = run("{name}", {inputs})  # {ENTRY_POINTS[name].about}')
+    return lines
 
 
 def _saved(program: torch.export.ExportedProgram) -> bytes:
@@ -62,7 +109,7 @@ def _called_by_torch(files: dict[str, bytes], model: PreparedModel) -> Called:
     programs = {name: torch.export.load(io.BytesIO(content)).module() for name, content in files.items()}
 
     def called(name: str, inputs: Values) -> Values:
-        tensors = {key: torch.from_numpy(value) for key, value in inputs.items()}
+        tensors = {key: torch.from_numpy(value).to(model.dtype) for key, value in inputs.items()}
         if model.elements:
             tensors["z"] = tensors["z"].reshape(-1, model.n, model.elements)
         with torch.no_grad():
@@ -75,17 +122,18 @@ def _called_by_torch(files: dict[str, bytes], model: PreparedModel) -> Called:
 class _Program(nn.Module):
     """An entry point with the inputs of its program."""
 
-    def __init__(self, model: PreparedModel, name: str) -> None:
+    def __init__(self, model: PreparedModel, name: str, flat_state: bool) -> None:
         super().__init__()
-        self._model, self._function = model, PROGRAMS[name]
-        self._stateful = "z" in program_inputs(model, name)
+        self._model, self._function, self._name, self._flat = model, PROGRAMS[name], name, flat_state
+        self._names = program_inputs(model, name)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return the output, (batch, ...), for inputs (batch, n) and z (batch, n, K) or (batch, n K)."""
-        if self._stateful:
-            *states, z = inputs
-            return self._function(self._model, *states, z.reshape(-1, self._model.n, self._model.elements))
-        return self._function(self._model, *inputs)
+        states = dict(zip(self._names, inputs, strict=True))
+        if "z" in states:
+            states["z"] = states["z"].reshape(-1, self._model.n, self._model.elements)
+        output = self._function(self._model, *states.values())
+        return output.flatten(1) if self._flat and self._name in FRICTION_STATE else output
 
 
 def export_program(
@@ -99,9 +147,9 @@ def export_program(
     if "z" in shapes:
         shapes["z"] = (model.n * model.elements,) if flat_state else (model.n, model.elements)
     # a batch of two: torch.export treats one as a constant
-    inputs = tuple(torch.full((2, *shape), 0.1, dtype=torch.float64) for shape in shapes.values())
+    inputs = tuple(torch.full((2, *shape), 0.1, dtype=model.dtype) for shape in shapes.values())
     batch = tuple({0: torch.export.Dim("batch")} for _ in inputs)
-    return torch.export.export(_Program(model, name), inputs, dynamic_shapes=(batch,))
+    return torch.export.export(_Program(model, name, flat_state), inputs, dynamic_shapes=(batch,))
 
 
 def program_inputs(model: PreparedModel, name: str) -> tuple[str, ...]:

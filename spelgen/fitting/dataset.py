@@ -26,7 +26,7 @@ from spelgen.settings.fits import DEFAULTS, Solver
 class WindowChoice:
     """Choice of the windows for training and validation.
 
-    validation: trajectories, or the fraction of the logs that validates. These are whole trajectories, chosen at random
+    validation: trajectories, or the fraction of the logs that validates: whole trajectories, chosen at random
     with `seed` before windows are cut, so that no sample is in both parts. window, stride, reach: see `cut_windows`.
     """
 
@@ -60,7 +60,7 @@ class TrainingData:
     """Windows of the logs for training and validation.
 
     preprocessing: the resolved one. digest: of all numbers, so that a fit resumes on the same data only. recordings:
-    all trajectories, those of validation included.
+    all trajectories, with validation.
     """
 
     training: Windows
@@ -84,6 +84,7 @@ def prepare_data(
     """Check the logs, split them and cut windows. Raises LogError."""
     if not trajectories:
         raise LogError("no logs", expected="a trajectory or more")
+    # Whole trajectories are set aside: neighbouring windows of one motion are not independent.
     split = _split(trajectories, choice)
     everything = list(trajectories)
     if not isinstance(choice.validation, float):
@@ -92,10 +93,12 @@ def prepare_data(
         require_joints(trajectory, joints)
     require_torques(everything)
     notes = check(everything, joints, joint_types)
+    # Resolved once for all logs: training and validation need the same filter.
     resolved = preprocessing.resolved([x.sample_rate for x in everything])
     windows = choice.windows(split.training, resolved)
     return TrainingData(
         training=windows,
+        # A bounded number of windows: validation follows every epoch.
         validation=thinned(choice.windows(split.validation, resolved), TUNING.validation_windows),
         scales=loss_scales(windows, joint_types),
         preprocessing=resolved,
@@ -121,6 +124,7 @@ def digest(trajectories: Iterable[Trajectory]) -> str:
     for x in trajectories:
         for array in (x.t, x.q, x.qd, x.tau, x.u):
             if array is not None:
+                # The bytes of the arrays, without a copy of contiguous ones.
                 numbers.update(np.ascontiguousarray(array).data)
     return numbers.hexdigest()
 
@@ -145,7 +149,9 @@ class Validation:
         self.solver, self.prescribed = solver, substeps
         self.size = len(data.validation)
         self.scales = data.scales.to(device)
+        # Larger batches than in training: no graph of derivatives is in memory.
         self.batches = data.validation.to(device).split(4 * batch)
+        # Evenly spread windows, so that fast and slow parts of the motion are in the probe.
         self.probe = data.training[:: -(-len(data.training) // TUNING.probe_windows)].to(device)
 
     def loss(self, substeps: int) -> float:
@@ -155,6 +161,7 @@ class Validation:
             with torch.no_grad():
                 for windows in self.batches:
                     loss = rollout_loss(self.model, windows, self.scales, substeps, self.solver)
+                    # Weighted by size: the last batch may be smaller.
                     total += loss.item() * len(windows)
         except torch.linalg.LinAlgError:
             return math.inf

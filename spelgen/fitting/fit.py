@@ -76,11 +76,13 @@ def fit(
     run = None if folder is None else RunFolder(folder)
     logs = [logs] if isinstance(logs, Trajectory) else logs
     config = choose_config(model, config, lambda: sample_rates(logs))
+    # A resumed run uses its own copy of the URDF: the user's file may have changed.
     urdf = run.urdf if run is not None and options.resume else _urdf(arm)
     folder = None if run is None else run.path
     request = FitRequest(model, logs, config, preprocessing, validation, seed, urdf, options, began, folder)
     objective = objective_of(request)
     if run is not None and not options.resume:
+        # Before the logs are filtered and cut, which may take minutes.
         run.require_free(force=options.force)
     with threads_of_torch(options.threads), termination_as_interrupt(), locked(folder):
         require_device(options.device)
@@ -106,6 +108,7 @@ class _Fitting:
             self._resume(self.run)
         else:
             self.notes += objective.begin()
+            # A new run is written after the first steps succeeded: there is no folder for logs that cannot be fitted.
             self.run.start(required_spec(request.model), request.urdf, force=request.options.force)
             self._save()
             mapping = self.record.mapping.model_dump(mode="json", exclude_defaults=True)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
+from typing import Literal, overload
 
 import numpy as np
 import torch
@@ -17,6 +19,7 @@ from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.files import write_json
 from spelgen.fitting.objective import Status
+from spelgen.fitting.posterior import Posterior, Uncertain, posterior_of
 from spelgen.fitting.process import locked
 from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import Checkpoint, Content, Record
@@ -113,21 +116,46 @@ class Fit:
         """Number of fitted parameters."""
         return used_parameter_count(self.model)
 
-    def predict(self, trajectory: Trajectory) -> np.ndarray:
+    @cached_property
+    def posterior(self) -> Posterior:
+        """95 % intervals of the parameters, of M(q), g(q) and of predicted torques.
+
+        Raises RunError unless rigid bodies were fitted to torques.
+        """
+        delay = self.record.preprocessing.torque_delay or 0.0
+        file = None if self.folder is None else RunFolder(self.folder).checkpoint
+        return posterior_of(self.model, self.checkpoint.posterior, delay, file)
+
+    @overload
+    def predict(self, trajectory: Trajectory, *, std: Literal[False] = False) -> np.ndarray: ...
+    @overload
+    def predict(self, trajectory: Trajectory, *, std: Literal[True]) -> Uncertain: ...
+    def predict(self, trajectory: Trajectory, *, std: bool = False) -> np.ndarray | Uncertain:
         """Return joint torques (T, n) [Nm, N] of the model's inverse dynamics along a trajectory, at its own times.
 
         Velocity is filtered as in the fit and differentiated. NaN in pieces between gaps that are too short for that.
+
+        Args:
+            trajectory: of the arm.
+            std: return the torques with their standard deviations (see `Posterior.torque`).
         """
-        tau, reach = np.full_like(trajectory.q, np.nan), bristle_reach(self.model)
+        reach = bristle_reach(self.model)
+        tau, deviation = np.full_like(trajectory.q, np.nan), np.full_like(trajectory.q, np.nan)
         for start, stop in pairwise(gap_ends(trajectory.t, self.preprocessing.gap)):
+            # One sample has no acceleration.
             if stop - start < 2:
                 continue
             piece = trajectory[start:stop]
+            # The zero-phase filter needs a few samples for its transient.
             if self.preprocessing.cutoff and len(piece) > 3:
                 piece = low_pass(piece, self.preprocessing.cutoff)
             qdd = np.gradient(piece.qd, piece.t, axis=0)
-            tau[start:stop] = self._torque(piece.q, piece.qd, qdd, bristles_along(piece.q, reach))
-        return tau
+            motion = piece.q, piece.qd, qdd, bristles_along(piece.q, reach)
+            if std:
+                tau[start:stop], deviation[start:stop] = self.posterior.torque(*motion)
+            else:
+                tau[start:stop] = self._torque(*motion)
+        return Uncertain(tau, deviation) if std else tau
 
     def score(self, logs: Trajectory | Sequence[Trajectory]) -> float:
         """Return 1 - nMSE of the torque on the samples of ``logs`` that move: 1 is perfect, 0 as good as a constant.
@@ -162,6 +190,7 @@ class Fit:
             run.start(spec, self.urdf, force=force)
             run.write_metrics(self.history)
             run.save(self.model.state_dict(), self.checkpoint.content)
+            # Before config.json, which marks a complete run.
             if self.baselines:
                 write_json(run.baseline, self.baselines)
             write_json(run.config, self.record.to_dict())

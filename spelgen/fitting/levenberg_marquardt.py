@@ -38,6 +38,7 @@ class NormalEquations(NamedTuple):
     def step(self, damping: float | torch.Tensor = 0.0) -> torch.Tensor:
         """Return the damped step (..., k); damping: one number, or (...), one per system of equations."""
         factor = torch.as_tensor(damping, dtype=self.curvature.dtype)[..., None, None]
+        # Marquardt's scaling by diag H, not Levenberg's by 1: steps do not depend on the units of the parameters.
         diagonal = torch.diag_embed(self.curvature.diagonal(dim1=-2, dim2=-1))
         result: torch.Tensor = torch.linalg.solve(self.curvature + factor * diagonal, self.descent)
         return result
@@ -52,7 +53,7 @@ class SolverState(Generic[Parameters]):
     """Iterate of the solver.
 
     residual: of the problem at x, reused by its normal equations. damping: of the next step. steps: accepted steps,
-    those of former calls included.
+    former calls included.
     """
 
     x: Parameters
@@ -79,10 +80,10 @@ class LeastSquaresProblem(Protocol[Parameters]):
     """Cost of parameters x, computed from a residual (or from its sums of squares, if the residual is too large)."""
 
     def residual(self, x: Parameters) -> torch.Tensor:
-        """Return the residual, from which the cost and the normal equations are computed."""
+        """Return the residual, from which the cost is computed: of samples, (T, n), or squared and summed, (n,)."""
 
     def cost(self, x: Parameters, residual: torch.Tensor) -> float:
-        """Return the cost; infinite if the residual diverged."""
+        """Return the cost for this residual, (...,); infinite if the residual diverged."""
 
     def normal_equations(self, x: Parameters, residual: torch.Tensor) -> NormalEquations:
         """Return Gauss-Newton Hessian and negative gradient with respect to the free parameters, (k, k) and (k,)."""
@@ -150,10 +151,12 @@ def _accepted_step(
     for _ in range(TUNING.max_trials):
         step = normal.step(damping)
         predicted = normal.predicted_decrease(step)
+        # More damping predicts a smaller decrease still: there is nothing to try after this.
         if predicted < max(TUNING.min_predicted_decrease * state.cost, min_decrease):
             return Termination.SMALL_PREDICTION
         best = _best_candidate(problem, state, step, predicted)
         if best.cost < state.cost:
+            # The lower bound keeps the damping within reach of the next few failures.
             return replace(best, damping=max(damping / TUNING.damping_factor, TUNING.min_damping))
         damping *= TUNING.damping_factor
     return Termination.NO_DECREASE
@@ -171,6 +174,7 @@ def _best_candidate(
         candidate = initial_state(problem, x, state.damping, state.steps + 1)
         if candidate.cost < best.cost:
             best = candidate
+        # The quadratic model holds here: further candidates would cost evaluations and gain little.
         if state.cost - best.cost >= TUNING.min_gain_ratio * predicted:
             break
     return best

@@ -117,6 +117,7 @@ class Objective(ABC):
 
         Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError for files of another model.
         """
+        # An objective without own states is finished at its checkpoint: only the weights count.
         self.model.load_state_dict(checkpoint["best_weights"])
         self._checkpoint = checkpoint
 
@@ -166,7 +167,8 @@ class TorqueLogObjective(Objective):
             return None
         try:
             return urdf_regularizer(urdf, self.model.joint_names, self.model, data.training)
-        except Exception as error:  # Pinocchio and its parser raise many kinds; the fit goes on without
+        # Pinocchio and its parser raise many types; the fit continues without a regularizer
+        except Exception as error:
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             message = f"fitted without the URDF's regularizer: {reason}"
             notes.append(Diagnostic("info", "no-regularizer", urdf.name, None, message))
@@ -179,6 +181,7 @@ def new_record(request: FitRequest, prepared: PreparedLogs) -> Record:
     config, fraction = prepared.config, None
     if prepared.validation and isinstance(request.validation, float):
         fraction = request.validation
+    notes = [*prepared.notes, *request.options.notes]
     record = Record(
         schema=2,
         robot=spec.robot if spec else type(model).__name__,
@@ -197,6 +200,7 @@ def new_record(request: FitRequest, prepared: PreparedLogs) -> Record:
         mapping=request.options.mapping or LogMapping(input=input_of(model)),
         device=request.options.device,
         threads=request.options.threads,
+        warnings=[f"{note.where}: {note.message}" for note in notes if note.severity == "warning"],
     )
     if prepared.scales is None:
         return record

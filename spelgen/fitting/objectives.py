@@ -28,7 +28,7 @@ class FitOptions:
     """Options of a fit whose objective may not be known yet.
 
     objective: None: chosen by `default_objective`. options: by name; an option that does not apply is an error.
-    defaults: by name, for options that are not given; those that do not apply are omitted.
+    defaults: by name, for options that are not given; inapplicable ones are omitted.
     """
 
     objective: str | None = None

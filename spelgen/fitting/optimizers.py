@@ -72,6 +72,7 @@ class MiniBatchAdamW(WindowOptimizer):
     ) -> None:
         self._parameters, matrices = _trainable(model)
         self._batch, self._generator = batch, generator
+        # Constants of friction and mass are few and have physical units: decay would bias them towards zero.
         vectors = [parameter for parameter in self._parameters if parameter.dim() <= 1]
         self._optimizer = torch.optim.AdamW(
             [
@@ -83,6 +84,7 @@ class MiniBatchAdamW(WindowOptimizer):
     def run(self, loss: Loss, windows: Windows, steps: int, learning_rate: LearningRate) -> float:
         """See `WindowOptimizer`."""
         rows, size = steps * self._batch, len(windows)
+        # Whole passes over the windows, so that each window is used equally often.
         passes = [torch.randperm(size, generator=self._generator) for _ in range(-(-rows // size))]
         total: torch.Tensor | float = 0.0  # on the device: no synchronization with a GPU between steps
         for step, batch in enumerate(torch.cat(passes)[:rows].split(self._batch)):
@@ -102,6 +104,7 @@ class MiniBatchAdamW(WindowOptimizer):
         value.backward()
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, TUNING.gradient_norm)
         self._optimizer.step()
+        # 0 * NaN is NaN: a gradient that is not finite marks the loss without a test on the host.
         return value.detach() + 0.0 * norm
 
 
@@ -141,7 +144,7 @@ class LBFGS(WindowOptimizer):
         return self.minimise(lambda: [loss(windows)], steps)
 
     def minimise(self, summands: Summands, steps: int) -> float:
-        """Run on a loss that is the sum of its summands."""
+        """Take steps on the sum of these losses, see `run`; only one of them is in memory with its graph."""
         group = self._optimizer.param_groups[0]
         group["max_iter"], group["max_eval"] = steps, steps
         self._finite = False
@@ -155,6 +158,7 @@ class LBFGS(WindowOptimizer):
         except torch.linalg.LinAlgError:
             return math.nan
         loss, (last, last_penalised) = total.item(), group["last"]
+        # The loss may rise while the penalised one falls: either is progress.
         progress = loss <= TUNING.lbfgs_stalled * last or penalised <= TUNING.lbfgs_stalled * last_penalised
         group["last"], group["waits"] = (loss, penalised), 0 if progress else group["waits"] + 1
         return loss
@@ -173,6 +177,7 @@ class LBFGS(WindowOptimizer):
             for number, summand in enumerate(summands()):
                 if number == 0:
                     summand = summand + self._penalty()
+                # Gradients add up, so that only one summand's graph is in memory.
                 summand.backward()
                 value = value + summand.detach()
             gradients = torch.cat([x.grad.flatten() for x in self._parameters if x.grad is not None])

@@ -28,6 +28,7 @@ LOCK = ".lock"
 def require_device(device: str) -> None:
     """Raise RunError if torch cannot use the device."""
     try:
+        # torch has no test for a device: it raises an error at the first tensor.
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
@@ -74,6 +75,7 @@ def locked(folder: Path | None) -> Iterator[None]:
     if folder is None:
         yield
         return
+    # Folders that do not exist yet: they are removed if the fit writes nothing.
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     file = folder / LOCK
     lock = FileLock(file, timeout=0)
@@ -87,6 +89,7 @@ def locked(folder: Path | None) -> Iterator[None]:
                 f"{holder} trains in this folder", file=folder, do="wait for it, or -o another"
             ) from None
     try:
+        # For the message to another process: the lock itself has no content.
         file.write_text(f"process {os.getpid()} on {socket.gethostname()}, since {time.strftime('%F %T')},")
         yield
     finally:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
@@ -17,11 +17,7 @@ from spelgen.logs.windows import Windows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import Solver
 
-SOLVER: dict[str, Any] = {
-    "method": "dopri5",
-    "rtol": TUNING.adaptive_rtol,
-    "atol": TUNING.adaptive_atol,
-}
+SOLVER: dict[str, object] = {"method": "dopri5", "rtol": TUNING.adaptive_rtol, "atol": TUNING.adaptive_atol}
 AT_REST = 1e-6  # [rad, m] below the resolution of encoders
 
 
@@ -52,13 +48,15 @@ def roll_out(
         def rhs(
             q: torch.Tensor, p: torch.Tensor, z: torch.Tensor, tau: torch.Tensor = tau
         ) -> tuple[torch.Tensor, torch.Tensor]:
+            """Return the rates of q and p, (W, n) each."""
             return model.port_hamiltonian_rhs(q, p, tau, prepared, *known_past(model, z))
 
         for substep in range(substeps):
             q, p, z, qd = advance(model, rhs, q, p, z, dt.unsqueeze(-1) / substeps)
             if substep == 0:
-                velocities.append(qd)  # of the sample that the interval starts at
+                velocities.append(qd)  # at the start of the interval
         positions.append(q)
+    # rk4 computes the velocity at the start of an interval anyway: only the last one is missing.
     velocities = [*velocities[1:], model.velocity(model.at(q, prepared=prepared), p)]
     return torch.stack(positions, dim=1), torch.stack(velocities, dim=1)  # each (W, K-1, n)
 
@@ -79,6 +77,7 @@ def _adaptive_step(
     from torchdiffeq import odeint  # its import takes half a second
 
     def rate(t: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        """Return the rate of the state (q, p), (W, 2 n), per sample interval."""
         q_now, p_now = state.chunk(2, dim=-1)
         return step * torch.cat(rhs(q_now, p_now, memory_after(dynamics, z, q_now - q)), dim=-1)
 
@@ -128,6 +127,7 @@ def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
             f"windows in which no joint moves by {AT_REST:g} rad or m", expected="motion", do="record some"
         )
     changed = windows.qd[:, 1:] - windows.qd[:, :1]
+    # A constant torque, mostly of gravity, is no scale of the torque that moves the arm.
     varied = windows.tau - windows.tau.mean(dim=(0, 1))
     return LossScales(
         _scale(moved.square().mean(dim=0)),
@@ -155,7 +155,7 @@ def rollout_errors(
 def rollout_loss(
     model: ArmModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
 ) -> torch.Tensor:
-    """Return the mean squared scaled error of the rollout, (): SPEL eq. 8 with other units.
+    """Return the mean squared scaled error, (), of the rollouts (W, K, n): SPEL eq. 8 with other units.
 
     The paper sums squared geodesic distances and velocity errors over joints and samples in rad and rad/s. Scaled, all
     joints and samples have the same weight, and the loss of a prediction of standstill is 1.
@@ -221,6 +221,7 @@ def choose_substeps(model: ArmModel, windows: Windows, scales: LossScales, start
     """Return the minimum number of rk4 steps per sample interval, at least `start`, with a small integration error."""
     substeps, coarse = start, probed(model, windows, scales, start)
     while substeps < TUNING.max_substeps:
+        # Half the step divides the error of rk4 by 16: the difference of the two is the error of the coarse one.
         fine = probed(model, windows, scales, 2 * substeps)
         if integration_error(coarse, fine) < TUNING.integration_fraction:
             break

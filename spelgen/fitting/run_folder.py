@@ -62,7 +62,7 @@ class RunFolder:
         """
         self.require_free(force=force)
         robot = self._robot_files(urdf)  # before anything is removed: they may be this very run's copies
-        # first what makes it a run
+        # first the files that mark a run
         old_files = (
             self.config, self.urdf, self.settings, self.mapping, self.metrics, self.checkpoint, self.weights,
             self.evaluation, self.baseline,
@@ -76,7 +76,7 @@ class RunFolder:
         if urdf is None:
             return []
         settings = urdf.with_suffix(".yaml")
-        robot = [(self.urdf, urdf_bytes(urdf))] if urdf.exists() else []  # what a xacro file expands to
+        robot = [(self.urdf, urdf_bytes(urdf))] if urdf.exists() else []  # a xacro file is expanded
         return robot + ([(self.settings, settings.read_bytes())] if settings.is_file() else [])
 
     def save(self, weights: Content, checkpoint: Content) -> None:
@@ -136,7 +136,7 @@ class RunFolder:
         try:
             _require_unpacked_size(path)
             state = torch.load(path, map_location="cpu", weights_only=True)
-        except Exception as error:  # torch names no common type for what a broken file raises
+        except Exception as error:  # torch has no common type of errors for broken files
             raise RunError(
                 f"unreadable ({type(error).__name__})", file=path, expected="a file of `spelgen train`"
             ) from error
@@ -167,7 +167,7 @@ SERVO_LIMIT = "servo.limit"
 
 
 def _require_unpacked_size(path: Path) -> None:
-    """Raise ValueError where tensors would fill the memory: torch itself takes what a file says of their sizes."""
+    """Raise ValueError if tensors would fill the memory: torch allocates the sizes that a file states."""
     with ZipFile(path) as archive:
         size = sum(member.file_size for member in archive.infolist())
     if size > LARGEST_STATE:

@@ -26,7 +26,7 @@ from spelgen.settings.messages import validated
 from spelgen.settings.values import Count, NonNegative, Positive, Whole
 
 Content = dict[str, Any]
-"""The content of a file of a run folder, by key: JSON, or what torch saves."""
+"""The content of a file of a run folder, by key: JSON, or a checkpoint of torch."""
 
 Schema = TypeVar("Schema", bound=BaseModel)
 MAY_CHANGE = ("epochs", "patience", "max_minutes")  # between a run and its resumption
@@ -35,10 +35,11 @@ MAY_CHANGE = ("epochs", "patience", "max_minutes")  # between a run and its resu
 class Record(BaseModel):
     """The record of a fit, which config.json keeps: the data, the settings as resolved, and the results.
 
-    config: the options that apply to the model; its type is that of the objective. joints: names in the order of q.
+    config: the options that apply to the model; its type depends on the objective. joints: names in the order of q.
     validation_fraction: None if validation logs were given. data_digest: SHA-256 of all numbers of the logs. training,
     validation: names of the logs. scales: of the validation loss. mapping: with which the logs were read. servo:
     parameters of position servos with intervals, when such a fit is finished. notes: messages of a fit to torques.
+    warnings: about the logs and the links of the URDF.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -63,6 +64,7 @@ class Record(BaseModel):
     threads: int = 1
     servo: Content | None = None
     notes: list[str] = []
+    warnings: list[str] = []
 
     @field_validator("config", mode="before")
     @classmethod
@@ -127,7 +129,8 @@ class Checkpoint(BaseModel):
     """The content of checkpoint.pt: the progress of a fit, and the states of its objective that it resumes from.
 
     seconds: time of the fit [s]. substeps: integrator steps per sample interval. torque_nmse: mean squared torque error
-    divided by the variance, per joint. The last three belong to fits to windows. States are checked by torch.
+    divided by the variance, per joint. posterior: see `fitting.posterior`; None
+    except for rigid bodies fitted to torques. The last three belong to fits to windows. States are checked by torch.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow")
@@ -140,6 +143,7 @@ class Checkpoint(BaseModel):
     substeps: Substeps
     best_weights: InstanceOf[dict]  # type: ignore[type-arg]
     torque_nmse: list[float] = []
+    posterior: InstanceOf[dict] | None = None  # type: ignore[type-arg]
     rollbacks: Whole = 0
     learning_rate_factor: Positive = 1.0
     momentum_done: bool = True

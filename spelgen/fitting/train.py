@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from spelgen.emission.loading import load_module
+from spelgen.emission.build import load_module
 from spelgen.errors import Diagnostic, ModuleError, RunError
 from spelgen.fitting.fit import AUTOMATIC, QUIET, RunOptions, fit, sample_rates
 from spelgen.fitting.fitted import Fit
@@ -39,7 +39,7 @@ def train(
     """Fit the module to the logs and write a run folder (see `RunFolder`); see `fit`.
 
     urdf: the robot the module was built from, for the regularizer and the baselines; by default the file
-    of that name beside the module. source: without a module, a run whose model is adapted. config: may
+    of that name in the module's folder. source: without a module, a run whose model is adapted. config: may
     also be options, for an objective that depends on the logs. require: raises for logs that are wrong, before anything
     is fitted, or returns findings. validation: 0.25 by default, seed: 0. For a resumed run all of these
     are by default as before, and logs are read as spelgen writes them if ``options`` has no mapping.

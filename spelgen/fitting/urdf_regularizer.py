@@ -31,7 +31,7 @@ class UrdfRegularizer(NamedTuple):
     gravity_scale: torch.Tensor
 
     def loss(self, model: ArmModel) -> torch.Tensor:
-        """Return the mean squared difference of the model in M and in the gravity torque, both without unit."""
+        """Return the mean squared difference of the model in M and in the gravity torque, (), both without unit."""
         variation = _variation(model.mass_matrix(self.q), self.whitening) - self.variation
         gravity = (model.gravity(self.q) - self.gravity) / self.gravity_scale
         return variation.square().sum(dim=(-2, -1)).mean() / gravity.shape[-1] + gravity.square().mean()

@@ -15,8 +15,8 @@ from spelgen.arm.arm import Chain
 from spelgen.dynamics.friction import BRISTLES, FrictionModel
 from spelgen.dynamics.regressor_dynamics import regressor
 from spelgen.identification.tuning import TUNING
+from spelgen.labels import parameter_name
 from spelgen.structure.base_parameters import base_parameters as body_base_parameters
-from spelgen.structure.base_parameters import parameter_name
 
 
 @dataclass(frozen=True, eq=False)

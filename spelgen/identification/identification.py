@@ -18,13 +18,13 @@ from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.regressor_dynamics import RegressorDynamics
 from spelgen.errors import Diagnostic
 from spelgen.identification.base_parameters import BaseParameters
+from spelgen.identification.intervals import DETERMINED, Interval, base_unit, interval_listing
 from spelgen.identification.torque_delay import NO_DELAY, TorqueDelay
 from spelgen.identification.tuning import TUNING
 from spelgen.labels import UNITS, counted
 from spelgen.listing import WIDTH, Listing
 
 SCHEMA = 3
-DETERMINED = ("firm", "fair", "weak", "may be zero")
 _WEIGHTED = {
     "equal": "joints weighted equally",
     "range": "each joint weighted by its torque's range",
@@ -37,7 +37,8 @@ class LeastSquares:
     """Method of a linear identification.
 
     weights: of the squared errors of the joints: ``equal``, ``range`` (divided by the variance of a joint's torque) or
-    ``noise`` (divided by the variance of its residual, in a few iterations).
+    ``noise`` (divided by the variance of its residual, in a few iterations). friction: columns of friction;
+    ``FrictionModel(memory=True)``: dry friction with hysteresis.
     """
 
     weights: Literal["equal", "range", "noise"] = "noise"
@@ -90,20 +91,19 @@ class Identification:
         position, velocity, acceleration = map(torch.from_numpy, (q, qd, qdd))
         return self.dynamics.joint_torque(position, velocity, acceleration, past).numpy()
 
-    @property
-    def determined(self) -> tuple[str, ...]:
-        """Precision of each base parameter: ``firm``, ``fair``, ``weak`` or ``may be zero``."""
-        return tuple(map(_determined, self.values, self.deviations))
+    @cached_property
+    def intervals(self) -> tuple[Interval, ...]:
+        """The base parameters with 95 % intervals."""
+        estimates = zip(self.base.names, self.values.tolist(), self.deviations.tolist(), strict=True)
+        return tuple(Interval(name, value, std, base_unit(name)) for name, value, std in estimates)
 
     def to_dict(self) -> dict[str, object]:
         """Return the result in its JSON form, a public contract."""
         joints = list(self.arm.joint_names)
         friction = self.method.friction
-        records: list[dict[str, object]] = []
-        formulas, determined = self.base.formulas(), self.determined
-        for k, name in enumerate(self.base.names):
-            record = {"name": name, "formula": formulas[k], "value": float(self.values[k])}
-            records.append(record | {"deviation": _finite(self.deviations[k]), "determined": determined[k]})
+        records = []
+        for interval, formula in zip(self.intervals, self.base.formulas(), strict=True):
+            records.append(interval.to_dict() | {"formula": formula})
         return {
             "schema": SCHEMA,
             "robot": self.arm.name,
@@ -146,16 +146,11 @@ class Identification:
         joints: list[tuple[str, ...]] = []
         for x, rms, nmse in zip(self.arm.coordinates, self.residual, self.nmse, strict=True):
             joints.append((x.name, f"{rms:.4g}", UNITS[x.joint_type].torque, f"{nmse:.3g}"))
-        parameters: list[tuple[str, ...]] = []
-        values = zip(self.base.names, self.values, self.deviations, self.determined, strict=True)
-        for name, value, deviation, word in values:
-            parameters.append((name, f"{value:.5g}", f"{deviation:.2g}", word))
-        title = "Base parameters [kg, m, s], with standard deviation; numbers after names: joint"
-        columns = ("parameter", "value", "+-", "determined")
+        title = "Base parameters [kg, m, s], with half 95 % intervals; numbers after names: joint"
         head = ("joint", "RMS", "", "nMSE")
         return (
             Listing("Torque residual: RMSE and nMSE", head, tuple(joints), left=(0, 2)),
-            Listing(title, columns, tuple(parameters), left=(0, 3)),
+            interval_listing(title, self.intervals),
         )
 
     def __repr__(self) -> str:
@@ -187,7 +182,7 @@ class Identification:
             conditioned += "acceptable."
         else:
             conditioned += "poor: some parameters trade against each other; excite the arm more."
-        counts = Counter(self.determined)
+        counts = Counter(x.determined for x in self.intervals)
         sure = ", ".join(f"{counts[word]} {word}" for word in DETERMINED if word in counts)
         return textwrap.fill(conditioned, WIDTH) + f"\nParameters: {sure}."
 
@@ -205,14 +200,6 @@ def identified_dynamics(
         return friction.torque(constants, qd, deflection, drives.speeds)
 
     return RegressorDynamics(arm, parameters[:inertial], constants[0], torque, drives, reach)
-
-
-def _determined(value: float, deviation: float) -> str:
-    """Return the precision of a base parameter: its standard deviation relative to its value."""
-    for word, limit in zip(DETERMINED, (TUNING.firm, TUNING.fair, 1.0), strict=False):
-        if deviation <= limit * abs(value):
-            return word
-    return DETERMINED[-1]
 
 
 def _finite(value: float) -> float | None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Chain
@@ -17,6 +18,7 @@ from spelgen.dynamics.regressor_dynamics import body_chain, regressor
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.identification import Identification, LeastSquares
+from spelgen.identification.intervals import BLOCKS, MIN_BLOCK, jackknife_covariance, student_scale
 from spelgen.identification.least_squares import Columns, Solution, deviations, reduce, solve
 from spelgen.identification.torque_delay import TorqueDelay, find_torque_delay
 from spelgen.identification.tuning import TUNING
@@ -134,6 +136,34 @@ class _Equations:
         residuals = [rows @ solution.parameters - tau for rows, tau in self._rows(friction)]
         return deviations(residuals, solution.rank)
 
+    def _jackknife(
+        self, friction: FrictionModel, solution: Solution, weights: np.ndarray, combination: np.ndarray
+    ) -> np.ndarray:
+        """Return standard deviations (r,) of combinations (r, k) of the k fitted parameters (`jackknife_covariance`).
+
+        weights: (n,) of the joints.
+        """
+        columns, count = solution.columns, sum(len(block.q) for block in self._blocks)
+        group = np.arange(count) * BLOCKS // count  # contiguous blocks of samples
+        curvature = np.zeros((BLOCKS, len(columns), len(columns)))
+        descent, first = np.zeros((BLOCKS, len(columns))), 0
+        for rows, tau in self._rows(friction):
+            residual = (tau - rows @ solution.parameters) * weights
+            weighted = rows[:, :, columns] * weights[:, None]
+            numbers = group[first : first + len(tau)]
+            for number in np.unique(numbers).tolist():
+                samples = numbers == number
+                jacobian = weighted[samples].reshape(-1, len(columns))
+                curvature[number] += jacobian.T @ jacobian
+                descent[number] += residual[samples].ravel() @ jacobian
+            first += len(tau)
+        length = np.sqrt(curvature.sum(axis=0).diagonal())  # columns have different units
+        curvature /= np.outer(length, length)
+        ridge = TUNING.negligible * np.eye(len(columns))
+        _, covariance = jackknife_covariance(*map(torch.from_numpy, (curvature, descent / length, ridge)))
+        root = combination / length
+        return np.asarray(np.sqrt(np.einsum("rk,kl,rl->r", root, covariance.numpy(), root)))
+
     def solved(self, method: LeastSquares) -> Identification:
         """Return the result of a method. Raises LogError without samples."""
         if not self._blocks:
@@ -153,13 +183,20 @@ class _Equations:
             noise = np.maximum(self._noise(method.friction, solution), TUNING.least_noise * torque_range)
             used, weights = weights, 1.0 / noise
         squares = triangles.squares(solution.parameters) / triangles.count
+        combination = base.combination[:, base.columns]
+        std = solution.deviations(triangles, used**2 * noise, combination)
+        # without parameters that the samples do not determine at all
+        if solution.rank == len(base) and triangles.count > BLOCKS * MIN_BLOCK:
+            std = np.maximum(
+                std, student_scale(BLOCKS) * self._jackknife(method.friction, solution, used, combination)
+            )
         return Identification(
             arm=self.arm,
             method=method,
             base=base,
             parameters=solution.parameters,
             values=base.combination @ solution.parameters,
-            deviations=solution.deviations(triangles, used**2 * noise, base.combination[:, base.columns]),
+            deviations=std,
             condition=solution.condition,
             unseen=len(base) - solution.rank,
             residual=np.sqrt(squares),

@@ -14,8 +14,8 @@ from spelgen.identification.tuning import GEOMETRY
 class InertialPrior:
     """Student-t prior of the inertial parameters (10 B,) of B bodies.
 
-    mean: (10 B,). precision: (10 B, 10 B), inverse of the scale matrix. freedom: half of the degrees of freedom and
-    parameters, the factor of log(1 + distance^2 / freedom).
+    mean: (10 B,). precision: (10 B, 10 B), inverse of the scale matrix. freedom: half the
+    sum of degrees of freedom and number of parameters, the factor of log(1 + distance^2 / freedom).
     """
 
     mean: np.ndarray

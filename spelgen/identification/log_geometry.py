@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -127,13 +127,39 @@ class GeometryProblem:
         self.samples = self.unchanged.logged(samples)
         self._prior: InertialPrior = inertial_prior(arm)
         self._count = float(np.clip(seconds / GEOMETRY.correlation_time, 1.0, GEOMETRY.max_errors))
+        self._counted: np.ndarray | None = None
         self._equations: dict[tuple[bytes, Vector3], tuple[np.ndarray, np.ndarray]] = {}
 
     def thinned(self, count: int) -> GeometryProblem:
-        """Return the problem on at most `count` samples."""
+        """Return the problem on at most `count` samples, evenly spaced."""
         fewer = copy(self)
         fewer.samples, fewer._equations = self.samples.thinned(count), {}
         return fewer
+
+    def on_torques(self, counted: np.ndarray) -> GeometryProblem:
+        """Return the problem in which only some torques count; counted: (S, n), of the unchanged log."""
+        fewer = copy(self)
+        fewer._equations, fewer._counted = {}, counted[..., None]
+        return fewer
+
+    def without_gravity(self, joint: int) -> GeometryProblem:
+        """Return the problem of the unchanged log in which the torque of one joint contains no gravity."""
+        weightless = replace(self.unchanged, gravity=(0.0, 0.0, 0.0))
+        rows = self.equations(self.unchanged)[0].copy()
+        rows[:, joint] = self.equations(weightless)[0][:, joint]
+        other = copy(self)
+        other._equations = {self.unchanged.motion_key: (rows, block_products(rows, 1)[:, 0])}
+        return other
+
+    def prediction_deviation(self, fit: HypothesisFit) -> np.ndarray:
+        """Return the standard deviation of the torques of a fit, (S, n) [Nm, N], from its parameters' covariance."""
+        rows, _ = self.equations(fit.hypothesis)
+        return np.asarray(np.sqrt(np.einsum("snk,kl,snl->sn", rows, fit.covariance, rows, optimize=True)))
+
+    def coulomb_friction(self, fit: HypothesisFit) -> np.ndarray:
+        """Return the Coulomb friction of a fit, (n,) [Nm, N]."""
+        joints = len(self.speeds)
+        return fit.parameters[len(self._prior.mean) + joints * COULOMB :][:joints]
 
     def torque(self, hypothesis: Hypothesis, parameters: np.ndarray) -> np.ndarray:
         """Return the torques (S, n) of parameters (K,) under a hypothesis."""
@@ -148,6 +174,7 @@ class GeometryProblem:
         if key not in self._equations:
             q, qd, qdd, _ = hypothesis.signals(self.samples)
             rows = drive_rows(body_chain(self.arm, hypothesis.gravity), q, qd, qdd, self.speeds)
+            rows = rows if self._counted is None else rows * self._counted
             if len(self._equations) >= GEOMETRY.kept:
                 self._equations.pop(next(iter(self._equations)))
             self._equations[key] = rows, block_products(rows, 1)[:, 0]
@@ -161,6 +188,7 @@ class GeometryProblem:
         """
         rows, normal = self.equations(hypothesis)
         tau = hypothesis.signals(self.samples).tau
+        tau = tau if self._counted is None else tau * self._counted[..., 0]
         right, total = np.einsum("snk,sn->nk", rows, tau), np.square(tau).sum(axis=0)
         variance = len(tau) * _variance(tau)
         prior, bodies = self._prior, len(self._prior.mean)

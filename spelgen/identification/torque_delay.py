@@ -1,4 +1,4 @@
-"""Find how much later than positions logs show torques, by least squares on torques moved in time."""
+"""Estimate the delay of torques relative to positions in logs, by least squares on torques shifted in time."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def find_torque_delay(
 
 
 def delay_of(problem: DriveProblem) -> TorqueDelay:
-    """Return the delay that samples show, or a coupling of motors instead."""
+    """Return the delay of the torques, or, if a coupling of motors explains the logs better, this coupling."""
     late, coupling = _likely_delay(problem), find_coupling(problem)
     if coupling is None:
         return late

@@ -29,7 +29,7 @@ class IdentificationTuning:
     firm: float = 0.05
     # [1] Relative standard deviation up to which a parameter is called fair; up to 1 it is called weak.
     fair: float = 0.2
-    # [1] Samples of one block of a pass.
+    # [1] Samples that a pass over the logs computes at a time.
     block: int = 2000
     # [1] A column is dependent if the part that other columns do not span is below this fraction of its length.
     dependent: float = 1e-9

@@ -2,41 +2,24 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic, LogError, collect
-from spelgen.identification.drive_hints import Coupling, drive_problem
-from spelgen.identification.drive_samples import DriveLog, DriveSamples
-from spelgen.identification.geometry_search import compare_readings
-from spelgen.identification.least_squares import varying
-from spelgen.identification.log_geometry import GeometryProblem, HypothesisFit, MotionSamples
-from spelgen.identification.torque_delay import delay_of
-from spelgen.identification.tuning import HINTS
-from spelgen.listing import Listing, number
 from spelgen.log_checks.check_servo_logs import ServoLogs
-from spelgen.log_checks.gravity import fit_gravity, joined, state_samples
-from spelgen.log_checks.remedies import GEOMETRY_CODES, Remedies, mapped_reading
-from spelgen.log_checks.report import JointReport, LogReport, joint_report, percent, signal_tables
-from spelgen.log_checks.robot_checks import CHECKS, WITHOUT_GRAVITY, JointEvidence, torque_factors
+from spelgen.log_checks.check_torque_logs import COUPLED, WRONG_LINK, TorqueLogs
+from spelgen.log_checks.remedies import GEOMETRY_CODES
+from spelgen.log_checks.report import LogReport, joint_report
+from spelgen.log_checks.robot_checks import CHECKS
 from spelgen.log_checks.statistics import Statistics, statistics
 from spelgen.log_checks.tuning import TUNING
-from spelgen.logs.bags import BAG
-from spelgen.logs.checks import Findings, LogChecks, run_checks
-from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.tables import UNIT_CODES
-from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_joints, require_torques
+from spelgen.logs.checks import LogChecks
+from spelgen.logs.trajectory import Trajectory, require_joints
 
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
     from spelgen.settings.log_mapping import LogMapping
 
-COUPLED, WRONG_VELOCITY, WRONG_LINK = "coupled-motors", "velocity-is-no-derivative", "urdf-inertials"
 ABOUT_ARM = {check.code for check in CHECKS} | {COUPLED, WRONG_LINK, *GEOMETRY_CODES}
 
 
@@ -94,144 +77,3 @@ def require_sound_logs(
     collect(report.errors)
     # a fit itself reports checks that need no arm, and finds the delay of torques
     return [note for note in report.findings if note.code in ABOUT_ARM]
-
-
-class TorqueLogs:
-    """Check logs of torques with the model of their arm, from samples that are kept while the logs go by."""
-
-    def __init__(self, arm: Arm, mapping: LogMapping) -> None:
-        self._arm, self._mapping, self._drives = arm, mapping, arm.actuation.drives()
-        self._samples: list[np.ndarray] = []
-        self._moving = DriveLog(arm.chain.joint_types, self._drives, Preprocessing())
-        self._declared: list[set[str]] = []
-        self._seconds, self._is_bag = 0.0, False
-
-    def add(self, trajectory: Trajectory) -> None:
-        """Take in a trajectory. Raises LogError without torques."""
-        require_torques([trajectory])
-        self._samples.append(state_samples(trajectory, self._drives.inputs))
-        self._moving.add(trajectory)
-        self._declared.append(set(trajectory.accepted))
-        self._seconds += trajectory.duration
-        if trajectory.file is not None:
-            self._is_bag |= trajectory.file.suffix in BAG.suffixes or (trajectory.file / BAG.marker).exists()
-
-    def check(
-        self, reports: Sequence[JointReport], summary: Findings
-    ) -> tuple[list[JointReport], tuple[Listing, ...]]:
-        """Return the reports with gravity's part in the torques, and tables; add the findings to the summary."""
-        # a code that files declare holds if all of them declare it
-        accepted = set(self._mapping.accept) | set.intersection(*self._declared)
-        motion = joined(self._samples)
-        completed = []
-        fits = fit_gravity(self._arm.chain, motion)
-        for report, gravity in zip(reports, fits, strict=True):
-            completed.append(replace(report, gravity=gravity))
-        evidence = list(map(JointEvidence, self._arm.chain.coordinates, completed))
-        # with wrong velocities friction is wrong too, and hints about drives would be wrong with wrong torques
-        has_errors = bool(summary.errors)
-        is_sound = not has_errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
-        moving = self._moving.samples()
-        is_right = not is_sound or self._is_read_right(moving, motion, evidence, accepted, summary)
-        if is_sound and is_right and moving is not None:
-            self._check_drives(moving, summary)
-        for joint in evidence:
-            passed = accepted | {code for code in UNIT_CODES if self._is_declared(joint.coordinate.name)}
-            if has_errors or not is_right:  # one cause, one message
-                passed |= {"torque-beyond-drive", WITHOUT_GRAVITY}
-            where = f"joint {joint.coordinate.name!r}"
-            for check, message in run_checks(CHECKS, joint, passed):
-                summary.add(check, message, f"{where}, tau" if check.severity == "error" else where)
-        return completed, (*signal_tables(completed, QUANTITIES), _physics_table(completed))
-
-    def _is_declared(self, joint: str) -> bool:
-        """Whether the mapping states the unit of a joint's torque."""
-        return self._mapping.unit("tau", joint) is not None
-
-    def _is_read_right(
-        self,
-        moving: DriveSamples | None,
-        motion: np.ndarray,
-        joints: Sequence[JointEvidence],
-        accepted: set[str],
-        summary: Findings,
-    ) -> bool:
-        """Whether no other reading of the columns explains the torques better; add the finding if one does.
-
-        moving: filtered samples; None: the logs are too slow for accelerations, and motion (4, S, n) is used.
-        """
-        arm = self._arm.chain
-        q, qd, qdd, tau = motion
-        samples = MotionSamples(q, qd, qdd, tau)
-        if moving is not None:
-            samples = MotionSamples(moving.q, moving.qd, moving.qdd, moving.tau)
-        if len(samples.q) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
-            return True
-        reading = mapped_reading(arm, self._mapping, self._drives)
-        problem = GeometryProblem(arm, samples, self._drives.speeds, self._seconds, reading)
-        undeclared = [not self._is_declared(name) for name in arm.joint_names]
-        comparison = compare_readings(problem, torque_factors(joints, undeclared))
-        if not comparison.better:
-            summary.notes.extend(_link_notes(problem, comparison.unchanged))
-        if not comparison.better or set(comparison.codes) <= accepted:
-            return True
-        finding = Remedies(problem.unchanged, arm, self._mapping, self._is_bag).finding(comparison)
-        if isinstance(finding, Diagnostic):
-            summary.notes.append(finding)
-        else:
-            summary.errors.append(finding)
-        return False
-
-    def _check_drives(self, moving: DriveSamples, summary: Findings) -> None:
-        """Add a coupling of motors that the logs show, or else a delay of the torques."""
-        late = delay_of(drive_problem(body_chain(self._arm.chain), self._drives, moving))
-        if late.coupling is not None:
-            summary.notes.append(_coupling_hint(self._arm, *late.coupling))
-        else:
-            summary.notes.extend(late.notes)
-
-
-def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagnostic]:
-    """Yield a warning for each link whose inertials in the URDF are far from the log's."""
-    for k, ratio, deviation in problem.wrong_links(fit):
-        message = (
-            f"its first moment (mass times centre of mass) is {ratio:.2f} +- {deviation:.2f} times the URDF's by "
-            "least squares: check its mass and centre of mass in the URDF"
-        )
-        yield Diagnostic("warning", WRONG_LINK, f"link {problem.arm.bodies[k].link!r}", None, message)
-
-
-def _coupling_hint(arm: Arm, coupling: Coupling, remaining: float) -> Diagnostic:
-    """Return a coupling that the logs show, in the sidecar's words."""
-    names = arm.chain.joint_names
-    pair = [coupling.moved_by, coupling.joint]
-    matrix = np.array([[1.0, coupling.ratio], [0.0, 1.0]]) * np.diag(arm.actuation.matrix())[pair]
-    joints = json.dumps([names[k] for k in pair])
-    setting = f"couplings: [{{joints: {joints}, matrix: {matrix.round(6).tolist()}}}]"
-    if coupling.logged_at == "motors" and arm.settings.torque == "joint":
-        uncoupled = [name for k, name in enumerate(names) if k not in pair]
-        gears = ", ".join(f"{json.dumps(name)}: {{gear: 1}}" for name in uncoupled)
-        setting += f", 'torque: motor' and joints: {{{gears}}}"
-    message = (
-        f"its motor turns with {names[coupling.moved_by]!r} too, {coupling.ratio:g} times as fast, and the logged "
-        f"torques are those of the {coupling.logged_at}: least squares then misses {remaining:.0%} of what it missed "
-        f"of both torques (mean square); say {setting} in the robot's YAML"
-    )
-    return Diagnostic("warning", COUPLED, f"joint {names[coupling.joint]!r}", None, message)
-
-
-def _physics_table(joints: Sequence[JointReport]) -> Listing:
-    head = ("joint", "dq/dt : qd", "agree", "gravity in tau", "x URDF")
-    rows = []
-    for joint in joints:
-        fit = joint.gravity
-        # with a low correlation the factor means nothing
-        is_seen = abs(fit.correlation or 0) > TUNING.seen
-        velocity = number(joint.velocity_factor), number(joint.velocity_correlation)
-        rows.append((joint.name, *velocity, percent(fit.explained), number(fit.factor if is_seen else None)))
-    note = (
-        "dq/dt : qd and its correlation are 1 where qd is the derivative of q; gravity in tau: part of tau's "
-        "variance that gravity explains, beside friction and acceleration; x URDF: ratio to the URDF's gravity "
-        "torque."
-    )
-    return Listing("Physics", head, tuple(rows), note)

@@ -156,7 +156,7 @@ class LogReport:
 def joint_report(
     index: int, coordinate: Coordinate, measured: Sequence[Statistics], products: np.ndarray
 ) -> JointReport:
-    """Return the report of one joint over all trajectories. products: see `velocity_products`."""
+    """Return the report of one joint over all trajectories. products: (2 n, 2 n), see `velocity_products`."""
     low, high, noise, steps = {}, {}, {}, {}
     for name in measured[0].signals:
         lows, highs, noises, quanta = np.array([x.signals[name][:, index] for x in measured]).T

@@ -93,7 +93,7 @@ def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) 
 
 
 def _rounded(factor: float) -> float:
-    """Return one significant digit where it is within a tenth, else two: gravity shows a factor no better."""
+    """Return one significant digit if this changes the factor by less than a tenth, else two digits."""
     one = float(f"{factor:.1g}")
     return one if abs(one - factor) < 0.1 * factor else float(f"{factor:.2g}")
 

@@ -36,6 +36,20 @@ class LogCheckTuning:
     all_gravity_samples: int = 6000
     # [1] A column is dependent if the part that other columns do not span is below this fraction of its length.
     dependent: float = 1e-8
+    # [1] Squared torque error of a joint, relative to the variance, from which on least squares does not explain it.
+    unexplained: float = 0.1
+    # [1] Width of a flat top, of the signal's range; its smallest fraction of the samples, and ratio to the samples in
+    # three times that width below it: at most 1 for the peaks of a sinusoid.
+    flat_top: float = 0.005
+    flat_share: float = 0.01
+    flat_ratio: float = 2.0
+    # [1] Distance of a filtered signal from its limit, of its range, up to which it is at the limit.
+    near_limit: float = 0.02
+    # [1] Samples that determine the parameters of a joint in the model that contradicts a limit.
+    free_samples: int = 30
+    # [1] Contradiction: median difference at the limit in standard deviations of the residual, and of the torque.
+    certain: float = 3.0
+    excess: float = 0.08
     # [1] Trajectories that a page draws.
     examples: int = 2
     # [1] Trajectories that a terminal and a notebook list.

@@ -24,11 +24,13 @@ from spelgen.logs.jump_checks import (
     find_unsigned_velocity,
 )
 from spelgen.logs.rates import SLOWEST, is_dense, shows_accelerations
+from spelgen.logs.resonance import find_elastic
 from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
 from spelgen.logs.tuning import SIGNALS
 from spelgen.settings.log_mapping import TIMES
 
 DEGREES = 180.0 / np.pi
+ELASTIC = "elastic-joint"
 TURNS = 4 * np.pi  # [rad] A joint with limits turns less: larger positions are in degrees.
 
 Subject = TypeVar("Subject")
@@ -284,6 +286,7 @@ CHECKS: list[Check[JointSignals]] = [
         "velocity-is-no-derivative", "warning", find_wrong_velocity,
         unless=("degrees", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign"),
     ),
+    Check(ELASTIC, "warning", find_elastic, unless=("degrees", "time-unit", "frozen", "dropouts", "jumps")),
     Check("constant-torque", "warning", find_constant_torque, unless=("no-torques",), everywhere=True),
     Check("joint-at-rest", "info", find_rest, unless=("frozen",), everywhere=True),
 ]  # fmt: skip

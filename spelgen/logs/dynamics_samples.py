@@ -67,7 +67,7 @@ def dynamics_samples(
         if not pieces or not shows_accelerations(trajectory.sample_rate):
             continue
         columns = [_columns(piece, pauses, preprocessing.acceleration_cutoff, reach) for piece in pieces]
-        joined = columns[0]  # hours of motion without a hole are not copied
+        joined = columns[0]  # a single segment, which may be hours long, is not copied
         if len(columns) > 1:
             joined = list(map(np.concatenate, zip(*columns, strict=True)))
         samples.append(DynamicsSamples(trajectory.name, *joined))

@@ -43,7 +43,7 @@ def is_lost(values: np.ndarray) -> np.ndarray:
     lost = np.zeros(len(values), bool)
     logged = np.flatnonzero(values)
     if not logged.size or logged[-1] - logged[0] == len(logged) - 1:
-        return lost  # zeros at either end have no neighbours on both sides
+        return lost  # all zeros are at the ends, where the signal may be zero
     steps = np.abs(np.diff(values[logged]))
     # a signal that passes through 0 has samples close to 0 first
     nearest = np.minimum(np.abs(values[logged[:-1]]), np.abs(values[logged[1:]]))

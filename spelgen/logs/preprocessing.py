@@ -96,6 +96,6 @@ class Preprocessing:
     def moved(self, trajectories: Sequence[Trajectory]) -> Sequence[Trajectory]:
         """Return trajectories with torques at the times at which they act."""
         delay = self.torque_delay
-        if not delay:  # most logs have none, and a copy is checked again
+        if not delay:  # most logs have no delay; new trajectories would be validated again
             return trajectories
         return [replace(x, tau=earlier(x.t, x.tau, delay)) for x in trajectories]

@@ -14,5 +14,5 @@ def shows_accelerations(rate: float) -> bool:
 
 
 def is_dense(rate: float) -> bool:
-    """Whether the motion between two samples is nearly a line, so that differences from a line are noise."""
+    """Whether motion between samples is almost linear at this rate [Hz]: differences from a line are noise."""
     return rate * FAST >= TUNING.dense_rate

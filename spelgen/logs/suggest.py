@@ -79,7 +79,7 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     if not found["t"]:
         got = f"only the columns {shortened([x.name for x in columns], TUNING.listed)}"
         raise LogError(got, file=file, expected="one of times, called t or time")
-    # the stamp of the measurement before the time of its receipt; else the fewest words, as the plain clock has
+    # a column named header is the time of measurement, others may be times of receipt; else the shortest name
     clock = min(found.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))
     order = _order_in_cells(table, joints)
     by_joint = {quantity: _by_joint(named, joints, order) for quantity, named in found.items()}

@@ -121,7 +121,7 @@ class Trajectory:
     def _as_array(self, column: str) -> np.ndarray:
         values: object = getattr(self, column)
         try:
-            if hasattr(values, "detach"):  # a tensor, on any device and with any gradient
+            if hasattr(values, "detach"):  # a tensor may be on another device, or require gradients
                 values = values.detach().cpu()
             return np.asarray(values, dtype=float)
         except (TypeError, ValueError) as error:

@@ -127,5 +127,34 @@ class ServoRolloutTuning:
     step: float = 3.4e-3
 
 
+@dataclass(frozen=True)
+class ResonanceTuning:
+    """Detection of elastic joints. Recorded arms: see benchmarks; none of them shows a resonance."""
+
+    # [s] Length of a segment: its inverse is the resolution in frequency.
+    segment: float = 2.0
+    # [1] Smallest number of segments of a recording.
+    segments: int = 4
+    # [Hz] Band that is evaluated: below, gravity and friction prevail; links of arms resonate between 3 and 30 Hz.
+    lowest: float = 0.9
+    highest: float = 30.0
+    # [1] Logarithmic bands in it, and the smallest number of coherent bands.
+    bands: int = 25
+    fewest_bands: int = 5
+    # [1] Squared coherence in phase, and power relative to the strongest band, of bands that count.
+    coherence: float = 0.85
+    excited: float = 1e-3
+    # [1] Candidates of the resonance, up to this multiple of the highest excited frequency.
+    candidates: int = 120
+    beyond: float = 1.5
+    # [1] Relative error at least of the rigid, and at most of the elastic apparent inertia.
+    rigid_error: float = 0.1
+    elastic_error: float = 0.06
+    # [1] Smallest inertia of the link relative to the motor's.
+    smallest_link: float = 0.1
+    # [1] Relative increase of the apparent inertia up to which the rigid model is valid.
+    valid: float = 0.1
+
+
 TUNING, SIGNALS, SAMPLES = LogTuning(), SignalCheckTuning(), SampleTuning()
-SERVO_ROLLOUT = ServoRolloutTuning()
+SERVO_ROLLOUT, RESONANCE = ServoRolloutTuning(), ResonanceTuning()

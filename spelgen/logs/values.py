@@ -1,4 +1,4 @@
-"""Turn columns as they were logged into numbers in SI units and the URDF's senses, or name the row that is none."""
+"""Turn columns as they were logged into numbers in SI units and the URDF's senses, or name the row without a number."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,11 +58,11 @@ class AnimatedMotion:
 
 @dataclass(frozen=True)
 class AnimatedArm:
-    """The picture of the arm. data: JSON for the script. motions: labels of the motions."""
+    """The picture of the arm. data: JSON for the script. motions: their labels. tubes: see ``Scene``."""
 
     data: Markup
     motions: tuple[str, ...]
-    has_meshes: bool
+    tubes: str
 
 
 def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
@@ -101,16 +102,15 @@ def _explanations(arm: Chain, structure: Structure) -> dict[str, str]:
     return explanations
 
 
-def arm_section(arm: Chain, urdf: Path, traces: Traces | None = None) -> AnimatedArm:
-    """Return the arm with the motions of an evaluation; without any, with a motion through the joint ranges."""
+def arm_section(arm: Chain, urdf: Path, motions: Sequence[AnimatedMotion] = ()) -> AnimatedArm:
+    """Return the arm with its motions; without any, with a motion through the joint ranges."""
     shapes = scene(urdf, arm.joint_names)
-    motions = [] if traces is None else _motions(traces)
     motions = motions or [_sweep(arm)]
     data = record(shapes) | {"motions": list(map(record, motions))}
-    return AnimatedArm(json_data(data), tuple(motion.label for motion in motions), shapes.has_meshes)
+    return AnimatedArm(json_data(data), tuple(motion.label for motion in motions), shapes.tubes)
 
 
-def _motions(traces: Traces) -> list[AnimatedMotion]:
+def evaluated_motions(traces: Traces) -> list[AnimatedMotion]:
     """Return predictions, with the position error as colour, then test motions with the torque residual as colour."""
     motions = []
     for example in traces.trajectories:

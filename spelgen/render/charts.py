@@ -45,6 +45,7 @@ class Axis:
 
     def pixels(self, values: np.ndarray) -> np.ndarray:
         """Return the pixels (T,) of values (T,); a value outside the axis lies on its edge."""
+        # Clipped first: browsers limit the range of coordinates.
         clipped, low, high = np.clip(values, self.low, self.high), self.low, self.high
         if self.log:
             clipped, low, high = np.log(clipped), math.log(low), math.log(high)
@@ -97,6 +98,7 @@ class Line:
         for segment in np.split(np.round(corners, 1), np.flatnonzero(gaps)):
             finite = segment[np.isfinite(segment[:, 0])]
             if len(finite) > 1:
+                # Relative steps are short numbers, which make a page smaller.
                 segments.append(f"M{_spaced(finite[0])}l{_spaced(np.diff(finite, axis=0))}")
         return "".join(segments)
 
@@ -279,8 +281,7 @@ def _steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
     # the smallest step of 1, 2, 5 or 10 times a power of ten that gives at most five intervals
     rough = (high - low) / 5
     fine = 10.0 ** math.floor(math.log10(rough)) * np.array([1, 2, 5, 10])
-    step = fine[fine >= rough * (1 - 1e-9)][
-        0
-    ]  # the tolerance keeps a step that equals rough but for rounding
+    # the tolerance keeps a step that equals rough but for rounding
+    step = fine[fine >= rough * (1 - 1e-9)][0]
     values = step * np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
     return values, [f"{value:.6g}" for value in values]

@@ -63,6 +63,7 @@ def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -
         if result.simulated is not None:
             first.setdefault(result.preset, result.simulated)
     styles = dict(zip(first, STYLES, strict=False))
+    # Reversed, so that the first run of a preset is the one that remains.
     folders = {job.preset: job.folder for job in reversed(study.jobs) if job.arm == section.name}
     arm = inputs.load().chain
     examples = {name: figures.example for name, figures in first.items() if figures.example is not None}

@@ -15,11 +15,12 @@ from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.parameters import parameters_of_kind
 from spelgen.dynamics.regressor_dynamics import urdf_parameters
 from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
+from spelgen.fitting.posterior import Posterior
 from spelgen.fitting.run_record import Content
 from spelgen.identification.base_parameters import base_parameters
+from spelgen.identification.intervals import Interval
 from spelgen.labels import UNITS, entry_name
 from spelgen.listing import Listing
-from spelgen.render.tuning import TUNING
 from spelgen.runtime.constant_mass import ConstantMass
 from spelgen.runtime.derived_mass import DerivedMass
 from spelgen.runtime.network_dynamics import NetworkDynamics
@@ -40,14 +41,23 @@ class ParameterTable(Listing):
     folded_title: str = ""
 
 
-def parameter_tables(model: ArmModel | None, arm: Arm | None, identified: Content | None) -> list[Listing]:
-    """Return the tables of a run's parameters; `identified`: result of least squares on the same logs."""
+def parameter_tables(
+    model: ArmModel | None, arm: Arm | None, identified: Content | None, posterior: Posterior | None
+) -> list[Listing]:
+    """Return the tables of a run's parameters.
+
+    Args:
+        model: the trained model.
+        arm: None if the URDF is unknown.
+        identified: result of least squares on the same logs.
+        posterior: of the model, with its 95 % intervals; None for a model without any.
+    """
     tables: list[Listing] = []
     if arm is not None and identified and "base_parameters" in identified:
-        tables.append(base_table(model, arm, identified))
+        tables.append(base_table(model, arm, identified, posterior))
     if isinstance(model, RigidBodyDynamics):
-        tables.append(_body_table(body_parameters(model), arm))
-        tables.append(_joint_table(model, arm))
+        tables.append(_body_table(body_parameters(model), arm, posterior))
+        tables.append(_joint_table(model, arm, posterior))
     elif isinstance(model, NetworkDynamics):
         mass = model.mass
         if isinstance(mass, DerivedMass | ConstantMass) and len(mass.raw_constants):
@@ -61,8 +71,10 @@ def body_parameters(model: RigidBodyDynamics) -> np.ndarray:
     return values
 
 
-def base_table(model: ArmModel | None, arm: Arm, identified: Content) -> ParameterTable:
-    """Return the base parameters by least squares, from the URDF and of a rigid-body model."""
+def base_table(
+    model: ArmModel | None, arm: Arm, identified: Content, posterior: Posterior | None = None
+) -> ParameterTable:
+    """Return the base parameters by least squares, from the URDF and of a rigid-body model, with 95 % intervals."""
     effects = identified["method"]["effects"]
     friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
     base = base_parameters(arm.chain, friction, arm.actuation.drives().speeds)
@@ -78,19 +90,24 @@ def base_table(model: ArmModel | None, arm: Arm, identified: Content) -> Paramet
     if not arm.chain.inertials_complete:
         nominal[:] = np.nan
     columns = {"parameter": names, "URDF": list(map(_number, nominal))}
-    note = "The intervals are those of least squares on the training logs [kg, m, s]"
-    if isinstance(model, RigidBodyDynamics):
-        # the inertial parameters of all bodies, then of the drives only the armature, as the friction models differ
+    note = "Intervals are of 95 % [kg, m, s]"
+    if posterior is not None:
+        # friction models differ: only base parameters of bodies and armatures are common
+        known = {x.name: x for x in posterior.base_parameters}
+        columns["model, 95 %"] = [known[name].text if name in known else "" for name in names]
+        pairs = zip(names, determined, strict=True)
+        determined = [known[name].determined if name in known else word for name, word in pairs]
+        note += (
+            "; a value of least squares may lie outside the interval of the model because of an effect that least "
+            "squares has no column for"
+        )
+    elif isinstance(model, RigidBodyDynamics):
         common = np.concatenate([body_parameters(model).ravel(), model.armature.detach().numpy()])
         learned = base.combination[:, : len(common)] @ common
         for k in range(base.bodies, len(names)):
             if not names[k].startswith("armature"):
                 learned[k] = np.nan
         columns["model"] = list(map(_number, learned))
-        note += (
-            "; a value of the model may lie outside its interval because of the prior, or of an effect that least "
-            "squares has no column for"
-        )
     columns["least squares, 95 %"] = list(map(_interval, parameters))
     columns["determined"], columns["made of"] = determined, formulas
     sure: list[tuple[str, ...]] = []
@@ -117,14 +134,17 @@ def _number(value: float) -> str:
 
 def _interval(parameter: Content) -> str:
     """Return the value of a base parameter with its confidence interval, if it has one."""
-    value = f"{parameter['value']:.4g}"
-    if parameter["deviation"] is not None:
-        value += f" ± {TUNING.interval * parameter['deviation']:.2g}"
-    return value
+    if parameter["deviation"] is None:
+        return _number(parameter["value"])
+    return Interval("", parameter["value"], parameter["deviation"]).text
 
 
-def _body_table(values: np.ndarray, arm: Arm | None) -> Listing:
+def _body_table(values: np.ndarray, arm: Arm | None, posterior: Posterior | None) -> Listing:
     """Return mass, centre of mass and principal moments of each body; values: (bodies, 10)."""
+    alone = ""
+    if posterior is not None:
+        alone = ", ".join(f"{x.name} = {x.text} {x.unit}" for x in posterior.bodies)
+        alone = f" Identifiable on their own, with 95 % intervals: {alone or 'none'}."
     names = [f"body {k + 1}" for k in range(len(values))]
     nominal = None
     if arm is not None:
@@ -142,7 +162,7 @@ def _body_table(values: np.ndarray, arm: Arm | None) -> Listing:
         ("moves with", "by", "m [kg]", "centre of mass x, y, z [m]", "principal moments about it [kg m²]"),
         tuple(rows),
         "In the frame of the joint; z is its axis. Only the base parameters are identifiable: many such sets give the "
-        "same motion. Every set shown is physically consistent.",
+        f"same motion. Every set shown is physically consistent.{alone}",
     )
 
 
@@ -158,29 +178,29 @@ def _listed(values: np.ndarray) -> str:
     return ", ".join(f"{value:.3g}" for value in values)
 
 
-def _joint_table(model: ArmModel, arm: Arm | None) -> Listing:
-    """Return armature, friction and torque offset of each joint of a rigid-body model."""
+def _joint_table(model: ArmModel, arm: Arm | None, posterior: Posterior | None) -> Listing:
+    """Return armature, friction and torque offset of each joint of a rigid-body model, with 95 % intervals."""
     units = [UNITS[joint_type] for joint_type in model.joint_types]
     torques = [unit.torque for unit in units]
     dampings = [f"{unit.torque} s/{unit.position}" for unit in units]
-    columns = {
-        "joint": [f"joint {number + 1}" for number in range(model.n)],
-        "armature": _with_units(model.armature.tolist(), [unit.inertia for unit in units]),
-    }
-    note = ""
+    columns = {"joint": list(model.joint_names)}
+    note = "Viscous and Coulomb friction are fitted to the model's friction law."
+    if posterior is not None:
+        columns |= posterior.drive_columns
+        note += " Intervals are of 95 %."
+    else:
+        columns["armature"] = _with_units(model.armature.tolist(), [unit.inertia for unit in units])
+        columns["offset"] = _with_units(model.torque_offset.tolist(), torques)
     if arm is not None:
         joints = arm.chain.coordinates
-        columns["joint"] = list(arm.chain.joint_names)
-        viscous, forward, backward, _ = nearest_friction(arm.chain, model, sampled_positions(arm.chain))
-        note = "Viscous and Coulomb friction are fitted to the model's friction law, as in exports."
-        # the damping of a servo's controller contains the viscous friction of its joint
-        if not parameters_of_kind(model, "damping"):
-            columns["viscous"] = _with_units(viscous, dampings)
-        columns["Coulomb, qd > 0"] = _with_units(forward, torques)
-        columns["Coulomb, qd < 0"] = _with_units(backward, torques)
+        if posterior is None:
+            friction = nearest_friction(arm.chain, model, sampled_positions(arm.chain))
+            # the damping of a servo's controller contains the viscous friction of its joint
+            if not parameters_of_kind(model, "damping"):
+                columns["viscous"] = _with_units(friction.viscous, dampings)
+            columns["coulomb"] = _with_units(friction.coulomb, torques)
         columns["URDF: viscous"] = _with_units([joint.damping for joint in joints], dampings)
-        columns["URDF: Coulomb"] = _with_units([joint.friction for joint in joints], torques)
-    columns["torque offset"] = _with_units(model.torque_offset.tolist(), torques)
+        columns["URDF: coulomb"] = _with_units([joint.friction for joint in joints], torques)
     return Listing("Drives and friction", tuple(columns), tuple(zip(*columns.values(), strict=True)), note)
 
 

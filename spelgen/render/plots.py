@@ -75,6 +75,7 @@ class JointRow:
             motion: See `line_chart`.
         """
         lines = [Line(label, t, values[:, k], style) for label, values, style in self.columns]
+        # The plot areas of all charts of a column have the same height.
         height = self.height + (MARGINS.bottom - MARGINS.bare if time else 0)
         title, axis = f"{self.title} of {joint.name}", joint.axis(self.quantity, self.axis)
         return line_chart(lines, title, time, axis, motion=motion, height=height)
@@ -144,6 +145,7 @@ def _error_limits(errors: Mapping[str, Quantiles]) -> tuple[float, float] | None
         return None
     model_errors = np.concatenate([errors[MODEL].low, errors[MODEL].high])
     values = np.concatenate([model_errors, *(error.median for error in errors.values())])
+    # A logarithmic axis has no zero; a baseline that diverged would compress all other lines.
     values = values[(values > 0) & (values <= TUNING.outlier * np.nanmax(model_errors))]
     if not values.size:
         return None

@@ -13,20 +13,29 @@ from spelgen.arm.configured_arm import Arm
 from spelgen.emission.specify import arm_of_spec
 from spelgen.emission.text import description
 from spelgen.errors import RunError, SpelgenError, in_one_line
+from spelgen.evaluation.measurements import Verdict
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.traces import Traces
-from spelgen.evaluation.verdict import Limits, Verdict, verdict
+from spelgen.evaluation.verdict import Limits
 from spelgen.files import write_json, write_text
+from spelgen.fitting.posterior import Posterior, posterior_of
 from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.labels import UNITS, named_joints
-from spelgen.render.arm_section import arm_section, matrix
+from spelgen.render.arm_section import arm_section, evaluated_motions, matrix
 from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, parameter_tables
 from spelgen.render.report_charts import coverage_panels, evaluation_charts, loss_chart
-from spelgen.render.run_facts import best_epoch, commands, head_numbers, settings, training_facts
+from spelgen.render.run_facts import (
+    best_epoch,
+    commands,
+    head_numbers,
+    outlier_note,
+    settings,
+    training_facts,
+)
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.spec import ModelSpec
 from spelgen.structure.structure import derive
@@ -63,9 +72,7 @@ class Run:
     @property
     def verdict(self) -> Verdict | None:
         """Assessment of the model; None before its evaluation."""
-        if self.results is None:
-            return None
-        return verdict(self.results, self.baselines, self.limits)
+        return None if self.results is None else self.results.assessment
 
 
 def open_run(path: Path | str) -> Run:
@@ -115,11 +122,13 @@ def report_data(folder: Path | str) -> Content:
     """Return the data of the page for programs: assessment, evaluation, baselines and parameters."""
     run = open_run(folder)
     model = _trained(run)
+    posterior = _posterior(run, model)
     return {
         "schema": SCHEMA,
         "verdict": None if run.verdict is None else asdict(run.verdict),
         "bodies": body_parameters(model).tolist() if isinstance(model, RigidBodyDynamics) else None,
-        "tables": list(map(asdict, parameter_tables(model, run.arm, run.baselines))),
+        "tables": list(map(asdict, parameter_tables(model, run.arm, run.baselines, posterior))),
+        "posterior": None if posterior is None else posterior.to_dict(),
         "evaluation": _record(run.folder, run.folder.evaluation),
         "least_squares": run.baselines or None,
     }
@@ -130,15 +139,22 @@ def _trained(run: Run) -> ArmModel | None:
     return fitted_model(run.folder).requires_grad_(False).eval() if run.folder.weights.is_file() else None
 
 
+def _posterior(run: Run, model: ArmModel | None) -> Posterior | None:
+    """Return the posterior of a trained model; None if its checkpoint has none."""
+    if model is None or run.config is None or not run.folder.checkpoint.is_file():
+        return None
+    content = run.folder.load_checkpoint().posterior
+    if content is None:
+        return None
+    return posterior_of(model, content, run.config.preprocessing.torque_delay or 0.0, run.folder.checkpoint)
+
+
 def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
     """Return the page about a run as HTML, deterministically. robot: see ``write_report``."""
     folder = Path(folder)
     if not RunFolder(folder).path.is_dir():
         raise RunError(
-            "no run",
-            file=folder,
-            expected="a folder with spec.json",
-            do="make one with `spelgen train`",
+            "no run", file=folder, expected="a folder with spec.json", do="make one with `spelgen train`"
         )
     # the files of a run folder are untrusted: each of them may have any content
     try:
@@ -160,7 +176,9 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
     sections = dict.fromkeys(("arm", "cells", "training", "settings", "losses"))
     sections |= evaluation_charts(traces, spec)
     if run.arm is not None:
-        sections["arm"] = arm_section(run.arm.chain, Path(robot or run.arm.robot.path), traces)
+        sections["arm"] = arm_section(
+            run.arm.chain, Path(robot or run.arm.robot.path), evaluated_motions(traces)
+        )
         sections["cells"] = matrix(run.arm.chain, derive(run.arm.chain, spec.options.assume))
     if record is not None:
         sections["training"] = training_facts(record, metrics, run.baselines, model)
@@ -176,6 +194,7 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         units=UNITS,
         numbers=head_numbers(model, record, metrics, run.results),
         verdict=run.verdict,
+        outliers=None if run.results is None else outlier_note(run.results),
         config=record,
         evaluation=run.results,
         tables=tables,
@@ -183,6 +202,6 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         trained=model is not None,
         under_servos=record is not None and record.mapping.input == "position",
         summary=None if record is None else servo_summary(record.servo),
-        parameters=parameter_tables(model, run.arm, run.baselines),
+        parameters=parameter_tables(model, run.arm, run.baselines, _posterior(run, model)),
         commands=commands(run.folder, spec, run.config),
     )

@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from spelgen.baselines.names import MODEL
 from spelgen.dynamics.parameters import used_parameter_count
 from spelgen.errors import shortened
 from spelgen.evaluation.results import Results
@@ -16,9 +17,10 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.torque.report import terms_in_use
-from spelgen.labels import counted
+from spelgen.labels import counted, share
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
+from spelgen.render.tuning import TUNING
 from spelgen.runtime.residual_dynamics import ResidualDynamics
 from spelgen.settings.fits import CONFIGS
 from spelgen.settings.training import TrainingSettings
@@ -29,10 +31,7 @@ if TYPE_CHECKING:
 
 
 def head_numbers(
-    model: ArmModel | None,
-    record: Record | None,
-    metrics: Sequence[Content],
-    results: Results | None,
+    model: ArmModel | None, record: Record | None, metrics: Sequence[Content], results: Results | None
 ) -> list[tuple[str, str]]:
     """Return the most important figures with their labels.
 
@@ -54,6 +53,21 @@ def head_numbers(
         label = f"of training, {metrics[-1]['step']:,} steps"
         numbers.append((_duration(metrics[-1]["seconds"]), label))
     return numbers
+
+
+def outlier_note(results: Results) -> str:
+    """Return a sentence on a root mean square that few starts dominate: far from the median; "" otherwise."""
+    growth = results.traces.growth
+    if growth is None or MODEL not in growth.relative or not results.horizons:
+        return ""
+    last, median = results.horizons[-1], growth.relative[MODEL].median[-1]
+    rms = last.errors[MODEL].mean_relative_rms
+    if rms is None or not rms > TUNING.dominated * median:
+        return ""
+    return (
+        f"After {last.name} the median error is {share(median, 'the motion')}, and the root mean square "
+        f"{share(rms, 'the motion')}: few starts dominate it."
+    )
 
 
 def best_epoch(metrics: Sequence[Content]) -> int:
@@ -90,6 +104,8 @@ def training_facts(
         facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"
         if record.options.get("solver", "rk4") == "rk4":
             facts["integrator"] = f"rk4, {counted(last['substeps'], 'step')} between samples"
+    if record.warnings:
+        facts["warnings"] = "; ".join(record.warnings)
     if record.notes:
         facts["notes"] = "; ".join(record.notes)
     if record.options.get("momentum_steps"):

@@ -1,7 +1,7 @@
 """The kinematic tree and the triangles of an arm, for the animated picture on a page.
 
-The triangles are the simplified visual shapes of the URDF. If a mesh is not found, links are drawn as tubes from joint
-to joint, and joints as drums about their axes.
+The triangles are the simplified visual shapes of the URDF. If no shape can be read, links are drawn as tubes from joint
+to joint, and joints as drums about their axes; if some cannot be read, only their links.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from spelgen.dynamics.constraint import Constraint, mimic_constraint
 from spelgen.evaluation.plain import Curve
-from spelgen.render.shapes import Shape, joined, tube, visual_shapes
+from spelgen.render.shapes import Shape, joined, triangles, tube
 from spelgen.render.tuning import TUNING
+from spelgen.urdf.geometry import link_shapes
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot, UrdfJoint
 
@@ -44,11 +45,11 @@ class SceneLink:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Links, parents first; extent: sum of the lengths between joints [m]; has_meshes: whether no link is a tube."""
+    """Links, parents first; extent: sum of the lengths between joints [m]; tubes: sentence about links as tubes."""
 
     links: tuple[SceneLink, ...]
     extent: float
-    has_meshes: bool
+    tubes: str
 
 
 def scene(urdf: Path, joints: Sequence[str]) -> Scene:
@@ -56,17 +57,20 @@ def scene(urdf: Path, joints: Sequence[str]) -> Scene:
     robot = read_urdf(urdf)
     constraint = mimic_constraint(robot, joints)
     names = _links(robot, joints)
-    shapes = visual_shapes(urdf, names)
+    visual = link_shapes(urdf, "visual", names, TUNING.faces)
+    tubes = f" Drawn as tubes, since meshes were not read: {visual.unread_text}." if visual.unread else ""
+    if not visual.shapes:
+        tubes = " No meshes were read; links are drawn as tubes."
     lengths = [np.linalg.norm(joint.xyz) for name, joint in robot.joint_above.items() if name in names]
     extent = max(float(sum(lengths)), 1e-3)  # positive even if all joints lie in one point
     links = []
     for name in names:
-        if shapes:
-            shape = shapes.get(name, joined([]))
-        else:
+        if name in visual.unread or not visual.shapes:
             shape = _tubes(robot, name, names, TUNING.tube_radius * extent)
+        else:
+            shape = joined([triangles(shape) for shape in visual.shapes if shape.link == name])
         links.append(_link(robot, name, names, constraint, shape))
-    return Scene(tuple(links), extent, bool(shapes))
+    return Scene(tuple(links), extent, tubes)
 
 
 def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint, shape: Shape) -> SceneLink:

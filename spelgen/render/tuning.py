@@ -16,6 +16,8 @@ class RenderTuning:
     # [1] Baselines with an error beyond this multiple of the model's error are cut off, so that the others are
     # distinguishable.
     outlier: float = 100.0
+    # [1] Root mean square relative to the median from which on few starts dominate it; 1.5 for a normal distribution.
+    dominated: float = 2.0
     # [1] Quantile of the measured friction that sets the axis: outliers are cut off.
     bulk: float = 0.995
     # [1] An entry of M below this fraction of the largest entry is 0 with rounding.
@@ -26,8 +28,6 @@ class RenderTuning:
     tube_radius: float = 0.028
     # [1] Relative error that has the last colour of the scale.
     worst_error: float = 0.5
-    # [1] Standard deviations of an interval of 95 %.
-    interval: float = 2.0
 
 
 TUNING = RenderTuning()

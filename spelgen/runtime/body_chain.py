@@ -78,43 +78,52 @@ class BodyChain(nn.Module):
 
     def forward(self, q: Tensor, points: Tensor) -> ChainConfiguration:
         """Return the bodies at q, (..., n); points: in body frames, block diagonal, (4 bodies, 4 bodies)."""
+        # Displacements of all bodies at once: mimic joints are multiples of a coordinate, plus an offset.
         value = q @ self.ratios.mT + self.offset
         features = torch.cat([value.cos(), value.sin(), value], dim=-1)
+        # One product gives all frames relative to their parents: they are linear in cos, sin and value.
         relative = torch.unflatten(F.linear(features, self.table, self.fixed), -1, (-1, 4, 4)).unbind(dim=-3)
+        # A parent precedes its children, so its frame in the base is known.
         placed: list[Tensor] = []
         for index, parent in enumerate(self.parents):
             placed.append(relative[index] if parent < 0 else placed[parent] @ relative[index])
         frames = torch.cat(placed, dim=-1)
         z, origin = torch.unflatten(frames[..., :3, :], -1, (-1, 4))[..., 2:].unbind(dim=-1)
         angular = self.turns * z
+        # Twist of a unit rate: (z, origin x z) for a rotation, (0, z) for a translation.
         axes = torch.cat([angular, torch.linalg.cross(origin, angular, dim=-2) + (z - angular)], dim=-2)
         points = frames @ points
+        # Velocity of every point of a body per rate of every body, of which the carried ones are kept.
         motions = torch.unflatten(axes.mT @ self.motions, -1, (3, 4)).flatten(-3, -2) @ points
         jacobian = torch.unflatten(motions, -2, (-1, 3)).flatten(-2) * self.carried
         place, mass = torch.unflatten(points, -1, (-1, 4)).tensor_split((3,), dim=-3)
         return ChainConfiguration(place, mass, axes, jacobian, (self.base * mass).flatten(-3))
 
-    def motion(self, at: ChainConfiguration, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def motion(self, cache: ChainConfiguration, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return velocities of points, (..., 3, bodies, 4), twists, and axis rates (Featherstone, 2.31)."""
         rates = qd @ self.ratios.mT
-        velocity = torch.unflatten(applied(at.jacobian.mT, rates), -1, (3, -1, 4))
-        twists = (at.axes * rates.unsqueeze(-2)) @ self.carriers
-        (w, u), (a, m) = twists.chunk(2, dim=-2), at.axes.chunk(2, dim=-2)
+        # Sums over carrying bodies are products with masks.
+        velocity = torch.unflatten(applied(cache.jacobian.mT, rates), -1, (3, -1, 4))
+        twists = (cache.axes * rates.unsqueeze(-2)) @ self.carriers
+        (w, u), (a, m) = twists.chunk(2, dim=-2), cache.axes.chunk(2, dim=-2)
+        # Rate of an axis (a, m) that moves with the twist (w, u): (w x a, w x m + u x a).
         linear = torch.linalg.cross(w, m, dim=-2) + torch.linalg.cross(u, a, dim=-2)
         return velocity, twists, torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
 
-    def accelerations(self, at: ChainConfiguration, qd: Tensor) -> Tensor:
+    def accelerations(self, cache: ChainConfiguration, qd: Tensor) -> Tensor:
         """Return accelerations of the points at constant qd, gravity included, (..., 12 bodies)."""
-        velocity, twists, turning = self.motion(at, qd)
+        velocity, twists, turning = self.motion(cache, qd)
         steady = (turning * (qd @ self.ratios.mT).unsqueeze(-2)) @ self.carriers
         w, (a, u) = twists[..., :3, :, None], steady.unsqueeze(-1).chunk(2, dim=-3)
-        turned = torch.linalg.cross(w, velocity, dim=-3) + torch.linalg.cross(a, at.place, dim=-3)
-        return torch.addcmul(turned, u, at.mass).flatten(-3) + at.weight
+        # Acceleration of a point at constant rates: w x v + dw/dt x p + du/dt.
+        turned = torch.linalg.cross(w, velocity, dim=-3) + torch.linalg.cross(a, cache.place, dim=-3)
+        return torch.addcmul(turned, u, cache.mass).flatten(-3) + cache.weight
 
-    def kinetic_gradient(self, at: ChainConfiguration, qd: Tensor) -> Tensor:
+    def kinetic_gradient(self, cache: ChainConfiguration, qd: Tensor) -> Tensor:
         """Return d/dq of the kinetic energy at qd, (..., n)."""
-        velocity, _, turning = self.motion(at, qd)
-        momenta = [torch.linalg.cross(at.place, velocity, dim=-3), at.mass * velocity]
+        velocity, _, turning = self.motion(cache, qd)
+        # Angular and linear momentum of the points about the origin of the base.
+        momenta = [torch.linalg.cross(cache.place, velocity, dim=-3), cache.mass * velocity]
         # momenta of all carried bodies, projected onto the axis of each body
         carried = torch.cat(momenta, dim=-3).sum(dim=-1) @ self.carriers.mT
         return (turning * carried).sum(dim=-2) @ self.ratios

@@ -43,11 +43,11 @@ class ConstantMass(nn.Module):
         return self.entries(*self.constants().unbind()) + torch.diag(self.armature())
 
     def forward(self, encoded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Return M for each state, and the encoding, which has the shape of its derivatives."""
+        """Return M, (..., n, n), and the encoding, (..., 2 n), which has the shape of its derivatives."""
         return parameters.expand(*encoded.shape[:-1], *parameters.shape), encoded
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Tensor) -> Tensor:
-        """Return the derivative of 1/2 qd^T M qd with respect to the encoding: zero."""
+        """Return d(1/2 qd^T M qd) / d encoding, (..., 2 n): zero."""
         return torch.zeros_like(intermediates)
 
     def jvp(self, rate: Tensor, intermediates: Tensor) -> Tensor:

@@ -56,7 +56,7 @@ class DenseMass(nn.Module):
         self.nominal = nn.Buffer(factor)
         self.moving = nn.Buffer(torch.linalg.inv(factor)[:, 2::3])
         row, column = torch.tril_indices(self.size, self.size, -1)
-        # positions in U of the entries below its diagonal, row by row
+        # positions in U of the entries below its diagonal, rows in sequence
         self.below = nn.Buffer(row * self.size + column)
         # initially U is the identity, and e is one
         initial = vector([0.0] * len(row) + [math.log(math.e - 1)] * self.size)
@@ -79,7 +79,7 @@ class DenseMass(nn.Module):
         return self._lower(entries), F.softplus(scale)
 
     def _lower(self, entries: Tensor) -> Tensor:
-        """Return the matrix, (..., 3 n, 3 n), with these entries below its diagonal, row by row."""
+        """Return the matrix, (..., 3 n, 3 n), with these entries below its diagonal, rows in sequence."""
         rows = entries.new_zeros(*entries.shape[:-1], self.size * self.size)
         rows = rows.index_copy(-1, self.below, entries)
         return rows.reshape(*entries.shape[:-1], self.size, self.size)
@@ -93,17 +93,21 @@ class DenseMass(nn.Module):
         """Return M(q), (..., n, n), and the intermediates of its derivatives."""
         raw, intermediates = self.network.forward(encoded, layers)
         factor, scale = self._factor(raw)
+        # Triangular solutions, not an inverse of M^-1, whose condition number is the square of its
+        # factor's.
         moved = self._unit_solved(factor, self.moving)
         mass = moved.mT @ (moved / scale.unsqueeze(-1))
         return mass, DenseIntermediates(intermediates, factor, moved, scale)
 
     def kinetic_vjp(self, qd: Tensor, intermediates: DenseIntermediates) -> Tensor:
-        """Return the derivative of 1/2 qd^T M(q) qd with respect to the encoding."""
+        """Return d(1/2 qd^T M(q) qd) / d encoding, (..., 2 n), at the velocity qd (..., n)."""
         _, factor, moved, scale = intermediates
         speed = moved @ qd.unsqueeze(-1)
         momentum = speed / scale.unsqueeze(-1)
+        # With w = U^-1 A qd and p = w / e: dT/dU = -U^-T p w^T, and dT/de = -p^2 / 2.
         by_factor = -self._unit_solved(factor.mT, momentum, upper=True) @ speed.mT
         by_entry = by_factor.flatten(-2).index_select(-1, self.below)
+        # e = softplus(s): de/ds = 1 - exp(-e) = -expm1(-e).
         by_scale = 0.5 * momentum.squeeze(-1) ** 2 * torch.expm1(-scale)
         cotangent = torch.cat([by_entry, by_scale], dim=-1)
         return self.network.vjp(intermediates.network, cotangent)
@@ -113,6 +117,7 @@ class DenseMass(nn.Module):
         _, factor, moved, scale = intermediates
         pushed = self.network.jvp(intermediates.network, rate)
         entries, raw_rate = pushed.tensor_split((len(self.below),), dim=-1)
+        # d(U^-1 A) = -U^-1 dU U^-1 A.
         turned = self._unit_solved(factor, self._lower(entries) @ moved)
         by_factor = moved.mT @ (turned / scale.unsqueeze(-1))
         by_scale = raw_rate * torch.expm1(-scale) / scale**2

@@ -63,6 +63,8 @@ class DerivedMass(nn.Module):
 
     def _by_outputs(self) -> Tensor:
         """Return dM / d output per output of the network, then M at zero outputs, (outputs + 1, n, n)."""
+        # M is linear in the outputs: unit outputs, and then the means with the constants, give all
+        # coefficients.
         functions = torch.cat([torch.diag(self.function_scale), self.function_mean.unsqueeze(-1)], dim=1)
         constants = F.pad(self.constants().unsqueeze(-1), (len(functions), 0))
         return self.entries(*functions.unbind(), *constants.unbind())
@@ -70,11 +72,12 @@ class DerivedMass(nn.Module):
     def prepare(self) -> Layers:
         """Return the layers that give the entries of M."""
         rows = self._by_outputs()
+        # This linear map is composed with the last layer, so that the network returns the entries of M.
         offset = rows[-1] + torch.diag(self.armature())
         return self.network.prepare(rows[:-1].flatten(1).mT, offset.flatten())
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
-        """Return M'(q), and the intermediates of its derivatives: of the network, and t."""
+        """Return M'(q), (..., n, n), and the intermediates of its derivatives: of the network, and t."""
         rows, intermediates = self.network.forward(encoded, layers)
         mass = rows.reshape(*rows.shape[:-1], *self.center.shape)
         fraction = self.fraction(mass.detach())
@@ -82,13 +85,17 @@ class DerivedMass(nn.Module):
 
     def fraction(self, mass: Tensor) -> Tensor:
         """Return t, (...), of matrices M, (..., n, n)."""
+        # cholesky_ex reports a failure per matrix of the batch; cholesky would raise an error for all of
+        # them.
         indefinite = torch.linalg.cholesky_ex(mass - self.smallest).info != 0
+        # The Frobenius norm of the scaled difference: an upper bound of its spectral norm.
         norm = torch.linalg.vector_norm(self.unit * (mass - self.center), dim=(-2, -1))
         return torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(norm)).clamp(min=1.0)), 1.0)
 
     def kinetic_vjp(self, qd: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
-        """Return the derivative of 1/2 qd^T M(q) qd with respect to the encoding."""
+        """Return d(1/2 qd^T M(q) qd) / d encoding, (..., 2 n), at the velocity qd (..., n)."""
         network, fraction = intermediates
+        # d(1/2 qd^T M' qd) / dM' = 1/2 qd qd^T, and M' has t times the derivative of M.
         half = 0.5 * fraction.unsqueeze(-1) * qd
         return self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))
 

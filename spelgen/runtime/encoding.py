@@ -21,7 +21,7 @@ class JointEncoding(nn.Module):
         self.slope = nn.Buffer((1 - self.revolute) / vector(joint.half_range for joint in joints))
 
     def forward(self, q: Tensor) -> Tensor:
-        """Return the encoding of q."""
+        """Return the encoding, (..., 2 n), of q (..., n) [rad, m]."""
         scaled = self.slope * (q - self.center)
         return torch.cat([torch.addcmul(scaled, self.revolute, q.cos()), self.revolute * q.sin()], dim=-1)
 

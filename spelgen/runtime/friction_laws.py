@@ -17,6 +17,8 @@ SHARP_VELOCITY = 0.001
 # Below this fraction of typical friction the magnitude of a gravity torque is rounded, because |x| has no
 # derivative at zero.
 MIN_LOAD = 0.01
+# Initial velocity over which dry friction changes its direction, relative to the typical speed.
+SMOOTHING_VELOCITY = 0.006
 
 
 class FrictionConstants(NamedTuple):
@@ -46,8 +48,11 @@ class FrictionConstants(NamedTuple):
         """Return the magnitude of dry friction, (..., n) [Nm, N], under a gravity torque (..., n)."""
         speed = qd.abs() / self.stribeck_velocity
         rounding = self.stribeck_rounding
+        # (1 + x / 8)^-8 approximates exp(-x); x = (1 + r) v^2 / (v + r) is near v^2 for large r and near v
+        # for small r.
         slow = 1 / (1 + (1 + rounding) / 8 * speed.square() / (speed + rounding))
         slow = slow.square().square().square()  # ** 8 takes twice the time
+        # A smooth |gravity torque|.
         load = (gravity.square() + self.min_load**2).sqrt()
         return self.coulomb + self.stribeck * slow + self.load_dependence * load
 
@@ -65,12 +70,15 @@ class FrictionConstants(NamedTuple):
         if direction is None:
             direction = qd * turning(qd, self.coulomb_smoothing_velocity)
         if z is not None:
+            # Each bristle carries its fraction in proportion to its deflection, fully at its break-away
+            # displacement.
             deflection = (self.bristle_fractions / self.bristle_reach * z).sum(dim=-1)
             direction = deflection + self.memoryless * direction
         return self.viscosity(qd) * qd + self.dry(qd, gravity) * direction
 
     def stored_energy(self, z: Tensor) -> Tensor:
         """Return the elastic energy of the bristles of Coulomb friction, (...) [J]."""
+        # Springs of stiffness coulomb * fraction / breakaway; further dry friction counts as dissipated.
         stored = self.bristle_fractions * z.square() / self.bristle_reach
         return 0.5 * (self.coulomb * stored.sum(dim=-1)).sum(dim=-1)
 
@@ -130,6 +138,8 @@ class FrictionLaws(nn.Module):
             "Nm s/rad, N s/m": friction / speed, "Nm, N": friction, "rad/s, m/s": speed, "1": friction.sign()
         }  # fmt: skip
         for name, _, unit, initial in FrictionLaws.parameter_groups[:-1]:
+            # Exponentials keep the constants positive; at zero they have the typical magnitude of the
+            # joint.
             constants.append(initial * units[unit] * getattr(self, name).exp())
         load = MIN_LOAD * torch.where(friction > 0, friction, 1.0)
         fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
@@ -142,3 +152,21 @@ class FrictionLaws(nn.Module):
 def turning(velocity: Tensor, width: Tensor) -> Tensor:
     """Return 1 / sqrt(velocity^2 + width^2), (..., n): times the velocity, a smooth sign of this width."""
     return torch.rsqrt(velocity * velocity + width**2)
+
+
+class SlidingFriction(FrictionLaws):
+    """Friction without bristles or state: dry friction depends on velocity, with a trained width of its jump."""
+
+    parameter_groups = (("raw_coulomb_smoothing_velocity", "velocities", "rad/s, m/s", SMOOTHING_VELOCITY),)
+
+    def __init__(self, joints: Sequence[Joint]) -> None:
+        super().__init__(joints, breakaway={"revolute": (), "prismatic": ()})
+        self.memoryless.fill_(1.0)
+        self.raw_coulomb_smoothing_velocity = nn.Parameter(torch.zeros_like(self.speed))
+        del self.raw_bristle_fractions
+        self.register_buffer("raw_bristle_fractions", self.reach)  # (n, 0)
+
+    def prepare(self) -> FrictionConstants:
+        """Return the constants in SI units."""
+        velocity = SMOOTHING_VELOCITY * self.speed * self.raw_coulomb_smoothing_velocity.exp()
+        return super().prepare()._replace(coulomb_smoothing_velocity=velocity)

@@ -67,7 +67,7 @@ class MaskedKAN(nn.Module):
         nn.init.zeros_(self.weights[-1])  # so that the outputs start at zero
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
-        """Return the masked weights, for offset + output_map y in place of y."""
+        """Return the masked layers of offset (rows,) + output_map (rows, outputs) y."""
         weights = [(w * self.get_buffer(f"mask{i}")).flatten(1) for i, w in enumerate(self.weights)]
         biases = list(self.biases)
         weights[-1], biases[-1] = output_map @ weights[-1], offset + output_map @ biases[-1]

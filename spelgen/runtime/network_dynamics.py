@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -19,7 +19,7 @@ class NetworkConfiguration(NamedTuple):
 
     encoded: Tensor  # input of the networks, see ``JointEncoding``
     mass: Tensor  # M(q), (..., n, n)
-    intermediates: Intermediates  # of the derivatives of M
+    intermediates: Intermediates  # intermediates of the derivatives of M
     parameters: dict[str, Parameters]
 
 
@@ -43,51 +43,88 @@ class NetworkDynamics(PortHamiltonian):
 
     def prepare(self) -> dict[str, Parameters]:
         """Return the parameter cache, by part."""
+        # No offset: a constant of V has no effect on the motion. The product keeps dtype and device.
         potential = self.potential.prepare(self.scale, 0 * self.scale[0])
         return {"mass": self.mass.prepare(), "potential": potential, "friction": self.friction.prepare()}
 
     def configuration(self, q: Tensor, parameters: dict[str, Parameters]) -> NetworkConfiguration:
-        """Return all that depends on q only."""
+        """Return all that depends on q, (..., n), only."""
         encoded = self.encoding.forward(q)
         mass, intermediates = self.mass.forward(encoded, parameters["mass"])
         return NetworkConfiguration(encoded, mass, intermediates, parameters)
 
     def potential_energy(self, q: Tensor | NetworkConfiguration) -> Tensor:
         """Return V(q), (...) [J]."""
-        at: NetworkConfiguration = self.at(q)
-        return self.potential.forward(at.encoded, at.parameters["potential"])[0].squeeze(-1)
+        cache: NetworkConfiguration = self.at(q)
+        return self.potential.forward(cache.encoded, cache.parameters["potential"])[0].squeeze(-1)
 
     def gravity(self, q: Tensor | NetworkConfiguration) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
-        at: NetworkConfiguration = self.at(q)
-        return -self.lagrangian_gradient(at, torch.zeros_like(at.mass[..., 0]))
+        cache: NetworkConfiguration = self.at(q)
+        # At rest the gradient of the kinetic energy is zero.
+        return -self.lagrangian_gradient(cache, torch.zeros_like(cache.mass[..., 0]))
 
     def lagrangian_gradient(self, q: Tensor | NetworkConfiguration, qd: Tensor) -> Tensor:
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        at: NetworkConfiguration = self.at(q, qd)
-        intermediates = self.potential.forward(at.encoded, at.parameters["potential"])[1]
-        kinetic = self.mass.kinetic_vjp(qd, at.intermediates)
-        return self.encoding.vjp(at.encoded, kinetic - self.potential.vjp(intermediates, qd.new_ones(1)))
+        cache: NetworkConfiguration = self.at(q, qd)
+        intermediates = self.potential.forward(cache.encoded, cache.parameters["potential"])[1]
+        # One reverse sweep per network, with 1/2 qd qd^T as the cotangent of M, then the chain rule of the
+        # encoding.
+        kinetic = self.mass.kinetic_vjp(qd, cache.intermediates)
+        return self.encoding.vjp(cache.encoded, kinetic - self.potential.vjp(intermediates, qd.new_ones(1)))
 
     def nonlinear_effects(self, q: Tensor | NetworkConfiguration, qd: Tensor) -> Tensor:
         """Return dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq, (..., n)."""
-        at: NetworkConfiguration = self.at(q, qd)
-        mass_rate = self.mass.jvp(self.encoding.jvp(at.encoded, qd), at.intermediates)
-        return applied(mass_rate, qd) - self.lagrangian_gradient(at, qd)
+        cache: NetworkConfiguration = self.at(q, qd)
+        # dM/dt is one directional derivative: the n^3 Christoffel symbols are not needed.
+        mass_rate = self.mass.jvp(self.encoding.jvp(cache.encoded, qd), cache.intermediates)
+        return applied(mass_rate, qd) - self.lagrangian_gradient(cache, qd)
 
     def friction_torque(self, q: Tensor | NetworkConfiguration, qd: Tensor) -> Tensor:
         """Return D(q, qd) qd, (..., n) [Nm, N]."""
-        at: NetworkConfiguration = self.at(q, qd)
-        layers = at.parameters["friction"]
-        return self.friction.forward(at.encoded, qd, layers, qd.unsqueeze(-1)).squeeze(-1)
+        cache: NetworkConfiguration = self.at(q, qd)
+        layers = cache.parameters["friction"]
+        return self.friction.forward(cache.encoded, qd, layers, qd.unsqueeze(-1)).squeeze(-1)
 
     def dissipation(self, q: Tensor | NetworkConfiguration, qd: Tensor) -> Tensor:
         """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
-        at: NetworkConfiguration = self.at(q, qd)
-        return self.friction.forward(at.encoded, qd, at.parameters["friction"], torch.eye(self.n).to(qd))
+        cache: NetworkConfiguration = self.at(q, qd)
+        return self.friction.forward(
+            cache.encoded, qd, cache.parameters["friction"], torch.eye(self.n).to(qd)
+        )
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
         """Return the rate of (q, p), (..., 2 n), or of (q, p, tau) with a constant tau, (..., 3 n)."""
+        # ODE solvers integrate one vector; a constant input is a part of it with the rate zero.
         q, p, tau = state.tensor_split((self.n, 2 * self.n), dim=-1)
         qd, force = self.port_hamiltonian_rhs(q, p, tau if tau.shape[-1] else None, self.prepare())
         return torch.cat([qd, force, torch.zeros_like(tau)], dim=-1)
+
+
+class DenseInputDynamics(NetworkDynamics):
+    """G(q) is diagonal: a network with an output for each of the three axes of a joint, of which z moves."""
+
+    def __init__(self, *, input_network: Network, **parts: Any) -> None:
+        super().__init__(**parts)
+        self.moving = nn.Buffer(torch.eye(3 * self.n).double()[2::3])
+        self.input_network = input_network
+
+    def prepare(self) -> dict[str, Parameters]:
+        """Return the parameter cache, by part."""
+        return super().prepare() | {"input": self.input_network.prepare(self.moving, self.moving.sum(dim=1))}
+
+    def _gains(self, cache: NetworkConfiguration) -> Tensor:
+        """Return the diagonal of G, (..., n)."""
+        return self.input_network.forward(cache.encoded, cache.parameters["input"])[0]
+
+    def input_matrix(self, q: Tensor) -> Tensor:
+        """Return G(q), (..., n, n)."""
+        return torch.diag_embed(self._gains(self.at(q)))
+
+    def input_force(self, cache: NetworkConfiguration, qd: Tensor, tau: Tensor) -> Tensor:
+        """Return G(q) tau, (..., n) [Nm, N]."""
+        return self._gains(cache) * tau
+
+    def input_torque(self, cache: NetworkConfiguration, force: Tensor) -> Tensor:
+        """Return the inputs, (..., n), that give this force."""
+        return force / self._gains(cache)

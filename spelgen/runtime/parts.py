@@ -1,10 +1,11 @@
-"""The interfaces between a model and its parts."""
+"""The interfaces between a model and its parts, and symmetric matrices from their lower triangle."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
 Row = Sequence[float]
@@ -22,7 +23,7 @@ class Network(Protocol):
     """Learned functions y of the encoded positions, with explicit derivatives."""
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
-        """Return the layers that give offset + output_map y in place of y."""
+        """Return the layers of offset (rows,) + output_map (rows, outputs) y."""
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, Intermediates]:
         """Return offset + output_map y, (..., rows), and the intermediates of ``vjp`` and ``jvp``."""
@@ -44,7 +45,7 @@ class Mass(Protocol):
         """Return M(q), (..., n, n), and the intermediates of its derivatives."""
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Intermediates) -> Tensor:
-        """Return the derivative of 1/2 qd^T M(q) qd with respect to the encoding."""
+        """Return d(1/2 qd^T M(q) qd) / d encoding, (..., 2 n), at the velocity qd (..., n)."""
 
     def jvp(self, rate: Tensor, intermediates: Intermediates) -> Tensor:
         """Return dM/dt, (..., n, n), for this rate of the encoding."""
@@ -71,3 +72,12 @@ class Inputs(Protocol):
 
     def torque(self, force: Tensor) -> Tensor:
         """Return the inputs, (..., n), that give this force."""
+
+
+def symmetric(*rows: Sequence[Tensor | float]) -> Tensor:
+    """Return the symmetric matrix, (..., n, n), of the rows of its lower triangle: (...) or numbers."""
+    n = len(rows)
+    entries = [rows[max(i, j)][min(i, j)] for i in range(n) for j in range(n)]
+    like = next(entry for entry in entries if isinstance(entry, Tensor))
+    filled = [entry if isinstance(entry, Tensor) else torch.full_like(like, entry) for entry in entries]
+    return torch.stack(filled, dim=-1).reshape(*like.shape, n, n)

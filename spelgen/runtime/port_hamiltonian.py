@@ -63,6 +63,7 @@ class PortHamiltonian(nn.Module):
             others: further vectors (..., n), which are only checked.
             prepared: result of ``prepare``; None: computed here.
         """
+        # A configuration of former calls, which has been checked.
         if isinstance(q, tuple):
             return q
         dtype = self.get_buffer("friction.nominal").dtype
@@ -85,11 +86,11 @@ class PortHamiltonian(nn.Module):
         matrix = torch.eye(self.n).to(q) if self.inputs is None else self.inputs.gains()
         return matrix.expand(*q.shape, -1)
 
-    def input_force(self, at: Configuration, qd: Tensor, tau: Tensor) -> Tensor:
+    def input_force(self, cache: Configuration, qd: Tensor, tau: Tensor) -> Tensor:
         """Return G tau, (..., n) [Nm, N]."""
         return tau if self.inputs is None else self.inputs.force(tau)
 
-    def input_torque(self, at: Configuration, force: Tensor) -> Tensor:
+    def input_torque(self, cache: Configuration, force: Tensor) -> Tensor:
         """Return the inputs tau, (..., n), that give this force."""
         return force if self.inputs is None else self.inputs.torque(force)
 
@@ -105,28 +106,30 @@ class PortHamiltonian(nn.Module):
 
     def hamiltonian(self, q: Position, p: Tensor, *state: Tensor) -> Tensor:
         """Return H, (...) [J]."""
-        at = self.at(q, p)
-        return 0.5 * (p * self.velocity(at, p)).sum(dim=-1) + self.potential_energy(at, *state)
+        cache = self.at(q, p)
+        # 1/2 p^T M^-1 p is 1/2 p^T qd.
+        return 0.5 * (p * self.velocity(cache, p)).sum(dim=-1) + self.potential_energy(cache, *state)
 
     def forward_dynamics(self, q: Position, qd: Tensor, tau: Tensor, *state: Tensor | None) -> Tensor:
         """Return qdd, (..., n), under the input tau; state: of friction, if the model has one."""
-        at = self.at(q, qd, tau)
-        force = self.input_force(at, qd, tau) - self.nonlinear_effects(at, qd)
-        force = force - self.friction_torque(at, qd, *state)
-        return self.velocity(at, force)  # M^-1 times the force
+        cache = self.at(q, qd, tau)
+        force = self.input_force(cache, qd, tau) - self.nonlinear_effects(cache, qd)
+        force = force - self.friction_torque(cache, qd, *state)
+        return self.velocity(cache, force)  # M^-1 times the force
 
     def inverse_dynamics(self, q: Position, qd: Tensor, qdd: Tensor, *state: Tensor | None) -> Tensor:
         """Return the input tau, (..., n), that gives qdd; state: of friction, if the model has one."""
-        at = self.at(q, qd, qdd)
-        force = applied(at.mass, qdd) + self.nonlinear_effects(at, qd)
-        force = force + self.friction_torque(at, qd, *state)
-        return self.input_torque(at, force - self.input_force(at, qd, 0 * qd))
+        cache = self.at(q, qd, qdd)
+        force = applied(cache.mass, qdd) + self.nonlinear_effects(cache, qd)
+        force = force + self.friction_torque(cache, qd, *state)
+        # Inputs may have an offset: it is the force at tau = 0.
+        return self.input_torque(cache, force - self.input_force(cache, qd, 0 * qd))
 
     def port_hamiltonian_rhs(
         self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Parameters, *state: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Return q' and p', (..., n), under the input tau; None: no input."""
-        at = self.at(q, p, p if tau is None else tau, prepared=prepared)
-        qd = self.velocity(at, p)
-        force = self.lagrangian_gradient(at, qd) - self.friction_torque(at, qd, *state)
-        return qd, force if tau is None else force + self.input_force(at, qd, tau)
+        cache = self.at(q, p, p if tau is None else tau, prepared=prepared)
+        qd = self.velocity(cache, p)
+        force = self.lagrangian_gradient(cache, qd) - self.friction_torque(cache, qd, *state)
+        return qd, force if tau is None else force + self.input_force(cache, qd, tau)

@@ -27,34 +27,34 @@ class ResidualDynamics(RigidBodyDynamics):
         return prepared._replace(residual=self.residuals.prepare(prepared.armature))
 
     def configuration(self, q: Tensor, prepared: RigidParameters) -> RigidConfiguration:
-        """Return all that depends on q only."""
-        at = super().configuration(q, prepared)
+        """Return all that depends on q, (..., n), only."""
+        cache = super().configuration(q, prepared)
         if self.residuals is None:
-            return at
+            return cache
         residual = self.residuals.at(q, prepared.residual)
-        return at._replace(mass=at.mass + residual.mass, varied=residual.friction, residual=residual)
+        return cache._replace(mass=cache.mass + residual.mass, varied=residual.friction, residual=residual)
 
     def potential_energy(self, q: Tensor | RigidConfiguration, z: Tensor | None = None) -> Tensor:
         """Return V(q) and the elastic energy of the bristles, (...) [J]."""
-        at: RigidConfiguration = self.at(q)
-        energy = super().potential_energy(at, z)
-        return energy if self.residuals is None else energy + self.residuals.energy(at.residual)
+        cache: RigidConfiguration = self.at(q)
+        energy = super().potential_energy(cache, z)
+        return energy if self.residuals is None else energy + self.residuals.energy(cache.residual)
 
     def gravity(self, q: Tensor | RigidConfiguration) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
-        at: RigidConfiguration = self.at(q)
+        cache: RigidConfiguration = self.at(q)
         if self.residuals is None:
-            return at.gravity
-        return at.gravity - self.residuals.gradient(at.residual, 0 * at.gravity)
+            return cache.gravity
+        return cache.gravity - self.residuals.gradient(cache.residual, 0 * cache.gravity)
 
     def lagrangian_gradient(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        at: RigidConfiguration = self.at(q, qd)
-        gradient = super().lagrangian_gradient(at, qd)
-        return gradient if self.residuals is None else gradient + self.residuals.gradient(at.residual, qd)
+        cache: RigidConfiguration = self.at(q, qd)
+        gradient = super().lagrangian_gradient(cache, qd)
+        return gradient if self.residuals is None else gradient + self.residuals.gradient(cache.residual, qd)
 
     def nonlinear_effects(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
         """Return Coriolis, centrifugal and gravity torque, (..., n)."""
-        at: RigidConfiguration = self.at(q, qd)
-        torque = super().nonlinear_effects(at, qd)
-        return torque if self.residuals is None else torque + self.residuals.nonlinear(at.residual, qd)
+        cache: RigidConfiguration = self.at(q, qd)
+        torque = super().nonlinear_effects(cache, qd)
+        return torque if self.residuals is None else torque + self.residuals.nonlinear(cache.residual, qd)

@@ -86,6 +86,8 @@ class ResidualTerms(nn.Module):
         n = len(joints)
         zeros = torch.zeros(n, SPLINES, dtype=torch.float64)
         self.encoding = JointEncoding(joints)
+        # The range has SPLINES - 3 intervals; the middles of the outermost splines are one spacing beyond
+        # it.
         spacing = 2 * vector(joint.half_range for joint in joints).unsqueeze(-1) / (SPLINES - 3)
         knots = torch.arange(SPLINES).double() - (SPLINES - 1) / 2
         self.spacing = nn.Buffer(spacing)
@@ -151,14 +153,16 @@ class ResidualTerms(nn.Module):
         )
 
     def at(self, q: Tensor, parameters: ResidualParameters) -> ResidualConfiguration:
-        """Return all that depends on q only."""
+        """Return all that depends on q, (..., n), only."""
         encoded = self.encoding.forward(q)
         splines = torch.einsum("...ik,ikm->...im", self.splines(q), parameters.splines)
+        # Both kinds of splines have the same basis: one product for torque and friction factor.
         smooth, friction = splines.unbind(-1)
         torque = smooth + (self.waves(q) * parameters.ripple).sum(dim=-1)
         mass, slope, intermediates = parameters.constant.expand(*q.shape[:-1], -1), None, None
         if self.mass is not None and parameters.mass is not None:
             y, intermediates = self.mass.forward(encoded, parameters.mass)
+            # Bounded outputs keep M + R positive definite, see ``bounds``.
             output = y.tanh()
             mass = F.linear(output, parameters.functions.mT, parameters.constant)
             slope = 1 - output * output
@@ -166,41 +170,44 @@ class ResidualTerms(nn.Module):
         friction = friction.exp()
         return ResidualConfiguration(q, encoded, torque, friction, mass, slope, intermediates, parameters)
 
-    def energy(self, at: ResidualConfiguration) -> Tensor:
+    def energy(self, cache: ResidualConfiguration) -> Tensor:
         """Return the residual of V, (...) [J]; each spline is zero in its middle."""
-        distance = self._distances(at.q)
+        distance = self._distances(cache.q)
         size = distance.abs()
         # integral of the B-spline from its middle
         step = 0.5 - (2 - size).relu() ** 4 / 24 + (1 - size).relu() ** 4 / 6
-        smooth = (self.spacing * distance.sign() * step * at.parameters.splines[..., 0]).sum(dim=-1)
-        by_cos, by_sin = (self.waves(at.q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
-        ripple = (torch.cat([by_sin, -by_cos], dim=-1) * at.parameters.ripple).sum(dim=-1)
+        smooth = (self.spacing * distance.sign() * step * cache.parameters.splines[..., 0]).sum(dim=-1)
+        # The integral of cos(f q) is sin(f q) / f, of sin(f q) it is -cos(f q) / f.
+        by_cos, by_sin = (self.waves(cache.q) / self.frequencies.repeat(1, 2)).chunk(2, dim=-1)
+        ripple = (torch.cat([by_sin, -by_cos], dim=-1) * cache.parameters.ripple).sum(dim=-1)
         energy = (smooth + ripple).sum(dim=-1)
-        if self.potential is not None and at.parameters.potential is not None:
-            energy = energy + self.potential.forward(at.encoded, at.parameters.potential)[0].squeeze(-1)
+        if self.potential is not None and cache.parameters.potential is not None:
+            energy = energy + self.potential.forward(cache.encoded, cache.parameters.potential)[0].squeeze(-1)
         return energy
 
-    def gradient(self, at: ResidualConfiguration, qd: Tensor) -> Tensor:
+    def gradient(self, cache: ResidualConfiguration, qd: Tensor) -> Tensor:
         """Return d/dq of the residual of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        by_encoded = torch.zeros_like(at.encoded)
-        if self.mass is not None and at.slope is not None:
-            kinetic = 0.5 * (qd.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2) @ at.parameters.functions.mT
-            by_encoded = self.mass.vjp(at.intermediates, at.slope * kinetic)
-        if self.potential is not None and at.parameters.potential is not None:
-            intermediates = self.potential.forward(at.encoded, at.parameters.potential)[1]
+        by_encoded = torch.zeros_like(cache.encoded)
+        if self.mass is not None and cache.slope is not None:
+            # Cotangent of R, 1/2 qd qd^T, through the linear map, tanh and the network.
+            kinetic = 0.5 * (qd.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2) @ cache.parameters.functions.mT
+            by_encoded = self.mass.vjp(cache.intermediates, cache.slope * kinetic)
+        if self.potential is not None and cache.parameters.potential is not None:
+            intermediates = self.potential.forward(cache.encoded, cache.parameters.potential)[1]
             by_encoded = by_encoded - self.potential.vjp(intermediates, qd.new_ones(1))
-        return self.encoding.vjp(at.encoded, by_encoded) - at.torque
+        return self.encoding.vjp(cache.encoded, by_encoded) - cache.torque
 
-    def nonlinear(self, at: ResidualConfiguration, qd: Tensor) -> Tensor:
+    def nonlinear(self, cache: ResidualConfiguration, qd: Tensor) -> Tensor:
         """Return dR/dt qd - ``gradient``, (..., n)."""
-        if self.mass is None or at.slope is None:
-            return -self.gradient(at, qd)
-        rate = self.mass.jvp(at.intermediates, self.encoding.jvp(at.encoded, qd))
-        mass_rate = ((at.slope * rate) @ at.parameters.functions).reshape(*qd.shape, self.n)
-        return applied(mass_rate, qd) - self.gradient(at, qd)
+        if self.mass is None or cache.slope is None:
+            return -self.gradient(cache, qd)
+        rate = self.mass.jvp(cache.intermediates, self.encoding.jvp(cache.encoded, qd))
+        mass_rate = ((cache.slope * rate) @ cache.parameters.functions).reshape(*qd.shape, self.n)
+        return applied(mass_rate, qd) - self.gradient(cache, qd)
 
     def splines(self, q: Tensor) -> Tensor:
         """Return the cubic B-splines at q, (..., n, SPLINES), each 2/3 high."""
+        # ((2 - d)^3 - 4 (1 - d)^3) / 6 with the positive parts: a cubic B-spline of unit spacing.
         wide = (2 - self._distances(q).abs()).relu()
         return torch.sub(wide**3, (wide - 1).relu() ** 3, alpha=4) / 6
 

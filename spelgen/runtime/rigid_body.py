@@ -32,20 +32,21 @@ class InertialParameters(nn.Module):
     """Inertial parameters that are physically consistent for all trained parameters; these start at zero.
 
     The pseudo-inertia of a body is [[S, m c], [(m c)^T, m]], S the second moments in its joint's frame. It
-    is C T T^T C^T, with C and T upper triangular, and C C^T that of the link as given. T is a function of
-    log-Cholesky parameters (Rucker and Wensing, IEEE RA-L 7:4352, 2022): logarithms of mass and of the extent
-    along three axes, relative to the given ones, and shear and center of mass in units of the extents.
+    is C T T^T C^T, with C and T upper triangular, and C C^T the pseudo-inertia of the given link. T is a
+    function of log-Cholesky parameters (Rucker and Wensing, IEEE RA-L 7:4352, 2022): logarithms of mass and
+    of the extent along three axes, relative to the given ones, and shear and center of mass in units of the
+    extents.
     """
 
     parameter_groups = (("raw", "bodies", "kg, kg m, kg m^2"),)
 
     def __init__(self, links: Sequence[Link]) -> None:
         super().__init__()
-        # from the entries of an upper triangle, row by row, to a matrix
+        # from the entries of an upper triangle, rows in sequence, to a matrix
         row, column = torch.triu_indices(4, 4)
         self.triangle = nn.Buffer(torch.eye(16, dtype=torch.float64)[4 * row + column])
         pseudo = torch.stack([pseudo_inertia(link) for link in links])
-        # upper triangular factors: those of the matrix with rows and columns in reverse order
+        # upper triangular factors, by the lower ones of the matrix with rows and columns in reverse order
         self.factors = nn.Buffer(torch.linalg.cholesky(pseudo.flip(-1, -2)).flip(-1, -2))
         self.raw = nn.Parameter(torch.zeros(len(links), 10, dtype=torch.float64))
 

@@ -20,10 +20,10 @@ from spelgen.runtime.rows import Joint, Link, vector
 class RigidParameters(NamedTuple):
     """All that depends on the parameters only."""
 
-    points: Tensor  # of the bodies in body frames, block diagonal, (4 bodies, 4 bodies)
+    points: Tensor  # points of the bodies in body frames, block diagonal, (4 bodies, 4 bodies)
     armature: Tensor  # inertia of the rotors, part of M, (n, n)
     friction: FrictionConstants
-    residual: Parameters = None  # of the residual terms
+    residual: Parameters = None  # parameter cache of the residual terms
 
 
 class RigidConfiguration(NamedTuple):
@@ -34,15 +34,15 @@ class RigidConfiguration(NamedTuple):
     gravity: Tensor  # dV/dq of the bodies, (..., n)
     prepared: RigidParameters
     varied: Tensor | float = 1.0  # factor on friction, (..., n)
-    residual: Configuration = None  # of the residual terms
+    residual: Configuration = None  # configuration cache of the residual terms
 
 
 class RigidBodyDynamics(PortHamiltonian):
     """Rigid bodies with trained inertial parameters, friction and a torque offset.
 
     z, (..., n, K) [rad, m], is the state of the friction bristles; their energy is part of H. Without z,
-    dry friction depends on velocity. motor_speeds: rows of C, the motors rotate at C qd, and friction, its
-    state and the armature are those of the motors; None: every motor drives its own joint. servo: position
+    dry friction depends on velocity. motor_speeds: rows of C, the motors rotate at C qd and have the
+    friction, its state and the armature; None: every motor drives its own joint. servo: position
     servos of the joints, if there are any.
     """
 
@@ -129,55 +129,55 @@ class RigidBodyDynamics(PortHamiltonian):
         return RigidParameters(points, armature, self.friction.prepare())
 
     def configuration(self, q: Tensor, prepared: RigidParameters) -> RigidConfiguration:
-        """Return all that depends on q only."""
+        """Return all that depends on q, (..., n), only."""
         chain, ratios = self.chain.forward(q, prepared.points), self.chain.ratios
         mass = ratios.mT @ (chain.jacobian @ chain.jacobian.mT) @ ratios + prepared.armature
         return RigidConfiguration(chain, mass, applied(chain.jacobian, chain.weight) @ ratios, prepared)
 
     def potential_energy(self, q: Tensor | RigidConfiguration, z: Tensor | None = None) -> Tensor:
         """Return V(q) and the elastic energy of the bristles, (...) [J]; V is 0 at the origin of the base."""
-        at: RigidConfiguration = self.at(q)
-        energy = (at.chain.place.flatten(-3) * at.chain.weight).sum(dim=-1)
-        return energy if z is None else energy + at.prepared.friction.stored_energy(z)
+        cache: RigidConfiguration = self.at(q)
+        energy = (cache.chain.place.flatten(-3) * cache.chain.weight).sum(dim=-1)
+        return energy if z is None else energy + cache.prepared.friction.stored_energy(z)
 
     def gravity(self, q: Tensor | RigidConfiguration) -> Tensor:
         """Return dV/dq, (..., n) [Nm, N]."""
-        at: RigidConfiguration = self.at(q)
-        return at.gravity
+        cache: RigidConfiguration = self.at(q)
+        return cache.gravity
 
     def lagrangian_gradient(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
         """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
-        at: RigidConfiguration = self.at(q, qd)
-        return self.chain.kinetic_gradient(at.chain, qd) - at.gravity
+        cache: RigidConfiguration = self.at(q, qd)
+        return self.chain.kinetic_gradient(cache.chain, qd) - cache.gravity
 
     def nonlinear_effects(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
         """Return Coriolis, centrifugal and gravity torque, (..., n), by the principle of d'Alembert."""
-        at: RigidConfiguration = self.at(q, qd)
-        return applied(at.chain.jacobian, self.chain.accelerations(at.chain, qd)) @ self.chain.ratios
+        cache: RigidConfiguration = self.at(q, qd)
+        return applied(cache.chain.jacobian, self.chain.accelerations(cache.chain, qd)) @ self.chain.ratios
 
-    def _at_motors(self, at: RigidConfiguration, qd: Tensor) -> tuple[Tensor, Tensor]:
+    def _at_motors(self, cache: RigidConfiguration, qd: Tensor) -> tuple[Tensor, Tensor]:
         """Return velocities and gravity torques of the motors, C qd and C^-T g, each (..., n)."""
         if self.motors is None or self.loads is None:
-            return qd, at.gravity
-        return qd @ self.motors.mT, at.gravity @ self.loads
+            return qd, cache.gravity
+        return qd @ self.motors.mT, cache.gravity @ self.loads
 
     def friction_torque(self, q: Tensor | RigidConfiguration, qd: Tensor, *state: Tensor | None) -> Tensor:
         """Return the friction torque C^T f(C qd), (..., n) [Nm, N]; state: see ``FrictionConstants``."""
-        at: RigidConfiguration = self.at(q, qd)
-        torque = at.varied * at.prepared.friction.torque(*self._at_motors(at, qd), *state)
+        cache: RigidConfiguration = self.at(q, qd)
+        torque = cache.varied * cache.prepared.friction.torque(*self._at_motors(cache, qd), *state)
         return torque if self.motors is None else torque @ self.motors
 
     def dissipation(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
         """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
-        at: RigidConfiguration = self.at(q, qd)
-        friction = at.prepared.friction
-        qd, gravity = self._at_motors(at, qd)
+        cache: RigidConfiguration = self.at(q, qd)
+        friction = cache.prepared.friction
+        qd, gravity = self._at_motors(cache, qd)
         dry = friction.dry(qd, gravity) * turning(qd, friction.coulomb_smoothing_velocity)
-        matrix = torch.diag_embed(at.varied * (friction.viscosity(qd) + dry))
+        matrix = torch.diag_embed(cache.varied * (friction.viscosity(qd) + dry))
         return matrix if self.motors is None else self.motors.mT @ matrix @ self.motors
 
     def _motor(self, qd: Tensor) -> Tensor:
-        """Return velocities or displacements of the motors, (..., n), for those of the joints."""
+        """Return velocities or displacements of the motors, (..., n), from the joints' (..., n)."""
         return qd if self.motors is None else qd @ self.motors.mT
 
     def memory(self, qd: Tensor) -> Tensor:
@@ -214,6 +214,6 @@ class RigidBodyDynamics(PortHamiltonian):
             flat = self.memory_rate(z, qd).flatten(-2)
         return torch.cat([qd, force, flat, torch.zeros_like(tau)], dim=-1)
 
-    def input_force(self, at: RigidConfiguration, qd: Tensor, tau: Tensor) -> Tensor:
+    def input_force(self, cache: RigidConfiguration, qd: Tensor, tau: Tensor) -> Tensor:
         """Return G (tau - torque offset) + friction compensation qd, (..., n) [Nm, N]."""
-        return super().input_force(at, qd, tau - self.torque_offset) + self.friction_compensation * qd
+        return super().input_force(cache, qd, tau - self.torque_offset) + self.friction_compensation * qd

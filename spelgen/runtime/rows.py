@@ -80,7 +80,7 @@ class Constant(NamedTuple):
 
 
 def vector(values: Iterable[float]) -> Tensor:
-    """Return the values as a float64 tensor."""
+    """Return the values as a float64 tensor, (values,)."""
     return torch.tensor(list(values), dtype=torch.float64)
 
 

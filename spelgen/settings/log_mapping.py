@@ -38,7 +38,7 @@ LONGEST_DELAY = 1.0  # s
 Accepted = Literal[
     "degrees", "frozen", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign", "no-torques",
     "torque-sense", "torque-unit", "torque-beyond-drive", "torque-order", "joint-sense", "joint-order", "joint-zero",
-    "gravity", "gravity-compensated",
+    "gravity", "gravity-compensated", "torque-clipped",
 ]  # fmt: skip
 """Codes of errors of `spelgen logs` that a user can accept."""
 
@@ -149,6 +149,7 @@ class MotorCalibration(Group):
 
     @model_validator(mode="after")
     def _has_range(self) -> MotorCalibration:
+        # An empty range cannot be normalised to -100..100.
         if not self.range_min < self.range_max:
             raise ValueError("a range_max above range_min")
         return self
@@ -187,6 +188,7 @@ class JointLog(Group):
 
     @model_validator(mode="after")
     def _moves(self) -> JointLog:
+        # A gain of zero would map every logged torque to zero.
         if self.gain == 0.0:
             raise ValueError("a gain that is not 0")
         return self
@@ -230,6 +232,7 @@ class LogMapping(Group):
         """Required quantities of a log."""
         if self.input == "position":
             return ("q", "u")
+        # Velocities are computed from the positions: no column is read for them.
         if self.velocity == "differentiated":
             return ("q", "tau")
         return ("q", "qd", "tau")

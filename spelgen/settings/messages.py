@@ -12,11 +12,7 @@ from spelgen.errors import SettingsError, collect, suggestion
 from spelgen.settings.yaml_document import Location, YamlDocument
 
 MAX_VALUE_LENGTH = 60  # characters of a value in a message
-EXPECTED = {
-    "missing": "a value",
-    "model_type": "keys with values",
-    "dict_type": "keys with values",
-}
+EXPECTED = {"missing": "a value", "model_type": "keys with values", "dict_type": "keys with values"}
 
 Checked = TypeVar("Checked", bound=BaseModel)
 

@@ -83,6 +83,7 @@ class Settings(Group):
             raise ValueError("'tip' or 'moving_joints', not both")
         if self.input == "position" and (self.torque == "motor" or self.couplings):
             raise ValueError("'input: position' or 'torque: motor' and couplings, not both")
+        # A joint in two couplings would have two different motor torques.
         coupled = [name for coupling in self.couplings for name in coupling.joints]
         for name in coupled:
             if coupled.count(name) > 1:
@@ -116,6 +117,7 @@ def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) ->
     """
     path = Path(urdf_path).with_suffix(".yaml")
     if not path.exists():
+        # A file with the other suffix would be ignored without a message.
         misnamed = path.with_suffix(".yml")
         if misnamed.exists():
             raise SettingsError(repr(misnamed.name), file=misnamed, expected=repr(path.name), do="rename it")
@@ -137,6 +139,7 @@ def load_settings(urdf_path: Path | str, joints: Iterable[str] | None = None) ->
                 collect([*errors, *(x for placeholder in unusable.values() for x in placeholder.errors)])
             previous = unusable.get(group, Unusable(()))
             unusable[group] = Unusable((*previous.errors, each))
+            # Read again without the group: its errors may have hidden errors of other groups.
             content.pop(group, None)
     # the logs have the input of the arm, so that a file states it only once
     if settings.input == "position" and not isinstance(settings.logs, Unusable):

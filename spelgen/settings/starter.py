@@ -16,6 +16,10 @@ ARM = """\
 ## Gravity in the frame of the root link [m/s^2]: turn it for an arm on a wall or under a ceiling.
 # gravity: [0.0, 0.0, -9.81]
 
+## Joints that move, from the root to the tip; all others are locked at 0. Or, in place of this line,
+## the last link of the arm: tip: {tip}
+# moving_joints: {names}
+
 ## Commanded and logged input: torque, or position (u) of position servos, as
 ## of hobby arms. A servo whose kp [Nm/rad] is known: kp, among the drives below.
 # input: torque
@@ -60,8 +64,8 @@ class StarterJoint(NamedTuple):
     friction: float
 
 
-def starter(urdf: str, joints: Sequence[StarterJoint]) -> str:
-    """Return YAML for the URDF with this file name: explanations begin with ``##``, settings with ``# ``."""
+def starter(urdf: str, joints: Sequence[StarterJoint], tip: str) -> str:
+    """Return YAML for a URDF of this name and last link: explanations begin with ``##``, settings with ``# ``."""
     drives, logs = "", ""
     for joint in joints:
         drive = {
@@ -77,7 +81,8 @@ def starter(urdf: str, joints: Sequence[StarterJoint]) -> str:
         }
         drives += f"#   {json.dumps(joint.name)}: {_flow(drive)}\n"
         logs += f"#     {json.dumps(joint.name)}: {_flow(log)}\n"
-    return ARM.format(urdf=json.dumps(urdf), drives=drives, logs=logs)
+    names = json.dumps([joint.name for joint in joints])
+    return ARM.format(urdf=json.dumps(urdf), drives=drives, logs=logs, names=names, tip=json.dumps(tip))
 
 
 def _flow(keys: Mapping[str, object]) -> str:

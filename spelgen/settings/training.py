@@ -55,6 +55,8 @@ class TrainingSettings(Group):
     @field_validator("*")
     @classmethod
     def _belongs(cls, value: object, info: ValidationInfo) -> object:
+        # Fields are validated in order, and `objective` is the first: an option of another objective is an error
+        # here.
         objective, owners = info.data.get("objective"), OWNERS.get(str(info.field_name))
         if objective and owners and objective not in owners:
             raise ValueError(

@@ -1,7 +1,7 @@
-"""The arm as it was built: a robot that differs from its URDF as real robots do, drawn from a seed.
+"""The arm as it was built: a robot that differs from its URDF as real robots do, random with a seed.
 
 Inertials are perturbed; the drives have armature, viscous friction, Coulomb friction that depends on the direction, and
-presliding hysteresis. The result is a URDF with a settings file beside it: the ground truth of simulated logs.
+presliding hysteresis. The result is a URDF with a settings file: the ground truth of simulated logs.
 """
 
 from __future__ import annotations
@@ -99,6 +99,7 @@ def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[s
     dynamics = arm_dynamics(bodies.chain, bodies.settings)
     inertia = np.einsum("tii->i", dynamics.mass_matrix(q)) / len(q)
     speed = np.array([min(joint.velocity or np.inf, SPEEDS[joint.joint_type]) for joint in joints])
+    # Gravity and inertia torques are independent: their mean squares add up.
     torque = np.hypot(
         np.sqrt(np.square(dynamics.gravity(q)).mean(axis=0)), AS_BUILT.acceleration * speed * inertia
     )
@@ -152,6 +153,7 @@ def perturbed_urdf(robot: Path, error: float, seed: int) -> bytes:
         error: Relative standard deviation: 0.3 is 30 %.
         seed: Seed of the random factors; the same seed gives the same bytes.
     """
+    # Text of a file opens no other file.
     parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
     tree = etree.ElementTree(etree.fromstring(urdf_bytes(robot), parser))
     for element in list(tree.iter("dynamics", "visual", "collision")):
@@ -182,6 +184,7 @@ def _perturb(inertial: etree._Element, log_factors: np.ndarray, displacement: np
         trace = sum(float(tensor.get(name, "0")) for name in ("ixx", "iyy", "izz"))
         for name, value in tensor.attrib.items():
             tensor.set(name, repr(mass_factor * inertia_factor * float(value)))
+    # trace(I) / 2 is the second moment of mass about the centre, m r^2.
     gyration_radius = np.sqrt(max(trace, 0.0) / 2 / kilograms)
     origin = inertial.find("origin")
     if origin is None:

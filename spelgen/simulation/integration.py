@@ -42,11 +42,13 @@ def rollout(
     tolerances = {"rtol": TUNING.rtol * tolerance_factor, "atol": TUNING.atol * tolerance_factor}
     states = np.empty((t.size, 2 * n))
     states[0] = initial
+    # A multistep method has no valid history across a jump of tau.
     changes = np.flatnonzero((tau[1:-1] != tau[:-2]).any(axis=1)) + 1
     for first, last in pairwise([0, *changes.tolist(), t.size - 1]):
         torque = tau[first]
 
         def derivative(_: float, state: np.ndarray, torque: np.ndarray = torque) -> np.ndarray:
+            """Return the derivative of the state (q, qd), (2 n,), under a constant torque (n,) [Nm, N]."""
             qd = state[n:]
             return np.concatenate([qd, dynamics.forward_dynamics(state[:n], qd, torque)])
 
@@ -57,12 +59,7 @@ def rollout(
             warnings.simplefilter("error", ODEintWarning)
             try:
                 states[span] = odeint(
-                    derivative,
-                    states[first],
-                    t[span],
-                    tfirst=True,
-                    mxstep=TUNING.most_steps,
-                    **tolerances,
+                    derivative, states[first], t[span], tfirst=True, mxstep=TUNING.most_steps, **tolerances
                 )
             except ODEintWarning as warning:
                 raise _stuck(t[first], str(warning).split(" (")[0].lower()) from warning

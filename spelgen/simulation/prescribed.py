@@ -105,10 +105,12 @@ def prescribed(
         motions = paths(arm, settings, sample_times(protocol))
     logs = []
     for number, motion in enumerate(motions):
+        # A generator per motion: a motion has the same noise in any set of motions.
         rng = np.random.default_rng([protocol.seed, number])
         torque = dynamics.inverse_dynamics(motion.q, motion.qd, motion.qdd)
         torque = torque + friction_along(friction, arm, motion, protocol.presliding)
         tau = torque @ to_motors.T
+        # Noise relative to the variation of each motor's torque, as of current sensors that fit their motors.
         tau = tau + protocol.torque_noise * tau.std(axis=0) * rng.standard_normal(tau.shape)
         states = np.concatenate([motion.q, motion.qd], axis=1)
         recording = Recording(motion.t, states, quantized(motion.q, settings.tracking), tau)

@@ -88,6 +88,7 @@ def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
     """
     count = settings.simulation.trajectories
     seeds = np.random.SeedSequence(settings.simulation.seed).spawn(count)
+    # Independent generators: the first trajectories are the same for any number of them.
     randoms = list(map(np.random.default_rng, seeds))
     low, high = initial_range(arm, settings)
     if settings.tracking.paths == "excitation":
@@ -102,6 +103,7 @@ def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
     middle, amplitude = (low + high) / 2, _amplitude(arm, settings, low, high)
     drawn = [random.uniform(0, 2 * np.pi, len(middle)) for random in randoms]
     if settings.tracking.paths == "same":
+        # The same path with equally spaced phases.
         drawn = [drawn[0] + 2 * np.pi * number / count for number in range(count)]
     return [sines(middle, amplitude, settings.tracking.frequency, phase, t) for phase in drawn]
 

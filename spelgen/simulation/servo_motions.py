@@ -14,10 +14,6 @@ from spelgen.settings.settings import Settings
 from spelgen.simulation.protocol import SimulatedLogs, initial_range, make_friction, sample_times
 from spelgen.simulation.tuning import TUNING
 
-SWEEPS = 4  # Gauss-Seidel iterations over the joints, for dry friction
-ENCODER = 2 * np.pi / 4096  # [rad], 12 bits per revolution; a tenth of it [m] for prismatic joints
-EFFORT, LAG = 5.0, 0.05  # [Nm], [s]: torque limit and time constant kd / kp of an unspecified servo
-
 
 def servo_motions(
     arm: Chain,
@@ -28,13 +24,15 @@ def servo_motions(
 ) -> SimulatedLogs:
     """Return trajectories under random commands; the same settings give the same logs.
 
-    Arguments and errors are those of `random_inputs`.
+    Arguments and errors: see `random_inputs`.
     """
     protocol = settings.simulation
     lowest, highest = initial_range(arm, settings)
     middle, width = (lowest + highest) / 2, np.minimum((highest - lowest) / 2, TUNING.command_amplitude)
     t = sample_times(protocol)
-    encoder = np.array([ENCODER if x.joint_type == "revolute" else ENCODER / 10 for x in arm.coordinates])
+    resolution = 2 * np.pi / TUNING.encoder_counts
+    is_revolute = np.array([x.joint_type == "revolute" for x in arm.coordinates])
+    encoder = np.where(is_revolute, resolution, resolution / 10)  # [rad], [m]
     logs: list[Trajectory] = []
     for number, seed in enumerate(np.random.SeedSequence(protocol.seed).spawn(protocol.trajectories)):
         u = middle + width * _commands(np.random.default_rng(seed), t, len(middle))
@@ -61,7 +59,7 @@ def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> 
 
     Method: semi-implicit Euler with dry friction as impulses. The impulse of a joint's dry friction stops it, within
     the bounds of Coulomb friction (projected Gauss-Seidel, as in physics engines: Catto, Iterative Dynamics with
-    Temporal Coherence, 2005). Servos without kp get kp = 2 limit, kd = `LAG` kp.
+    Temporal Coherence, 2005). Servos without kp get kp = 2 limit, kd = `servo_lag` kp.
 
     Args:
         arm: The arm.
@@ -70,11 +68,11 @@ def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> 
         u: Commanded positions (T, n) [rad; m].
     """
     dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings)
-    limit = np.array([coordinate.effort or EFFORT for coordinate in arm.coordinates])
+    limit = np.array([coordinate.effort or TUNING.servo_effort for coordinate in arm.coordinates])
     kp = 2 * limit
     for joint, coordinate in enumerate(arm.coordinates):
         kp[joint] = settings.joint(coordinate.name).kp or kp[joint]
-    kd = LAG * kp
+    kd = TUNING.servo_lag * kp
     interval = t[1] - t[0]
     steps = int(np.ceil(interval / TUNING.servo_step))
     h, delay = interval / steps, round(settings.simulation.delay * steps / interval)
@@ -105,7 +103,7 @@ def _after_dry_friction(
         upper: Largest impulses (n,).
     """
     impulse = np.zeros_like(qd)
-    for _ in range(SWEEPS):
+    for _ in range(TUNING.friction_sweeps):
         for k in range(len(qd)):
             stopping = impulse[k] - qd[k] / inverse[k, k]
             change = min(max(stopping, lower[k]), upper[k]) - impulse[k]

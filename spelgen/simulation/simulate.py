@@ -1,4 +1,4 @@
-"""Simulate logs of an arm, in memory, by the protocol that its settings name; random torques are one."""
+"""Simulated logs of an arm in memory, by the protocol that its settings name, for example random torques."""
 
 from __future__ import annotations
 
@@ -87,9 +87,9 @@ def simulate(
     motions: Sequence[Motion] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> SimulatedLogs:
-    """Return simulated logs of the arm: all trajectories in a list, and those in `train` and `test`.
+    """Return simulated logs of the arm: all trajectories, and their split into `train` and `test`.
 
-    Values that are not given are those of `simulation` in the settings beside the URDF. The same arguments give the
+    Default values are in `simulation` of the arm's settings. The same arguments give the
     same logs. Mimic joints move as the URDF specifies. Raises ArmError without inertials, SettingsError for an invalid
     value or a joint without a range of initial positions, and RunError if the motion cannot be integrated.
 

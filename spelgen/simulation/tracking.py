@@ -61,7 +61,7 @@ def track(
 
     Each recording has its own gains, and its own phases or initial position. The last `test_fraction` of each recording
     is for testing. Logged are positions from the encoders after a zero-phase low-pass, velocities by central
-    differences of these, and motor torques. Arguments and errors are those of `random_inputs`; `settings.tracking` is
+    differences, and motor torques. Arguments and errors: see `random_inputs`; `settings.tracking` is
     used as well.
     """
     protocol = settings.simulation
@@ -96,6 +96,7 @@ def tuned_gains(inertia: np.ndarray, bandwidth: float) -> Gains:
         bandwidth: Bandwidth of the position loop [Hz].
     """
     omega = 2 * np.pi * bandwidth
+    # inertia (s^2 + 2 omega s + omega^2) = 0: a double pole, without overshoot.
     return Gains(inertia * omega**2, TUNING.integral_gain * inertia * omega**3, 2 * inertia * omega)
 
 
@@ -123,6 +124,7 @@ def computed_torque(
     """
     q, qd, qdd = motion
     mass = dynamics.mass_matrix(q)
+    # Such a joint follows viscous qd = k e: its time constant is 1 / omega for k = viscous omega.
     slow = np.where(friction.viscous > np.diag(mass) * omega, friction.viscous * omega, 0.0)
     torque = mass @ (qdd + 2 * omega * velocity_error + omega**2 * error) + slow * error
     return np.asarray(torque + dynamics.nonlinear_effects(q, qd) + friction(qd))
@@ -162,6 +164,7 @@ def record(
     within = np.arange(samples + 1) / settings.simulation.sample_rate
     for k, (q, qd, qdd) in enumerate(zip(path.q, path.qd, path.qdd, strict=True)):
         previous, encoders = encoders, quantized(state[:n], tracking)
+        # Velocities by differences of encoder steps, as a servo drive measures them.
         error, velocity_error = q - encoders, qd - (encoders - previous) / tick
         integral = integral + tick * gains.integral * error
         effort = gains.proportional * error + gains.derivative * velocity_error + integral

@@ -28,6 +28,14 @@ class SimulationTuning:
 
     # [s] Largest step of the integration.
     servo_step: float = 1e-3
+    # [1] Gauss-Seidel iterations over the joints, for dry friction.
+    friction_sweeps: int = 4
+    # [1] Counts of an encoder per revolution: 12 bits.
+    encoder_counts: int = 4096
+    # [Nm] Torque limit of a servo without an effort limit.
+    servo_effort: float = 5.0
+    # [s] Ratio kd / kp of an unspecified servo.
+    servo_lag: float = 0.05
     # [rad, m] Largest amplitude of a command about the middle of a joint's range.
     command_amplitude: float = 0.6
     # [s] Time between jumps of the commands.
@@ -51,7 +59,7 @@ class AsBuiltTuning:
     viscous: tuple[float, float] = (0.3, 1.0)
     # Armature, relative to the mean diagonal entry of M.
     armature: tuple[float, float] = (0.02, 0.2)
-    # Moderate motion: angular frequency [rad/s] that turns a speed into an acceleration.
+    # Angular frequency [rad/s] of moderate motion: its acceleration is this number times its speed.
     acceleration: float = 2.0
     # Random positions, and the fraction of the joint ranges they cover, from which magnitudes are computed.
     positions: int = 50

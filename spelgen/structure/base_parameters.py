@@ -17,13 +17,11 @@ import numpy as np
 from flint import fmpq, fmpq_mat
 
 from spelgen.arm.arm import Chain
+from spelgen.labels import BASE_ORDER, INERTIAL_PARAMETERS, parameter_name
 from spelgen.structure import field
-from spelgen.structure.recursion import PARAMETERS, Position, coefficients
+from spelgen.structure.recursion import Position, coefficients
 from spelgen.structure.sampling import regressor_rows
 
-# Order of the columns: the first parameter of a group names the group. Iyy, hz and m come last, because those
-# parameters of a body with a revolute joint can always be regrouped into others.
-_PREFERRED = ("Izz", "Ixx", "Ixy", "Ixz", "Iyz", "hx", "hy", "m", "Iyy", "hz")
 # Random rational numbers have numerators and denominators below this bound.
 _GRID = 1000
 
@@ -33,19 +31,14 @@ class BaseParameter:
     """A linear combination of inertial parameters that can be identified from the motion.
 
     ``index`` and ``name`` are the first parameter's, with the suffix R if others are regrouped into it. ``weights`` are
-    pairs (parameter, coefficient); parameter i of a body has the index 10 body + i, in the order of ``PARAMETERS``.
-    ``value`` follows from the URDF; it is None if a body has no inertial.
+    pairs (parameter, coefficient); parameter i of a body, in the order of ``INERTIAL_PARAMETERS``, has the index
+    10 body + i. ``value`` follows from the URDF; it is None if a body has no inertial.
     """
 
     name: str
     index: int
     weights: tuple[tuple[int, Fraction], ...]
     value: Fraction | None
-
-
-def parameter_name(index: int) -> str:
-    """Return the name of an inertial parameter: ``Izz2`` is the tensor component zz of the second body."""
-    return f"{PARAMETERS[index % 10]}{index // 10 + 1}"
 
 
 @lru_cache(maxsize=16)
@@ -66,7 +59,7 @@ def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
     """Return the base parameters of ``arm``, in the order of the bodies from the root."""
     order: list[int] = []
     for body in range(len(arm.bodies)):
-        order += [10 * body + PARAMETERS.index(name) for name in _PREFERRED]
+        order += [10 * body + INERTIAL_PARAMETERS.index(name) for name in BASE_ORDER]
     result = []
     for row in _reduced_rows(arm, order):
         weights = []

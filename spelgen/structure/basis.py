@@ -123,6 +123,8 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
         while missing:
             pairs = next(candidates)
             weights = np.array([w for w, _ in pairs], dtype=np.uint64).reshape(-1, len(spans.keys))
+            # Functionals as vectors of their values on the basis of U: two functionals with equal rows agree on all
+            # changes.
             rows = np.concatenate([chosen, field.product(weights, spans.varying.T)])
             # The pivot columns of the transposed matrix are the rows that do not depend on earlier rows.
             independent = field.pivots(field.row_basis(rows.T))
@@ -142,6 +144,7 @@ def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
                 for tail in combinations(later, size):
                     yield frozenset((first, *tail))
             else:
+                # An arm with many joints has too many subsets: only sets of consecutive joints are tried.
                 yield frozenset((first, *later[:size]))
 
 
@@ -213,6 +216,8 @@ def _fraction(element: int, value: float) -> Fraction:
     Computer Algebra*, section 5.10). Geometry with irrational lengths gives longer fractions; for these the float is as
     accurate as the URDF.
     """
+    # Extended Euclidean algorithm for (PRIME, element), stopped early: numerator = denominator * element modulo
+    # PRIME.
     bound = 2**30
     previous, current = (field.PRIME, 0), (element, 1)
     while current[0] > bound:
@@ -224,6 +229,7 @@ def _fraction(element: int, value: float) -> Fraction:
     numerator, denominator = current
     if denominator and gcd(numerator, denominator) == 1:
         candidate = Fraction(numerator, denominator)
+        # The float decides whether the short fraction is the number or a coincidence.
         if abs(candidate - Fraction(value)) <= 1e-8 * max(1.0, abs(value)):
             return candidate
     return Fraction(value)

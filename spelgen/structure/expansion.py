@@ -93,6 +93,7 @@ class Expansion:
 
     def polynomial(self, element: Deferred | int, parameter: int, budget: Budget) -> fmpq_mpoly:
         """Return the coefficient of ``parameter`` (10 body + i) in ``element``. Raises TooLarge."""
+        # Values by the identity of the recorded operation: a shared subexpression is computed once.
         values: dict[int, Value] = {}
         for index, leaf in enumerate(self._parameters):
             values[id(leaf)] = int(index == parameter)
@@ -120,6 +121,7 @@ def _executed(node: Deferred, values: dict[int, Value], budget: Budget) -> Value
         return x + y
     if _is_zero(x) or _is_zero(y):
         return 0
+    # Every product of two terms is computed before like terms are collected.
     budget.spend(_terms(x) * _terms(y))
     return x * y
 

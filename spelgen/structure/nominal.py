@@ -66,6 +66,7 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
     # An output that hardly varies for the nominal parameters may vary for the true ones: a lower bound of its scale.
     output_floor = TUNING.min_scale * (np.abs(output_rows) @ typical)
     constant_floor = TUNING.min_scale * (np.abs(constant_rows) @ typical)
+    # Friction of drives scales with the torque that they carry.
     torque = _gravity_torque(arm, q, inertias)
     inertial = np.sqrt((mass[:, diagonal] ** 2).mean(axis=0))
     return Nominal(
@@ -73,6 +74,7 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
         output_scales=_rounded(np.maximum(outputs.std(axis=0), output_floor), zero_below=0.0),
         constants=_rounded(constants),
         constant_scales=_rounded(np.maximum(np.abs(constants), constant_floor), zero_below=0.0),
+        # V is determined up to a constant: its scale is its variation.
         potential_scale=_round(max(float(potential.std()), 1e-3), _DIGITS),
         joint_torque=_rounded(np.hypot(torque, inertial)),
         mass_sensitivities=_sensitivities(_mass_changes(arm, q, inertias, mass, typical)),
@@ -86,6 +88,7 @@ def working_range(coordinate: Coordinate) -> tuple[float, float]:
     """Return the range of a coordinate [rad, m]: its limits if usable, else one revolution or one metre."""
     lower, upper = coordinate.lower, coordinate.upper
     is_revolute = coordinate.joint_type == "revolute"
+    # Exporters write +-1e16 or equal limits for a joint without limits.
     if coordinate.continuous or lower is None or upper is None or not 0 < upper - lower < 1e3:
         half_range = pi if is_revolute else 0.5
         return -half_range, half_range

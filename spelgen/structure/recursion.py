@@ -23,9 +23,6 @@ Element = Any
 Vector = tuple[Element, Element, Element]
 Terms = tuple[tuple[int, Element], ...]
 
-PARAMETERS = ("m", "hx", "hy", "hz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
-"""Names of the ten inertial parameters of a body, in their order."""
-
 TENSOR = tuple(combinations_with_replacement(range(3), 2))
 """Order of the six tensor components of a ten-vector: Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
 
@@ -107,6 +104,7 @@ def energies(
     composites = [_Inertia(ten[0], tuple(ten[1:4]), tuple(ten[4:10])) for ten in inertias]
     total = _Inertia(0, (0, 0, 0), (0,) * 6)
     mass: dict[tuple[int, int], Element] = dict.fromkeys(triangle(len(arm.coordinates)), 0)
+    # Parents precede children: in reverse order a composite is complete before its column of M is computed.
     for index in reversed(range(len(arm.bodies))):
         for ancestor, entry in _column(arm, poses, motions, index, composites[index]):
             _add_entry(mass, arm.bodies[index], arm.bodies[ancestor], entry, number)
@@ -183,6 +181,7 @@ def _multiple_angle(c: Element, s: Element, factor: int) -> tuple[Element, Eleme
     # Exponentiation by squaring: multipliers of mimic joints reach twenty.
     for bit in bin(abs(factor))[2:]:
         x, y = result
+        # Square of the complex number x + i y, the point of twice the angle.
         result = (x * x - y * y, 2 * (x * y))
         if bit == "1":
             x, y = result
@@ -197,6 +196,9 @@ def _column(
 ) -> list[tuple[int, Element]]:
     """Return the entries of the mass matrix of the bodies' joints: of joint ``index`` with itself and its ancestors."""
     body = arm.bodies[index]
+    # The wrench that accelerates the composite body about (or along) its z axis at unit rate: force z x h and moment
+    # I z, or force m z and moment h x z. Its component along the axis of an ancestor is the entry of M (Featherstone,
+    # table 6.2).
     (hx, hy, _), tensor = inertia.moment, inertia.tensor
     if body.joint_type == "revolute":
         wrench = _Wrench((-hy, hx, 0), (tensor[2], tensor[4], tensor[5]))
@@ -248,6 +250,7 @@ def _moved_inertia(body: Body, motion: _JointMotion, inertia: _Inertia) -> _Iner
     xx, xy, xz, yy, yz, zz = inertia.tensor
     # sin^2 = 1 - cos^2 is substituted here, so that polynomials need no reduction.
     cc, cs, difference = c * c, c * s, xx - yy
+    # R I R^T for a rotation about z. Ixx + Iyy is invariant, so the second diagonal entry needs no products.
     turned_xx = yy + cc * difference - 2 * (cs * xy)
     return _Inertia(
         inertia.mass,
@@ -275,6 +278,7 @@ def _posed_inertia(pose: _Pose, inertia: _Inertia) -> _Inertia:
     x, y, z = pose.rotation
     xx, xy, xz, yy, yz, zz = inertia.tensor
     columns = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+    # R I first, then (R I) R^T: rows of R are sparse, as most joints are at right angles.
     half = []
     for row in (x, y, z):
         half.append([_dot(row, column) for column in columns])
@@ -326,6 +330,7 @@ def _pose(body: Body, number: Callable[[Fraction], Element]) -> _Pose:
 
 
 def _terms(row: Sequence[Fraction], number: Callable[[Fraction], Element]) -> Terms:
+    # Products with the integers 1 and -1 cost nothing, unlike those with elements of the ring.
     return tuple((i, int(x) if abs(x) == 1 else number(x)) for i, x in enumerate(row) if x)
 
 

@@ -53,6 +53,7 @@ def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray,
             inertias.append(list(map(Residues, random_residues(rng, (10, samples)))))
         else:
             inertias.append(list(map(residue, body.inertia or (Fraction(0),) * 10)))
+    # One pass of the recursion computes all samples: its elements are arrays.
     result = energies(arm, positions, inertias, residue)
     shape = (1 + n, samples)
     entries = [_residue_values(entry, shape) for entry in result.mass.values()]
@@ -119,7 +120,7 @@ def float_energies(arm: Chain, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[
 
 
 def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
-    """Return values (2 S,) as blocks (blocks, S): the first half, but in block ``index`` + 1 the second half."""
+    """Return blocks (blocks, S) of values (2 S,): the second half in block ``index`` + 1, the first in all others."""
     base, moved = np.split(values, 2)
     result = np.tile(base, (blocks, 1))
     result[index + 1] = moved
@@ -191,6 +192,7 @@ class Spans:
     def outside(self, joints: frozenset[int]) -> np.ndarray:
         """Return rows (m, dim U) that span the changes of M with joints outside ``joints``, in the basis of U."""
         first, last = min(joints), max(joints)
+        # The joints outside are mostly a prefix and a suffix of the chain, whose echelon forms are cached.
         between = [self._coordinates[k] for k in range(first, last) if k not in joints]
         return np.concatenate([self._nearer_root[first], *between, self._nearer_tip[last]])
 

@@ -35,6 +35,7 @@ class ServoRank:
 def servo_rank(arm: Chain) -> ServoRank:
     """Return the identifiable ratios for generic values: random states, inertial parameters and drive parameters."""
     random, n = np.random.default_rng(0), len(arm.coordinates)
+    # Twice as many equations as unknowns, so that the rank is not limited by the samples.
     samples = 2 * (10 * len(arm.bodies) // n + len(PARAMETERS)) + 20
     q, qd, qdd = random.normal(size=(3, samples, n))
     columns = torque_rows(arm, q, qd, qdd).reshape(samples * n, -1)
@@ -45,9 +46,11 @@ def servo_rank(arm: Chain) -> ServoRank:
     torque = drives.sum(axis=-1) + bodies.sum(axis=-1).reshape(samples, n)
     rows = np.zeros((samples, n, n, len(PARAMETERS)))
     for joint in range(n):
+        # kp (u - q) is the torque, with a known command error: divided by it, the column of kp is minus the torque.
         rows[:, joint, joint, 0] = -torque[:, joint]
         rows[:, joint, joint, 1:] = drives[:, joint]
     system = np.concatenate([rows.reshape(samples * n, -1), bodies], axis=1)
+    # Columns of equal length, so that the threshold of singular values has no unit.
     norms = np.linalg.norm(system, axis=0)
     _, null = _row_and_null_space(system / norms)
     changes = (null / norms[:, None])[: n * len(PARAMETERS)].reshape(n, len(PARAMETERS), -1)
@@ -90,6 +93,7 @@ def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> n
     for entry, (row, column) in enumerate(triangle(n)):
         mass[..., row, column] = mass[..., column, row] = triangles[..., entry]
     # tau = d/dt (M qd) - d/dq (qd^T M qd / 2) + dV/dq
+    # The last direction of the derivatives is the velocity, along which qd changes by qdd.
     momentum = np.einsum("spij,sj->sip", mass[:, n], qd + 1j * step * qdd)
     kinetic = np.einsum("skpij,si,sj->skp", mass[:, :n], qd, qd) / 2
     torque: np.ndarray = (momentum - kinetic + potential[:, :n]).imag / step

@@ -87,6 +87,7 @@ def _refuse_damage(path: Path, data: bytes) -> None:
     """Raise UrdfError for damage with unclear errors of the XML parser, and for unsafe declarations."""
     if not data.strip():
         raise UrdfError("an empty file", file=path, expected="a URDF document")
+    # Markers of git are the most common damage, and the parser's message would not name them.
     conflict = _CONFLICT.search(data)
     if conflict:
         raise UrdfError(
@@ -104,6 +105,7 @@ def _refuse_damage(path: Path, data: bytes) -> None:
             expected="<?xml ...?> at the very start of the file",
             do="delete what stands before it",
         )
+    # Before parsing: an entity could expand to gigabytes, or read another file.
     for declaration in (b"<!DOCTYPE", b"<!ENTITY"):
         if declaration in data:
             raise _doctype_error(path, _line_of(data, data.index(declaration)))

@@ -109,6 +109,7 @@ def _unique(notes: Notes, elements: Sequence[Part | None]) -> list[Part]:
     for element in elements:
         if element is None:
             continue
+        # The first element of a name is kept, so that further checks report no consequences of the second.
         first = by_name.setdefault(element.name, element)
         if first is not element:
             kind = "link" if isinstance(element, UrdfLink) else "joint"
@@ -123,6 +124,7 @@ def _check_ends(notes: Notes, links: Sequence[UrdfLink], joints: Sequence[UrdfJo
     above: dict[str, UrdfJoint] = {}
     for joint in joints:
         where = f"joint {joint.name!r}"
+        # Both ends are checked before any error is raised: a renamed link breaks several joints.
         for role, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in names:
                 got = f"no link is named {link!r}"
@@ -157,6 +159,7 @@ def _is_circle(joint: UrdfJoint, by_name: dict[str, UrdfJoint]) -> bool:
     """Whether ``joint`` is part of a cycle of mimic joints."""
     seen: set[str] = set()
     leader: UrdfJoint | None = joint
+    # The names that were seen end a cycle that does not contain the joint.
     while leader is not None and leader.mimic is not None and leader.name not in seen:
         seen.add(leader.name)
         leader = by_name.get(leader.mimic.joint)
@@ -184,6 +187,7 @@ def _check_tree(
     connected = {tops[0].name}
     pending = [tops[0].name]
     while pending:
+        # Each link has one parent here, so that the walk from the root ends even if other links form a cycle.
         pending += below.get(pending.pop(), [])
         connected.update(pending)
     for link in links:

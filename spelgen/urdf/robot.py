@@ -137,6 +137,7 @@ class Robot:
     @cached_property
     def joints_below(self) -> dict[str, tuple[UrdfJoint, ...]]:
         """The joints whose parent is a link, by the name of the link, in the order of the file."""
+        # All links have an entry, so that the tips are the links with an empty one.
         below: dict[str, list[UrdfJoint]] = {link.name: [] for link in self.links}
         for joint in self.joints:
             below[joint.parent].append(joint)

@@ -76,7 +76,7 @@ def read_number(
 
 
 def read_limit(notes: Notes, element: etree._Element, key: str, where: str) -> float | None:
-    """Read a limit; None if it states none: absent, inf, nan, or beyond what joints have."""
+    """Read a limit; None without a limit: absent, inf, nan, or beyond the range of joints."""
     text = (element.get(key) or "").strip().lower()
     if text.lstrip("+-") in ("inf", "infinity", "nan"):
         return None

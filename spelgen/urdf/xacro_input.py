@@ -43,6 +43,7 @@ def expand(path: Path, max_bytes: int) -> XacroOutput:
     """
     # -P: modules in the current folder must not shadow the package
     command = [sys.executable, "-P", "-X", "utf8", xacro_child.__file__, str(path)]
+    # A file and not a pipe: output of any size must not fill the memory of this process.
     with tempfile.TemporaryFile() as output:
         try:
             run = subprocess.run(

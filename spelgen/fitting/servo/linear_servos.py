@@ -8,13 +8,10 @@ import numpy as np
 from scipy.optimize import least_squares, minimize_scalar
 
 from spelgen.baselines.linear_servos import LinearServos, linear_response
+from spelgen.fitting.servo.tuning import LinearServoTuning
 from spelgen.fitting.servo.windows import ServoWindows
 
-# Upper bound of the delays [s].
-MAX_DELAY = 0.4
-# Initial logarithms of natural frequency [rad/s] and damping ratio, delay [s], and offset [rad, m], with their bounds.
-INITIAL = (np.log(20.0), 0.0, 0.02, 0.0)
-BOUNDS = ((-np.inf, -np.inf, 0.0, -np.inf), (np.inf, np.inf, MAX_DELAY, np.inf))
+TUNING = LinearServoTuning()
 
 
 def fit_linear_servos(windows: ServoWindows) -> LinearServos:
@@ -22,9 +19,8 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
     q, qd = windows.q.numpy(), windows.qd.numpy()
     measured, dt = q[:, 1:], float(windows.dt.mean())
 
-    @lru_cache(
-        maxsize=8
-    )  # finite differences change one of four unknowns at a time, three of which are not the delay
+    # finite differences change one of four unknowns at a time, three of which are not the delay
+    @lru_cache(maxsize=8)
     def commands(delay: float) -> np.ndarray:
         """Return the mean command of each interval, (W, K-1, n)."""
         return windows.commands(delay).mean(dim=2).numpy()
@@ -33,7 +29,10 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
         return float(np.square(commands(delay) - measured).mean())
 
     # commands change little within the bounds, so the error has one minimum
-    late = minimize_scalar(delayed_error, bounds=(0, MAX_DELAY), method="bounded").x
+    late = minimize_scalar(delayed_error, bounds=(0, TUNING.max_delay), method="bounded").x
+    # logarithms of natural frequency and damping ratio, delay, offset
+    initial = (np.log(TUNING.frequency), 0.0, TUNING.delay, 0.0)
+    bounds = ((-np.inf, -np.inf, 0.0, -np.inf), (np.inf, np.inf, TUNING.max_delay, np.inf))
     fits = []
     for joint in range(q.shape[2]):
         column = slice(joint, joint + 1)
@@ -47,7 +46,7 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
             result: np.ndarray = (predicted - measured[..., column])[:, windows.burn_in :].ravel()
             return result
 
-        fits.append(least_squares(residual, INITIAL, bounds=BOUNDS, x_scale="jac", max_nfev=30).x)
+        fits.append(least_squares(residual, initial, bounds=bounds, x_scale="jac", max_nfev=30).x)
     columns = np.array(fits).T
     columns[:2] = np.exp(columns[:2])
     frequency, damping, delay, offset = columns.tolist()

@@ -1,8 +1,7 @@
 """Result of a servo fit: ratios to kp with confidence intervals, and the ratios that the logs do not determine.
 
-Errors are correlated within a motion, and by the form of the model even over a whole log. So each log is one
-observation: a jackknife of the weighted least-squares solution, with one step without each log (Cameron and Miller,
-J. Human Resources 50:317, 2015, CV3). A parameter that the logs do not determine keeps the interval of its prior.
+Errors are correlated within a motion, and by the form of the model even over a whole log. So each log is one block of
+a jackknife (see `jackknife_covariance`). A parameter that the logs do not determine keeps the interval of its prior.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from spelgen.fitting.servo.laws import sliding_friction
 from spelgen.fitting.servo.parameters import DEAD_ZONE, ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
 from spelgen.fitting.servo.tuning import ServoIntervalTuning
+from spelgen.identification.intervals import jackknife_covariance
 from spelgen.listing import Listing, number
 
 if TYPE_CHECKING:
@@ -31,18 +31,19 @@ TUNING = ServoIntervalTuning()
 QUANTILE = 0.975
 RATIOS = {
     "kd": ("kd/kp", "s"),
+    "lag": ("lag", "s"),
     "armature": ("armature/kp", "s^2"),
     "dry": ("dry/kp", "rad, m"),
     "static_error": ("static error", "rad, m"),
     "dead_zone": ("half dead zone", "rad, m"),
 }
-"""Label and unit of each ratio to kp. dry: mean dry friction of a joint in motion. static_error: the sum of dry / kp
-and
-half the dead zone."""
+"""Label and unit of each ratio to kp. lag: kd / kp plus the delay. dry: mean dry friction of a joint in motion.
+static_error: the sum of dry / kp and half the dead zone."""
 ABOUT = (
     "divided by kp, with half a 95 % interval. kp itself is scaled by the URDF's masses, unless it is known. kd is the "
-    "sum of kd and viscous friction, which such logs do not distinguish. dry: dry friction; open where it cannot be "
-    "distinguished from a dead zone, as without gravity. static error: the sum of dry/kp and half the dead zone"
+    "sum of kd and viscous friction, which such logs do not distinguish. lag: the sum of kd/kp and the delay, one "
+    "quantity in slow motion. dry: dry friction; open where it cannot be distinguished from a dead zone, as without "
+    "gravity. static error: the sum of dry/kp and half the dead zone"
 )
 
 
@@ -94,37 +95,20 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     # a joint at the break-away torque: the errors are far from linear in the parameters
     if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
-    return end, ServoSolution(blocks, precision, covariance(blocks, precision, step))
+    _, covariance = jackknife_covariance(*blocks, torch.diag(precision))
+    # the step is the effect of half the integration step
+    return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
 
 def sum_by_block(windows: NormalEquations, numbers: torch.Tensor) -> NormalEquations:
     """Return sums of normal equations, (W, k, k) and (W, k), over the windows of each block, by number (W,)."""
 
     def summed(terms: torch.Tensor) -> torch.Tensor:
+        """Return the sums of the terms per log, (logs, ...)."""
         sums = terms.new_zeros(int(numbers.max()) + 1, *terms.shape[1:])
         return sums.index_add(0, numbers, terms)
 
     return NormalEquations(*map(summed, windows))
-
-
-def covariance(blocks: NormalEquations, precision: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
-    """Return the covariance of the parameters, (k, k): J + S^-1 P S^-1 + d d^T.
-
-    J is the jackknife covariance of the steps without each block, and S the Hessian of all blocks and the prior.
-
-    Args:
-        blocks: normal equations of B blocks, (B, k, k) and (B, k), with gradients that balance the gradient of the
-        prior. precision: P of the prior, (k,). change: d (k,), change of the parameters by half the integration step.
-    """
-    count, prior = len(blocks.curvature), torch.diag(precision)
-    hessian = blocks.curvature.sum(dim=0) + prior
-    # Newton steps without each block: its gradient is minus the sum of all others
-    shifts = torch.linalg.solve(hessian - blocks.curvature, -blocks.descent.unsqueeze(-1)).squeeze(-1)
-    shifts = shifts - shifts.mean(dim=0)
-    inverse = torch.linalg.inv(hessian)
-    jackknife = (count - 1) / count * shifts.mT @ shifts
-    result: torch.Tensor = jackknife + inverse @ prior @ inverse + torch.outer(change, change)
-    return result
 
 
 def identifiable(blocks: NormalEquations, precision: torch.Tensor, indices: torch.Tensor) -> torch.Tensor:
@@ -156,6 +140,7 @@ def ratios(model: ArmModel, qd: torch.Tensor, gravity: torch.Tensor) -> dict[str
     dry = sliding_friction(model.friction, qd, gravity) / kp
     return {
         "kd": servo.kd() / kp,
+        "lag": servo.kd() / kp + servo.delay,
         "armature": model.armature / kp,
         "dry": dry,
         "static_error": dry + servo.dead_zone,
@@ -172,14 +157,17 @@ def ratios_with_deviations(
     qd, gravity = rollouts.motion.qd, rollouts.load.gravity
     values = evaluate_with(rollouts.model, tensors, lambda model: ratios(model, qd, gravity))
     p, n = parameters.prior_mean.joints.shape
-    blocks = solution.covariance[: p * n, : p * n].view(p, n, p, n).diagonal(dim1=1, dim2=3)  # (p, p, n)
+    # the parameters of each joint, and the delay, which all joints share: (p + 1, p + 1, n)
+    index = torch.cat([torch.arange(p * n).view(p, n), torch.full((1, n), len(solution.covariance) - 1)])
+    blocks = solution.covariance[index.unsqueeze(1), index.unsqueeze(0)]
     result = {}
     for name, value in values.items():
         # the ratio of a joint depends on the parameters of this joint only: the gradient of the sum has all derivatives
         derivatives = torch.autograd.grad(
             value.sum(), list(tensors.values()), retain_graph=True, materialize_grads=True
         )
-        relative = torch.cat([x.reshape(n, -1).mT for x in derivatives]) / value.detach()
+        by_delay = torch.full((1, n), float(name == "lag")).double()
+        relative = torch.cat([*(x.reshape(n, -1).mT for x in derivatives), by_delay]) / value.detach()
         variance = torch.einsum("pn,pqn,qn->n", relative, blocks, relative)
         result[name] = value.detach(), variance.clamp(min=0).sqrt()
     return result
@@ -254,7 +242,7 @@ def _undetermined(record: Content) -> str:
     names = []
     for joint in record["joints"]:
         for ratio, (label, _) in RATIOS.items():
-            if ratio != "dead_zone" and not joint[ratio]["determined"]:
+            if ratio != "dead_zone" and ratio in joint and not joint[ratio]["determined"]:
                 names.append(f"{label} of {joint['joint']}")
     if not names:
         return "All ratios are determined"

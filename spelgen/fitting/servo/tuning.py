@@ -110,3 +110,15 @@ class ServoStartTuning:
     # [1] Smallest dry friction as a fraction of the nominal one; squared the smallest kd/kp, cubed the smallest
     # armature/kp, so that their logarithms exist.
     min_friction: float = 0.05
+
+
+@dataclass(frozen=True)
+class LinearServoTuning:
+    """Fit of linear second-order servos, the baseline."""
+
+    # [s] Upper bound of the delays.
+    max_delay: float = 0.4
+    # [s] Initial delay.
+    delay: float = 0.02
+    # [rad/s] Initial natural frequency; the initial damping ratio is 1.
+    frequency: float = 20.0

@@ -19,7 +19,7 @@ from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, LogError
 from spelgen.fitting.dataset import TrainingData, Validation
 from spelgen.fitting.objective import PreparedLogs, TorqueLogObjective
-from spelgen.fitting.torque.fit import fit_torque
+from spelgen.fitting.torque.fit import TorqueSolution, fit_torque
 from spelgen.fitting.torque.networks import BLOCK, adapt_networks, fit_networks
 from spelgen.fitting.torque.report import torque_notes
 from spelgen.fitting.torque.samples import TorqueSamples
@@ -75,7 +75,7 @@ class TorqueObjective(TorqueLogObjective):
         regularizer = None
         if not isinstance(model, RigidBodyDynamics):  # rigid bodies have a prior of their own at the URDF
             regularizer = self._regularizer(self.data, self.config.urdf_weight, notes)
-        fit_notes = fit_torques(model, samples, self.config, regularizer)
+        fit_notes, solution = fit_torques(model, samples, self.config, regularizer)
         self.results = {"notes": [note.message for note in fit_notes]}
         notes += fit_notes
         # residual terms that were not selected are zero, and take time
@@ -92,6 +92,13 @@ class TorqueObjective(TorqueLogObjective):
             "substeps": substeps,
             "torque_nmse": torque_nmse(model, samples),
         }
+        if solution is not None and not self.config.adapt:  # an adapted model has parameters of two fits
+            self._checkpoint["posterior"] = {
+                "covariance": solution.covariance,
+                "torque_std": solution.torque_std,
+                # the interval of a delay is of 99 %
+                "delay_std": self._delay.interval / 2.576,
+            }
         return notes
 
 
@@ -134,9 +141,10 @@ def torque_samples(model: ArmModel, data: TrainingData) -> TorqueSamples | None:
 
 def fit_torques(
     model: ArmModel, samples: TorqueSamples, config: TorqueFit, regularizer: UrdfRegularizer | None = None
-) -> list[Diagnostic]:
-    """Fit the model to samples; return the notes of the fit."""
+) -> tuple[list[Diagnostic], TorqueSolution | None]:
+    """Fit the model to samples; return the notes of the fit, and its solution for a model of rigid bodies."""
     notes: list[Diagnostic] = []
+    solution = None
     if isinstance(model, RigidBodyDynamics):
         solution = fit_torque(model, samples, config.prior, config.adapt)
         steps = solution.steps
@@ -153,4 +161,4 @@ def fit_torques(
         f"{FITTED.get(config.adapt or '', 'fitted')} to the torques of {samples.original_count} samples, those of "
         f"validation included, in {steps} steps"
     )
-    return [Diagnostic("info", "torque-fit", "logs", None, message), *notes]
+    return [Diagnostic("info", "torque-fit", "logs", None, message), *notes], solution

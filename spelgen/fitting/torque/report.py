@@ -19,6 +19,7 @@ from spelgen.fitting.torque.fit import TorqueSolution
 from spelgen.fitting.torque.parameters import ParameterVector
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
+from spelgen.identification.intervals import QUANTILE
 from spelgen.runtime.inputs import MotorInputs
 
 TERM_NAMES = {
@@ -105,7 +106,10 @@ def _trained_gains(
     rows = inputs.gain_rows.numpy()
     parts = []
     for name, gain, factor in zip(
-        names[rows], inputs.gains().detach().numpy()[rows].sum(axis=1), np.exp(1.96 * deviation), strict=True
+        names[rows],
+        inputs.gains().detach().numpy()[rows].sum(axis=1),
+        np.exp(QUANTILE * deviation),
+        strict=True,
     ):
         parts.append(f"{name} {gain:.4g} ({gain / factor:.4g} to {gain * factor:.4g})")
     message = f"joint torque per logged torque, with 95 % intervals: {', '.join(parts)}"

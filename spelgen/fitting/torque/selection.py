@@ -221,5 +221,5 @@ def significant_reduction(
     if not g.isfinite().all() or g.mean() <= standard_errors * standard_error:
         return None
     mean = float(g.mean())
-    reduction = 2 * mean / (1 + mean)  # (before - after) / before of a block with the mean g
+    reduction = 2 * mean / (1 + mean)  # g = (b - a) / (b + a) solved for (b - a) / b, at the mean g
     return reduction if reduction > SELECTION.min_reduction else None

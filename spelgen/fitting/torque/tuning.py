@@ -42,8 +42,8 @@ class TorqueTuning:
     # [1] Twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773,
     # 1995).
     strong_evidence: float = 6.0
-    # [1] The same for the Stribeck effect, saturation and load dependence of a joint (2 per parameter: Akaike, IEEE
-    # Trans. Autom. Control 19:716, 1974).
+    # [1] Twice the log likelihood ratio that adds the Stribeck effect, saturation or load dependence to a joint: 2 per
+    # parameter (Akaike, IEEE Trans. Autom. Control 19:716, 1974).
     effects_evidence: float = 2.0
     # [1] Largest number of steps before noise and prior are estimated.
     initial_steps: int = 60

@@ -45,7 +45,7 @@ class RolloutObjective(MomentumObjective):
         if self.config.torque_first and isinstance(self.model, RigidBodyDynamics):
             samples = torque_samples(self.model, self.data)
             if samples is not None:
-                self.notes += fit_torques(self.model, samples, TorqueFit())
+                self.notes += fit_torques(self.model, samples, TorqueFit())[0]
             else:
                 message = f"no torque fit: no log that moves has {SLOWEST:g} Hz for a second; windows alone are fitted"
                 self.notes.append(Diagnostic("warning", "no-torque-fit", "logs", None, message))
@@ -116,6 +116,7 @@ class RolloutObjective(MomentumObjective):
     def _run_epoch(self) -> Content:
         """Run one epoch; if its losses are not finite, repeat it at a lower learning rate."""
         while True:
+            # The state before the epoch, for a repetition at half the learning rate.
             state = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
             steps, start = self._steps_in_time(), self.seconds_now()
             # NaN if the loss or gradient of any step is not finite
@@ -150,6 +151,7 @@ class RolloutObjective(MomentumObjective):
         steps = self.epoch_steps
         if math.isinf(self.allowed):
             return steps
+        # Nothing has been measured yet: a short epoch, which measures the time of a step.
         if not self._step_seconds:
             return min(steps, self.call_steps)
         remaining = self.allowed - self.seconds_now() - self._validation_seconds
@@ -162,6 +164,7 @@ class RolloutObjective(MomentumObjective):
 
     def _done(self, ahead: int = 0) -> float:
         """Return the completed fraction `ahead` steps from now: of all steps or of the allowed time, the larger one."""
+        # With a limit of time the schedule of the learning rate must end with the time, not with the epochs.
         steps = self.config.epochs * self.epoch_steps
         return max((self.step + ahead) / steps, self.fraction(self.seconds))
 
@@ -170,7 +173,7 @@ class RolloutObjective(MomentumObjective):
         return TUNING.first_stage if self.fixed else 1.0
 
     def _release(self, end: Status) -> bool:
-        """Start the second part, in which no weights are fixed, and return whether it is not at its end already."""
+        """Start the second stage, in which all weights are trained; False if there is none or its time is used up."""
         if not self.fixed or end == "out of time" or not self.epoch:
             return False
         self.model.load_state_dict(self.best_weights)

@@ -1,4 +1,4 @@
-"""Friction of each joint as a function of its own q_i and qd_i: a viscous constant, and a network for dry friction."""
+"""Friction from networks: of each joint as a function of its own q_i and qd_i, or a full matrix D(q, qd)."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from spelgen.runtime.rows import Joint, vector
 # Initial velocity below which dry friction goes to zero, relative to the typical speed, and its lower bound.
 SMOOTHING = 0.03
 MIN_SMOOTHING = 0.001
+# Initial diagonal of L, relative to the root of typical friction per typical speed.
+INITIAL_FACTOR = 0.35
 
 
 class JointFrictionParameters(NamedTuple):
@@ -26,7 +28,7 @@ class JointFrictionParameters(NamedTuple):
 
 
 class JointFriction(nn.Module):
-    """A diagonal D(q, qd), positive for all parameters."""
+    """A diagonal D(q, qd), positive for all parameters: viscous constants, and a network for dry friction."""
 
     parameter_groups = (
         ("raw_viscous", "sizes", "Nm s/rad, N s/m"),
@@ -63,3 +65,34 @@ class JointFriction(nn.Module):
         dry = F.softplus(self.network.forward(inputs, layers)[0])
         diagonal: Tensor = viscous + self.nominal * dry / smooth_speed
         return diagonal.unsqueeze(-1) * right
+
+
+class DenseFriction(nn.Module):
+    """D(q, qd) = L L^T, with ``axes`` rows of L for each joint.
+
+    A joint moves along the last of its axes only, so only those rows of L are computed.
+    """
+
+    def __init__(self, joints: Sequence[Joint], network: Network, axes: int) -> None:
+        super().__init__()
+        self.speed = nn.Buffer(vector(joint.speed for joint in joints))
+        self.nominal = nn.Buffer(vector(joint.friction for joint in joints))
+        rows = axes * len(joints)
+        row, column = torch.tril_indices(rows, rows)
+        # from the entries of a lower triangle, rows in sequence, to the matrix: (rows, rows, entries)
+        spread = torch.eye(rows * rows).double()[:, rows * row + column].reshape(rows, rows, -1)
+        self.entries = nn.Buffer(spread[axes - 1 :: axes])
+        self.initial = nn.Buffer(INITIAL_FACTOR * torch.eye(rows).double()[axes - 1 :: axes])
+        self.network = network
+
+    def prepare(self) -> Layers:
+        """Return the layers that give the rows of L."""
+        size = torch.sqrt(self.nominal / self.speed).unsqueeze(-1)
+        output_map = (size.unsqueeze(-1) * self.entries).flatten(0, 1)
+        return self.network.prepare(output_map, (size * self.initial).flatten())
+
+    def forward(self, encoded: Tensor, qd: Tensor, layers: Layers, right: Tensor) -> Tensor:
+        """Return D(q, qd) right, (..., n, k)."""
+        rows = self.network.forward(torch.cat([encoded, qd / self.speed], dim=-1), layers)[0]
+        factor = rows.reshape(*qd.shape[:-1], *self.initial.shape)
+        return factor @ (factor.mT @ right)

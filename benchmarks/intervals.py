@@ -1,0 +1,115 @@
+"""95 % intervals of a fitted arm, compared with the truth of a simulated arm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch.autograd.functional import jacobian
+
+from spelgen.dynamics.protocol import is_stateful, sliding_memory
+from spelgen.emission.assemble import ArmModel
+from spelgen.fitting.functional_model import evaluate_with
+from spelgen.fitting.torque.parameters import ParameterVector
+
+QUANTITIES = ("base", "friction", "mass", "gravity")
+QUANTILE = 1.96
+NEGLIGIBLE = 1e-6  # relative to the largest true value of a quantity
+Uncertain = Callable[[Callable[[ArmModel], torch.Tensor]], tuple[np.ndarray, np.ndarray]]
+"""Gives the value and the standard deviation of a function of a fitted model, both (k,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class SteadySliding:
+    """Conditions under which friction constants are compared: magnitudes of Coulomb and viscous friction at two speeds.
+
+    q: (T, n) positions over which friction is averaged. speeds: (speeds, n) [rad/s, m/s]. The friction of a speed is
+    half the difference of both directions, long after a reversal.
+    """
+
+    q: np.ndarray
+    speeds: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class TrueValues:
+    """True values. combination: (r, K), base parameters from bodies and armatures. base: (r,). friction: (speeds, n).
+
+    mass: M (T, n, n) and gravity: g (T, n), at some positions.
+    """
+
+    combination: np.ndarray
+    base: np.ndarray
+    friction: np.ndarray
+    mass: np.ndarray
+    gravity: np.ndarray
+
+
+def propagated(model: ArmModel, covariance: torch.Tensor) -> Uncertain:
+    """Return the function that gives values and standard deviations of functions of a fitted model.
+
+    Args:
+        model: fitted model.
+        covariance: (K, K) of its rigid parameters, propagated to first order.
+    """
+    parameters = ParameterVector(model).initial
+
+    def uncertain(function: Callable[[ArmModel], torch.Tensor]) -> tuple[np.ndarray, np.ndarray]:
+        def values(*tensors: torch.Tensor) -> torch.Tensor:
+            return evaluate_with(model, dict(zip(parameters, tensors, strict=True)), function)
+
+        blocks = jacobian(values, tuple(parameters.values()))
+        slopes = torch.cat([block.flatten(1) for block in blocks], dim=1)
+        variance = torch.einsum("jk,kl,jl->j", slopes, covariance, slopes)
+        return values(*parameters.values()).detach().numpy(), variance.clamp(min=0).sqrt().numpy()
+
+    return uncertain
+
+
+def interval_ratios(
+    uncertain: Uncertain, true: TrueValues, sliding: SteadySliding, q: np.ndarray
+) -> dict[str, list[float]]:
+    """Return the errors divided by the half width of the 95 % interval, per quantity of `QUANTITIES`.
+
+    Values whose truth is zero with an error of zero (joints that gravity does not load) are omitted.
+
+    Args:
+        uncertain: gives values and standard deviations of the fitted model.
+        true: values, with g and M at the positions q.
+        sliding: conditions of the friction constants.
+        q: (T, n) positions.
+    """
+    positions, combination = torch.from_numpy(q), torch.from_numpy(true.combination)
+    diagonal = np.diagonal(true.mass, axis1=1, axis2=2)
+    truths = [x.ravel() for x in (true.base, true.friction, diagonal, true.gravity)]
+
+    def quantities(model: ArmModel) -> torch.Tensor:
+        base = combination @ torch.cat([model.inertial_parameters.flatten(), model.armature])
+        mass = model.mass_matrix(positions).diagonal(dim1=-2, dim2=-1)
+        friction, gravity = _sliding_friction(model, sliding), model.gravity(positions)
+        return torch.cat([base, friction, mass.flatten(), gravity.flatten()])
+
+    value, std = uncertain(quantities)
+    parts = np.cumsum([len(x) for x in truths])[:-1]
+    ratios = {}
+    for name, truth, found, width in zip(
+        QUANTITIES, truths, np.split(value, parts), np.split(QUANTILE * std, parts), strict=True
+    ):
+        error, negligible = np.abs(found - truth), NEGLIGIBLE * np.abs(truth).max()
+        informative = np.maximum(error, width) > negligible
+        ratio = error[informative] / np.maximum(width[informative], negligible)
+        ratios[name] = [round(float(x), 3) for x in ratio]
+    return ratios
+
+
+def _sliding_friction(model: ArmModel, sliding: SteadySliding) -> torch.Tensor:
+    q, rows = torch.from_numpy(sliding.q), []
+    for speed in torch.from_numpy(sliding.speeds):
+        both = []
+        for qd in (speed.expand_as(q), -speed.expand_as(q)):
+            past = (sliding_memory(model, qd),) if is_stateful(model) else ()
+            both.append(model.friction_torque(q, qd, *past))
+        rows.append((both[0] - both[1]).mean(dim=0) / 2)
+    return torch.cat(rows)

@@ -1,0 +1,163 @@
+"""Tables of the results of `leaderboard.py`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+
+DEFAULT = "hybrid"
+REFERENCES = ("URDF", "ridge", "least squares", "with memory", "closed-form")
+GOALS = (1.05, 1.25)  # of the default divided by the best reference: on 95 % of the cells, and on every cell
+MARKS = "<!-- leaderboard -->", "<!-- end of leaderboard -->"
+LARGE = 100.0  # a larger nMSE is not a figure
+
+Row = dict[str, object]
+Cell = tuple[str, str, str]
+"""Fold, duration, group of test recordings."""
+
+
+def cells_of(rows: Iterable[Row]) -> dict[Cell, dict[str, float]]:
+    """Return the error on moving samples of each method, by cell."""
+    cells: dict[Cell, dict[str, float]] = {}
+    for row in rows:
+        groups = row.get("nmse")
+        if isinstance(groups, dict):
+            for group, (moving, _) in groups.items():
+                cell = str(row["fold"]), str(row["seconds"]), group
+                cells.setdefault(cell, {})[str(row["method"])] = moving
+    return cells
+
+
+def errors_table(cells: Mapping[Cell, Mapping[str, float]], methods: Sequence[str]) -> list[list[str]]:
+    """Return the table of errors: one row per cell of the splits, one per fold and duration of the motions."""
+    table: dict[tuple[str, str, str], list[Mapping[str, float]]] = {}
+    for (fold, seconds, group), errors in cells.items():
+        arm, kind = fold.split("/")
+        if kind.startswith("motion"):
+            fold, group = f"{arm}/motion pairs", ""
+        table.setdefault((fold, seconds, group), []).append(errors)
+    lines = [["fold", "trained on [s]", "tested on", *methods, f"{DEFAULT} / best"]]
+    for (fold, seconds, group), each in table.items():
+        medians = [_median([x[name] for x in each if name in x]) for name in methods]
+        label = group or f"{len(each)} pairs, median"
+        ratios = [ratio for x in each if (ratio := ratio_to_best(x)) is not None]
+        lines.append([fold, seconds, label, *medians, f"{np.median(ratios):.2f}" if ratios else "-"])
+    return lines
+
+
+def _median(values: Sequence[float]) -> str:
+    if not values:
+        return "-"
+    median = float(np.median(values))
+    return f"{median:.3g}" if median <= LARGE else f"> {LARGE:g}"
+
+
+def ratio_to_best(errors: Mapping[str, float]) -> float | None:
+    """Return the error of the default divided by the least of the references; None if one of both is absent."""
+    best = min((errors[name] for name in REFERENCES if name in errors), default=None)
+    return None if best is None or DEFAULT not in errors else errors[DEFAULT] / best
+
+
+def summary(cells: Mapping[Cell, Mapping[str, float]]) -> list[str]:
+    """Return lines about the default divided by the best reference."""
+    ratios = {cell: x for cell, errors in cells.items() if (x := ratio_to_best(errors)) is not None}
+    if not ratios:
+        return []
+    lines = []
+    groups = {"all": ratios}
+    for cell, ratio in ratios.items():
+        kind = "motion pairs" if "/motion" in cell[0] else "splits"
+        for name in (kind, f"{cell[1]} s" if cell[1] != "all" else "all data"):
+            groups.setdefault(name, {})[cell] = ratio
+    for name, chosen in groups.items():
+        values = np.array(list(chosen.values()))
+        share = 100 * (values <= GOALS[0]).mean()
+        lines.append(
+            f"{DEFAULT} / best, {name}: median {np.median(values):.3f}, 95 % quantile "
+            f"{np.quantile(values, 0.95):.3f}, maximum {values.max():.3f}; "
+            f"at most {GOALS[0]} on {share:.0f} % of {len(values)} cells"
+        )
+    worst = sorted(((x, cell) for cell, x in ratios.items() if x > GOALS[1]), reverse=True)
+    lines += [f"  above {GOALS[1]}: {x:.2f}  {', '.join(cell)}" for x, cell in worst]
+    return lines
+
+
+def changes(
+    before: Mapping[Cell, Mapping[str, float]],
+    now: Mapping[Cell, Mapping[str, float]],
+    methods: Iterable[str],
+) -> list[str]:
+    """Return lines about each method's errors divided by those of other results, cell by cell."""
+    lines = []
+    for name in methods:
+        ratios = {
+            cell: errors[name] / before[cell][name]
+            for cell, errors in now.items()
+            if name in errors and before.get(cell, {}).get(name)
+        }
+        if ratios:
+            values, worst = np.array(list(ratios.values())), max(ratios, key=lambda cell: ratios[cell])
+            lines.append(
+                f"{name} / before: median {np.median(values):.3f}, geometric mean "
+                f"{np.exp(np.log(values).mean()):.3f}, {np.mean(values > 1.03):.0%} worse by more than 3 %, "
+                f"{np.mean(values < 0.97):.0%} better; maximum {ratios[worst]:.2f} ({', '.join(worst)}), "
+                f"minimum {values.min():.2f}; {len(values)} cells"
+            )
+    return lines
+
+
+def text(table: Sequence[Sequence[str]]) -> str:
+    """Return a table as aligned text."""
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    return "\n".join(
+        "  ".join(
+            x.ljust(w) if k < 3 else x.rjust(w) for k, (x, w) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in table
+    )
+
+
+def method_lines(rows: Sequence[Row], methods: Sequence[str]) -> list[list[str]]:
+    """Return the table of the methods: number of fits, median fit time, coverage of 95 % torque intervals."""
+    table = [["method", "fits", "median fit [CPU s]", "longest", "torques within 95 % intervals"]]
+    for name in methods:
+        each = [row for row in rows if row["method"] == name and "nmse" in row]
+        times = [x for row in each if isinstance(x := row["fit_s"], float)]
+        shares = [
+            x for row in each if isinstance(groups := row.get("coverage"), dict) for x in groups.values()
+        ]
+        if each:
+            covered = f"{np.mean(shares):.0%}" if shares else "-"
+            table.append([name, str(len(each)), f"{np.median(times):.2g}", f"{max(times):.2g}", covered])
+    return table
+
+
+def write_page(
+    page: Path, rows: Sequence[Row], cells: Mapping[Cell, Mapping[str, float]], methods: Sequence[str]
+) -> None:
+    """Write the tables between the marks of a Markdown page."""
+    text = page.read_text()
+    before, rest = text.split(MARKS[0])
+    after = rest.split(MARKS[1])[1]
+    present = [name for name in methods if any(name in errors for errors in cells.values())]
+    parts = [
+        f"Made on {date.today():%d %B %Y} by `python benchmarks/leaderboard.py`; {len(cells)} cells.",
+        *_lists(summary(cells)),
+        markdown(errors_table(cells, present)),
+        markdown(method_lines(rows, present)),
+    ]
+    page.write_text("\n\n".join([before + MARKS[0], *parts, MARKS[1]]) + after)
+
+
+def _lists(lines: Sequence[str]) -> Iterator[str]:
+    """Yield the lines of a summary as a list, indented lines as a list within it."""
+    yield "\n".join(f"    - {x.strip()}" if x.startswith(" ") else f"- {x}" for x in lines)
+
+
+def markdown(table: Sequence[Sequence[str]]) -> str:
+    """Return a table as Markdown."""
+    head, *rows = table
+    return "\n".join(f"|{'|'.join(row)}|" for row in [head, ["---"] * len(head), *rows])

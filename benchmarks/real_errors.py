@@ -1,0 +1,162 @@
+"""Errors that real arms and their sensors have, at random levels, for the simulated arms of `truth.py`.
+
+Levels are chosen so that torque residuals resemble the ones of recordings, see `residual_statistics.py`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter
+
+RIPPLE_PERIODS = (
+    1,
+    2,
+    12,
+    30,
+    60,
+    100,
+    160,
+)  # per revolution of a joint: eccentric bearings, gear teeth, motors
+CABLE_BREAKAWAY = (0.05, 0.5)  # [rad, m] displacement at which the hysteresis of a cable saturates
+CURRENT_CORRELATION = 0.01  # [s]
+BACKLASH_TORQUE = (
+    0.05  # of the torque's standard deviation: half width of the transition between tooth flanks
+)
+
+
+@dataclass(frozen=True)
+class RealErrors:
+    """Levels of errors; `none` has all of them absent."""
+
+    friction_position: float = 0.0  # [1] largest relative change of dry friction with position
+    warm_up: float = 0.0  # [1] relative decrease of friction during a recording
+    warm_up_time: float = np.inf  # [s]
+    friction_drift: float = 0.0  # [1] relative standard deviation of friction between recordings
+    cable: float = 0.0  # [1] hysteresis of cables, relative to nominal dry friction
+    ripple: float = 0.0  # [1] torque ripple of gears, relative to nominal dry friction
+    resonance: float = np.inf  # [Hz] of the elastic joints
+    backlash: float = 0.0  # [rad, m]
+    encoder_step: float = 0.0  # [rad, m]
+    sensor_cutoff: float = np.inf  # [Hz] of the first-order low-pass of the torque signal
+    current_noise: float = 0.0  # [1] of the motor current, relative to the standard deviation of the torque
+    slow_noise: float = 0.0  # [1] changes of the torque without a cause in this list, likewise
+    slow_correlation: float = 0.0  # [s] correlation time of the slow noise
+    gain: float = 0.0  # [1] relative standard deviation of the torque's unit, per joint
+    zero: float = 0.0  # [rad, m] standard deviation of the zero of positions, per joint
+
+
+def draw_errors(rng: np.random.Generator) -> RealErrors:
+    """Draw levels: log-uniform, each error present with a probability of its own."""
+
+    def level(probability: float, low: float, high: float, absent: float = 0.0) -> float:
+        present, value = rng.random() < probability, float(np.exp(rng.uniform(*np.log([low, high]))))
+        return value if present else absent
+
+    return RealErrors(
+        friction_position=level(0.9, 0.1, 0.5),
+        warm_up=level(0.6, 0.03, 0.3),
+        warm_up_time=level(1.0, 10.0, 300.0),
+        friction_drift=level(0.6, 0.01, 0.06),
+        cable=level(0.8, 0.2, 1.0),
+        ripple=level(0.95, 0.3, 1.5),
+        resonance=level(0.6, 10.0, 40.0, np.inf),
+        backlash=level(0.4, 1e-4, 2e-3),
+        encoder_step=2 * np.pi / 2 ** int(rng.integers(12, 19)),
+        sensor_cutoff=level(0.4, 15.0, 60.0, np.inf),
+        current_noise=level(0.95, 0.03, 0.15),
+        slow_noise=level(0.95, 0.03, 0.15),
+        slow_correlation=level(1.0, 0.2, 3.0),
+        gain=level(0.4, 0.005, 0.03),
+        zero=level(0.5, 5e-4, 5e-3),
+    )
+
+
+class ErrorProcess:
+    """Errors of one arm with n joints: levels, and what is random once per arm."""
+
+    def __init__(self, errors: RealErrors, dry: np.ndarray, rng: np.random.Generator) -> None:
+        """dry: (n,) nominal dry friction [Nm, N]."""
+        n = len(dry)
+        self.errors = errors
+        self.gain = np.exp(errors.gain * rng.normal(size=n))
+        self.zero = errors.zero * rng.normal(size=n)
+        self._phase, self._second_phase, self._ripple_phase = rng.uniform(0, 2 * np.pi, (3, n))
+        self._waves = rng.integers(1, 6, n)
+        self._periods = rng.choice(RIPPLE_PERIODS, n)
+        self._ripple = errors.ripple * dry * rng.uniform(0.3, 1.0, n)
+        self.cable = errors.cable * dry * rng.uniform(0.3, 1.0, n)
+        self._breakaway = np.exp(rng.uniform(*np.log(CABLE_BREAKAWAY), n))
+
+    def friction_factor(self, q: np.ndarray) -> np.ndarray:
+        """Return the factor of dry friction at positions (T, n) [rad, m]."""
+        wave = 0.6 * np.sin(q + self._phase) + 0.4 * np.sin(self._waves * q + self._second_phase)
+        return 1 + self.errors.friction_position * wave
+
+    def temperature_factor(self, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Return the factor of friction along a recording, (T, n); its mean over recordings is one."""
+        drift = np.exp(self.errors.friction_drift * rng.normal(size=len(self.gain)))
+        warm = np.exp(-t / self.errors.warm_up_time)
+        return (1 + self.errors.warm_up * (warm - warm.mean()))[:, None] * drift
+
+    def ripple(self, q: np.ndarray) -> np.ndarray:
+        """Return the torque ripple at positions (T, n)."""
+        return np.asarray(self._ripple * np.sin(self._periods * q + self._ripple_phase))
+
+    def hysteresis(self, q: np.ndarray) -> np.ndarray:
+        """Return the friction of cables along a motion (T, n); it is `cable` long after a reversal."""
+        return self.cable * play(q, self._breakaway) if self.cable.any() else np.zeros_like(q)
+
+    def deflection(self, torque: np.ndarray, inertia: np.ndarray) -> np.ndarray:
+        """Return the positions of the motor less the ones of the link, (T, n) [rad, m].
+
+        Args:
+            torque: (T, n) of the link [Nm, N].
+            inertia: (n,) of the link [kg m^2, kg], from which the stiffness has the resonance of `RealErrors`.
+        """
+        twist = torque / (inertia * (2 * np.pi * self.errors.resonance) ** 2)
+        if self.errors.backlash:
+            flank = np.tanh(torque / (BACKLASH_TORQUE * torque.std(axis=0) + 1e-12))
+            twist = twist + 0.5 * self.errors.backlash * flank
+        return twist
+
+    def sensed(self, torque: np.ndarray, rate: float, rng: np.random.Generator) -> np.ndarray:
+        """Return the torque (T, n) after the low-pass of its sensor, with correlated noise; rate: of samples [Hz]."""
+        errors, seen = self.errors, torque
+        if np.isfinite(errors.sensor_cutoff):
+            keep = np.exp(-2 * np.pi * errors.sensor_cutoff / rate)
+            seen = lfilter([1 - keep], [1, -keep], seen, axis=0, zi=keep * seen[:1])[0]
+        noises = (errors.current_noise, CURRENT_CORRELATION), (errors.slow_noise, errors.slow_correlation)
+        for level, time in noises:
+            if level:
+                deviation = level * torque.std(axis=0)
+                seen = seen + deviation * _correlated_noise(torque.shape, rate * time, rng)
+        return seen
+
+    def encoded(self, q: np.ndarray) -> np.ndarray:
+        """Return positions (T, n) in steps of the encoder."""
+        step = self.errors.encoder_step
+        return q if not step else step * np.round(q / step)
+
+
+def _correlated_noise(shape: tuple[int, ...], time: float, rng: np.random.Generator) -> np.ndarray:
+    """Return stationary noise (T, n) of variance one, with autocorrelation exp(-lag / time), in samples."""
+    keep = np.exp(-1 / time)
+    first = keep * rng.normal(size=(1, shape[1]))
+    white = np.sqrt(1 - keep**2) * rng.normal(size=shape)
+    return np.asarray(lfilter([1.0], [1.0, -keep], white, axis=0, zi=first)[0])
+
+
+def play(q: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Return the state of a spring and slider per joint along positions (T, n), in -1..1; reach: (..., n) [rad, m].
+
+    The initial state is zero. A reach (K, n) is of K elements; the result is their mean.
+    """
+    reaches = np.atleast_2d(reach)
+    z = np.zeros_like(reaches)
+    states = np.zeros_like(q)
+    for k in range(1, len(q)):
+        z = np.clip(z + (q[k] - q[k - 1]), -reaches, reaches)
+        states[k] = (z / reaches).mean(axis=0)
+    return states

@@ -1,0 +1,392 @@
+"""Other methods of the field, for `leaderboard.py`: figaroh, MuJoCo sysid, Gaussian processes, networks.
+
+Packages: figaroh (with Pinocchio) and `mujoco[sysid]`, in an environment of their own that has this checkout in
+PYTHONPATH; all others need PyTorch only. Each method gets the training samples of the leaderboard; settings are chosen
+by the error in held-out blocks of these samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from figaroh_identification import figaroh_dynamics
+from torch import Tensor, nn
+from torch.func import grad, jvp
+
+import spelgen
+from spelgen.exporting.mjcf_export import mjcf_text
+from spelgen.exporting.rigid_body_projection import rigid_body_projection
+from spelgen.logs.dynamics_samples import DynamicsSamples
+
+if TYPE_CHECKING:
+    from leaderboard import Problem
+
+Torque = Callable[[DynamicsSamples], np.ndarray]
+
+
+class Prediction(NamedTuple):
+    """Torque of a fitted method, (T, n) [Nm, N], and its standard deviation, if the method has one."""
+
+    torque: Torque
+    std: Torque | None = None
+
+
+Method = Callable[["Problem"], Prediction]
+
+WIDTHS, DECAYS = (32, 128), (1e-4, 1e-1)  # settings of networks: units per hidden layer, weight decay
+EPOCHS, PATIENCE, BATCH = 400, 30, 512
+SMOOTHING = 0.02  # [rad/s] of Coulomb friction in networks and Gaussian processes
+SYSID_SAMPLES = 600  # evenly spread: MuJoCo computes inverse dynamics one sample at a time
+GP_SAMPLES, GP_TRAINING, GP_STEPS, GP_RATE = 1500, 300, 100, 0.05  # of predictions; of hyperparameters
+
+
+def figaroh(problem: Problem) -> Prediction:
+    """Return figaroh's weighted least squares, see `figaroh_identification.py`."""
+    dynamics = figaroh_dynamics(problem.arm.chain, problem.arm.settings, problem.samples)
+    return Prediction(lambda x: dynamics.inverse_dynamics(*tensors(x)))
+
+
+def tensors(x: DynamicsSamples) -> tuple[Tensor, Tensor, Tensor]:
+    """Return q, qd and qdd, (T, n)."""
+    q, qd, qdd = (torch.from_numpy(np.ascontiguousarray(column)) for column in (x.q, x.qd, x.qdd))
+    return q, qd, qdd
+
+
+def subset(samples: Sequence[DynamicsSamples], count: int) -> DynamicsSamples:
+    """Return at most `count` evenly spread samples of all trajectories."""
+    columns = [np.concatenate([getattr(x, name) for x in samples]) for name in ("q", "qd", "qdd", "tau")]
+    rows = np.unique(np.linspace(0, len(columns[0]) - 1, count).round().astype(int))
+    return DynamicsSamples("subset", *(column[rows] for column in columns))
+
+
+def mujoco_sysid(problem: Problem) -> Prediction:
+    """Return MuJoCo's system identification: its pseudo-inertia, damping, friction loss, armature and torque offset.
+
+    The residual is the one of inverse dynamics, divided by the range of each joint's torque: the same samples and
+    errors as all other methods. The initial values are the ones of the URDF.
+    """
+    import mujoco
+    from mujoco import sysid
+
+    model = spelgen.build(problem.fold.urdf, "closed-form")
+    spec = mujoco.MjSpec.from_string(mjcf_text(rigid_body_projection(model, problem.arm)).decode())
+    compiled, names = spec.compile(), problem.arm.chain.joint_names
+    samples = subset(problem.samples, SYSID_SAMPLES)
+    scale = np.maximum(samples.tau.std(axis=0), 1e-3 * samples.tau.std(axis=0).max())
+    parameters = sysid.ParameterDict()
+    bounds = {
+        "mass_bound_mult": np.array([0.01, 100.0]), "stretch_bound_mult": np.array([0.01, 100.0]),
+        "ipos_bound_off": np.array([-1.0, 1.0]), "shear_bound_off": np.array([-1.0, 1.0]),
+    }  # fmt: skip
+    for k in range(1, compiled.nbody):
+        body = compiled.body(k).name
+
+        def set_inertia(changed: Any, parameter: Any, body: str = body) -> None:
+            _set_inertia(changed.body(body), sysid.model_modifier.pi_from_theta(parameter.value))
+
+        parameters.add(
+            sysid.body_inertia_param(
+                spec, compiled, body, sysid.InertiaType.Pseudo, modifier=set_inertia, **bounds
+            )
+        )
+    for name, range_ in zip(names, scale, strict=True):
+
+        def set_drive(changed: Any, parameter: Any, name: str = name) -> None:
+            joint = changed.joint(name)
+            damping, joint.frictionloss, joint.armature = parameter.value
+            joint.damping = [damping, 0.0, 0.0]  # the coefficients of |qd| and qd^2 are zero
+
+        parameters.add(
+            sysid.Parameter(
+                f"{name}_drive", [0.1 * range_] * 3, [0.0] * 3, [10 * range_] * 3, modifier=set_drive
+            )
+        )
+    parameters.add(sysid.Parameter("offset", 0 * scale, -10 * scale, 10 * scale))
+
+    def torque(x: DynamicsSamples, values: Any) -> np.ndarray:
+        changed = sysid.apply_param_modifiers(values, spec.copy())
+        data, rows = mujoco.MjData(changed), []
+        for q, qd, qdd in zip(x.q, x.qd, x.qdd, strict=True):
+            data.qpos[:], data.qvel[:], data.qacc[:] = q, qd, qdd
+            mujoco.mj_inverse(changed, data)
+            rows.append(data.qfrc_inverse.copy())
+        return np.array(rows) + values["offset"].value
+
+    def residual(x: np.ndarray, values: Any) -> tuple[list[np.ndarray], None, None]:
+        """Return the residuals (S, k) of k parameter vectors, the columns of x."""
+        columns = []
+        for vector in x.reshape(len(x), -1).T:
+            values.update_from_vector(vector)
+            columns.append(((torque(samples, values) - samples.tau) / scale).ravel())
+        return [np.stack(columns, axis=1).reshape(-1, *x.shape[1:])], None, None
+
+    best, _ = sysid.optimize(parameters, residual, optimizer="mujoco", verbose=False, max_iters=50)
+    return Prediction(lambda x: torque(x, best))
+
+
+def _set_inertia(body: Any, parameters: np.ndarray) -> None:
+    """Set the inertial parameters (m, m c, I about the origin as 3 x 3) of a body of an MjSpec.
+
+    The modifier of sysid 4.0.0 sets the orientation to NaN, which MuJoCo 4.0.0 rejects.
+    """
+    mass, moment, inertia = parameters[0], parameters[1:4], parameters[4:].reshape(3, 3)
+    center = moment / mass
+    about_center = inertia - mass * (center @ center * np.eye(3) - np.outer(center, center))
+    body.explicitinertial = True
+    body.mass, body.ipos, body.iquat = mass, center, (1.0, 0.0, 0.0, 0.0)
+    body.inertia[:] = 0.0  # the full inertia replaces it
+    body.fullinertia[:] = about_center[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].reshape(body.fullinertia.shape)
+
+
+class InverseDynamicsKernel(nn.Module):
+    """Geometrically inspired polynomial kernel (Dalla Libera and Carli, IEEE RA-L 5:24, 2020), with friction.
+
+    k = k1(a, a') prod_j k2(c_j, c_j') + k1(f, f'), with a = (qdd, qd qd^T), c_j = (cos q_j, sin q_j) or q_j, the
+    inhomogeneous polynomial kernels k1, k2 of degree one and two, and friction features f of one joint.
+    """
+
+    def __init__(self, revolute: Sequence[bool], joint: int) -> None:
+        super().__init__()
+        n = len(revolute)
+        self.revolute, self.joint = revolute, joint
+        self.motion = nn.Parameter(torch.zeros(1 + n + n * (n + 1) // 2).double())
+        # polynomials of low degree first: their product over all joints has degree 2 n
+        self.position = nn.Parameter(torch.tensor([0.0, -3.0, -3.0]).double().repeat(2, n, 1))
+        self.friction = nn.Parameter(torch.full((3,), -2.0).double())
+        self.noise = nn.Parameter(torch.tensor(-4.0).double())
+
+    def features(self, q: Tensor, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the features of motion (T, A), position (T, n, 3) and friction (T, 3)."""
+        row, column = torch.triu_indices(q.shape[1], q.shape[1])
+        one = torch.ones_like(q[:, :1])
+        motion = torch.cat([one, qdd, qd[:, row] * qd[:, column]], dim=1)
+        turns = torch.tensor(self.revolute)
+        position = torch.stack(
+            [torch.ones_like(q), torch.where(turns, q.cos(), q), torch.where(turns, q.sin(), 0 * q)], dim=2
+        )
+        own = qd[:, self.joint : self.joint + 1]
+        return motion, position, torch.cat([one, own, torch.tanh(own / SMOOTHING)], dim=1)
+
+    def forward(self, x: tuple[Tensor, ...], y: tuple[Tensor, ...]) -> Tensor:
+        """Return the covariance (S, T) of the torques with these features."""
+        covariance: Tensor = (x[0] * self.motion.exp()) @ y[0].mT
+        for weights in self.position:
+            covariance = covariance * torch.einsum("snk,nk,tnk->nst", x[1], weights.exp(), y[1]).prod(dim=0)
+        return covariance + (x[2] * self.friction.exp()) @ y[2].mT
+
+
+def gaussian_process(problem: Problem) -> Prediction:
+    """Return one Gaussian process per joint; hyperparameters by maximum marginal likelihood on a subset."""
+    revolute = [kind == "revolute" for kind in problem.arm.chain.joint_types]
+    training, fitted = subset(problem.samples, GP_SAMPLES), subset(problem.samples, GP_TRAINING)
+    deviation = [np.maximum(getattr(training, k).std(axis=0), 1e-9) for k in ("qd", "qdd")]
+    mean, scale = training.tau.mean(axis=0), np.maximum(training.tau.std(axis=0), 1e-9)
+
+    def inputs(x: DynamicsSamples) -> tuple[Tensor, Tensor, Tensor]:
+        q, qd, qdd = tensors(x)
+        # one scale per kind of motion: products of velocities have the unit of accelerations
+        return q, qd / float(deviation[0].max()), qdd / float(deviation[1].max())
+
+    processes: list[tuple[InverseDynamicsKernel, tuple[Tensor, ...], Tensor, Tensor]] = []
+    for joint in range(len(revolute)):
+        kernel = InverseDynamicsKernel(revolute, joint)
+        optimizer = torch.optim.Adam(kernel.parameters(), lr=GP_RATE)
+        few, target = kernel.features(*inputs(fitted)), _torque(fitted, mean, scale)[:, joint]
+        for _ in range(GP_STEPS):
+            optimizer.zero_grad()
+            _negative_log_likelihood(kernel, few, target).backward()
+            optimizer.step()
+        with torch.no_grad():
+            many = kernel.features(*inputs(training))
+            factor = _factor(kernel, many)
+            weights = torch.cholesky_solve(_torque(training, mean, scale)[:, joint, None], factor)[:, 0]
+        processes.append((kernel, many, factor, weights))
+
+    def moments(x: DynamicsSamples) -> np.ndarray:
+        """Return the mean and the standard deviation of the torque, (2, T, n)."""
+        parts = [
+            _moments(process, inputs(x[k : k + 2000]))
+            for k in range(0, len(x.q), 2000)
+            for process in processes
+        ]
+        stacked = np.concatenate(
+            [np.stack(parts[k : k + len(processes)], axis=2) for k in range(0, len(parts), len(processes))],
+            axis=1,
+        )
+        return np.stack([mean + scale * stacked[0], scale * stacked[1]])
+
+    return Prediction(lambda x: moments(x)[0], lambda x: moments(x)[1])
+
+
+def _torque(x: DynamicsSamples, mean: np.ndarray, scale: np.ndarray) -> Tensor:
+    return torch.from_numpy((x.tau - mean) / scale)
+
+
+def _factor(kernel: InverseDynamicsKernel, x: tuple[Tensor, ...]) -> Tensor:
+    noise = kernel.noise.exp() + 1e-6
+    covariance = kernel(x, x)
+    factor: Tensor = torch.linalg.cholesky(covariance + noise * torch.eye(len(covariance)).double())
+    return factor
+
+
+def _negative_log_likelihood(kernel: InverseDynamicsKernel, x: tuple[Tensor, ...], target: Tensor) -> Tensor:
+    factor = _factor(kernel, x)
+    white = torch.linalg.solve_triangular(factor, target[:, None], upper=False)
+    return 0.5 * white.square().sum() + factor.diagonal().log().sum()
+
+
+def _moments(process: tuple[Any, ...], inputs: tuple[Tensor, Tensor, Tensor]) -> np.ndarray:
+    """Return the mean and the standard deviation of a joint's torque with noise, (2, T)."""
+    kernel, many, factor, weights = process
+    with torch.no_grad():
+        features = kernel.features(*inputs)
+        cross = kernel(many, features)
+        explained = torch.linalg.solve_triangular(factor, cross, upper=False).square().sum(dim=0)
+        own = (features[0].square() * kernel.motion.exp()).sum(dim=1)
+        for weights_of_position in kernel.position:
+            own = own * (features[1].square() * weights_of_position.exp()).sum(dim=2).prod(dim=1)
+        own = own + (features[2].square() * kernel.friction.exp()).sum(dim=1)
+        variance = (own - explained).clamp(min=0) + kernel.noise.exp()
+        return torch.stack([cross.mT @ weights, variance.sqrt()]).numpy()
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """Units per hidden layer and weight decay of a network."""
+
+    width: int
+    decay: float
+
+
+SETTINGS = tuple(NetworkSettings(width, decay) for width, decay in product(WIDTHS, DECAYS))
+
+
+def network(training: Sequence[DynamicsSamples], known: Torque | None = None) -> Torque:
+    """Return a network of q, qd and qdd, fitted to torques, or to the torque residual of another method."""
+    inputs = np.concatenate([np.concatenate([x.q, x.qd, x.qdd], axis=1) for x in training])
+    mean, scale = (torch.from_numpy(x) for x in (inputs.mean(axis=0), inputs.std(axis=0) + 1e-9))
+    residuals = [x.tau if known is None else x.tau - known(x) for x in training]
+
+    def make(settings: NetworkSettings) -> tuple[nn.Module, Callable[..., Tensor]]:
+        layers = mlp(inputs.shape[1], residuals[0].shape[1], settings.width, nn.Tanh)
+        return layers, lambda q, qd, qdd: layers((torch.cat([q, qd, qdd], dim=-1) - mean) / scale)
+
+    learned = best_of(make, training, residuals)
+    return learned if known is None else lambda x: learned(x) + known(x)
+
+
+class DeepLagrangian(nn.Module):
+    """Deep Lagrangian network (Lutter, Ritter and Peters, ICLR 2019): a factor of M, and V, from cos q and sin q.
+
+    Viscous and Coulomb friction of each joint are added.
+    """
+
+    def __init__(self, joints: int, width: int) -> None:
+        super().__init__()
+        rows, columns = torch.tril_indices(joints, joints)
+        entries = torch.eye(joints * joints).double()[rows * joints + columns]
+        self.entries = entries.unflatten(-1, (joints, joints))  # of the factor of M
+        self.factor = mlp(2 * joints, joints * (joints + 1) // 2, width, nn.Softplus)
+        self.potential = mlp(2 * joints, 1, width, nn.Softplus)
+        self.viscous, self.coulomb = (nn.Parameter(torch.zeros(joints).double()) for _ in range(2))
+
+    def mass(self, q: Tensor) -> Tensor:
+        """Return M, (..., n, n)."""
+        entries = self.factor(torch.cat([q.cos(), q.sin()], dim=-1))
+        lower = torch.tensordot(entries, self.entries, dims=1)
+        return lower @ lower.mT + 1e-3 * torch.eye(q.shape[-1]).double()
+
+    def forward(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        """Return the torque, (..., n)."""
+
+        def lagrangian(x: Tensor) -> Tensor:
+            kinetic = 0.5 * torch.einsum("...i,...ij,...j->...", qd, self.mass(x), qd)
+            return (kinetic - self.potential(torch.cat([x.cos(), x.sin()], dim=-1))[..., 0]).sum()
+
+        change = jvp(lambda x: torch.einsum("...ij,...j->...i", self.mass(x), qd), (q,), (qd,))[1]
+        inertia = torch.einsum("...ij,...j->...i", self.mass(q), qdd)
+        friction = self.viscous * qd + self.coulomb * torch.tanh(qd / SMOOTHING)
+        return inertia + change - grad(lagrangian)(q) + friction
+
+
+def deep_lagrangian(training: Sequence[DynamicsSamples]) -> Torque:
+    """Return a Deep Lagrangian network fitted to torques."""
+
+    def make(settings: NetworkSettings) -> tuple[nn.Module, Callable[..., Tensor]]:
+        model = DeepLagrangian(training[0].q.shape[1], settings.width)
+        return model, model
+
+    return best_of(make, training, [x.tau for x in training])
+
+
+def mlp(inputs: int, outputs: int, width: int, activation: type[nn.Module]) -> nn.Sequential:
+    """Return a network with two hidden layers."""
+    layers = [nn.Linear(inputs, width), activation(), nn.Linear(width, width), activation()]
+    return nn.Sequential(*layers, nn.Linear(width, outputs)).double()
+
+
+def best_of(
+    make: Callable[[NetworkSettings], tuple[nn.Module, Callable[..., Tensor]]],
+    training: Sequence[DynamicsSamples],
+    torques: Sequence[np.ndarray],
+) -> Torque:
+    """Return the network of `SETTINGS` with the smallest error in held-out blocks of time."""
+    states = [np.concatenate([getattr(x, k) for x in training]) for k in ("q", "qd", "qdd")]
+    y = np.concatenate(torques)
+    mean, scale = y.mean(axis=0), y.std(axis=0) + 1e-9
+    # every fifth of ten blocks of time: adjacent samples are correlated
+    out = np.arange(len(y)) * 10 // len(y) % 5 == 4
+    seen, held = ([torch.from_numpy(x[rows]) for x in (*states, (y - mean) / scale)] for rows in (~out, out))
+    best_loss, best = np.inf, None
+    for settings in SETTINGS:
+        torch.manual_seed(0)
+        weights, model = make(settings)
+        loss = early_stopped(weights, model, seen, held, settings.decay)
+        if loss < best_loss:
+            best_loss, best = loss, model
+    if best is None:
+        raise ArithmeticError("no network has a finite error")
+    chosen = best
+
+    def torque(x: DynamicsSamples) -> np.ndarray:
+        with torch.no_grad():
+            return np.asarray(chosen(*tensors(x)).numpy() * scale + mean)
+
+    return torque
+
+
+def early_stopped(
+    weights: nn.Module, model: Callable[..., Tensor], seen: list[Tensor], held: list[Tensor], decay: float
+) -> float:
+    """Fit a network by AdamW with early stopping; return its smallest held-out error, with the weights at it."""
+    optimizer = torch.optim.AdamW(weights.parameters(), lr=1e-3, weight_decay=decay)
+    best, kept, waits = np.inf, weights.state_dict(), 0
+    for _ in range(EPOCHS):
+        for batch in torch.randperm(len(seen[0])).split(BATCH):
+            optimizer.zero_grad()
+            *given, target = (x[batch] for x in seen)
+            (model(*given) - target).square().mean().backward()
+            optimizer.step()
+        with torch.no_grad():
+            loss = float((model(*held[:3]) - held[3]).square().mean())
+        waits = 0 if loss < best else waits + 1
+        if loss < best:
+            best, kept = loss, {name: value.clone() for name, value in weights.state_dict().items()}
+        if waits > PATIENCE:
+            break
+    weights.load_state_dict(kept)
+    return best
+
+
+RIVALS: dict[str, Method] = {
+    "figaroh": figaroh,
+    "MuJoCo sysid": mujoco_sysid,
+    "GP": gaussian_process,
+    "DeLaN": lambda problem: Prediction(deep_lagrangian(problem.samples)),
+    "network": lambda problem: Prediction(network(problem.samples)),
+}

@@ -1,0 +1,250 @@
+"""Collisions of an arm with itself and its surroundings, by the collision models of Pinocchio and Coal.
+
+The shapes are the <collision> elements of the URDF; a mesh is replaced by its convex hull, which contains it, so that
+signed distances are exact and have a gradient, and no contact is overlooked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import ceil
+
+import coal
+import numpy as np
+import pinocchio as pin
+from scipy.spatial.transform import Rotation
+
+from spelgen.arm.arm import Chain
+from spelgen.arm.chain import choose_chain
+from spelgen.arm.configured_arm import Arm
+from spelgen.arm.lump_links import lump_links
+from spelgen.dynamics.pinocchio_arm import body_constraint, kinematic_model
+from spelgen.excitation.surroundings import Surroundings
+from spelgen.excitation.trajectory import Motion, MotionBounds
+from spelgen.excitation.tuning import TUNING
+from spelgen.labels import counted
+from spelgen.urdf.geometry import LinkShape, link_shapes
+
+FLOOR = "the floor"
+
+
+@dataclass(frozen=True)
+class Contact:
+    """The first time [s] at which two objects are closer than the clearance, and their distance [m] at this time."""
+
+    time: float
+    distance: float
+    first: str
+    second: str
+
+    def __str__(self) -> str:
+        return f"{self.first} and {self.second} at {self.time:.2f} s ({1e3 * self.distance:.0f} mm)"
+
+
+class Collisions:
+    """Distances of the links of an arm to each other, and to floor and boxes.
+
+    Links of one body and of bodies that one joint connects are not compared, because shapes of neighbours overlap. Nor
+    are pairs that are too close at nearly all random positions; ``ignored`` lists these pairs. unread: names of the
+    links with shapes that cannot be read. clearance: smallest allowed distance [m].
+    """
+
+    def __init__(self, arm: Arm, surroundings: Surroundings, bounds: MotionBounds) -> None:
+        """Raises LookupError if the URDF has no collision shape that can be read."""
+        robot, chain, self.clearance = arm.robot, arm.chain, surroundings.clearance
+        found = link_shapes(robot.path, "collision", [link.name for link in robot.links], TUNING.faces)
+        self.unread = found.unread_text
+        if not found.shapes:
+            unread = f"no collision shape can be read: {self.unread}"
+            raise LookupError(unread if self.unread else "the URDF has no collision geometry")
+        frames = lump_links(robot, choose_chain(robot, chain.joint_names, None), arm.angle_tolerance).frames
+        self._model, self._constraint = kinematic_model(chain), body_constraint(chain)
+        self._geometry = pin.GeometryModel()
+        self._bodies: list[int] = []  # body of each object, -1: the root link
+        self._extents = np.zeros(
+            len(chain.bodies)
+        )  # largest distance of a shape from the origin of its body [m]
+        for shape in found.shapes:
+            frame = frames[shape.link]
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = frame.rotation, frame.position
+            self._add(shape.link, frame.body, pose @ shape.pose, _geometry(shape))
+        links = len(self._bodies)
+        if surroundings.floor is not None:
+            self._add(FLOOR, -1, np.eye(4), coal.Halfspace(np.array([0.0, 0.0, 1.0]), surroundings.floor))
+        for name, box in surroundings.boxes.items():
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = Rotation.from_euler("xyz", box.rpy).as_matrix(), box.xyz
+            self._add(f"box {name!r}", -1, pose, coal.Box(*box.size))
+        for first, second in self._pairs(chain, links):
+            self._geometry.addCollisionPair(pin.CollisionPair(first, second))
+        self._displacement = self._largest_displacements(chain, bounds)
+        self._data, self._found = self._model.createData(), pin.GeometryData(self._geometry)
+        self.ignored = self._remove_overlapping(bounds, links)
+
+    @property
+    def pairs(self) -> int:
+        """Number of pairs of objects that are compared."""
+        return len(self._geometry.collisionPairs)
+
+    @property
+    def statement(self) -> str:
+        """What is checked and what is not, in sentences."""
+        pairs = counted(self.pairs, "pair")
+        text = f"Checked: {pairs} of links, floor and boxes, approach included; all keep {1e3 * self.clearance:g} mm."
+        if self.ignored:
+            text += f" Not checked, since their shapes overlap in most positions: {', '.join(self.ignored)}."
+        if self.unread:
+            text += f" Not checked, since their shapes cannot be read: {self.unread}."
+        return text
+
+    def distances(self, q: np.ndarray) -> np.ndarray:
+        """Return the signed distance of each pair, (pairs,) [m], at q (n,)."""
+        positions = self._constraint.jacobian @ q + self._constraint.offset
+        pin.computeDistances(self._model, self._data, self._geometry, self._found, positions)
+        return np.array([result.min_distance for result in self._found.distanceResults])
+
+    def contact(self, motion: Motion) -> Contact | None:
+        """Return the first contact of a motion; None if every distance exceeds zero at all times.
+
+        Distances are computed at positions between which no point moves, relative to any other, by more than 1.5 times
+        the clearance. Each position of the motion is within half of this of such a position.
+        """
+        lengths = np.abs(np.diff(motion.q, axis=0)) @ self._displacement
+        path = np.concatenate([[0.0], np.cumsum(lengths)])
+        points = np.linspace(0.0, path[-1], ceil(path[-1] / (1.5 * self.clearance)) + 1)
+        for point in points:
+            q = np.array([np.interp(point, path, column) for column in motion.q.T])
+            contact = self.contact_at(q, float(np.interp(point, path, motion.t)))
+            if contact is not None:
+                return contact
+        return None
+
+    def contact_at(self, q: np.ndarray, time: float = 0.0) -> Contact | None:
+        """Return the nearest pair at q (n,) if it is closer than the clearance."""
+        distances = self.distances(q)
+        nearest = int(distances.argmin()) if self.pairs else 0
+        if not self.pairs or distances[nearest] >= self.clearance:
+            return None
+        return Contact(time, float(distances[nearest]), *self._names(nearest))
+
+    def penalty(self, q: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the squared violations of a margin, summed over pairs and positions q (T, n), and the gradient (T, n).
+
+        The margin is ``TUNING.margin`` times the clearance. Violations are relative to the margin.
+        """
+        value, gradient, margin = 0.0, np.zeros_like(q), TUNING.margin * self.clearance
+        for row, position in enumerate(q):
+            distances = self.distances(position)
+            close = np.flatnonzero(distances < margin).tolist()
+            if close:
+                positions = self._constraint.jacobian @ position + self._constraint.offset
+                pin.computeJointJacobians(self._model, self._data, positions)
+            for pair in close:
+                violation = 1.0 - distances[pair] / margin
+                value += violation**2
+                gradient[row] -= 2 * violation / margin * self._distance_gradient(pair)
+        return value, gradient
+
+    def _distance_gradient(self, pair: int) -> np.ndarray:
+        """Return the derivative of the distance of a pair, (n,), after ``distances`` and the joint Jacobians."""
+        result, objects = self._found.distanceResults[pair], self._geometry.collisionPairs[pair]
+        gradient = np.zeros(self._model.nv)
+        for index, point, sign in (
+            (objects.first, result.getNearestPoint1(), -1.0),
+            (objects.second, result.getNearestPoint2(), 1.0),
+        ):
+            joint = self._bodies[index] + 1
+            if joint:
+                frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+                jacobian = pin.getJointJacobian(self._model, self._data, joint, frame)
+                # velocity of the nearest point along the normal, which points from the first to the second object
+                arm = np.cross(point - self._data.oMi[joint].translation, result.normal)
+                gradient += sign * (result.normal @ jacobian[:3] + arm @ jacobian[3:])
+        derivative: np.ndarray = gradient @ self._constraint.jacobian
+        return derivative
+
+    def _add(self, name: str, body: int, pose: np.ndarray, geometry: coal.CollisionGeometry) -> None:
+        """Add an object that a body carries. pose: (4, 4), in the frame of the body."""
+        unique = f"{len(self._bodies)} {name}"
+        placed = pin.GeometryObject(unique, body + 1, pin.SE3(pose), geometry)
+        self._geometry.addGeometryObject(placed)
+        self._bodies.append(body)
+        if body >= 0:
+            geometry.computeLocalAABB()
+            center = pose[:3, :3] @ geometry.aabb_center + pose[:3, 3]
+            extent = float(np.linalg.norm(center) + geometry.aabb_radius)
+            self._extents[body] = max(self._extents[body], extent)
+
+    def _names(self, pair: int) -> tuple[str, str]:
+        """Return the names of the two objects of a pair."""
+        objects = self._geometry.collisionPairs[pair]
+        first, second = (self._geometry.geometryObjects[k].name for k in (objects.first, objects.second))
+        return first.partition(" ")[2], second.partition(" ")[2]
+
+    def _pairs(self, chain: Chain, links: int) -> Iterator[tuple[int, int]]:
+        """Yield the pairs of objects to be compared; the first `links` objects are shapes of links."""
+        neighbour: dict[int, int] = {}
+        for index, body in enumerate(chain.bodies):
+            # beyond bodies without a shape
+            parent = body.parent
+            while parent >= 0 and parent not in self._bodies:
+                parent = chain.bodies[parent].parent
+            neighbour[index] = parent
+        for k, second in enumerate(self._bodies):
+            for index, first in enumerate(self._bodies[:k]):
+                is_connected = neighbour.get(second) == first or neighbour.get(first) == second
+                if first != second and (k >= links or not is_connected):
+                    yield index, k
+
+    def _largest_displacements(self, chain: Chain, bounds: MotionBounds) -> np.ndarray:
+        """Return the largest displacement of a point of the arm per displacement of each coordinate, (n,) [m/rad, 1].
+
+        The distance from a joint to any point that it carries is at most the length of the chain from there on.
+        """
+        extents, weights = self._extents.copy(), np.zeros(len(chain.coordinates))
+        travel = np.maximum(np.abs(bounds.low), np.abs(bounds.high))
+        for index, body in reversed(list(enumerate(chain.bodies))):
+            k, ratio = body.coordinate, abs(float(body.multiplier))
+            length = float(np.linalg.norm(np.array(body.translation, dtype=float)))
+            if body.joint_type == "prismatic":
+                length += ratio * travel[k] + abs(body.offset)
+                weights[k] += ratio
+            else:
+                weights[k] += ratio * extents[index]
+            if body.parent >= 0:
+                extents[body.parent] = max(extents[body.parent], length + extents[index])
+        return weights
+
+    def _remove_overlapping(self, bounds: MotionBounds, links: int) -> tuple[str, ...]:
+        """Remove the pairs that are too close at nearly all random positions within bounds; return their names."""
+        random = np.random.default_rng(0).uniform(
+            bounds.low, bounds.high, (TUNING.positions, len(bounds.low))
+        )
+        share = (np.array(list(map(self.distances, random))) < self.clearance).mean(axis=0)
+        names: dict[str, None] = {}
+        for pair in reversed(range(self.pairs)):
+            objects = self._geometry.collisionPairs[pair]
+            # floor and boxes: only links that no joint moves away
+            if share[pair] >= (TUNING.overlap if objects.second < links else 1.0):
+                names[" and ".join(self._names(pair))] = None
+                self._geometry.removeCollisionPair(objects)
+        self._found = pin.GeometryData(self._geometry)
+        return tuple(reversed(names))
+
+
+def _geometry(shape: LinkShape) -> coal.CollisionGeometry:
+    """Return a shape for Coal, of a mesh its convex hull."""
+    if shape.kind == "box":
+        return coal.Box(*shape.size)
+    if shape.kind == "cylinder":
+        return coal.Cylinder(*shape.size)
+    if shape.kind == "sphere":
+        return coal.Sphere(*shape.size)
+    assert shape.mesh is not None
+    points = coal.StdVec_Vec3s()
+    for vertex in shape.mesh[0]:
+        points.append(vertex)
+    # Qt: triangles only. QJ: flat meshes have a hull, too
+    return coal.Convex.convexHull(points, False, "Qt QJ")

@@ -1,0 +1,108 @@
+"""Criterion of exciting motions.
+
+It is the logarithm of the condition number of the base regressor with columns of unit length (Swevers et al., IEEE T-RA
+13:730, 1997), plus penalties on violated effort limits, on distances below a margin and on reduced amplitudes. Unit
+columns do not depend on the amplitude of the motion, but the signal-to-noise ratio of the torque does.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spelgen.arm.arm import Chain
+from spelgen.dynamics.body_regressor import regressor_of
+from spelgen.dynamics.friction import FrictionModel
+from spelgen.dynamics.regressor_dynamics import body_chain, urdf_parameters
+from spelgen.excitation.trajectory import ExcitationTrajectory
+from spelgen.excitation.tuning import TUNING
+from spelgen.identification.base_parameters import base_parameters
+
+if TYPE_CHECKING:
+    from spelgen.excitation.collisions import Collisions
+
+FRICTION = FrictionModel()
+
+
+class Criterion:
+    """Criterion to be minimized over the parameters of an `ExcitationTrajectory`."""
+
+    def __init__(
+        self, arm: Chain, trajectory: ExcitationTrajectory, collisions: Collisions | None = None
+    ) -> None:
+        self.trajectory, self.chain, self.collisions = trajectory, body_chain(arm), collisions
+        self.columns = torch.from_numpy(base_parameters(arm, FRICTION).columns)
+        count = TUNING.samples_per_harmonic * trajectory.harmonics + 1
+        self.times = torch.linspace(0.0, trajectory.duration, count, dtype=torch.float64)
+        self.inertial = torch.from_numpy(urdf_parameters(arm))
+        # without inertials the torque is unknown, and effort limits are ignored
+        is_known = all(body.inertia for body in arm.bodies)
+        efforts = [(is_known and coordinate.effort) or torch.inf for coordinate in arm.coordinates]
+        self.limits = torch.tensor(efforts, dtype=torch.float64)
+
+    def states(self, parameters: np.ndarray) -> Tensor:
+        """Return q, qd and qdd at the samples of the criterion, (3, T, n), for parameters (size,)."""
+        return self.trajectory.states(torch.from_numpy(parameters), self.times)
+
+    def condition(self, states: Tensor) -> float:
+        """Return the condition number of the base regressor with unit columns, for states (3, T, n).
+
+        It is infinite if a column is zero.
+        """
+        return float(self._log_condition(self._rows(states)).exp())
+
+    def efforts(self, states: Tensor) -> np.ndarray:
+        """Return rigid-body torques divided by the effort limits, (T, n), for states (3, T, n); NaN without a limit."""
+        efforts = torch.where(self.limits.isinf(), torch.nan, self._efforts(self._rows(states)))
+        return np.asarray(efforts.numpy())
+
+    def value(self, parameters: np.ndarray) -> float:
+        """Return the criterion for parameters (size,)."""
+        return float(self._value(torch.from_numpy(parameters)))
+
+    def value_and_gradient(self, parameters: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the criterion and its gradient (size,) for parameters (size,) with a finite criterion."""
+        variables = torch.from_numpy(parameters).requires_grad_()
+        value = self._value(variables)
+        (gradient,) = torch.autograd.grad(value, variables)
+        return value.item(), gradient.numpy()
+
+    def _value(self, parameters: Tensor) -> Tensor:
+        """Return the criterion, (), for parameters (size,)."""
+        states = self.trajectory.states(parameters, self.times)
+        rows = self._rows(states)
+        overrun = (self._efforts(rows).abs() - TUNING.effort).clamp(min=0.0)
+        penalties = (
+            TUNING.penalty * overrun.square().sum() + self.trajectory.amplitude_reduction(parameters).sum()
+        )
+        if self.collisions is not None:
+            value, gradient = self.collisions.penalty(states[0].detach().numpy())
+            # a linear function of q with the value and the gradient of the penalty
+            change = torch.from_numpy(gradient) * (states[0] - states[0].detach())
+            penalties = penalties + TUNING.collision_penalty * (value + change.sum())
+        return self._log_condition(rows) + penalties
+
+    def _rows(self, states: Tensor) -> Tensor:
+        """Return the regressor (T, n, K) of bodies, then armature and friction in the order of `FRICTION.columns`."""
+        q, qd, qdd = states
+        direction = (qd / FRICTION.coulomb_smoothing_velocity).tanh()
+        effects = torch.stack([qdd, qd, direction, torch.ones_like(qd)])
+        drives = torch.diag_embed(effects).permute(1, 2, 0, 3).flatten(2)
+        return torch.cat([regressor_of(self.chain, q, qd, qdd), drives], dim=2)
+
+    def _efforts(self, rows: Tensor) -> Tensor:
+        """Return rigid-body torques divided by the effort limits, (T, n), from the regressor (T, n, K)."""
+        return rows[:, :, : len(self.inertial)] @ self.inertial / self.limits
+
+    def _log_condition(self, rows: Tensor) -> Tensor:
+        """Return the logarithm of the condition number, (), from the regressor (T, n, K)."""
+        columns = rows[:, :, self.columns].flatten(0, 1)
+        length = columns.norm(dim=0)
+        # a parameter that the motion does not excite
+        if not length.all():
+            return torch.tensor(torch.inf, dtype=torch.float64)
+        condition: Tensor = torch.linalg.cond(columns / length)
+        return condition.log()

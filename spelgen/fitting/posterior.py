@@ -1,0 +1,326 @@
+"""Posterior of a fitted model: 95 % intervals of its parameters, of M(q), g(q) and of predicted torques.
+
+The covariance of the fitted parameters (`fitting.torque.covariance`) is propagated to first order: the variance of a
+function f is |df/dx R|^2 with the covariance R R^T. Torque predictions add the residual of held-out samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from spelgen.dynamics.base_combinations import base_combinations, constants_regressor
+from spelgen.dynamics.parameters import friction_factor
+from spelgen.dynamics.protocol import motors_of
+from spelgen.emission.assemble import ArmModel
+from spelgen.errors import RunError
+from spelgen.fitting.functional_model import evaluate_with
+from spelgen.fitting.run_record import Content
+from spelgen.fitting.torque.jacobian import TorqueJacobian
+from spelgen.fitting.torque.parameters import ParameterVector
+from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.identification.intervals import Interval, base_unit, interval_listing
+from spelgen.labels import UNITS, parameter_name
+from spelgen.listing import Listing
+from spelgen.logs.dynamics_samples import DynamicsSamples
+from spelgen.runtime.friction_laws import FrictionLaws
+from spelgen.runtime.inputs import MotorInputs
+
+# Finite difference, in standard deviations of the parameters.
+STEP = 1e-4
+# Speeds, relative to the typical speed, and positions at which viscous and Coulomb friction approximate friction.
+SPEEDS = np.geomspace(0.02, 1.0, 25)
+POSITIONS = 32
+# Samples of one block of predicted torques.
+BLOCK = 2048
+
+
+class Uncertain(NamedTuple):
+    """Values of a quantity and their standard deviations, of the same shape and unit."""
+
+    value: np.ndarray
+    std: np.ndarray
+
+
+class Propagated(NamedTuple):
+    """Value of a function of the model, (...), and its derivative times R, (..., k): the standard deviations' root."""
+
+    value: Tensor
+    root: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Posterior of a model that was fitted to torques.
+
+    covariance: (K, K) of the rigid-body, drive and friction parameters. torque_std: (n,) RMS torque residual of samples
+    that were held out [Nm, N], below the cutoff of the fit's filter. delay: of the torques relative to the positions.
+    """
+
+    model: ArmModel
+    covariance: Tensor
+    torque_std: np.ndarray
+    delay: Interval | None = None
+
+    def uncertain(self, function: Callable[[ArmModel], Tensor]) -> Uncertain:
+        """Return a function of the model, such as ``lambda model: model.armature``, with standard deviations."""
+        value, root = self.propagate(function)
+        return Uncertain(value.numpy(), root.norm(dim=-1).numpy())
+
+    def propagate(self, function: Callable[[ArmModel], Tensor]) -> Propagated:
+        """Return a function of the model, (...), and its derivative times R."""
+
+        def at(x: Tensor) -> Tensor:
+            return evaluate_with(self.model, self._vector.unflatten(x), function)
+
+        with torch.no_grad():
+            steps = STEP * self._root.mT
+            columns = [(at(self._x + step) - at(self._x - step)) / (2 * STEP) for step in steps]
+            return Propagated(at(self._x), torch.stack(columns, dim=-1))
+
+    def mass_matrix(self, q: np.ndarray) -> Uncertain:
+        """Return M (T, n, n) at q (T, n), with standard deviations."""
+        position, zero = torch.as_tensor(q), torch.zeros(len(q), self.model.n).double()
+        at_rest, columns = constants_regressor(self.model, position, zero, zero), []
+        for unit in torch.eye(self.model.n).double():
+            columns.append(constants_regressor(self.model, position, zero, unit.expand_as(zero)) - at_rest)
+        with torch.no_grad():
+            return self._linear(self.model.mass_matrix(position), torch.stack(columns, dim=-2))
+
+    def gravity(self, q: np.ndarray) -> Uncertain:
+        """Return gravity torques (T, n) [Nm, N] at q (T, n), with standard deviations."""
+        position, zero = torch.as_tensor(q), torch.zeros(len(q), self.model.n).double()
+        with torch.no_grad():
+            return self._linear(
+                self.model.gravity(position), constants_regressor(self.model, position, zero, zero)
+            )
+
+    def torque(self, *motion: np.ndarray) -> Uncertain:
+        """Return the torques (T, n) [Nm, N] that would be logged, with standard deviations.
+
+        motion: q, qd, qdd (T, n), and z and direction where known. The standard deviation includes the torque residual
+        of held-out samples, that is noise and errors of the model.
+        """
+        q, *motion_and_state = (torch.as_tensor(np.ascontiguousarray(x)) for x in motion)
+        model, root, of_bodies = self.model, self._root.clone(), self._vector.mask("bodies")
+        root[of_bodies] = self._constants.root[: int(of_bodies.sum())]
+        with torch.no_grad():
+            value = model.inverse_dynamics(q, *motion_and_state)
+            inputs = model.input_matrix(q[:1])[0]
+            inverse = torch.linalg.inv(inputs + torch.diag((~inputs.any(dim=1)).double()))
+        variance = (inverse.square() @ torch.from_numpy(self.torque_std).square()).expand_as(q).clone()
+        samples = DynamicsSamples("", motion[0], motion[1], motion[2], np.zeros_like(motion[0]), *motion[3:])
+        for first in range(0, len(q), BLOCK):
+            block = TorqueSamples.of([samples[first : first + BLOCK]])
+            rows = torch.zeros(block.count, model.n, root.shape[1]).double()
+            for joint, columns, jacobian, _ in TorqueJacobian(model, block).joint_rows(self._x):
+                rows[:, joint] = jacobian @ root[columns]
+            variance[first : first + BLOCK] += (inverse @ rows).square().sum(dim=-1)
+        return Uncertain(value.numpy(), variance.sqrt().numpy())
+
+    @cached_property
+    def base_parameters(self) -> tuple[Interval, ...]:
+        """The identifiable combinations of inertial parameters and armatures."""
+        names, combination = self._base
+        values, roots = (combination @ factor for factor in self._constants)
+        result = []
+        for name, value, root in zip(names, values.tolist(), roots, strict=True):
+            result.append(Interval(name, value, float(root.norm()), base_unit(name)))
+        return tuple(result)
+
+    @cached_property
+    def bodies(self) -> tuple[Interval, ...]:
+        """Mass [kg] and first moments [kg m] of each body that the logs can determine on their own."""
+        names, _ = self._base
+        value, root = self._constants
+        result = []
+        for index in range(10 * len(self.model.chain.parents)):
+            if (
+                index % 10 < 4 and parameter_name(index) in names
+            ):  # base parameters of several have the suffix R
+                unit, positive = ("kg", True) if index % 10 == 0 else ("kg m", False)
+                std = float(root[index].norm())
+                result.append(Interval(parameter_name(index), float(value[index]), std, unit, positive))
+        return tuple(result)
+
+    @property
+    def unidentifiable(self) -> tuple[str, ...]:
+        """Names of the masses and first moments that only occur in combinations, or in none."""
+        known = {x.name for x in self.bodies}
+        names = map(parameter_name, range(10 * len(self.model.chain.parents)))
+        return tuple(name for name in names if name[0] in "mh" and name not in known)
+
+    @cached_property
+    def drives(self) -> dict[str, tuple[Interval, ...]]:
+        """Armature, viscous and Coulomb friction, torque offset and trained gain, each per joint, by quantity.
+
+        Viscous and Coulomb friction approximate the friction model by least squares up to the typical speed.
+        """
+        model = self.model
+        trained = model.inputs.gain_rows.tolist() if isinstance(model.inputs, MotorInputs) else []
+        load, factor = self._loads()
+
+        def constants(model: ArmModel) -> Tensor:
+            rows = [model.armature, *_friction_line(model.friction, load, factor), model.torque_offset]
+            if isinstance(model.inputs, MotorInputs) and trained:
+                rows.append(model.inputs.gains().sum(dim=1))
+            return torch.stack(rows)
+
+        value, std = self.uncertain(constants)
+        units = [UNITS[joint_type] for joint_type in model.joint_types]
+        rows = {
+            "armature": [unit.inertia for unit in units],
+            "viscous": [f"{unit.torque} s/{unit.position}" for unit in units],
+            "coulomb": [unit.torque for unit in units],
+            "offset": [unit.torque for unit in units],
+            "gain": [""] * model.n,
+        }
+        result = {}
+        for row, (quantity, labels) in enumerate(list(rows.items())[: len(value)]):
+            positive, joints = quantity in ("armature", "coulomb", "gain"), range(model.n)
+            result[quantity] = tuple(
+                Interval(model.joint_names[k], float(value[row, k]), float(std[row, k]), labels[k], positive)
+                for k in (trained if quantity == "gain" else joints)
+            )
+        return result
+
+    @property
+    def drive_columns(self) -> dict[str, list[str]]:
+        """Cells of a table of the drives, (n,) per quantity."""
+        columns = {}
+        for quantity, of_joints in self.drives.items():
+            cells = {x.name: f"{x.text} {x.unit}".rstrip() for x in of_joints}
+            columns[quantity] = [cells.get(name, "") for name in self.model.joint_names]
+        return columns
+
+    @property
+    def listings(self) -> tuple[Listing, Listing]:
+        """Two tables with 95 % intervals: the determined base parameters, and constants of the drives."""
+        determined = [x for x in self.base_parameters if x.determined in ("firm", "fair")]
+        note = (
+            f"{len(self.base_parameters) - len(determined)} more are not determined to 20 %. Unidentifiable on their "
+            f"own: {', '.join(self.unidentifiable) or 'none'}."
+        )
+        title = "Base parameters [kg, m], with half 95 % intervals; numbers after names: joint"
+        columns = {"joint": list(self.model.joint_names), **self.drive_columns}
+        drives = tuple(zip(*columns.values(), strict=True))
+        note_delay = "" if self.delay is None else f"Torque delay: {self.delay.text} s."
+        return (
+            interval_listing(title, determined, note),
+            Listing("Drives, with half 95 % intervals", tuple(columns), drives, note_delay),
+        )
+
+    def to_dict(self) -> Content:
+        """Return all intervals in their JSON form."""
+        return {
+            "base_parameters": [x.to_dict() for x in self.base_parameters],
+            "bodies": [x.to_dict() for x in self.bodies],
+            "unidentifiable": list(self.unidentifiable),
+            "drives": {name: [x.to_dict() for x in of_joints] for name, of_joints in self.drives.items()},
+            "torque_delay": None if self.delay is None else self.delay.to_dict(),
+            "torque_deviation": self.torque_std.tolist(),
+        }
+
+    def _loads(self) -> tuple[Tensor, Tensor]:
+        """Return gravity torques on the drives and residual factors on friction at random positions, (P, n) each."""
+        joints = self.model.spec.joints
+        places = np.random.default_rng(0).uniform(-1.0, 1.0, (POSITIONS, self.model.n))
+        q = torch.from_numpy([x.center for x in joints] + places * [x.half_range for x in joints])
+        with torch.no_grad():
+            load = self.model.gravity(q) @ torch.linalg.inv(motors_of(self.model))
+            return load, friction_factor(self.model, q)
+
+    @cached_property
+    def _vector(self) -> ParameterVector:
+        return ParameterVector(self.model)
+
+    @cached_property
+    def _x(self) -> Tensor:
+        return self._vector.flatten(self._vector.initial)
+
+    @cached_property
+    def _root(self) -> Tensor:
+        """R, (K, k), without directions of negligible variance."""
+        values, vectors = torch.linalg.eigh(self.covariance)
+        kept = values > 1e-14 * values.max()
+        root: Tensor = vectors[:, kept] * values[kept].sqrt()
+        return root
+
+    @cached_property
+    def _base(self) -> tuple[tuple[str, ...], Tensor]:
+        return base_combinations(self.model)
+
+    @cached_property
+    def _constants(self) -> Propagated:
+        """Inertial parameters of all bodies, then armatures, (10 B + n,)."""
+        return self.propagate(lambda model: torch.cat([model.inertial_parameters.flatten(), model.armature]))
+
+    def _linear(self, value: Tensor, rows: Tensor) -> Uncertain:
+        """Return a value (...) with the standard deviation of the constants' contribution, rows (..., 10 B + n)."""
+        return Uncertain(value.numpy(), (rows @ self._constants.root).norm(dim=-1).numpy())
+
+
+def posterior_of(
+    model: ArmModel, content: Content | None, delay: float, file: Path | None = None
+) -> Posterior:
+    """Return the posterior of a fitted model.
+
+    Args:
+        model: with the fitted parameters.
+        content: `Checkpoint.posterior`: covariance (K, K), torque_std (n,) and delay_std [s]; it may be any file's.
+        delay: of the torques [s].
+        file: checkpoint, for messages.
+
+    Raises RunError without content, and for the content of another model.
+    """
+    if content is None:
+        raise RunError(
+            "a fit without intervals", file=file, expected="rigid bodies fitted to torques, and not adapted",
+            do="fit the preset closed-form or hybrid by the objective torque",
+        )  # fmt: skip
+    vector = ParameterVector(model)
+    count = len(vector.flatten(vector.initial))
+    covariance, torque_std = (
+        _tensor(content, "covariance", (count, count)),
+        _tensor(content, "torque_std", (model.n,)),
+    )
+    delay_std = content.get("delay_std")
+    if covariance is None or torque_std is None or not isinstance(delay_std, float):
+        raise RunError(
+            "a posterior of another model",
+            file=file,
+            element="posterior",
+            do="restore it from a copy, or fit again",
+        )
+    late = Interval("torque delay", delay, delay_std, "s") if delay else None
+    return Posterior(model, covariance, torque_std.numpy(), late)
+
+
+def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | None:
+    """Return a tensor by its name; None if it is absent, has another shape or type, or is not finite."""
+    tensor = content.get(name)
+    if isinstance(tensor, Tensor) and tensor.shape == shape and tensor.dtype == torch.float64:
+        return tensor if bool(tensor.isfinite().all()) else None
+    return None
+
+
+def _friction_line(friction: FrictionLaws, load: Tensor, factor: Tensor) -> Tensor:
+    """Return the viscous and Coulomb friction, (2, n), that are nearest to a friction model.
+
+    Args:
+        friction: of the drives.
+        load: gravity torques on the drives, (P, n) [Nm, N].
+        factor: of the residual terms on friction, (P, n).
+    """
+    speed = torch.from_numpy(SPEEDS).unsqueeze(-1) * friction.speed
+    torque = (factor * friction.prepare().torque(speed.unsqueeze(1), load)).mean(dim=1)
+    line = np.linalg.pinv(np.stack([SPEEDS, np.ones_like(SPEEDS)], axis=-1))
+    slope, intercept = torch.from_numpy(line) @ torque
+    return torch.stack([slope / friction.speed, intercept])

@@ -1,0 +1,120 @@
+"""Find signals that stop at a limit although the motion goes on: clipped torques, positions at a mechanical stop.
+
+A flat top of a signal is no proof: an arm that rests, or accelerates uniformly, has flat torques. It is a limit if the
+model that least squares finds on all other samples contradicts it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from spelgen.errors import Diagnostic, LogError
+from spelgen.identification.log_geometry import GeometryProblem
+from spelgen.identification.tuning import GEOMETRY
+from spelgen.labels import UNITS
+from spelgen.log_checks.tuning import TUNING
+from spelgen.logs.checks import Findings
+
+CLIPPED, AT_A_STOP = "torque-clipped", "at-a-stop"
+SIDES = np.array([-1.0, 1.0])
+
+
+@dataclass
+class FlatTops:
+    """Flat tops of the positions and torques of n joints, collected from trajectories.
+
+    levels: by "q" and "tau", (2, n): the most extreme flat bottom and top, NaN without one. shares: likewise, samples
+    there as a fraction of all samples.
+    """
+
+    levels: dict[str, np.ndarray] = field(default_factory=dict)
+    shares: dict[str, np.ndarray] = field(default_factory=dict)
+    _samples: int = 0
+
+    def add(self, q: np.ndarray, tau: np.ndarray) -> None:
+        """Take in the positions and joint torques (T, n) of a trajectory."""
+        total = self._samples + len(q)
+        for name, values in (("q", q), ("tau", tau)):
+            levels, shares = flat_tops(values)
+            if name in self.levels:
+                levels = SIDES[:, None] * np.fmax(*(SIDES[:, None] * x for x in (self.levels[name], levels)))
+                shares = (self.shares[name] * self._samples + shares * len(q)) / total
+            self.levels[name], self.shares[name] = levels, shares
+        self._samples = total
+
+
+def flat_tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the values (2, n) of the flat bottoms and tops of signals (T, n), NaN without one, and their shares.
+
+    Many more samples are next to the extreme value than in three times as wide a band below it; the peaks of a
+    sinusoid have as many in both.
+    """
+    upright = SIDES[:, None, None] * values
+    tops = upright.max(axis=1)
+    width = TUNING.flat_top * np.ptp(values, axis=0)
+    shares = (upright >= (tops - width)[:, None]).mean(axis=1)
+    below = (upright >= (tops - 4 * width)[:, None]).mean(axis=1) - shares
+    is_flat = (shares > TUNING.flat_share) & (shares > TUNING.flat_ratio * below) & (width > 0)
+    return np.where(is_flat, SIDES[:, None] * tops, np.nan), np.where(is_flat, shares, 0.0)
+
+
+def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
+    """Return an error for each joint with clipped torques, or else a warning for each one that rests at a stop."""
+    problem, findings = problem.thinned(GEOMETRY.confirming_samples), Findings()
+    samples = problem.unchanged.signals(problem.samples)
+    at_torque, at_position = (_at_levels(flat.levels[name], getattr(samples, name)) for name in ("tau", "q"))
+    free = ~(at_torque | at_position).any(axis=0)
+    if free.all():
+        return findings
+    # the torques at a limit do not count
+    fit = problem.on_torques(free).fit(problem.unchanged)
+    residual = problem.torque(problem.unchanged, fit.parameters) - samples.tau
+    deviation, friction = problem.prediction_deviation(fit), problem.coulomb_friction(fit)
+    # of few torques the residual is no noise
+    noise = np.sqrt(
+        np.square(residual * free).sum(axis=0) / np.maximum(free.sum(axis=0) - TUNING.free_samples, 1e-9)
+    )
+    for k, coordinate in enumerate(problem.arm.coordinates):
+        unit, levels = UNITS[coordinate.joint_type].torque, flat.levels["tau"][:, k]
+        sides = zip(SIDES, at_torque[..., k], strict=True)
+        doubt = TUNING.certain * deviation[:, k]
+        excess = np.array([_median((side * residual[:, k] - doubt)[rows]) for side, rows in sides])
+        # wrong friction of few free samples must not be confused with it
+        sure = max(TUNING.certain * noise[k], TUNING.excess * samples.tau[:, k].std(), abs(friction[k]))
+        is_clipped = excess > sure
+        if is_clipped.any():
+            limits = " and ".join(f"{x:.4g}" for x in levels[is_clipped])
+            needed = np.abs(residual + samples.tau)[at_torque[is_clipped, :, k].any(axis=0), k].max()
+            got = (
+                f"torques that stop at {limits} {unit} in {flat.shares['tau'][is_clipped, k].sum():.1%} of the "
+                f"samples, in which the motion needs up to {needed:.4g} {unit} by least squares on the others"
+            )
+            do = f"log torques without this limit, or record slower motion; --accept {CLIPPED} if it is right"
+            where = f"joint {coordinate.name!r}, tau"
+            findings.errors.append(LogError(got, element=where, expected="the torques that moved it", do=do))
+    for k, coordinate in enumerate(problem.arm.coordinates if not findings.errors else ()):
+        for level, rows in zip(flat.levels["q"][:, k], at_position[..., k], strict=True):
+            difference = _median((np.abs(residual) - TUNING.certain * deviation)[rows, k])
+            if difference > TUNING.certain * noise[k] + 2 * abs(friction[k]):
+                message = (
+                    f"q stays at {level:.4g} while its torque differs by {difference:.3g} from the model of the other "
+                    "samples: contact with a stop; remove such motion"
+                )
+                findings.notes.append(
+                    Diagnostic("warning", AT_A_STOP, f"joint {coordinate.name!r}", None, message)
+                )
+    return findings
+
+
+def _at_levels(levels: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the samples of filtered signals (S, n) that are at a level (2, n), (2, S, n); False without a level."""
+    distance = SIDES[:, None, None] * (levels[:, None] - values)
+    return np.asarray(distance < TUNING.near_limit * np.ptp(values, axis=0))
+
+
+def _median(values: Sequence[float] | np.ndarray) -> float:
+    """Return the median; minus infinity without values."""
+    return float(np.median(values)) if len(values) else -np.inf

@@ -1,0 +1,227 @@
+"""Posterior of torque fits: intervals against known arms, sampled parameters and exact combinations."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from motions import smooth_motion
+from scipy.signal import lfilter
+from typer.testing import CliRunner
+
+import spelgen
+from spelgen.arm.configured_arm import load_arm
+from spelgen.cli.main import app
+from spelgen.dynamics.base_combinations import base_combinations
+from spelgen.dynamics.friction import FrictionModel
+from spelgen.emission.build import build
+from spelgen.errors import RunError
+from spelgen.exporting.export import export
+from spelgen.fitting.fit import fit, load_run
+from spelgen.fitting.posterior import Posterior
+from spelgen.fitting.run_folder import RunFolder, write_state
+from spelgen.fitting.torque import fit as torque_fit
+from spelgen.fitting.torque.fit import fit_torque
+from spelgen.fitting.torque.parameters import ParameterVector
+from spelgen.identification.base_parameters import base_parameters
+from spelgen.identification.intervals import QUANTILE, Interval, larger_covariance
+from spelgen.logs.dynamics_samples import DynamicsSamples
+from spelgen.logs.filtering import low_pass
+from spelgen.logs.read import write_logs
+from spelgen.logs.trajectory import Trajectory
+from spelgen.render.report_page import render_report, report_data
+from spelgen.settings.fits import TorqueFit
+from tests.test_closed_form import FOLLOWED, drawn
+
+
+@pytest.mark.parametrize("robot", ["two_link", "rpr", "six_dof", "followed"])
+def test_base_parameters_are_the_exact_ones(robots, tmp_path, robot):
+    urdf = robots / f"{robot}.urdf"
+    if robot == "followed":
+        urdf = tmp_path / "followed.urdf"
+        urdf.write_text(FOLLOWED, encoding="utf-8")
+    arm = load_arm(urdf)
+    exact = base_parameters(arm.chain, FrictionModel(), arm.actuation.drives().speeds)
+    count = 10 * len(arm.chain.bodies) + len(arm.chain.coordinates)
+    common = exact.columns < count  # friction and offsets follow
+    names, combination = base_combinations(build(arm, "closed-form"))
+    assert names == tuple(np.array(exact.names)[common])
+    np.testing.assert_allclose(combination, exact.combination[common, :count], atol=1e-7)
+
+
+def test_the_larger_covariance_bounds_both():
+    draw = torch.Generator().manual_seed(0)
+    scale = torch.logspace(-3, 3, 5).double()  # units differ
+    roots = torch.randn(2, 5, 5, generator=draw).double() * scale.unsqueeze(-1)
+    first, second = roots @ roots.mT
+    both = larger_covariance(first, second)
+    for smaller in (first, second):
+        excess = (both - smaller) / scale.outer(scale)
+        assert torch.linalg.eigvalsh(excess).min() > -1e-9
+    torch.testing.assert_close(larger_covariance(1e-3 * second, second), second)
+    torch.testing.assert_close(larger_covariance(7 * second, second), 7 * second)
+
+
+def arm_like(robots, seed):
+    """An arm with the kinematics of rpr.urdf and other parameters."""
+    return drawn(SimpleNamespace(Model=lambda: build(robots / "rpr.urdf", "closed-form")), seed, 0.3)
+
+
+def base_values(model):
+    """Base parameters of a model."""
+    with torch.no_grad():
+        constants = torch.cat([model.inertial_parameters.flatten(), model.armature])
+    return (base_combinations(model)[1] @ constants).tolist()
+
+
+def logged(model, seconds, seed, correlation=0.98, noise=0.05):
+    """Samples with torque errors that last; correlation: of successive errors at 100 Hz."""
+    rng = np.random.default_rng(seed)
+    motion = smooth_motion(model.n, seconds, rng)
+    with torch.no_grad():
+        tau = model.inverse_dynamics(*map(torch.from_numpy, motion)).numpy()
+    errors = lfilter([np.sqrt(1 - correlation**2)], [1, -correlation], rng.normal(size=tau.shape), axis=0)
+    return DynamicsSamples("known", *motion, tau + noise * tau.std(axis=0) * errors)
+
+
+def test_intervals_hold_the_truth_if_errors_last_longer_than_the_fit_assumes(robots, monkeypatch):
+    """Errors of 0.5 s: intervals of the posterior covariance, which assumes 0.2 s, are too narrow."""
+    estimates, held, held_by_posterior = [], [], []
+    measured = torque_fit.parameter_covariance
+
+    def kept(estimate):
+        estimates.append(estimate)
+        return measured(estimate)
+
+    monkeypatch.setattr(torque_fit, "parameter_covariance", kept)
+    for seed in range(12):
+        true, model = arm_like(robots, seed), build(robots / "rpr.urdf", "closed-form")
+        solution = fit_torque(model, [logged(true, 12.0, seed)])
+        posterior = estimates[-1].with_current_covariance().covariance
+        for covariance, result in ((solution.covariance, held), (posterior, held_by_posterior)):
+            intervals = Posterior(model, covariance, solution.torque_std.numpy()).base_parameters
+            for interval, value in zip(intervals, base_values(true), strict=True):
+                result.append(interval.low <= value <= interval.high)
+    print(np.mean(held), np.mean(held_by_posterior))
+    assert 0.9 <= np.mean(held) < 1.0
+    assert np.mean(held_by_posterior) < np.mean(held) - 0.03
+
+
+@pytest.fixture(scope="module")
+def fitted(robots):
+    """A fit to two recordings of a known arm, with the arm."""
+    true, logs = arm_like(robots, 3), []
+    for seed in range(3):
+        x = logged(true, 10.0, seed, correlation=0.5)
+        logs.append(Trajectory(np.arange(len(x.q)) / 100, x.q, x.qd, x.tau, f"motion {seed}"))
+    urdf = robots / "rpr.urdf"
+    return fit(build(urdf, "closed-form"), logs[:2], TorqueFit(), arm=urdf), logs
+
+
+def test_standard_deviations_are_those_of_sampled_parameters(fitted):
+    """M, g, torques and drives of models with random parameters, from a small multiple of the covariance."""
+    result, _ = fitted
+    posterior, shrink = result.posterior, 1e-3
+    small = replace(posterior, covariance=shrink**2 * posterior.covariance, torque_std=np.zeros(3))
+    rng = np.random.default_rng(0)
+    q, qd, qdd = rng.uniform(-1, 1, (3, 4, 3))
+    draws = []
+    vector = ParameterVector(result.model)
+    x = vector.flatten(vector.initial)
+    for noise in torch.from_numpy(rng.normal(size=(300, len(x)))):
+        values, vectors = torch.linalg.eigh(small.covariance)
+        vector.write(x + vectors @ (values.clamp(min=0).sqrt() * noise))
+        with torch.no_grad():
+            model, states = result.model, list(map(torch.from_numpy, (q, qd, qdd)))
+            drawn = model.mass_matrix(states[0]), model.gravity(states[0]), model.inverse_dynamics(*states)
+            draws.append(torch.cat([y.flatten() for y in (*drawn, model.armature)]).numpy())
+    vector.write(x)
+    armature = np.array([interval.std for interval in small.drives["armature"]])
+    stated = [small.mass_matrix(q).std, small.gravity(q).std, small.torque(q, qd, qdd).std, armature]
+    np.testing.assert_allclose(
+        np.std(draws, axis=0), np.concatenate([y.ravel() for y in stated]), rtol=0.2, atol=1e-9
+    )
+
+
+def test_torque_intervals_hold_the_torques_of_another_motion(fitted):
+    result, logs = fitted
+    tau, std = result.predict(logs[2], std=True)
+    np.testing.assert_allclose(tau, result.predict(logs[2]), rtol=1e-9)
+    inner = slice(100, -100)  # without transients of the filter, which the measured torque passes, too
+    measured = low_pass(logs[2], result.preprocessing.acceleration_cutoff).tau[inner]
+    held = np.abs(measured - tau[inner]) <= QUANTILE * std[inner]
+    assert 0.9 < held.mean() < 0.995
+
+
+def test_a_loaded_run_its_report_and_its_exports_state_the_same_intervals(fitted, tmp_path):
+    result, _ = fitted
+    folder = result.save(tmp_path / "run")
+    stated = result.posterior.to_dict()
+    read = json.loads(json.dumps(report_data(folder)))["posterior"]
+    for name in ("base_parameters", "bodies"):
+        for one, other in zip(stated[name], read[name], strict=True):
+            assert one["name"] == other["name"] and one["low"] == pytest.approx(
+                other["low"], rel=1e-6, abs=1e-9
+            )
+    first = result.posterior.drives["armature"][0]
+    page, readme = render_report(folder), export(load_run(folder), "urdf").files[".urdf.README.md"].decode()
+    for text in (page, readme):
+        assert f"{first.text} {first.unit}" in text
+    determined = next(x for x in result.posterior.base_parameters if x.determined == "firm")
+    assert determined.text in page
+    assert f"{determined.half:.2g}" in readme
+
+
+def test_a_foreign_or_absent_posterior_is_one_clear_error(fitted, tmp_path):
+    result, _ = fitted
+    folder = RunFolder(result.save(tmp_path / "run"))
+    checkpoint = result.checkpoint.content
+    nan = checkpoint["posterior"] | {"covariance": torch.full_like(result.posterior.covariance, torch.nan)}
+    small = checkpoint["posterior"] | {"covariance": torch.eye(3).double()}
+    for content in (nan, small, {}):
+        write_state(folder.checkpoint, checkpoint | {"posterior": content})
+        with pytest.raises(
+            RunError, match=r"checkpoint\.pt: posterior: a posterior of another model; restore"
+        ):
+            load_run(folder.path).posterior  # noqa: B018
+    del checkpoint["posterior"]
+    write_state(folder.checkpoint, checkpoint)
+    with pytest.raises(RunError, match="a fit without intervals, expected rigid bodies fitted to torques"):
+        load_run(folder.path).posterior  # noqa: B018
+    assert report_data(folder.path)["posterior"] is None
+
+
+def test_train_states_the_intervals_of_the_fit(robots, fitted, tmp_path):
+    _, logs = fitted
+    module, urdf = tmp_path / "rpr.py", robots / "rpr.urdf"
+    write_logs(tmp_path / "logs.parquet", logs[:2], ("joint1", "joint2", "joint3"))
+    module.write_text(spelgen.generate(urdf, preset="closed-form"), encoding="utf-8")
+    command = [
+        "train",
+        module,
+        tmp_path / "logs.parquet",
+        "--robot",
+        urdf,
+        "-o",
+        tmp_path / "run",
+        "--format",
+        "json",
+    ]
+    told = CliRunner().invoke(app, list(map(str, command)))
+    assert told.exit_code == 0, told.output
+    stated = json.loads(told.stdout)["posterior"]
+    assert stated["base_parameters"] == load_run(tmp_path / "run").posterior.to_dict()["base_parameters"]
+
+
+def test_intervals_of_positive_quantities_have_no_negative_end():
+    assert Interval("armature", 1.0, 2.0, positive=True).low == 0
+    assert Interval("hx1", 1.0, 2.0).low == pytest.approx(-2.92)
+    assert [Interval("m1", 1.0, std).determined for std in (0.05, 0.2, 1.0, 1.1)] == [
+        "firm",
+        "fair",
+        "weak",
+        "may be zero",
+    ]
+    assert Interval("m1", 1.0, np.inf).to_dict()["high"] is None
