@@ -14,13 +14,13 @@ from typer.testing import CliRunner
 import spelgen
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
+from spelgen.dynamics.base_combinations import base_combinations
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.emission.build import build
 from spelgen.errors import RunError
 from spelgen.exporting.export import export
-from spelgen.fitting.base_combinations import base_combinations
 from spelgen.fitting.fit import fit, load_run
 from spelgen.fitting.posterior import Posterior
 from spelgen.fitting.run_folder import RunFolder, write_state

@@ -57,13 +57,18 @@ def samples(missing: torch.Tensor, q: torch.Tensor) -> ResidualSamples:
     return ResidualSamples(q, still, still, missing, torch.ones_like(q))
 
 
+def data(correlation_length: float, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Correlation length, recordings and torque of one recording of two joints."""
+    return torch.full((2,), correlation_length), torch.zeros(count).long(), torch.full((2,), 4.0).double()
+
+
 def test_what_the_samples_of_one_stretch_say_is_judged_on_others(hybrid):
     """The first joint moves slowly through its range, and the residual is another constant in each direction."""
     levels = torch.randn(10, 1, generator=torch.Generator().manual_seed(3)).double()
     missing = levels.repeat_interleave(200, dim=0) * torch.tensor([[1.0, 0.0]]).double()
     q = torch.stack([torch.linspace(-2, 2, 2000), torch.zeros(2000)], dim=1).double()
     # a function of q explains nearly all of it, and nothing where it was not fitted
-    assert select_functions(hybrid, samples(missing, q), ALONE, [], torch.full((2,), 1.0)) == []
+    assert select_functions(hybrid, samples(missing, q), ALONE, [], *data(1.0, len(q))) == []
 
 
 def test_neighbours_of_what_is_held_out_are_not_fitted_to(hybrid):
@@ -73,9 +78,9 @@ def test_neighbours_of_what_is_held_out_are_not_fitted_to(hybrid):
     q = torch.stack([torch.linspace(-2, 2, 2000), torch.zeros(2000)], dim=1).double()
     missed = samples(missing, q)
     spline = next(joint_functions.joint_functions(hybrid, missed, ALONE))
-    errors, _ = selection._cross_validate(spline, missing[:, 0], 40.0)
+    errors, _ = selection._cross_validate(spline, missing[:, 0], 40.0, torch.zeros(2000).long())
     assert errors.square().sum() > missing.square().sum()
-    assert select_functions(hybrid, missed, ALONE, [], torch.full((2,), 40.0)) == []
+    assert select_functions(hybrid, missed, ALONE, [], *data(40.0, len(q))) == []
 
 
 def test_what_the_first_half_shows_has_to_hold_in_the_last(hybrid):
@@ -85,7 +90,7 @@ def test_what_the_first_half_shows_has_to_hold_in_the_last(hybrid):
     missing = torch.stack([torch.sin(q[:, 0]), torch.zeros_like(t)], dim=1)
     for later, selected in ((0.45, 0), (0.75, 1)):
         missing[2000:] = later * torch.sin(q[2000:])
-        found = select_functions(hybrid, samples(missing, q), ALONE, [], torch.full((2,), 1.0))
+        found = select_functions(hybrid, samples(missing, q), ALONE, [], *data(1.0, len(q)))
         assert len(found) == selected
 
 
@@ -102,7 +107,7 @@ def test_the_first_half_is_judged_where_it_has_been(hybrid):
     weights = spline.fit(missed.torque_residual[:, 0], 1.0, first).coef
     error = missed.torque_residual[last, 0] - spline.torque(weights, last)
     assert error.square().sum() > missed.torque_residual[last, 0].square().sum()
-    selected = select_functions(hybrid, missed, ALONE, [], torch.full((2,), 1.0))
+    selected = select_functions(hybrid, missed, ALONE, [], *data(1.0, len(q)))
     assert [(residual.name, residual.joint) for residual in selected] == [("raw_torque_splines", 0)]
 
 
@@ -112,12 +117,12 @@ def test_a_gain_in_one_of_ten_stretches_is_luck(hybrid):
     everywhere = torch.stack([torch.sin(q[:, 0]), torch.zeros_like(t)], dim=1)
     noise = torch.randn(4000, 2, generator=torch.Generator().manual_seed(0)).double()
     noise[:, 1] = 0.0
-    found = select_functions(hybrid, samples(everywhere + 0.1 * noise, q), ALONE, [], torch.full((2,), 1.0))
+    found = select_functions(hybrid, samples(everywhere + 0.1 * noise, q), ALONE, [], *data(1.0, len(q)))
     # of the functions that explain it the best one is selected, and none of the joint that misses nothing
     assert [(residual.name, residual.joint) for residual in found] == [("raw_torque_splines", 0)]
     # in one stretch it is so, in the others the torque is nearly nothing: held out it gains in one at most
     once = everywhere * (torch.arange(4000) < 400).unsqueeze(-1)
-    assert select_functions(hybrid, samples(0.3 * once + noise, q), ALONE, [], torch.full((2,), 1.0)) == []
+    assert select_functions(hybrid, samples(0.3 * once + noise, q), ALONE, [], *data(1.0, len(q))) == []
 
 
 def test_a_stretch_without_torque_hides_no_gain():

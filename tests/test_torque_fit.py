@@ -601,7 +601,7 @@ def test_a_spring_is_found_that_bodies_pass_for(emitted, robots):
     model = build(robots / "six_dof.urdf", "hybrid", width=8)
     model.residuals.potential = model.residuals.mass = None
     solution = fit_torque(model, logs)
-    names = ["initial fit", "friction state", "friction effects", "residual terms"]
+    names = ["initial fit", "friction state", "friction effects", "residual terms", "final fit"]
     assert [stage.name for stage in solution.stages] == names
     steps = [stage.steps for stage in solution.stages]
     assert steps == sorted(steps) and (steps[-1], solution.stages[-1].cost) == (solution.steps, solution.cost)

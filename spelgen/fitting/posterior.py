@@ -17,11 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from spelgen.dynamics.base_combinations import base_combinations, constants_regressor
 from spelgen.dynamics.parameters import friction_factor
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
-from spelgen.fitting.base_combinations import base_combinations, constants_regressor
 from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.jacobian import TorqueJacobian

@@ -97,6 +97,8 @@ class TorqueTuning:
     # [1] Relative standard deviation above which logs do not determine a motor gain: its 95 % interval then reaches
     # 20 % to either side, as the difference of two datasheets does.
     undetermined_gain: float = 0.1
+    # [1] nMSE of held-out seconds above which logs do not support the fit at a joint.
+    unsupported: float = 0.5
     # [1] Factor of the prior standard deviation of URDF masses above which the URDF is wrong.
     wrong_urdf: float = 5.0
     # [1] Torque residual divided by the inertial torque of a joint, above which the predicted motion is unreliable.
@@ -127,6 +129,12 @@ class ResidualTuning:
     # [1] Standard errors that the mean error reduction over the blocks must exceed: p = 0.01 of Student's t with nine
     # degrees of freedom.
     standard_errors: float = 2.82
+    # [1] The same for samples of one recording, whose motion may repeat errors: p = 0.001.
+    standard_errors_of_one: float = 4.30
+    # [1] Largest torque of position that one recording supports, as a fraction of the joint's torque.
+    max_torque_fraction: float = 0.5
+    # [1] Gravity torque of a joint, as a fraction of its torque, below which it has no spring to balance it.
+    min_load_fraction: float = 0.1
     # [1] Smallest error reduction of a residual term.
     min_reduction: float = 1e-3
     # [1] A later term is preferred to the best one so far only if its residual is below this fraction of the residual
