@@ -1,4 +1,4 @@
-"""Find signals that stay at a limit during a motion: clipped torques, positions at a mechanical stop.
+"""Find signals that stop at a limit although the motion continues: clipped torques, positions at a mechanical stop.
 
 A flat top of a signal is no proof: an arm that rests, or accelerates uniformly, has flat torques. It is a limit if the
 model that least squares finds on all other samples contradicts it.
