@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from spelgen.dynamics.friction import FrictionModel as FrictionModel
     from spelgen.dynamics.tip import tip_kinematics as tip_kinematics
     from spelgen.emission.build import build as build
-    from spelgen.emission.build import load_module as load_module
+    from spelgen.emission.loading import load_module as load_module
     from spelgen.emission.specify import generate as generate
     from spelgen.errors import SpelgenError as SpelgenError
     from spelgen.evaluation.evaluate import evaluate as evaluate
@@ -51,7 +51,8 @@ _MODULES = {
     "certificate.inspection": "inspect Inspection",
     "emission.specify": "generate",
     "design": "Design",
-    "emission.build": "build load_module",
+    "emission.build": "build",
+    "emission.loading": "load_module",
     "certificate.module_check": "check",
     "logs.read": "read_logs write_logs",
     "logs.trajectory": "Trajectory",

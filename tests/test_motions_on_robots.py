@@ -1,6 +1,6 @@
 """`spelgen excite` for a robot: approach, message of ROS 2, and no contact with itself, a floor or boxes.
 
-The arm has spheres on its links and moves in a plane, so distances follow from sines and cosines alone.
+The arm has spheres on its links and moves in a plane, so distances follow from sines and cosines only.
 """
 
 import json
@@ -192,7 +192,7 @@ def test_pairs_and_links_that_cannot_be_checked_are_named(urdf, monkeypatch):
 
 
 def test_an_arm_that_cannot_move_freely_gets_no_motion(urdf, monkeypatch):
-    """A shell of boxes around the upright arm: the errors name links, times and what to do."""
+    """A shell of boxes around the upright arm: the errors name links, times and remedies."""
     side = {"size": (0.1, 4, 4)}
     near = Surroundings(
         boxes={"left": Box(**side, xyz=(-0.15, 0, 2.3)), "right": Box(**side, xyz=(0.15, 0, 2.3))}

@@ -93,7 +93,7 @@ class Collisions:
 
     @property
     def statement(self) -> str:
-        """What is checked and what is not, in sentences."""
+        """Statement of the checked and unchecked collisions, in sentences."""
         pairs = counted(self.pairs, "pair")
         clearance = f"approach included; all keep {1e3 * self.clearance:g} mm"
         text = f"Checked: {pairs} of links{self._surroundings}, {clearance}."

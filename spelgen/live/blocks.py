@@ -82,7 +82,8 @@ def joined(first: Block, second: Block) -> Block:
     weight = second.duration / duration
 
     def mean(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return a + weight * (b - a)
+        average: np.ndarray = a + weight * (b - a)
+        return average
 
     return Block(
         duration,

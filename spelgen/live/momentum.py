@@ -65,7 +65,8 @@ class LoadAxes:
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
-    return torch.linalg.cross(a, b, dim=-1)
+    product: Tensor = torch.linalg.cross(a, b, dim=-1)
+    return product
 
 
 def load_axes(model: RigidBodyDynamics, q: Tensor, qd: Tensor) -> LoadAxes:
