@@ -1,6 +1,6 @@
 """Base parameters of a model: the combinations of inertial parameters and armatures that determine its torques.
 
-The same as in `identification.base_parameters`, from the kinematics of the model only and without exact arithmetic.
+Equal to `identification.base_parameters`, but from the kinematics of the model only and without exact arithmetic.
 """
 
 from __future__ import annotations

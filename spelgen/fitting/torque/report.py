@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from itertools import compress
 
@@ -51,12 +52,18 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
             "effort limits of the URDF, the zeros of the torques and their unit"
         )
         yield Diagnostic("warning", "offset-prior", "logs", None, message)
+    unsupported = solution.held_out_nmse > TUNING.unsupported
+    if unsupported.any():
+        yield _few_data(samples, solution, names[unsupported])
     if isinstance(model.inputs, MotorInputs) and len(model.inputs.gain_rows):
         yield _trained_gains(posterior)
     if solution.compensated.any():
         yield _compensation(model, solution, names)
     if residual_terms(model) is not None:
-        yield Diagnostic("info", "residuals", "model", None, _selected_terms(solution, names))
+        message = _selected_terms(solution, names)
+        if solution.selected_terms and not samples.recordings.any():
+            message += "; all of them rest on one recording: test them on another motion"
+        yield Diagnostic("info", "residuals", "model", None, message)
     subset = samples.subsampled(TUNING.report_positions).columns
     inertia, std = posterior.uncertain(lambda other: _mean_inertia(other, subset.q))
     undetermined = std > TUNING.undetermined * inertia
@@ -71,6 +78,20 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
             "than constant velocity; record faster motion"
         )
         yield Diagnostic("warning", "acceleration-unseen", "logs", None, message)
+
+
+def _few_data(samples: TorqueSamples, solution: TorqueSolution, joints: np.ndarray) -> Diagnostic:
+    """Return the warning that the samples do not support the parameters of these joints."""
+    nmse = float(np.nanmax(solution.held_out_nmse))
+    seconds = samples.count * samples.interval
+    # the error of the parameters is inversely proportional to the duration of the motion
+    enough = math.ceil(seconds * nmse / TUNING.unsupported)
+    message = (
+        f"the torque of held-out seconds is predicted hardly better than by a constant at {', '.join(joints)} (nMSE "
+        f"{nmse:.2g}): {seconds:.2g} s of this motion do not support a fit, the values of the URDF or of a ridge "
+        f"regression may be as good; record about {enough} s in which all joints move"
+    )
+    return Diagnostic("warning", "few-data", "logs", None, message)
 
 
 def _trained_gains(posterior: Posterior) -> Diagnostic:
@@ -89,7 +110,9 @@ def _trained_gains(posterior: Posterior) -> Diagnostic:
 
 def _compensation(model: ArmModel, solution: TorqueSolution, names: np.ndarray) -> Diagnostic:
     value = model.friction_compensation.detach().numpy()
-    joints = ", ".join(f"{names[k]} {value[k]:.3g}" for k in np.flatnonzero(solution.compensated))
+    joints = ", ".join(
+        f"{names[k]} {value[k]:.3g}" for k in np.flatnonzero(solution.compensated & (value > 0))
+    )
     message = (
         "the measured torque decreases with velocity, as if the drive compensated friction: "
         f"{joints} Nm s/rad (N s/m) are added; check the torques' signs and what the controller subtracts"
