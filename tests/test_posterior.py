@@ -141,7 +141,7 @@ def fitted(robots):
     return fit(build(urdf, "closed-form"), logs[:2], TorqueFit(), arm=urdf), logs
 
 
-def test_standard_deviations_are_those_of_sampled_parameters(fitted):
+def test_standard_deviations_agree_with_sampled_parameters(fitted):
     """M, g, torques and drives of models with random parameters, from a small multiple of the covariance."""
     result, _ = fitted
     posterior, shrink = result.posterior, 1e-3

@@ -62,7 +62,8 @@ class Posterior:
     """Posterior of a model that was fitted to torques.
 
     covariance: (K, K) of the rigid-body, drive and friction parameters. torque_std: (n,) RMS torque residual of blocks
-    of samples that were not fitted [Nm, N], below the cutoff of the fit's filter. delay: of the torques relative to the positions.
+    of samples that were not fitted [Nm, N], below the cutoff of the fit's filter. delay: of the torques relative to the
+    positions.
     """
 
     model: ArmModel
