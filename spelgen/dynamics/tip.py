@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class TipKinematics:
-    """Pose and Jacobian of a link in the frame of the root link by pytorch-kinematics, functions of q (..., n) [rad, m].
+    """Pose and Jacobian of a link in the frame of the root link, as functions of q (..., n) [rad, m].
 
     Mimic joints move with their leaders, all other joints are at zero. Angles are the unrounded angles of the URDF.
     Results have the type of q.
@@ -40,7 +40,9 @@ class TipKinematics:
 
     def pose(self, q: torch.Tensor) -> torch.Tensor:
         """Return the homogeneous transform, (..., 4, 4)."""
-        poses: torch.Tensor = self._chains[q.dtype].forward_kinematics_tensor(self._rows(q))[-1]
+        poses: torch.Tensor = self._chains[q.dtype].forward_kinematics_tensor(
+            self._rows(q), analytical_grad=False
+        )[-1]
         return poses.reshape(*q.shape[:-1], 4, 4)
 
     def position(self, q: torch.Tensor) -> torch.Tensor:
@@ -69,7 +71,7 @@ def _serial_chain(root: str, path: Sequence[UrdfJoint], dtype: torch.dtype) -> S
     for joint in path:
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, :3] = torch.from_numpy(Rotation.from_euler("xyz", joint.rpy).as_matrix())
-        pose[:3, 3] = torch.tensor(joint.xyz)
+        pose[:3, 3] = torch.tensor(joint.xyz, dtype=torch.float64)
         kind = "fixed" if not joint.moves else "prismatic" if joint.type == "prismatic" else "revolute"
         axis = torch.tensor(joint.axis, dtype=torch.float64)
         offset = pk.Transform3d(matrix=pose[None].to(dtype), dtype=dtype)

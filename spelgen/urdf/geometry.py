@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 import os
@@ -11,22 +12,18 @@ import zipfile
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import isfinite
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from lxml import etree
-from scipy.spatial.transform import Rotation
 
 from spelgen.urdf import mesh_child
 from spelgen.urdf.document import urdf_bytes
 
 Mesh = tuple[np.ndarray, np.ndarray]
-PRIMITIVES = {"box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",)}
-"""Attributes of the shapes that are no meshes."""
-COUNTS = {"box": 3, "cylinder": 2, "sphere": 1}
-"""Numbers in these attributes."""
+COUNTS = {"box": 3, "cylinder": 2, "sphere": 1, "mesh": 3}
+"""Numbers of the size of each shape."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,31 +103,38 @@ def mesh_file(urdf: Path, name: str) -> Path:
 
 
 def _shape(link: str, element: etree._Element) -> LinkShape:
-    """Return a shape, a mesh without its triangles. Raises ValueError with the kind of an invalid shape."""
-    pose = np.eye(4)
-    origin = element.find("origin")
-    if origin is not None:
-        pose[:3, 3] = _numbers(origin.get("xyz", "0 0 0"), 3)
-        pose[:3, :3] = Rotation.from_euler("xyz", _numbers(origin.get("rpy", "0 0 0"), 3)).as_matrix()
-    for kind, names in PRIMITIVES.items():
-        primitive = element.find(f"geometry/{kind}")
-        if primitive is not None:
-            size = _numbers(" ".join(primitive.get(name, "") for name in names), COUNTS[kind])
-            if min(size) < 0:
-                raise ValueError(f"a {kind} of negative size")
-            return LinkShape(link, kind, size, pose)
-    mesh = element.find("geometry/mesh")
-    if mesh is None:
-        raise ValueError("no box, cylinder, sphere or mesh")
-    return LinkShape(link, "mesh", _numbers(mesh.get("scale", "1 1 1"), 3), pose, mesh.get("filename", ""))
+    """Return a shape as read by yourdfpy, a mesh without its triangles. Raises ValueError for an invalid shape."""
+    import yourdfpy  # imports trimesh, which takes long
 
-
-def _numbers(text: str, count: int) -> tuple[float, ...]:
-    """Return `count` finite numbers. Raises ValueError."""
-    values = tuple(map(float, text.split()))
-    if len(values) != count or not all(map(isfinite, values)):
-        raise ValueError(f"not {count} numbers: {text!r}")
-    return values
+    # a file of one shape: an invalid shape does not affect the others
+    root = etree.Element("robot", name=link)
+    collision = etree.SubElement(etree.SubElement(root, "link", name=link), "collision")
+    collision.extend(copy.deepcopy(child) for child in element if child.tag in ("origin", "geometry"))
+    try:
+        file = io.BytesIO(etree.tostring(root))
+        model = yourdfpy.URDF.load(file, build_scene_graph=False, load_meshes=False)
+        (shape,) = model.robot.links[0].collisions
+        geometry = shape.geometry
+        pose = np.eye(4) if shape.origin is None else np.asarray(shape.origin)
+        file_name = ""
+        if geometry.box is not None:
+            kind, size = "box", geometry.box.size
+        elif geometry.cylinder is not None:
+            kind, size = "cylinder", (geometry.cylinder.radius, geometry.cylinder.length)
+        elif geometry.sphere is not None:
+            kind, size = "sphere", geometry.sphere.radius
+        else:
+            kind, size, file_name = (
+                "mesh",
+                1.0 if geometry.mesh.scale is None else geometry.mesh.scale,
+                geometry.mesh.filename,
+            )
+        numbers = np.broadcast_to(np.asarray(size, dtype=float), COUNTS[kind])
+    except Exception as error:  # of any type, from attributes that are absent or are not numbers
+        raise ValueError("a shape that is not valid") from error
+    if not (np.isfinite(pose).all() and np.isfinite(numbers).all()) or (kind != "mesh" and numbers.min() < 0):
+        raise ValueError(f"a {kind} of negative or infinite size or place")
+    return LinkShape(link, kind, tuple(numbers.tolist()), pose, file_name or "")
 
 
 def _meshes(urdf: Path, shapes: Sequence[LinkShape], faces: int) -> dict[tuple[str, tuple[float, ...]], Mesh]:
