@@ -320,6 +320,12 @@ def test_the_payload_is_the_map_estimate(offset):
     assert ours < best + 1e-4 * abs(best)
 
 
+def test_an_indefinite_covariance_is_no_payload_and_no_error():
+    covariance = np.diag(LOAD_PRIOR**2.0)
+    covariance[0, 0] = -1e-9
+    assert find_payload(PAYLOAD, covariance, 1.5).status == "not yet"
+
+
 def test_noise_levels_are_those_of_the_residuals():
     """White noise and an Ornstein-Uhlenbeck process of known size, under drifting friction and an offset."""
     random = np.random.default_rng(0)

@@ -12,7 +12,7 @@ from spelgen.live.payload import Payload
 from spelgen.live.tuning import TUNING
 
 
-class Contact(NamedTuple):
+class ContactState(NamedTuple):
     """External torques and their thresholds, (n,) [Nm, N]; touched: joints above, (n,); force: at the tip, (3,) [N]."""
 
     external_torque: np.ndarray
@@ -38,13 +38,15 @@ class ContactObserver:
         self.t: float | None = None
         self.inputs, self.load_inputs = np.zeros((5, n)), np.zeros((n, 10))
 
-    def step(self, t: float, qd: np.ndarray, at: Balance, payload: Payload, scale: np.ndarray) -> Contact:
+    def step(
+        self, t: float, qd: np.ndarray, at: Balance, payload: Payload, scale: np.ndarray
+    ) -> ContactState:
         """Use the terms of a sample; scale: friction scale minus one, (n,)."""
         signal, variance = self.residual(t, qd, at, payload, scale)
         threshold = self.factor * np.sqrt(variance)
         touched = np.abs(signal) > threshold
         force = tip_force(at.jacobian, -signal, variance) if touched.any() else np.zeros(3)
-        return Contact(-signal, threshold, touched, force)
+        return ContactState(-signal, threshold, touched, force)
 
     def residual(
         self, t: float, qd: np.ndarray, at: Balance, payload: Payload, scale: np.ndarray

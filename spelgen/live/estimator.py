@@ -14,7 +14,7 @@ from spelgen.dynamics.protocol import is_stateful
 from spelgen.errors import RunError
 from spelgen.fitting.fitted import Fit
 from spelgen.live.blocks import Block, Blocks, joined
-from spelgen.live.contact import Contact, ContactObserver
+from spelgen.live.contact import ContactObserver, ContactState
 from spelgen.live.cross_validation import noise_levels
 from spelgen.live.filters import DriftFilter
 from spelgen.live.hypotheses import PayloadEstimate
@@ -31,14 +31,14 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 class EstimatorState:
     """Result of a step; vectors are (n,).
 
-    t [s]. refusal: "used", or why the sample was not. contact: see `Contact`. payload: as reported last.
+    t [s]. refusal: "used", or why the sample was not. contact: see `ContactState`. payload: as reported last.
     load_changed: whether the payload became another one in this step. friction_scale: friction of now relative to the
     model [1]. disturbance: slow torque that neither model nor payload explains [Nm, N].
     """
 
     t: float
     refusal: Refusal
-    contact: Contact
+    contact: ContactState
     payload: Payload
     load_changed: bool
     friction_scale: np.ndarray
@@ -80,7 +80,7 @@ class Estimator:
         self.payload = NO_REPORT
         self.half: Block | None = None
         self.reported = 0.0
-        self.contact = Contact(np.zeros(n), np.zeros(n), np.zeros(n, dtype=bool), np.zeros(3))
+        self.contact = ContactState(np.zeros(n), np.zeros(n), np.zeros(n, dtype=bool), np.zeros(3))
 
     @property
     def refused(self) -> dict[str, int]:

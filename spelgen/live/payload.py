@@ -64,8 +64,16 @@ NO_REPORT = Payload()
 def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float) -> Payload:
     """Return the payload for the estimate of the payload filter, mean (10,) and covariance (10, 10).
 
-    factor: on the covariance of the likelihood.
+    factor: on the covariance of the likelihood. "not yet" also if rounding errors make a matrix indefinite.
     """
+    try:
+        return _found_payload(mean, covariance, factor)
+    except np.linalg.LinAlgError:
+        return NO_REPORT
+
+
+def _found_payload(mean: np.ndarray, covariance: np.ndarray, factor: float) -> Payload:
+    """Return the payload, as `find_payload`. Raises LinAlgError if a matrix is not positive definite."""
     precision = _inverse(covariance)
     linear = precision @ mean / factor
     precision = (precision - np.diag(LOAD_PRIOR**-2.0)) / factor
