@@ -199,7 +199,15 @@ def by_preset(preset: str) -> Method:
     def fitted(problem: Problem) -> Prediction:
         model = spelgen.build(problem.fold.urdf, preset)
         fit = spelgen.fit(model, problem.logs, preprocessing=problem.preprocessing, arm=problem.fold.urdf)
-        return Prediction(torque_of(fit.model))
+        if preset != DEFAULT:
+            return Prediction(torque_of(fit.model))
+        posterior = fit.posterior
+
+        def std(x: DynamicsSamples) -> np.ndarray:
+            past = [state for state in (x.z, x.direction) if state is not None]
+            return posterior.torque(x.q, x.qd, x.qdd, *past).std
+
+        return Prediction(torque_of(fit.model), std)
 
     return fitted
 
