@@ -57,13 +57,18 @@ def samples(missing: torch.Tensor, q: torch.Tensor) -> ResidualSamples:
     return ResidualSamples(q, still, still, missing, torch.ones_like(q))
 
 
+def data(correlation_length: float, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Correlation length, recordings and torque of one recording of two joints."""
+    return torch.full((2,), correlation_length), torch.zeros(count).long(), torch.full((2,), 4.0).double()
+
+
 def test_what_the_samples_of_one_stretch_say_is_judged_on_others(hybrid):
-    """The first joint moves slowly through its range, and what is missed is another constant on each way."""
+    """The first joint moves slowly through its range, and the residual is another constant in each direction."""
     levels = torch.randn(10, 1, generator=torch.Generator().manual_seed(3)).double()
     missing = levels.repeat_interleave(200, dim=0) * torch.tensor([[1.0, 0.0]]).double()
     q = torch.stack([torch.linspace(-2, 2, 2000), torch.zeros(2000)], dim=1).double()
     # a function of q explains nearly all of it, and nothing where it was not fitted
-    assert select_functions(hybrid, samples(missing, q), ALONE, [], torch.full((2,), 1.0)) == []
+    assert select_functions(hybrid, samples(missing, q), ALONE, [], *data(1.0, len(q))) == []
 
 
 def test_neighbours_of_what_is_held_out_are_not_fitted_to(hybrid):
@@ -73,19 +78,19 @@ def test_neighbours_of_what_is_held_out_are_not_fitted_to(hybrid):
     q = torch.stack([torch.linspace(-2, 2, 2000), torch.zeros(2000)], dim=1).double()
     missed = samples(missing, q)
     spline = next(joint_functions.joint_functions(hybrid, missed, ALONE))
-    errors, _ = selection._cross_validate(spline, missing[:, 0], 40.0)
+    errors, _ = selection._cross_validate(spline, missing[:, 0], 40.0, torch.zeros(2000).long())
     assert errors.square().sum() > missing.square().sum()
-    assert select_functions(hybrid, missed, ALONE, [], torch.full((2,), 40.0)) == []
+    assert select_functions(hybrid, missed, ALONE, [], *data(40.0, len(q))) == []
 
 
 def test_what_the_first_half_shows_has_to_hold_in_the_last(hybrid):
-    """All tenths gain by the mean of both halves; the last loses by what the first half shows."""
+    """All tenths gain by the mean of both halves; the last loses by the data of the first half."""
     t = torch.linspace(0, 200, 4000).double()
     q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
     missing = torch.stack([torch.sin(q[:, 0]), torch.zeros_like(t)], dim=1)
     for later, selected in ((0.45, 0), (0.75, 1)):
         missing[2000:] = later * torch.sin(q[2000:])
-        found = select_functions(hybrid, samples(missing, q), ALONE, [], torch.full((2,), 1.0))
+        found = select_functions(hybrid, samples(missing, q), ALONE, [], *data(1.0, len(q)))
         assert len(found) == selected
 
 
@@ -102,7 +107,7 @@ def test_the_first_half_is_judged_where_it_has_been(hybrid):
     weights = spline.fit(missed.torque_residual[:, 0], 1.0, first).coef
     error = missed.torque_residual[last, 0] - spline.torque(weights, last)
     assert error.square().sum() > missed.torque_residual[last, 0].square().sum()
-    selected = select_functions(hybrid, missed, ALONE, [], torch.full((2,), 1.0))
+    selected = select_functions(hybrid, missed, ALONE, [], *data(1.0, len(q)))
     assert [(residual.name, residual.joint) for residual in selected] == [("raw_torque_splines", 0)]
 
 
@@ -112,12 +117,12 @@ def test_a_gain_in_one_of_ten_stretches_is_luck(hybrid):
     everywhere = torch.stack([torch.sin(q[:, 0]), torch.zeros_like(t)], dim=1)
     noise = torch.randn(4000, 2, generator=torch.Generator().manual_seed(0)).double()
     noise[:, 1] = 0.0
-    found = select_functions(hybrid, samples(everywhere + 0.1 * noise, q), ALONE, [], torch.full((2,), 1.0))
+    found = select_functions(hybrid, samples(everywhere + 0.1 * noise, q), ALONE, [], *data(1.0, len(q)))
     # of the functions that explain it the best one is selected, and none of the joint that misses nothing
     assert [(residual.name, residual.joint) for residual in found] == [("raw_torque_splines", 0)]
     # in one stretch it is so, in the others the torque is nearly nothing: held out it gains in one at most
     once = everywhere * (torch.arange(4000) < 400).unsqueeze(-1)
-    assert select_functions(hybrid, samples(0.3 * once + noise, q), ALONE, [], torch.full((2,), 1.0)) == []
+    assert select_functions(hybrid, samples(0.3 * once + noise, q), ALONE, [], *data(1.0, len(q))) == []
 
 
 def test_a_stretch_without_torque_hides_no_gain():
@@ -136,7 +141,7 @@ def test_a_stretch_that_goes_farther_than_all_others_hides_no_gain():
 
 
 def test_a_network_is_fitted_to_what_functions_of_joints_leave(robots, monkeypatch):
-    """Both networks are to give what is missed, beside the torque that functions of joints give already."""
+    """Both networks are to explain the residual of the functions of joints."""
     model = build(robots / "two_link.urdf", "hybrid", width=8)
     torch.nn.init.constant_(model.residuals.raw_torque_splines, 3.0)
     left = []
@@ -165,7 +170,7 @@ def test_gains_have_to_be_beyond_their_own_scatter():
 
 
 def test_samples_that_err_alike_count_once():
-    """Each sample twenty times, with errors that are the same, says what it says once."""
+    """Each sample twenty times, with equal errors, has the evidence of one."""
     draw = torch.Generator().manual_seed(0)
     x = torch.randn(300, 4, generator=draw).double()
     y = x @ torch.tensor([0.1, 0.0, -0.2, 0.3]).double() + torch.randn(300, generator=draw).double()
@@ -219,7 +224,7 @@ def test_intervals_of_errors_that_last_are_wider():
 
 @pytest.mark.parametrize("correlation", [1.0, 5.0])
 def test_the_first_noise_is_that_of_least_squares(correlation):
-    """Of two joints, one with three weights of its own: what is missed, with a sample fewer for every weight, and with
+    """Of two joints, one with three weights of its own: the residual, with a sample fewer for every weight, and with
     more where errors last.
     """
     draw = torch.Generator().manual_seed(0)

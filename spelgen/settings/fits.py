@@ -83,7 +83,7 @@ class GaussianPrior(Group):
     shared_velocities: NonNegative = 1.0
     shared_fractions: NonNegative = 3.0
     shared_friction: NonNegative = 3.0
-    friction_compensation: Positive = 1000.0
+    friction_compensation: Positive = 100.0
     degrees_of_freedom: Positive = 4.0
 
 

@@ -20,7 +20,13 @@ from spelgen.fitting.levenberg_marquardt import Termination
 from spelgen.fitting.torque.covariance import parameter_covariance
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import limit_friction
-from spelgen.fitting.torque.problem import TorqueEstimate, TorqueProblem, refine, with_correlation_time
+from spelgen.fitting.torque.problem import (
+    TorqueEstimate,
+    TorqueProblem,
+    held_out_nmse,
+    refine,
+    with_correlation_time,
+)
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.selection import SelectedTerm
 from spelgen.fitting.torque.stages import (
@@ -52,8 +58,8 @@ class TorqueSolution:
 
     rms_residual: (n,) root mean square torque residual [Nm, N]. steps, cost: of the solver, at the end. prior: standard
     deviations as estimated. covariance, torque_std: see `ParameterCovariance`. compensated: (n,) joints whose drives
-    compensate friction. correlation_time: (n,) of the torque errors [s]. selected_terms: residual terms. stages: in
-    order.
+    compensate friction. correlation_time: (n,) of the torque errors [s]. held_out_nmse: (n,) mean squared error of
+    held-out segments, divided by the variance of the torque. selected_terms: residual terms. stages: in order.
     """
 
     rms_residual: np.ndarray
@@ -64,6 +70,7 @@ class TorqueSolution:
     torque_std: torch.Tensor
     compensated: np.ndarray
     correlation_time: np.ndarray
+    held_out_nmse: np.ndarray
     selected_terms: tuple[SelectedTerm, ...]
     stages: tuple[FitStage, ...]
 
@@ -106,6 +113,7 @@ def fit_torque(
         torque_std=uncertainty.torque_std,
         compensated=estimate.problem.compensated.numpy(),
         correlation_time=estimate.problem.correlation_time.numpy(),
+        held_out_nmse=held_out_nmse(estimate, samples).numpy(),
         selected_terms=tuple(selected),
         stages=tuple(stages),
     )

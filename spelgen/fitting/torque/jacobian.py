@@ -116,14 +116,14 @@ class TorqueJacobian:
         if self.terms:
             rows = self._projected(rows)
         curvature, descent = linearization.normal_equations(rows, noise, len(x))
-        change = self._theta_jacobian(x)
+        change = self.theta_jacobian(x)
         return change.mT @ curvature @ change, change.mT @ descent
 
     def joint_rows(self, x: torch.Tensor) -> Iterator[JointRows]:
         """Yield the Jacobian of each joint and block with respect to theta (K,), at x (K,).
 
         theta is x with the inertial parameters in place of their log-Cholesky parameters: there the Jacobian is the
-        regressor, without a derivative to compute. `_theta_jacobian` is d theta / d x.
+        regressor, without a derivative to compute. `theta_jacobian` is d theta / d x.
         """
         parameters, scale = self.rigid.unflatten(x), self.logged_scale(x)
         body_columns = self._of_bodies.nonzero()[:, 0]
@@ -149,7 +149,7 @@ class TorqueJacobian:
                 jacobian, residual = terms.residual(of_joint.jacobian), terms.residual(of_joint.residual)
                 yield of_joint._replace(jacobian=jacobian, residual=residual)
 
-    def _theta_jacobian(self, x: torch.Tensor) -> torch.Tensor:
+    def theta_jacobian(self, x: torch.Tensor) -> torch.Tensor:
         """Return d theta / d x, (K, K): block diagonal over bodies, identity for all other parameters."""
         parameters = self.rigid.unflatten(x)
         # ten copies of the bodies' parameters, so that one reverse pass has the gradients of all ten entries of theta:
@@ -182,7 +182,7 @@ class TorqueJacobian:
             noise: (n,) standard deviations [Nm, N].
             covariance: (K, K) posterior covariance of x.
         """
-        change = self._theta_jacobian(x)
+        change = self.theta_jacobian(x)
         covariance = change @ covariance @ change.mT
         rows = concatenate_blocks(self.joint_rows(x), len(noise))
         gains = []

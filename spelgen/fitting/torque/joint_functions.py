@@ -30,7 +30,7 @@ TermKey = tuple[str, int | None]
 """Parameter of a residual term, and its joint; None: all joints."""
 
 ALL = slice(None)
-FRICTION = "raw_friction_splines"
+TORQUE, FRICTION, RIPPLE = "raw_torque_splines", "raw_friction_splines", "raw_torque_ripple"
 LOG_FACTOR_LIMIT = 0.99 * LARGEST  # of friction's log factor: at LARGEST its parameter is infinite
 
 
@@ -48,6 +48,8 @@ class JointFunction:
     groups: (P,) index of the weights' group, which has one prior precision.
     friction: (T,) friction torque that the term multiplies; its weights are then the ones of the factor's logarithm,
         and columns @ weights is its torque to first order. None: the term is a torque.
+    visit_length: number of samples per visit of a position: a joint visits a position anew after it has moved by the
+        distance between two splines.
     """
 
     parameter: str
@@ -60,6 +62,7 @@ class JointFunction:
     trends: torch.Tensor
     groups: torch.Tensor
     friction: torch.Tensor | None
+    visit_length: float
 
     def read(self, terms: ResidualTerms) -> torch.Tensor:
         """Return weights (P,) that represent the model's current parameter."""
@@ -78,7 +81,7 @@ class JointFunction:
         with torch.no_grad():
             terms.get_parameter(self.parameter)[self.joint] = entries / self.scale
 
-    def torque(self, weights: torch.Tensor, rows: slice = ALL) -> torch.Tensor:
+    def torque(self, weights: torch.Tensor, rows: slice | torch.Tensor = ALL) -> torch.Tensor:
         """Return the torque (T,) [Nm, N] of weights (P,) on the samples of these rows."""
         features = self.features[rows]
         if self.friction is None:
@@ -92,10 +95,13 @@ class JointFunction:
         weight = self.direction / noise.square()
         return (torque_residual @ weight) / (self.direction @ weight)
 
-    def fit(self, target: torch.Tensor, correlation_length: float, rows: slice = ALL) -> BayesianRidge:
-        """Return the fit to a target (T,) on the samples of these rows."""
+    def fit(
+        self, target: torch.Tensor, correlation_length: float, rows: slice | torch.Tensor = ALL
+    ) -> BayesianRidge:
+        """Return the fit to a target (T,) on the samples of these rows: samples of one visit count as one error."""
         samples = append_target(self.features[rows], target[rows])
-        return bayesian_ridge(samples.mT @ samples, len(samples), self.groups, correlation_length)
+        length = max(correlation_length, self.visit_length)
+        return bayesian_ridge(samples.mT @ samples, len(samples), self.groups, length)
 
 
 class ProjectedTerms(NamedTuple):
@@ -178,14 +184,15 @@ def joint_functions(
     with torch.no_grad():
         splines, ripple = terms.splines(samples.q), terms.revolute * terms.waves(samples.q)
     joints, unit = torch.eye(len(motors)).to(motors), terms.unit.flatten()
+    visits = 1 + samples.q.diff(dim=0).abs().sum(dim=0) / terms.spacing.flatten()
     one_group, frequencies = torch.zeros(SPLINES), torch.arange(ripple.shape[-1] // 2).repeat(2)
     line = torch.linspace(-1, 1, SPLINES).double().unsqueeze(-1)
     friction = splines * samples.friction.unsqueeze(-1)
     no_line, no_trend = line[:, :0], torch.zeros(len(frequencies), 0).double()
     forms = (
-        ("raw_torque_splines", splines, unit, joints, line, F.pad(one_group + 1, (1, 0))),
+        (TORQUE, splines, unit, joints, line, F.pad(one_group + 1, (1, 0))),
         (FRICTION, friction, torch.ones(len(motors)), motors, no_line, one_group),
-        ("raw_torque_ripple", ripple, unit, joints, no_trend, frequencies),
+        (RIPPLE, ripple, unit, joints, no_trend, frequencies),
     )
     for parameter, values, scale, directions, trends, groups in forms:
         for joint in range(len(motors)):
@@ -207,6 +214,7 @@ def joint_functions(
                 trends=trends,
                 groups=groups,
                 friction=samples.friction[:, joint] if of_friction else None,
+                visit_length=len(samples.q) / float(visits[joint]),
             )
 
 

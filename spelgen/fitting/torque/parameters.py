@@ -8,6 +8,7 @@ single joint.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -192,6 +193,11 @@ class ParameterPrior:
     widths: GaussianPrior
     hyperprior: GaussianPrior
     mean: torch.Tensor
+
+    @property
+    def plausible(self) -> bool:
+        """Whether the width of the bodies' parameters is that of a URDF of this arm."""
+        return math.exp(self.widths.bodies) <= TUNING.wrong_urdf
 
     @cached_property
     def precision(self) -> torch.Tensor:

@@ -30,6 +30,7 @@ from spelgen.fitting.torque.linearization import (
     NO_TERMS,
     LinearTerms,
     RigidProjection,
+    concatenate_blocks,
     least_squares_residual,
 )
 from spelgen.fitting.torque.parameters import ParameterPrior, update_widths
@@ -216,6 +217,16 @@ class TorqueEstimate:
         normal = self.problem.normal_equations(self.state.x, self.state.residual)
         return replace(self, covariance=self.problem.covariance(normal.curvature))
 
+    def on_segments(self, samples: TorqueSamples) -> TorqueEstimate:
+        """Return the estimate on segments of samples, with the noise of their interval and the current covariance."""
+        jacobian = TorqueJacobian(
+            self.problem.jacobian.model, samples.segments(TUNING.segment, TUNING.initial_samples)
+        )
+        segments = self.with_current_covariance().with_jacobian(jacobian)
+        length = segments.problem.noise_estimator.correlation_length
+        noise = self.problem.noise * (length / self.problem.noise_estimator.correlation_length).sqrt()
+        return replace(segments, problem=replace(segments.problem, noise=noise))
+
     def linearize(self) -> tuple[ResidualSamples, RigidProjection]:
         """Return the torque residual, and the projection of joint torques onto the rigid-body and friction model.
 
@@ -264,17 +275,34 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     It is estimated once, after friction was chosen. In the outer iterations it would drive itself up: a joint with a
     long correlation time has a small weight, and its residual grows. Friction without history has errors of its own.
     """
-    problem, x = estimate.problem, estimate.state.x
-    segments = samples.segments(TUNING.segment, TUNING.initial_samples)
-    jacobian = TorqueJacobian(problem.jacobian.model, segments)
-    current, prior_mean = NoiseEstimator.of(jacobian, problem.correlation_time), TUNING.correlation_time
-    scale = (current.correlation_length / problem.noise_estimator.correlation_length).sqrt()
-    covariance = estimate.with_current_covariance().covariance
-    projection = jacobian.rigid_projection(x, scale * problem.noise, covariance)
-    residual = jacobian.residual_samples(x).torque_residual
-    errors = projection.errors(residual, segments.segment_length(TUNING.segment))
-    observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * segments.interval
-    weight = segments.count * segments.interval / prior_mean / TUNING.correlation_weight
+    segments, problem, prior_mean = estimate.on_segments(samples), estimate.problem, TUNING.correlation_time
+    residual, projection = segments.linearize()
+    interval, size = segments.problem.jacobian.samples.interval, samples.segment_length(TUNING.segment)
+    errors = projection.errors(residual.torque_residual, size)
+    observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * interval
+    weight = len(residual.q) * interval / prior_mean / TUNING.correlation_weight
     mean = (weight * observed + prior_mean) / (weight + 1)
     noise = problem.noise * (mean / problem.correlation_time).sqrt()
     return replace(estimate, problem=replace(problem, noise=noise, correlation_time=mean))
+
+
+def held_out_nmse(estimate: TorqueEstimate, samples: TorqueSamples) -> torch.Tensor:
+    """Return the mean squared error (n,) of held-out segments, divided by the variance of the torque.
+
+    A fit to all other segments has the residual (1 - H)^-1 r on a segment, with its residual r and its block H of the
+    hat matrix of all joints, to first order in the change of the parameters.
+    """
+    segments, size = estimate.on_segments(samples), samples.segment_length(TUNING.segment)
+    jacobian, x, noise = segments.problem.jacobian, segments.state.x, segments.problem.noise
+    weighted = torch.zeros(len(noise), jacobian.samples.count, len(x)).double()
+    for joint, columns, of_joint, _ in concatenate_blocks(jacobian.joint_rows(x), len(noise)):
+        weighted[joint, :, columns] = of_joint / noise[joint]
+    weighted = weighted @ jacobian.theta_jacobian(x)
+    residual = (jacobian.residual_samples(x).torque_residual * jacobian.logged_scale(x) / noise).mT
+    error = torch.zeros_like(residual)
+    for start in range(0, residual.shape[1], size):
+        rows = slice(start, start + size)
+        block = weighted[:, rows].flatten(0, 1)
+        kept = torch.eye(len(block)).double() - block @ segments.covariance @ block.mT
+        error[:, rows] = torch.linalg.solve(kept, residual[:, rows].flatten()).view(len(noise), -1)
+    return error.square().mean(dim=1) * (noise / estimate.problem.noise_estimator.torque_std).square()

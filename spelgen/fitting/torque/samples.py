@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -36,16 +36,20 @@ class TorqueSamples:
     """Samples of all trajectories, concatenated.
 
     original_count: number of samples before decimation and subsampling. interval: between successive samples [s].
+    recordings: (T,) index of the recording of each sample.
     """
 
     columns: SampleBlock
     original_count: int
     interval: float
+    recordings: torch.Tensor
 
     @classmethod
     def of(cls, trajectories: Iterable[DynamicsSamples], decimation: int = 1) -> TorqueSamples:
         """Return every `decimation`-th sample of each trajectory."""
         decimated, count, interval = [], 0, 0.0
+        names: dict[str, int] = {}
+        recordings = []
         for x in trajectories:
             columns = (x.q, x.qd, x.qdd, x.tau, x.z, x.direction)
             # copies: a view would keep all samples in memory
@@ -53,7 +57,9 @@ class TorqueSamples:
                 [None if column is None else np.ascontiguousarray(column[::decimation]) for column in columns]
             )
             count, interval = count + len(x.q), decimation / x.rate
-        return cls(SampleBlock._make(map(_concatenated, zip(*decimated, strict=True))), count, interval)
+            recordings.append(torch.full((len(x.q[::decimation]),), names.setdefault(x.name, len(names))))
+        table = SampleBlock._make(map(_concatenated, zip(*decimated, strict=True)))
+        return cls(table, count, interval, torch.cat(recordings))
 
     @property
     def count(self) -> int:
@@ -71,19 +77,18 @@ class TorqueSamples:
         starts = torch.linspace(0, self.count - size, number).long()
         rows = (starts.unsqueeze(-1) + torch.arange(size)).flatten()
         columns = SampleBlock._make(None if column is None else column[rows] for column in self.columns)
-        return TorqueSamples(columns, self.original_count, self.interval)
+        return replace(self, columns=columns, recordings=self.recordings[rows])
 
     def subsampled(self, max_count: int) -> TorqueSamples:
         """Return at most `max_count` samples, evenly spaced; this object itself if it has no more."""
         step = -(-self.count // max_count)
         if step <= 1:
             return self
-        columns = self.columns.select(slice(None, None, step))
-        return TorqueSamples(columns, self.original_count, step * self.interval)
+        return replace(self.select(slice(None, None, step)), interval=step * self.interval)
 
     def select(self, rows: slice) -> TorqueSamples:
         """Return the samples of these rows."""
-        return TorqueSamples(self.columns.select(rows), self.original_count, self.interval)
+        return replace(self, columns=self.columns.select(rows), recordings=self.recordings[rows])
 
     def blocks(self, size: int) -> Iterator[SampleBlock]:
         """Yield all samples in order, at most `size` at a time."""

@@ -1,16 +1,17 @@
 """Selection of single-joint residual terms by cross-validation of the torque residual.
 
-Each candidate is fitted with 10-fold cross-validation over contiguous blocks, with a gap on both sides of the held-out
-block, since successive errors are correlated. It is accepted if its mean relative error reduction over the blocks is
-significant (one-sided t test, 1 %), and if, fitted to the first half, it also lowers the error on the last half: often
-one motion repeats errors that another motion does not have. If no candidate of a joint is accepted, both tests are
+With several recordings one recording is held out at a time; with one, one of ten contiguous blocks, with a gap on both
+sides, since successive errors are correlated. A candidate is accepted if its mean relative error reduction over ten
+blocks is significant (one-sided t test, 1 %, or 0.1 % for one recording), and if, fitted to the first half, it also
+lowers the error on the last half: often one motion repeats errors that another motion does not have. With one
+recording its torque must be plausible, too (`max_torques`). If no candidate of a joint is accepted, both tests are
 repeated with the held-out samples at positions within the range of the fitted samples, since splines do not
 extrapolate. Of the accepted candidates of a joint the one with the largest error reduction is selected.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -18,8 +19,16 @@ import torch
 
 from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.torque.jacobian import ResidualSamples
-from spelgen.fitting.torque.joint_functions import JointFunction, TermKey, joint_functions, rms_per_joint
-from spelgen.fitting.torque.linearization import RigidProjection, append_target, bayesian_ridge
+from spelgen.fitting.torque.joint_functions import (
+    FRICTION,
+    RIPPLE,
+    TORQUE,
+    JointFunction,
+    TermKey,
+    joint_functions,
+    rms_per_joint,
+)
+from spelgen.fitting.torque.linearization import RigidProjection
 from spelgen.fitting.torque.tuning import SELECTION
 
 
@@ -64,6 +73,8 @@ def select_functions(
     projection: RigidProjection,
     selected: Collection[TermKey],
     correlation_length: torch.Tensor,
+    recordings: torch.Tensor,
+    torque_std: torch.Tensor,
 ) -> list[SelectedTerm]:
     """Return the term selected per joint, for joints with an accepted candidate.
 
@@ -73,17 +84,37 @@ def select_functions(
         projection: of the rigid-body and friction model.
         selected: terms that the model has already.
         correlation_length: (n,) number of samples per independent error.
+        recordings: (T,) index of the recording of each sample.
+        torque_std: (n,) standard deviation of the torque [Nm, N].
     """
     noise, joints = rms_per_joint(samples.torque_residual), range(samples.q.shape[1])
     candidates: list[list[JointFunction]] = [[] for _ in joints]
     for candidate in joint_functions(model, samples, projection):
         if (candidate.parameter, candidate.joint) not in selected:
             candidates[candidate.joint].append(candidate)
+    limits = None if recordings.any() else max_torques(model, samples.q, torque_std)
     best = (
-        _best(of_joint, samples.torque_residual, noise, float(length))
+        _best(of_joint, samples.torque_residual, noise, float(length), recordings, limits)
         for of_joint, length in zip(candidates, correlation_length, strict=True)
     )
     return [term for term in best if term is not None]
+
+
+def max_torques(model: ArmModel, q: torch.Tensor, torque_std: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Return the largest plausible standard deviation (n,) [Nm, N] of a torque of position, by its parameter.
+
+    It bounds terms that one recording supports. A smooth torque balances a load, as springs and gas cylinders do, so a
+    joint that gravity does not load has none.
+
+    Args:
+        model: fitted model.
+        q: (T, n) positions [rad, m].
+        torque_std: (n,) standard deviation of the torque [Nm, N].
+    """
+    with torch.no_grad():
+        loaded = model.gravity(q).std(dim=0) > SELECTION.min_load_fraction * torque_std
+    limit = SELECTION.max_torque_fraction * torque_std
+    return {RIPPLE: limit, TORQUE: limit * loaded, FRICTION: torch.full_like(limit, torch.inf)}
 
 
 def _best(
@@ -91,23 +122,28 @@ def _best(
     torque_residual: torch.Tensor,
     noise: torch.Tensor,
     correlation_length: float,
+    recordings: torch.Tensor,
+    limits: dict[str, torch.Tensor] | None,
 ) -> SelectedTerm | None:
     """Return the accepted candidate of one joint with the largest error reduction, or None.
 
-    torque_residual: (T, n). noise: (n,).
+    torque_residual: (T, n). noise: (n,). recordings: (T,). limits: `max_torques` of one recording; None: several.
     """
+    significance = SELECTION.standard_errors if limits is None else SELECTION.standard_errors_of_one
     first, last = split_halves(len(torque_residual), correlation_length)
     best = best_within = None
     for candidate in candidates:
         target = candidate.target(torque_residual, noise)
-        error, within = _cross_validate(candidate, target, correlation_length)
-        reduction = significant_reduction(block_squares(target), block_squares(error))
+        error, within = _cross_validate(candidate, target, correlation_length, recordings)
+        reduction = significant_reduction(block_squares(target), block_squares(error), significance)
         reduction_within = significant_reduction(
-            block_squares(target * within), block_squares(error * within)
+            block_squares(target * within), block_squares(error * within), significance
         )
         if reduction is None and reduction_within is None:
             continue
         weights = candidate.fit(target, correlation_length, first).coef
+        if limits and candidate.torque(weights).std() > limits[candidate.parameter][candidate.joint]:
+            continue
         before, after = target[last].square(), (target - candidate.torque(weights))[last].square()
         if reduction is not None and after.sum() < before.sum():
             best = _better(best, SelectedTerm(candidate.parameter, candidate.joint, reduction))
@@ -134,23 +170,34 @@ def _blocks(count: int) -> list[slice]:
     return [slice(start, stop) for start, stop in pairwise(edges)]
 
 
+def _folds(recordings: torch.Tensor, gap: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+    """Yield masks (T,) of the held-out and of the fitted samples: of recordings (T,), or of blocks of one recording."""
+    number = int(recordings.max()) + 1
+    if number == 1:
+        rows = torch.arange(len(recordings))
+        for block in _blocks(len(recordings)):
+            held_out = (rows >= block.start) & (rows < block.stop)
+            yield held_out, (rows < block.start - gap) | (rows >= block.stop + gap)
+        return
+    folds = min(number, SELECTION.folds)
+    for fold in range(folds):
+        held_out = recordings * folds // number == fold
+        yield held_out, ~held_out
+
+
 def _cross_validate(
-    candidate: JointFunction, target: torch.Tensor, correlation_length: float
+    candidate: JointFunction, target: torch.Tensor, correlation_length: float, recordings: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the held-out error (T,) of all blocks, each after a fit to the others, and a mask (T,) of the held-out
+    """Return the held-out error (T,) of all folds, each after a fit to the others, and a mask (T,) of the held-out
     positions within the range of the fitted ones.
     """
-    rows, gap = append_target(candidate.features, target), _gap(correlation_length)
-    all_products = rows.mT @ rows
-    errors, within, position = [], [], candidate.position
-    for block in _blocks(len(target)):
-        excluded = slice(max(0, block.start - gap), block.stop + gap)
-        fitted = torch.cat([position[: excluded.start], position[excluded.stop :]])
-        products = all_products - rows[excluded].mT @ rows[excluded]
-        fit = bayesian_ridge(products, len(fitted), candidate.groups, correlation_length)
-        errors.append(target[block] - candidate.torque(fit.coef, block))
-        within.append(within_range(position[block], fitted))
-    return torch.cat(errors), torch.cat(within)
+    position = candidate.position
+    error, within = torch.zeros_like(target), torch.zeros_like(target, dtype=torch.bool)
+    for held_out, fitted in _folds(recordings, _gap(correlation_length)):
+        fit = candidate.fit(target, correlation_length, fitted)
+        error[held_out] = target[held_out] - candidate.torque(fit.coef, held_out)
+        within[held_out] = within_range(position[held_out], position[fitted])
+    return error, within
 
 
 def block_squares(values: torch.Tensor) -> torch.Tensor:
@@ -159,7 +206,9 @@ def block_squares(values: torch.Tensor) -> torch.Tensor:
     return torch.stack(squares)
 
 
-def significant_reduction(before: torch.Tensor, after: torch.Tensor) -> float | None:
+def significant_reduction(
+    before: torch.Tensor, after: torch.Tensor, standard_errors: float = SELECTION.standard_errors
+) -> float | None:
     """Return the relative reduction of sums of squares per block (folds,), or None if it is not significant.
 
     The t test is on g = (before - after) / (before + after) per block, which is between -1 and 1: neither a block of
@@ -169,7 +218,7 @@ def significant_reduction(before: torch.Tensor, after: torch.Tensor) -> float | 
     negligible = 2 * SELECTION.min_reduction * before.mean()
     g = (before - after) / (before + after + negligible)
     standard_error = g.std() / len(g) ** 0.5
-    if not g.isfinite().all() or g.mean() <= SELECTION.standard_errors * standard_error:
+    if not g.isfinite().all() or g.mean() <= standard_errors * standard_error:
         return None
     mean = float(g.mean())
     reduction = 2 * mean / (1 + mean)  # g = (b - a) / (b + a) solved for (b - a) / b, at the mean g

@@ -44,7 +44,14 @@ def initial_fit(problem: TorqueProblem) -> TorqueEstimate:
     while problem.adapt is None and (further := find_compensation(problem, state.x)).any():
         problem = replace(problem, compensated=problem.compensated | further)
         problem, state = _annealed_fit(problem, state.steps)
-    return alternate(problem, state, TUNING.iterations)
+    estimate = alternate(problem, state, TUNING.iterations)
+    if problem.adapt is not None or estimate.problem.prior.plausible or problem.compensated.all():
+        return estimate
+    # masses that are wrong by such a factor are less plausible than drives that compensate friction, whose torque the
+    # masses absorb
+    problem = replace(problem, compensated=torch.ones_like(problem.compensated))
+    compensated = alternate(*_annealed_fit(problem, estimate.state.steps), TUNING.iterations)
+    return compensated if compensated.problem.prior.plausible else estimate
 
 
 def _annealed_fit(problem: TorqueProblem, steps: int) -> tuple[TorqueProblem, State]:
@@ -79,7 +86,8 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     No friction model explains a torque that decreases with velocity. A drive that compensates friction after its torque
     was measured adds such a torque. The slope of the residual over velocity must be negative, significant, explain a
     part of the squared residual, and be visible in the torque: a delay of some milliseconds between torque and motion
-    causes a negative slope, too, but a smaller one.
+    causes a negative slope, too, but a smaller one. The drives of an arm are similar: if one compensates friction, a
+    slope of more than one standard deviation suffices for the others, whose parameters may absorb the compensation.
     """
     samples = problem.jacobian.residual_samples(x)
     residual, estimator = samples.torque_residual, problem.noise_estimator
@@ -87,11 +95,15 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     slope = products / samples.qd.square().sum(dim=0).clamp(min=1e-300)
     # share of the squared residual that the regression line explains (coefficient of determination)
     explained = slope * products / residual.square().sum(dim=0).clamp(min=1e-300)
-    significant = explained * estimator.errors > TUNING.min_significance**2 * (1 - explained)
+    deviations = (
+        explained * estimator.errors / (1 - explained)
+    ).sqrt()  # by which the slope differs from zero
+    decreasing = (slope < 0) & (deviations > 1) & ~problem.compensated
+    if problem.compensated.any():
+        return decreasing
     amplitude = (slope * products / estimator.count).sqrt()
     visible = amplitude > TUNING.min_compensation * estimator.torque_std
-    decreasing = (slope < 0) & (explained > TUNING.min_explained) & visible
-    return decreasing & significant & ~problem.compensated
+    return decreasing & (deviations > TUNING.min_significance) & (explained > TUNING.min_explained) & visible
 
 
 def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
@@ -189,7 +201,8 @@ def fit_residual_terms(
     rigid_only = estimate
     selected: list[SelectedTerm] = []
     estimate = estimate.with_current_covariance()
-    while further := select_functions(model, *estimate.linearize(), _keys(selected), correlation_length):
+    data = correlation_length, samples.recordings, estimate.problem.jacobian.torque_std
+    while further := select_functions(model, *estimate.linearize(), _keys(selected), *data):
         selected += further
         estimate = _refit(estimate, samples, selected).with_current_covariance()
     if selected:

@@ -35,7 +35,7 @@ class TorqueTuning:
     # [s] Segments from which the correlation time is estimated.
     segment: float = 1.0
     # [1] Largest estimated prior width: masses and armatures are known to a factor of 20, torque offsets to three times
-    # the typical friction. Logs that need a wider prior are not those of the URDF, or not in Nm.
+    # the typical friction. Logs that need a wider prior are not of the URDF's arm, or not in Nm.
     max_width: float = 3.0
     # [1] Outer iterations of noise and prior after the initial fit.
     iterations: int = 5
@@ -47,7 +47,7 @@ class TorqueTuning:
     effects_evidence: float = 2.0
     # [1] Largest number of steps before noise and prior are estimated.
     initial_steps: int = 60
-    # [1] Largest number of iterations in which the noise is lowered to that of least squares.
+    # [1] Largest number of iterations in which the noise is lowered to the least-squares level.
     annealing_iterations: int = 12
     # [1] Noise of these iterations, as a fraction of the torque residual (a low_cost_robot with placeholder
     # inertials: error of M(q) 0.44 -> 0.005).
@@ -83,7 +83,7 @@ class TorqueTuning:
     min_explained: float = 0.1
     # [1] Standard deviations by which the coefficient of friction compensation must differ from zero.
     min_significance: float = 4.0
-    # [1] Smallest standard deviation of friction compensation, as a fraction of that of the torque: delays of
+    # [1] Smallest standard deviation of friction compensation, as a fraction of the torque's: delays of
     # milliseconds have a similar but smaller effect.
     min_compensation: float = 0.05
     # [1] Samples of one block: some 100 MB for seven joints with their derivatives.
@@ -97,6 +97,8 @@ class TorqueTuning:
     # [1] Relative standard deviation above which logs do not determine a motor gain: its 95 % interval then reaches
     # 20 % to either side, as the difference of two datasheets does.
     undetermined_gain: float = 0.1
+    # [1] nMSE of held-out seconds above which logs do not support the fit at a joint.
+    unsupported: float = 0.5
     # [1] Factor of the prior standard deviation of URDF masses above which the URDF is wrong.
     wrong_urdf: float = 5.0
     # [1] Torque residual divided by the inertial torque of a joint, above which the predicted motion is unreliable.
@@ -127,6 +129,12 @@ class ResidualTuning:
     # [1] Standard errors that the mean error reduction over the blocks must exceed: p = 0.01 of Student's t with nine
     # degrees of freedom.
     standard_errors: float = 2.82
+    # [1] The same for samples of one recording, whose motion may repeat errors: p = 0.001.
+    standard_errors_of_one: float = 4.30
+    # [1] Largest torque of position that one recording supports, as a fraction of the joint's torque.
+    max_torque_fraction: float = 0.5
+    # [1] Gravity torque of a joint, as a fraction of its torque, below which it has no spring to balance it.
+    min_load_fraction: float = 0.1
     # [1] Smallest error reduction of a residual term.
     min_reduction: float = 1e-3
     # [1] A later term is preferred to the best one so far only if its residual is below this fraction of the residual

@@ -1,0 +1,240 @@
+"""A torque fit is sure of no more than its samples support: noise, prior widths, residual terms, few data."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from motions import smooth_motion
+from scipy.signal import lfilter
+
+from spelgen.arm.configured_arm import load_arm
+from spelgen.dynamics.bristles import bristle_reach
+from spelgen.emission.build import build
+from spelgen.fitting.torque.fit import TorqueSolution, fit_torque
+from spelgen.fitting.torque.jacobian import ResidualSamples, TorqueJacobian
+from spelgen.fitting.torque.linearization import RigidProjection
+from spelgen.fitting.torque.parameters import ParameterPrior, ParameterVector, update_widths
+from spelgen.fitting.torque.problem import TorqueProblem, held_out_nmse
+from spelgen.fitting.torque.report import torque_notes
+from spelgen.fitting.torque.samples import TorqueSamples
+from spelgen.fitting.torque.selection import max_torques, select_functions
+from spelgen.fitting.torque.stages import initial_fit
+from spelgen.fitting.torque.tuning import TUNING
+from spelgen.identification.least_squares import correlation_time
+from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
+from spelgen.logs.read import read_logs
+from spelgen.settings.fits import GaussianPrior
+
+
+class Unabsorbed:
+    """Rigid bodies and a friction model that absorb none of an added torque."""
+
+    @staticmethod
+    def orthogonalize(joint, torque):
+        return torque
+
+
+def recording(model, name: str, seconds: float, seed: int, correlation: float = 0.0) -> DynamicsSamples:
+    """A smooth motion with the model's torque and 2 % noise: white, or autoregressive with this coefficient."""
+    rng = np.random.default_rng(seed)
+    q, qd, qdd = smooth_motion(model.n, seconds, rng)
+    with torch.no_grad():
+        tau = model.inverse_dynamics(*(torch.from_numpy(x) for x in (q, qd, qdd))).numpy()
+    noise = lfilter([1.0], [1.0, -correlation], rng.normal(size=tau.shape), axis=0)
+    return DynamicsSamples(name, q, qd, qdd, tau + 0.02 * tau.std(0) * noise / noise.std(0))
+
+
+@pytest.mark.parametrize("coefficient", [0.0, 0.8])
+def test_errors_are_as_correlated_as_the_noise(coefficient):
+    """The residual of a fit of 60 parameters is less correlated, and smaller, than the noise."""
+    rng, count, joints = np.random.default_rng(0), 1000, 8
+    noise = lfilter([1.0], [1.0, -coefficient], rng.normal(size=(count, joints)), axis=0)
+    # smooth regressors, as those of an arm
+    smooth = [lfilter([1.0], [1.0, -0.97], rng.normal(size=(count, 60)), axis=0) for _ in range(joints)]
+    jacobian = tuple(map(torch.from_numpy, smooth))
+    gain = tuple(torch.linalg.inv(x.mT @ x) for x in jacobian)
+    target = torch.from_numpy(noise)
+    fitted = [x @ (g @ (x.mT @ target[:, k])) for k, (x, g) in enumerate(zip(jacobian, gain, strict=True))]
+    residual = target - torch.stack(fitted, dim=1)
+    errors = RigidProjection(jacobian, gain).errors(residual, 50)
+    expected = (1 + coefficient) / (1 - coefficient)
+    found = correlation_time(list(errors.numpy())).mean()
+    naive = correlation_time(list(residual.unflatten(0, (-1, 50)).numpy())).mean()
+    assert abs(found - expected) < 0.35 * expected
+    if coefficient:
+        assert naive < 0.9 * found
+    else:
+        assert float(errors.var()) == pytest.approx(noise.var(), rel=0.05)
+        assert float(residual.var()) < 0.95 * noise.var()
+
+
+def test_the_fit_finds_whether_errors_are_correlated(robots):
+    """White noise of 100 Hz, and noise with an integrated correlation time of 0.4 s, on the same arm."""
+    found = {}
+    for coefficient in (0.0, 0.95):
+        model = build(robots / "two_link.urdf", "closed-form")
+        logs = [recording(model, str(seed), 20.0, seed, coefficient) for seed in range(3)]
+        found[coefficient] = fit_torque(model, logs).correlation_time
+    assert (found[0.0] < 0.1).all()
+    assert (found[0.95] > 0.25).all() and (found[0.95] < 0.6).all()
+
+
+def test_estimated_prior_widths_are_bounded(robots):
+    """Bodies that are wrong by a factor of e^40, as for torques of another unit, widen the prior to its bound only."""
+    rigid = ParameterVector(build(robots / "two_link.urdf", "closed-form"))
+    widths, mean = GaussianPrior(), rigid.flatten(rigid.initial)
+    prior = ParameterPrior(rigid, widths, widths, mean)
+    x = mean + 40.0 * rigid.mask("bodies", "offset")
+    found = update_widths(prior, x, torch.zeros(len(mean), len(mean)).double()).widths
+    assert found.bodies == found.offset == TUNING.max_width
+    assert found.armature < widths.armature
+
+
+def test_masses_beyond_the_bound_are_a_warning(robots):
+    model = build(robots / "two_link.urdf", "closed-form")
+    samples = TorqueSamples.of([recording(model, "x", 5.0, 0)])
+    solution = fit_torque(model, samples)
+    for bodies, severity in ((0.5, "info"), (2.0, "warning"), (TUNING.max_width, "warning")):
+        widths = solution.prior.model_copy(update={"bodies": bodies})
+        (note,) = [
+            x for x in torque_notes(model, samples, replace(solution, prior=widths)) if x.code == "urdf-prior"
+        ]
+        assert note.severity == severity
+        assert ("upper bound" in note.message) == (bodies == TUNING.max_width)
+
+
+def residual_of(torque: torch.Tensor, q: torch.Tensor) -> ResidualSamples:
+    still = torch.zeros_like(q)
+    return ResidualSamples(q, still, still, torque, still)
+
+
+@pytest.fixture
+def hybrid(robots):
+    """Two links with single-joint terms only."""
+    model = build(robots / "two_link.urdf", "hybrid", width=8)
+    model.residuals.potential = model.residuals.mass = None
+    return model
+
+
+@pytest.mark.parametrize("other, selected", [(1.0, True), (-0.2, False)])
+def test_a_term_has_to_hold_in_the_recording_that_is_held_out(hybrid, other, selected):
+    """Both halves of the first recording support the term, and the second one has the opposite torque."""
+    t = torch.linspace(0, 200, 4000).double()
+    q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
+    torque = torch.stack([torch.sin(2 * q[:, 0]), torch.zeros_like(t)], dim=1)
+    recordings = (torch.arange(4000) >= 2000).long()
+    torque[recordings == 1] *= other
+    std, lengths = torch.full((2,), 10.0).double(), torch.full((2,), 5.0)
+    found = select_functions(hybrid, residual_of(torque, q), Unabsorbed(), [], lengths, recordings, std)
+    assert bool(found) == selected
+
+
+def test_one_recording_supports_only_a_part_of_the_torque(hybrid):
+    """The same torque of position, at a joint whose torque is five times as large, and nearly this torque only."""
+    t = torch.linspace(0, 200, 4000).double()
+    q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
+    samples = residual_of(torch.stack([torch.sin(2 * q[:, 0]), torch.zeros_like(t)], dim=1), q)
+    lengths, one, two = torch.full((2,), 5.0), torch.zeros(4000).long(), (torch.arange(4000) >= 2000).long()
+    spread = float(samples.torque_residual[:, 0].std())
+    for recordings, ratio, selected in ((one, 5.0, True), (one, 1.2, False), (two, 1.2, True)):
+        std = torch.full((2,), ratio * spread).double()
+        found = select_functions(hybrid, samples, Unabsorbed(), [], lengths, recordings, std)
+        assert bool(found) == selected
+
+
+def test_no_spring_from_one_recording_at_a_joint_without_load(robots):
+    """The first axis of the six-axis arm is vertical."""
+    model = build(robots / "six_dof.urdf", "hybrid", width=8)
+    q = torch.from_numpy(smooth_motion(6, 10.0, np.random.default_rng(0))[0])
+    with torch.no_grad():
+        gravity = model.gravity(q).std(dim=0)
+    limits = max_torques(model, q, gravity.clamp(min=0.1 * float(gravity.max())))
+    assert limits["raw_torque_splines"][0] == 0 and limits["raw_torque_ripple"][0] > 0
+    assert (limits["raw_torque_splines"][gravity > 0.5 * gravity.max()] > 0).all()
+
+
+def test_slow_passes_are_few_errors(hybrid):
+    """A joint that passes its range once has as many independent errors as the range has splines."""
+    from spelgen.fitting.torque.joint_functions import joint_functions
+
+    lengths = []
+    for passes in (1, 40):
+        t = torch.linspace(0, 1, 4000).double()
+        q = torch.stack([torch.cos(torch.pi * passes * t), torch.zeros_like(t)], dim=1)
+        candidate = next(joint_functions(hybrid, residual_of(q.sin(), q), Unabsorbed()))
+        lengths.append(candidate.visit_length)
+    spacing = float(hybrid.residuals.spacing[0])
+    assert lengths[0] == pytest.approx(4000 / (1 + 2 / spacing), rel=1e-3)
+    assert lengths[0] > 5 * lengths[1]
+
+
+def test_held_out_errors_are_those_of_fits_without_the_segment(robots):
+    """Against a refit of the linearized problem without each second, one after the other."""
+    model = build(robots / "two_link.urdf", "closed-form")
+    samples = TorqueSamples.of([recording(model, "x", 4.0, 0)], 2)
+    estimate = initial_fit(TorqueProblem.of(TorqueJacobian(model, samples), GaussianPrior()))
+    found = held_out_nmse(estimate, samples)
+    jacobian, x, noise = estimate.problem.jacobian, estimate.state.x, estimate.problem.noise
+    change, free = jacobian.theta_jacobian(x), estimate.problem.free
+    rows = torch.zeros(2, samples.count, len(x)).double()
+    for joint, columns, block, _ in jacobian.joint_rows(x):
+        rows[joint, :, columns] = block
+    rows = (rows @ change)[..., free]
+    residual = jacobian.residual_samples(x).torque_residual.mT
+    offset = (x - estimate.problem.prior.mean)[free]
+    precision = estimate.problem.prior.precision[free][:, free]
+    squares = torch.zeros(2).double()
+    for start in range(0, 200, 50):
+        kept = torch.ones(samples.count, dtype=torch.bool)
+        kept[start : start + 50] = False
+        if kept.all():
+            continue
+        weighted = rows[:, kept] / noise[:, None, None] ** 2
+        curvature = torch.einsum("jtk,jtl->kl", weighted, rows[:, kept]) + precision
+        gradient = torch.einsum("jtk,jt->k", weighted, residual[:, kept]) - precision @ offset
+        # the estimate is stationary to the tolerance of the solver: the step of the whole problem is subtracted
+        whole = torch.einsum("jtk,jt->k", rows / noise[:, None, None] ** 2, residual) - precision @ offset
+        step = torch.linalg.solve(curvature, gradient - whole)
+        squares += (residual[:, ~kept] - rows[:, ~kept] @ step).square().sum(dim=1)
+    expected = squares / samples.count / jacobian.torque_std.square()
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-12)
+
+
+ARMS = {
+    "ur10e": ("ur10e/ur10e.urdf", "ur10e/20_02_10_30sec_12harm.parquet"),
+    "panda": ("../arms/panda_erd.urdf", "panda/exciting_traj1.parquet"),
+    "xmate3": ("xmate3/xmate3.urdf", "xmate3/excit.parquet"),
+    "ar5": ("ar5/ar5.urdf", "ar5/real.parquet"),
+    "tx40": ("tx40/tx40.urdf", "tx40/identification.parquet"),
+    "shanghai": ("shanghai/shanghai.urdf", "shanghai/traj1.parquet"),
+    "airbot": ("airbot/airbot.urdf", "airbot/ps_N7T25QR-5.parquet"),
+}
+
+
+def first_seconds(folder: Path, arm: str, seconds: float) -> tuple[TorqueSolution, set[str], list[str]]:
+    """Fit `closed-form` to the first seconds of a recording; return the notes' codes and the few-data messages."""
+    urdf, log = (folder / x for x in ARMS[arm])
+    model = build(urdf, "closed-form")
+    (whole,) = read_logs([log], load_arm(urdf))
+    part = whole[: int(np.searchsorted(whole.t, whole.t[0] + seconds))]
+    samples = TorqueSamples.of(dynamics_samples([part], reach=bristle_reach(model)), TUNING.decimation)
+    solution = fit_torque(model, samples)
+    notes = list(torque_notes(model, samples, solution))
+    return solution, {x.code for x in notes}, [x.message for x in notes if x.code == "few-data"]
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_a_second_of_motion_supports_no_fit(shared, arm):
+    """A second and a half of each recorded arm: the warning names joints, what is as good, and the seconds needed."""
+    solution, codes, messages = first_seconds(shared / "logs", arm, 1.5)
+    assert (solution.held_out_nmse > TUNING.unsupported).any()
+    assert "few-data" in codes
+    assert "URDF" in messages[0] and "ridge" in messages[0] and " s in which all joints move" in messages[0]
+
+
+def test_twelve_seconds_of_an_exciting_motion_support_a_fit(shared):
+    solution, codes, _ = first_seconds(shared / "logs", "panda", 12.0)
+    assert "few-data" not in codes
+    assert (solution.held_out_nmse < 0.05).all()
