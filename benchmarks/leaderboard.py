@@ -235,9 +235,9 @@ def folds(folder: Path) -> Iterator[Fold]:
     for name, seconds in TRAINED_FIRST.items():
         urdf = panda_urdf(folder) if name == "panda" else folder / name / f"{name}.urdf"
         (log,) = recordings_of(folder / name, urdf).values()
-        yield Fold(f"{name}/split", urdf, (first(log, seconds),), {"rest": (after(log, seconds),)})
+        yield Fold(f"{name}/split", urdf, (first(log, seconds),), {"remainder": (after(log, seconds),)})
         seconds = log.duration - seconds
-        yield Fold(f"{name}/reversed", urdf, (after(log, seconds),), {"rest": (first(log, seconds),)})
+        yield Fold(f"{name}/reversed", urdf, (after(log, seconds),), {"remainder": (first(log, seconds),)})
     yield from motions
 
 
