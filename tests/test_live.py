@@ -350,6 +350,28 @@ def test_models_that_it_cannot_use_are_refused(arm, levels, tmp_path):
         Estimator(load_run(plain.path))
 
 
+def test_training_from_a_run_prints_the_load(arm, run, tmp_path):
+    model, log, qdd = arm
+    lifted = dataclasses.replace(log, tau=loaded(model, log, qdd, PAYLOAD), name="lifted")
+    write_logs(tmp_path / "logs.parquet", [lifted], model.joint_names)
+    arguments = [
+        "train",
+        "--from",
+        str(run),
+        "--data",
+        str(tmp_path / "logs.parquet"),
+        "-o",
+        str(tmp_path / "run"),
+    ]
+    result = CliRunner().invoke(app, [*arguments, "--format", "json"])
+    assert result.exit_code == 0, result.output
+    payload = json.loads(result.stdout)["payload"]
+    assert payload["status"] == "payload"
+    assert payload["mass_interval"][0] < 2.0 < payload["mass_interval"][1]
+    # the noise levels of the run, for an estimator with this load as part of the arm
+    assert (tmp_path / "run" / "estimator.json").exists()
+
+
 def test_the_command_prints_payload_contacts_and_drift(arm, levels, run, tmp_path):
     model, log, qdd = arm
     tau = loaded(model, log, qdd, PAYLOAD)

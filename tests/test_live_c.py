@@ -98,7 +98,7 @@ def test_c_equals_python_with_couplings_and_hostile_samples(tmp_path):
     (tmp_path / "arm.yaml").write_text(MOTORS)
     model = randomised(tmp_path / "arm.urdf", "closed-form")
     log = hostile(motion_of(model, 20.0))
-    levels = levels_of(model, motion_of(model, 20.0))
+    levels = levels_of(model, motion_of(model, 20.0), 0.02)
     compiled = CompiledEstimator(model, load_arm(tmp_path / "arm.urdf"), levels)
     found = compiled.run(*log)
     fit = load_run(saved_run(model, tmp_path / "arm.urdf", tmp_path / "run").path)

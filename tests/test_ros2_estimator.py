@@ -55,7 +55,7 @@ def ur10e(tmp_path_factory):
     folders = [tmp_path_factory.mktemp(name) for name in ("free", "loaded")]
     free, loaded = (arm_in(folder, loaded=k > 0) for k, folder in enumerate(folders))
     model = build(free, "closed-form")
-    export_ros2(Trained(model, free, (), levels(free))).write(folders[0] / "package")
+    export_ros2(Trained(model, free, levels=levels(free))).write(folders[0] / "package")
     library = compiled(folders[0] / "package", folders[0])
     plants = [SimulatedArm(model, free, folders[0])]
     plants.append(SimulatedArm(build(loaded, "closed-form"), loaded, folders[1]))

@@ -23,7 +23,7 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 _TIME_CONSTANTS = np.geomspace(0.1, 6.4, 7)  # [s] of the disturbance
 _RATIOS = np.array([0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 5])  # of disturbance and white noise
 
-WINDOW = 25  # blocks of a trial of the payload filter, 5 s
+WINDOWS = (25, 50)  # blocks of a trial of the payload filter, 5 and 10 s
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,18 +90,22 @@ def load_variance(segments: Sequence[Sequence[Block]], levels: NoiseLevels) -> f
     """Return the factor on the covariance of payloads: none is carried, and the estimates show the error.
 
     Windows of blocks are independent trials. The factor is the mean squared estimate of mass and first moments, (4,),
-    relative to its covariance.
+    relative to its covariance, for windows of the worse length: errors of the model average out slowly.
     """
-    squares: list[float] = []
-    for blocks in segments:
-        for start in range(0, len(blocks) - WINDOW + 1, WINDOW):
-            load = LoadFilter(levels.load, levels.effort)
-            for block in blocks[start : start + WINDOW]:
-                load.predict(block.duration)
-                for joint in range(load.n):
-                    load.update(block, joint)
-            squares.append(float(load.x[:4] @ np.linalg.solve(load.P[:4, :4], load.x[:4])) / 4)
-    return max(TUNING.variance, float(np.mean(squares))) if squares else TUNING.variance
+    factors = [TUNING.variance]
+    for window in WINDOWS:
+        squares: list[float] = []
+        for blocks in segments:
+            for start in range(0, len(blocks) - window + 1, window):
+                load = LoadFilter(levels.load, levels.effort)
+                for block in blocks[start : start + window]:
+                    load.predict(block.duration)
+                    for joint in range(load.n):
+                        load.update(block, joint)
+                squares.append(float(load.x[:4] @ np.linalg.solve(load.P[:4, :4], load.x[:4])) / 4)
+        if squares:
+            factors.append(float(np.mean(squares)))
+    return max(factors)
 
 
 def blocks_along(tested: HeldOut, levels: NoiseLevels) -> list[Block]:

@@ -62,7 +62,7 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
     if residual_terms(model) is not None:
         message = _selected_terms(solution, names)
         if solution.selected_terms and not samples.recordings.any():
-            message += "; all of them rest on one recording: test them on another motion"
+            message += "; all of them were selected in one recording: test them on another motion"
         yield Diagnostic("info", "residuals", "model", None, message)
     subset = samples.subsampled(TUNING.report_positions).columns
     inertia, std = posterior.uncertain(lambda other: _mean_inertia(other, subset.q))
@@ -87,7 +87,7 @@ def _few_data(samples: TorqueSamples, solution: TorqueSolution, joints: np.ndarr
     # the error of the parameters is inversely proportional to the duration of the motion
     enough = math.ceil(seconds * nmse / TUNING.unsupported)
     message = (
-        f"the torque of held-out seconds is predicted hardly better than by a constant at {', '.join(joints)} (nMSE "
+        f"torques that were not fitted are predicted no better than by a constant at {', '.join(joints)} (nMSE "
         f"{nmse:.2g}): {seconds:.2g} s of this motion do not support a fit, the values of the URDF or of a ridge "
         f"regression may be as good; record about {enough} s in which all joints move"
     )
