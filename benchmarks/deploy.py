@@ -81,7 +81,7 @@ def parity() -> None:
             files = {name: onnx_model(prepared, name) for name in PROGRAMS}
             onnx = worst(called_by_onnx(files), list(PROGRAMS))
             projection = rigid_body_projection(each.model, each.arm)
-            mujoco = _largest(check_mjcf(mjcf_text(projection), projection, states=STATES))
+            mujoco = _largest(check_mjcf(mjcf_text(projection)[0], projection, states=STATES))
             print(
                 f"{robot:12s}{preset:12s}" + "".join(f"{x:12.1e}" for x in (*c, casadi, onnx, mujoco)),
                 flush=True,

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch.autograd.functional import jacobian
 
 from spelgen.dynamics.protocol import is_stateful, sliding_memory
 from spelgen.emission.assemble import ArmModel
-from spelgen.fitting.functional_model import evaluate_with
-from spelgen.fitting.torque.parameters import ParameterVector
+from spelgen.fitting.posterior import Posterior
 
 QUANTITIES = ("base", "friction", "mass", "gravity")
 QUANTILE = 1.96
 NEGLIGIBLE = 1e-6  # relative to the largest true value of a quantity
-Uncertain = Callable[[Callable[[ArmModel], torch.Tensor]], tuple[np.ndarray, np.ndarray]]
-"""Gives the value and the standard deviation of a function of a fitted model, both (k,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,36 +42,15 @@ class TrueValues:
     gravity: np.ndarray
 
 
-def propagated(model: ArmModel, covariance: torch.Tensor) -> Uncertain:
-    """Return the function that gives values and standard deviations of functions of a fitted model.
-
-    Args:
-        model: fitted model.
-        covariance: (K, K) of its rigid parameters, propagated to first order.
-    """
-    parameters = ParameterVector(model).initial
-
-    def uncertain(function: Callable[[ArmModel], torch.Tensor]) -> tuple[np.ndarray, np.ndarray]:
-        def values(*tensors: torch.Tensor) -> torch.Tensor:
-            return evaluate_with(model, dict(zip(parameters, tensors, strict=True)), function)
-
-        blocks = jacobian(values, tuple(parameters.values()))
-        slopes = torch.cat([block.flatten(1) for block in blocks], dim=1)
-        variance = torch.einsum("jk,kl,jl->j", slopes, covariance, slopes)
-        return values(*parameters.values()).detach().numpy(), variance.clamp(min=0).sqrt().numpy()
-
-    return uncertain
-
-
 def interval_ratios(
-    uncertain: Uncertain, true: TrueValues, sliding: SteadySliding, q: np.ndarray
+    posterior: Posterior, true: TrueValues, sliding: SteadySliding, q: np.ndarray
 ) -> dict[str, list[float]]:
     """Return the errors divided by the half width of the 95 % interval, per quantity of `QUANTITIES`.
 
     Values whose truth is zero with an error of zero (joints that gravity does not load) are omitted.
 
     Args:
-        uncertain: gives values and standard deviations of the fitted model.
+        posterior: of the fitted model.
         true: values, with g and M at the positions q.
         sliding: conditions of the friction constants.
         q: (T, n) positions.
@@ -91,7 +65,7 @@ def interval_ratios(
         friction, gravity = _sliding_friction(model, sliding), model.gravity(positions)
         return torch.cat([base, friction, mass.flatten(), gravity.flatten()])
 
-    value, std = uncertain(quantities)
+    value, std = posterior.uncertain(quantities)
     parts = np.cumsum([len(x) for x in truths])[:-1]
     ratios = {}
     for name, truth, found, width in zip(

@@ -199,7 +199,15 @@ def by_preset(preset: str) -> Method:
     def fitted(problem: Problem) -> Prediction:
         model = spelgen.build(problem.fold.urdf, preset)
         fit = spelgen.fit(model, problem.logs, preprocessing=problem.preprocessing, arm=problem.fold.urdf)
-        return Prediction(torque_of(fit.model))
+        if preset != DEFAULT:
+            return Prediction(torque_of(fit.model))
+        posterior = fit.posterior
+
+        def std(x: DynamicsSamples) -> np.ndarray:
+            past = [state for state in (x.z, x.direction) if state is not None]
+            return posterior.torque(x.q, x.qd, x.qdd, *past).std
+
+        return Prediction(torque_of(fit.model), std)
 
     return fitted
 
@@ -227,9 +235,9 @@ def folds(folder: Path) -> Iterator[Fold]:
     for name, seconds in TRAINED_FIRST.items():
         urdf = panda_urdf(folder) if name == "panda" else folder / name / f"{name}.urdf"
         (log,) = recordings_of(folder / name, urdf).values()
-        yield Fold(f"{name}/split", urdf, (first(log, seconds),), {"rest": (after(log, seconds),)})
+        yield Fold(f"{name}/split", urdf, (first(log, seconds),), {"remainder": (after(log, seconds),)})
         seconds = log.duration - seconds
-        yield Fold(f"{name}/reversed", urdf, (after(log, seconds),), {"rest": (first(log, seconds),)})
+        yield Fold(f"{name}/reversed", urdf, (after(log, seconds),), {"remainder": (first(log, seconds),)})
     yield from motions
 
 

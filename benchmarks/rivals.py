@@ -74,7 +74,7 @@ def mujoco_sysid(problem: Problem) -> Prediction:
     from mujoco import sysid
 
     model = spelgen.build(problem.fold.urdf, "closed-form")
-    spec = mujoco.MjSpec.from_string(mjcf_text(rigid_body_projection(model, problem.arm)).decode())
+    spec = mujoco.MjSpec.from_string(mjcf_text(rigid_body_projection(model, problem.arm))[0].decode())
     compiled, names = spec.compile(), problem.arm.chain.joint_names
     samples = subset(problem.samples, SYSID_SAMPLES)
     scale = np.maximum(samples.tau.std(axis=0), 1e-3 * samples.tau.std(axis=0).max())

@@ -47,19 +47,18 @@ from scipy.signal import butter, sosfiltfilt
 sys.path.insert(0, str(Path(__file__).parent))
 
 from figaroh_identification import figaroh_dynamics
-from intervals import SteadySliding, TrueValues, Uncertain, interval_ratios, propagated
+from intervals import SteadySliding, TrueValues, interval_ratios
 from real_errors import ErrorProcess, RealErrors, draw_errors, play
 from residual_statistics import residual_statistics
 from truth_summary import summary
 
 import spelgen
-from spelgen.dynamics.bristles import bristle_reach, reach_of
+from spelgen.dynamics.bristles import reach_of
 from spelgen.dynamics.protocol import is_stateful, memory_along
 from spelgen.dynamics.regressor_dynamics import regressor
 from spelgen.errors import SpelgenError
 from spelgen.evaluation.torque import predicted_torques
-from spelgen.fitting.torque.fit import fit_torque
-from spelgen.fitting.torque.objective import torque_delay
+from spelgen.fitting.posterior import Posterior
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.logs.dynamics_samples import dynamics_samples
 
@@ -438,12 +437,12 @@ def measure(fitted: Fitted, truth: Truth, motion: Motion) -> dict[str, Any]:
         "nmse": float(nmse.mean()),
         "nmse_filtered": float(filtered.mean()),
     }
-    if fitted.uncertain is not None:
+    if fitted.posterior is not None:
         sliding = SteadySliding(q[::100], np.quantile(np.abs(qd), (0.5, 0.9), axis=0))
         values = TrueValues(
             combination, true_base, truth.sliding_friction(sliding), true_mass[::20], true_gravity[::200]
         )
-        errors["intervals"] = interval_ratios(fitted.uncertain, values, sliding, q[::200])
+        errors["intervals"] = interval_ratios(fitted.posterior, values, sliding, q[::200])
     return errors
 
 
@@ -451,31 +450,22 @@ def measure(fitted: Fitted, truth: Truth, motion: Motion) -> dict[str, Any]:
 class Fitted:
     """Fitted dynamics, and their parameters.
 
-    bodies: (B, 10) in the frames of the joints. armature: (n,). uncertain: gives intervals of the default preset.
+    bodies: (B, 10) in the frames of the joints. armature: (n,). posterior: of the default preset.
     residual: correlation and spectrum of the torque residual, of one method.
     """
 
     dynamics: Any
     bodies: np.ndarray
     armature: np.ndarray
-    uncertain: Uncertain | None = None
+    posterior: Posterior | None = None
     residual: list[float] | None = None
 
 
 def fit_hybrid(urdf: Path, logs: list[spelgen.Trajectory]) -> Fitted:
-    """Fit the default model to torques as `spelgen train` does, without its evaluation on windows."""
-    model = spelgen.build(urdf, "hybrid")
-    delay = torque_delay(model, logs, spelgen.Preprocessing()).delay
-    preprocessing = spelgen.Preprocessing(torque_delay=delay)
-    samples = dynamics_samples(logs, preprocessing=preprocessing, reach=bristle_reach(model))
-    solution = fit_torque(model, samples)
-    with torch.no_grad():
-        return Fitted(
-            model,
-            model.inertial_parameters.numpy(),
-            model.armature.numpy(),
-            propagated(model, solution.covariance),
-        )
+    """Fit the default model to torques as `spelgen train` does."""
+    fit = spelgen.fit(spelgen.build(urdf, "hybrid"), logs, spelgen.TorqueFit(), arm=urdf)
+    model = fit.model.requires_grad_(False)
+    return Fitted(model, model.inertial_parameters.numpy(), model.armature.numpy(), fit.posterior)
 
 
 def fit_least_squares(memory: bool) -> Callable[[Path, list[spelgen.Trajectory]], Fitted]:
