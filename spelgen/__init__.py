@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from spelgen.dynamics.friction import FrictionModel as FrictionModel
     from spelgen.dynamics.tip import tip_kinematics as tip_kinematics
     from spelgen.emission.build import build as build
-    from spelgen.emission.build import load_module as load_module
+    from spelgen.emission.loading import load_module as load_module
     from spelgen.emission.specify import generate as generate
     from spelgen.errors import SpelgenError as SpelgenError
     from spelgen.evaluation.evaluate import evaluate as evaluate
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from spelgen.identification.identification import Identification as Identification
     from spelgen.identification.identification import LeastSquares as LeastSquares
     from spelgen.identification.identify import identify as identify
+    from spelgen.live.estimator import Estimator as Estimator
+    from spelgen.live.estimator import EstimatorState as EstimatorState
     from spelgen.log_checks.check_logs import check_logs as check_logs
     from spelgen.logs.preprocessing import Preprocessing as Preprocessing
     from spelgen.logs.read import read_logs as read_logs
@@ -49,7 +51,8 @@ _MODULES = {
     "certificate.inspection": "inspect Inspection",
     "emission.specify": "generate",
     "design": "Design",
-    "emission.build": "build load_module",
+    "emission.build": "build",
+    "emission.loading": "load_module",
     "certificate.module_check": "check",
     "logs.read": "read_logs write_logs",
     "logs.trajectory": "Trajectory",
@@ -70,6 +73,7 @@ _MODULES = {
     "evaluation.results": "Results",
     "dynamics.tip": "tip_kinematics",
     "exporting.export": "export",
+    "live.estimator": "Estimator EstimatorState",
     "errors": "SpelgenError",
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names.split()}

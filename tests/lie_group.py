@@ -1,6 +1,6 @@
 """The paper's equations on SO(3)^k x R^3^l: rotation matrices in, rates of all three axes of each joint out.
 
-The emitted module integrates one number for each joint. These are the equations of the paper
+The emitted module integrates one number for each joint. This file has the equations of the paper
 (Wang, Chen, Ding, Sci Rep 15:33179, 2025), to compare with models that are trained so and to show that nothing
 is lost.
 """

@@ -42,9 +42,9 @@ class DrawnArm:
 
 @dataclass(frozen=True)
 class _Style:
-    """What the numbers of one arm are drawn from.
+    """Distribution of the numbers of one arm.
 
-    Right angles go with straight sliding axes: several skew ones stand in relations, such as 60 degrees, that
+    Right angles go with straight sliding axes: several skew ones have relations, such as 60 degrees, that
     no rational rotation has, and that spelgen keeps to 1e-11 only.
     """
 

@@ -292,7 +292,7 @@ def test_the_line_for_velocities_of_the_opposite_sense_mends_them(robots, arm, l
 
 @pytest.mark.parametrize("constant", [0.0, 0.1, 5.0])
 def test_a_torque_that_never_changes_is_told(loaded, log, constant):
-    """0.1 is no binary number: what is left of it is rounding, not 0."""
+    """0.1 is no binary number: the remainder is rounding, not 0."""
     report = check_logs([replace(log, tau=np.full_like(log.tau, constant))], loaded)
     assert {x.code for x in report.findings} == {"constant-torque"}
     assert [x.gravity.explained for x in report.joints] == [None] * 3
@@ -371,7 +371,7 @@ def test_torques_that_cannot_be_are_refused_unless_accepted(loaded, log, case):
 
 @pytest.mark.parametrize("rate", [20, 200])
 def test_negated_torques_of_an_arm_without_gravity_are_refused(robots, rate):
-    """M11 of two_link became a tenth of what it is, at 20 Hz, where no accelerations can be filtered."""
+    """M11 of two_link was a tenth of its true value at 20 Hz, where no accelerations can be filtered."""
     flat = load_arm(robots / "two_link.urdf")
     t = np.arange(0.0, 20.0, 1.0 / rate)
     q = np.stack([np.sin(1.3 * t), np.cos(2 * t) + 0.3 * np.sin(0.7 * t)], axis=1)

@@ -16,7 +16,18 @@ from spelgen.cli.main import app
 from spelgen.fitting.process import TrainingProgress
 
 ROOT = Path(__file__).parents[1]
-COMMANDS = ["inspect", "build", "simulate", "excite", "logs", "train", "evaluate", "report", "check"]
+COMMANDS = [
+    "inspect",
+    "build",
+    "simulate",
+    "excite",
+    "logs",
+    "train",
+    "evaluate",
+    "estimate",
+    "report",
+    "check",
+]
 
 
 @pytest.fixture
@@ -412,7 +423,7 @@ def test_bare_command_shows_the_help(spelgen):
 
 def test_help_shows_whole_sentences(spelgen):
     commands = spelgen("--help").stdout.partition("Commands:\n")[2].splitlines()
-    assert len(commands) == 13
+    assert len(commands) == 14
     assert all(line.endswith(".") and not line.endswith("...") for line in commands)
 
 

@@ -51,7 +51,7 @@ def test_errors_are_as_correlated_as_the_noise(coefficient):
     """The residual of a fit of 60 parameters is less correlated, and smaller, than the noise."""
     rng, count, joints = np.random.default_rng(0), 1000, 8
     noise = lfilter([1.0], [1.0, -coefficient], rng.normal(size=(count, joints)), axis=0)
-    # smooth regressors, as those of an arm
+    # smooth regressors, as of an arm
     smooth = [lfilter([1.0], [1.0, -0.97], rng.normal(size=(count, 60)), axis=0) for _ in range(joints)]
     jacobian = tuple(map(torch.from_numpy, smooth))
     gain = tuple(torch.linalg.inv(x.mT @ x) for x in jacobian)

@@ -1,5 +1,7 @@
 """The exported ROS 2 package compiles against stubs of its interface and computes the torques of the model."""
 
+import os
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -18,10 +20,12 @@ DRIVER = r"""
 #include <cstdio>
 #include <memory>
 #include <stdexcept>
-inverse_dynamics_solver::InverseDynamicsSolver * make_plugin();
+template <typename Base> Base * make_plugin();
+template <> inverse_dynamics_solver::InverseDynamicsSolver * make_plugin();
 int main()
 {
-  std::unique_ptr<inverse_dynamics_solver::InverseDynamicsSolver> solver(make_plugin());
+  std::unique_ptr<inverse_dynamics_solver::InverseDynamicsSolver> solver(
+    make_plugin<inverse_dynamics_solver::InverseDynamicsSolver>());
   solver->initialize(nullptr, "", "");
   Eigen::VectorXd q(2), qd(2), qdd(2), few(1);
   q[0] = 0.3; q[1] = -0.7; qd[0] = 0.5; qd[1] = -1.1; qdd[0] = 2.0; qdd[1] = 1.0;
@@ -41,23 +45,26 @@ int main()
 @pytest.fixture(scope="module")
 def package(tmp_path_factory):
     model = moved_model("two_link", "closed-form")
-    folder = tmp_path_factory.mktemp("ros2") / "two_link_solver"
+    folder = tmp_path_factory.mktemp("ros2") / "two_link_dynamics"
     export(model, "ros2", folder, arm=arm_of("two_link"))
     return model, folder
 
 
 def test_it_is_a_colcon_package(package):
     _, folder = package
-    name = etree.parse(folder / "package.xml").findtext("name")
-    plugin = etree.parse(folder / "plugin.xml").getroot()
-    assert name == plugin.get("path") == "two_link_solver"
-    assert plugin.find("class").get("type") == f"{name}::Solver"
-    build = (folder / "CMakeLists.txt").read_text()
-    assert f"project({name} LANGUAGES C CXX)" in build
-    assert "pluginlib_export_plugin_description_file(inverse_dynamics_solver plugin.xml)" in build
-    for source in ("src/solver.cpp", "src/two_link.c"):
-        assert source in build
-        assert (folder / source).exists()
+    manifest = etree.parse(folder / "package.xml")
+    name = manifest.findtext("name")
+    for plugin, base in [
+        ("solver", "inverse_dynamics_solver::InverseDynamicsSolver"),
+        ("controller", "controller_interface::ChainableControllerInterface"),
+    ]:
+        described = etree.parse(folder / f"{plugin}.xml").getroot()
+        assert name == described.get("path") == "two_link_dynamics"
+        assert described.find("class").get("type") == f"{name}::{plugin.capitalize()}"
+        assert described.find("class").get("base_class_type") == base
+        assert (folder / f"src/{plugin}.cpp").exists()
+    used = set(re.findall(r"#include <(\w+)/", (folder / "src/controller.cpp").read_text()))
+    assert used <= {dependency.text for dependency in manifest.findall("depend")}
     assert len((folder / "README.md").read_text().splitlines()) == 5
 
 
@@ -119,27 +126,69 @@ def test_it_builds_against_the_header_of_older_interfaces(package, tmp_path):
     run("g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", f"-I{stubs}", source)
 
 
+def stand_in_packages(folder: Path) -> list[str]:
+    """Write CMake packages of the stubs; return the definitions with which CMake finds them.
+
+    ament_cmake and colcon are not replaced if the machine has them.
+    """
+    interfaces = [
+        "controller_interface",
+        "hardware_interface",
+        "inverse_dynamics_solver",
+        "pluginlib",
+        "rclcpp",
+    ]
+    interfaces += [
+        "rclcpp_lifecycle",
+        *(f"{name}_msgs" for name in ("geometry", "sensor", "std", "trajectory")),
+    ]
+    interfaces += ["rcl_interfaces", "Eigen3"]
+    for name in interfaces:
+        target = f"{name}::{'Eigen' if name == 'Eigen3' else name}"
+        text = (
+            f"if(NOT TARGET {target})\n  add_library({target} INTERFACE IMPORTED)\n"
+            f"  target_include_directories({target} INTERFACE {STUBS})\nendif()\n"
+            f"set({name}_TARGETS {target})\nset({name}_INCLUDE_DIRS {STUBS})\n"
+        )
+        if name == "pluginlib":
+            text += (STUBS / "cmake" / "pluginlib.cmake").read_text()
+        (folder / f"{name}Config.cmake").write_text(text)
+    if Path("/usr/share/ament_cmake").is_dir():
+        definitions = ["-DPython3_EXECUTABLE=/usr/bin/python3"]  # has the Python package of ament
+    else:
+        definitions = []
+        shutil.copy(STUBS / "cmake" / "ament_cmakeConfig.cmake", folder)
+    found = (f"-D{path.stem.removesuffix('Config')}_DIR={folder}" for path in sorted(folder.iterdir()))
+    return [*definitions, *found]
+
+
 @pytest.mark.skipif(
     not all(shutil.which(program) for program in ("cmake", "g++")),
     reason="no cmake or no g++ on this machine",
 )
 def test_colcon_builds_it(package, tmp_path):
-    """The installed library is the plugin. Without colcon its commands of CMake are run; stubs replace dependencies."""
+    """The installed library has both plugins. Without colcon its commands of CMake are run; stubs replace ROS 2."""
     _, folder = package
     shutil.copytree(folder, tmp_path / "src" / folder.name)
-    stubs = [
-        f"-D{path.stem.removesuffix('Config')}_DIR={path.parent}" for path in (STUBS / "cmake").iterdir()
-    ]
+    (tmp_path / "cmake").mkdir()
+    definitions = stand_in_packages(tmp_path / "cmake")
     installed = tmp_path / "install" / folder.name
-    if shutil.which("colcon"):
-        run("colcon", "build", "--packages-select", folder.name, "--cmake-args", *stubs, cwd=tmp_path)
+    # colcon is of use with its extensions only
+    if shutil.which("colcon") and "--packages-select" in run("colcon", "build", "--help"):
+        run("colcon", "build", "--packages-select", folder.name, "--cmake-args", *definitions, cwd=tmp_path)
     else:
         build = tmp_path / "build" / folder.name
         prefix = f"-DCMAKE_INSTALL_PREFIX={installed}"
-        run("cmake", "-S", tmp_path / "src" / folder.name, "-B", build, prefix, *stubs)
+        run("cmake", "-S", tmp_path / "src" / folder.name, "-B", build, prefix, *definitions)
         run("cmake", "--build", build, "--target", "install")
-    assert (installed / "share/inverse_dynamics_solver/plugins/plugin.xml").exists()
+    for plugin, base in [("solver", "inverse_dynamics_solver"), ("controller", "controller_interface")]:
+        assert (installed / "share" / base / "plugins" / f"{plugin}.xml").exists()
+    assert (installed / "share" / folder.name / "config" / "controller.yaml").exists()
+    assert (installed / "share" / folder.name / "package.xml").exists()
     library = installed / "lib" / f"lib{folder.name}.so"
+    names = run("nm", "-D", "--defined-only", "-C", library)
+    assert "make_plugin<inverse_dynamics_solver::InverseDynamicsSolver>()" in names
+    assert "make_plugin<controller_interface::ChainableControllerInterface>()" in names
     by_colcon = compiled_driver(folder, tmp_path, str(library), f"-Wl,-rpath,{library.parent}")
     (tmp_path / "own").mkdir()
     own = compiled_driver(
@@ -149,3 +198,12 @@ def test_colcon_builds_it(package, tmp_path):
         [[float(x) for x in line.split()] for line in driver_lines(each)[:-1]] for each in (by_colcon, own)
     )
     np.testing.assert_allclose(*lines, rtol=1e-13)
+
+
+@pytest.mark.skipif("AMENT_PREFIX_PATH" not in os.environ, reason="no ROS 2 on this machine")
+def test_colcon_builds_it_with_ros_2(package, tmp_path):
+    _, folder = package
+    shutil.copytree(folder, tmp_path / "src" / folder.name)
+    run("colcon", "build", "--packages-select", folder.name, cwd=tmp_path)
+    installed = tmp_path / "install" / folder.name
+    assert "Controller" in run("nm", "-D", "-C", installed / "lib" / f"lib{folder.name}.so")

@@ -23,6 +23,7 @@ certificate logs
 identification excitation simulation
 log_checks baselines
 fitting
+live
 exporting
 evaluation
 comparison
@@ -39,7 +40,7 @@ OURS = {f"spelgen.{name}" for name in LAYERS}
 SYMBOLIC = {"sympy", "flint", "spelgen.arm", "spelgen.structure"}
 PLAIN = {"spelgen.arm.actuation"}  # G by the files, without the exact arithmetic of its folder
 DERIVING = ("urdf.", "arm.", "structure.", "emission.", "certificate.")
-MODELS = {f"emission.{name}" for name in ("assemble", "build")}  # models in memory
+MODELS = {f"emission.{name}" for name in ("assemble", "build", "loading")}  # models in memory
 DERIVES = [x for x in LAYERS if x.startswith(DERIVING) and x not in MODELS]
 OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "page", "scene")}
 LEAST_SQUARES = ("fitting.fit", "fitting.train")  # fit least squares as well, whose base parameters are exact

@@ -16,7 +16,7 @@ from spelgen.settings.log_mapping import LogMapping
 
 
 def clipped_joints(arm, log) -> dict[str, list[float]]:  # noqa: F811
-    """Return the limits in the errors about clipped torques, by joint; every error must be one of these."""
+    """Return the limits in the errors about clipped torques, per joint; every error must be one of these."""
     found = {}
     for error in check_logs([log], arm).errors:
         joint, limits = re.match(r"joint '(.*)', tau: got torques that stop at (.*?) N", str(error)).groups()
@@ -48,7 +48,7 @@ def test_the_joints_with_clipped_torques_are_named_with_their_limits(arm, motion
 
 
 def test_clipped_torques_are_refused_and_slower_motion_mends_them(arm):  # noqa: F811
-    """The message advises slower motion: at a third of the speed, what was clipped are torques of acceleration."""
+    """The message advises slower motion: at a third of the speed: the clipped torques were torques of acceleration."""
     log = recorded(arm, 3)
     slow = recorded(arm, 3, lambda arm, rng: (excitation(arm, rng)[0] * 3, excitation(arm, rng)[1]))
     k = int((np.abs(log.tau).max(axis=0) / np.abs(slow.tau).max(axis=0)).argmax())

@@ -1,6 +1,6 @@
 """`spelgen excite` for a robot: approach, message of ROS 2, and no contact with itself, a floor or boxes.
 
-The arm has spheres on its links and moves in a plane, so distances follow from sines and cosines alone.
+The arm has spheres on its links and moves in a plane, so distances follow from sines and cosines only.
 """
 
 import json
@@ -91,13 +91,14 @@ def test_motion_and_approach_keep_the_clearance_at_all_times(urdf):
     """A motion that knows nothing of floor and wall hits them; one that does keeps away between samples, too."""
     blind = excite(load_arm(urdf), **QUICK, start=[0, 0.5, 0.5])
     assert clearances(blind.motion.q).min() < -0.05
+    assert blind.collisions == "Checked: 3 pairs of links, approach included; all keep 10 mm."
     found = excite(load_arm(urdf), **QUICK, start=[0, 0.5, 0.5], surroundings=CELL)
     whole = found.approach.then(found.motion)
     fine = np.arange(0, whole.t[-1], 1e-3)
     q = np.stack([np.interp(fine, whole.t, column) for column in whole.q.T], axis=-1)
     assert clearances(q).min() > 0
     assert (
-        "Checked: 9 pairs of links, floor and boxes, approach included; all keep 10 mm." in found.collisions
+        "Checked: 9 pairs of links and surroundings, approach included; all keep 10 mm." in found.collisions
     )
 
 
@@ -191,7 +192,7 @@ def test_pairs_and_links_that_cannot_be_checked_are_named(urdf, monkeypatch):
 
 
 def test_an_arm_that_cannot_move_freely_gets_no_motion(urdf, monkeypatch):
-    """A shell of boxes around the upright arm: the errors name links, times and what to do."""
+    """A shell of boxes around the upright arm: the errors name links, times and remedies."""
     side = {"size": (0.1, 4, 4)}
     near = Surroundings(
         boxes={"left": Box(**side, xyz=(-0.15, 0, 2.3)), "right": Box(**side, xyz=(0.15, 0, 2.3))}

@@ -16,6 +16,8 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.dynamics.base_combinations import base_combinations
 from spelgen.dynamics.friction import FrictionModel
+from spelgen.dynamics.protocol import motors_of
+from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.emission.build import build
 from spelgen.errors import RunError
 from spelgen.exporting.export import export
@@ -26,6 +28,7 @@ from spelgen.fitting.torque import fit as torque_fit
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.parameters import ParameterVector
 from spelgen.identification.base_parameters import base_parameters
+from spelgen.identification.identify import least_squares
 from spelgen.identification.intervals import QUANTILE, Interval, larger_covariance
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.filtering import low_pass
@@ -46,7 +49,8 @@ def test_base_parameters_are_the_exact_ones(robots, tmp_path, robot):
     exact = base_parameters(arm.chain, FrictionModel(), arm.actuation.drives().speeds)
     count = 10 * len(arm.chain.bodies) + len(arm.chain.coordinates)
     common = exact.columns < count  # friction and offsets follow
-    names, combination = base_combinations(build(arm, "closed-form"))
+    model = build(arm, "closed-form")
+    names, combination = base_combinations(model.chain, motors_of(model))
     assert names == tuple(np.array(exact.names)[common])
     np.testing.assert_allclose(combination, exact.combination[common, :count], atol=1e-7)
 
@@ -73,7 +77,7 @@ def base_values(model):
     """Base parameters of a model."""
     with torch.no_grad():
         constants = torch.cat([model.inertial_parameters.flatten(), model.armature])
-    return (base_combinations(model)[1] @ constants).tolist()
+    return (base_combinations(model.chain, motors_of(model))[1] @ constants).tolist()
 
 
 def logged(model, seconds, seed, correlation=0.98, noise=0.05):
@@ -109,6 +113,23 @@ def test_intervals_hold_the_truth_if_errors_last_longer_than_the_fit_assumes(rob
     assert np.mean(held_by_posterior) < np.mean(held) - 0.03
 
 
+def test_least_squares_counts_friction_that_changes_during_a_log(robots):
+    """Coulomb friction rises by half: the standard deviation of its mean is the one of ten values."""
+    arm = load_arm(robots / "rpr.urdf").chain
+    q, qd, qdd = smooth_motion(3, 60.0, np.random.default_rng(0))
+    bodies, friction = urdf_parameters(arm), np.linspace(0.8, 1.2, len(q))[:, None]
+    tau = regressor(arm, q, qd, qdd) @ bodies + np.tanh(qd / 0.01) * friction
+    found = least_squares(arm, [DynamicsSamples("rising", q, qd, qdd, tau)])
+    of_ten = (
+        1.15 * np.linspace(0.82, 1.18, 10).std(ddof=1) / np.sqrt(10)
+    )  # 1.15: Student's t instead of normal
+    interval = next(x for x in found.intervals if x.name == "coulomb3")
+    assert interval.low < 1.0 < interval.high
+    assert interval.std == pytest.approx(
+        of_ten, rel=0.4
+    )  # 0.018, if errors of a log were the same all along it
+
+
 @pytest.fixture(scope="module")
 def fitted(robots):
     """A fit to two recordings of a known arm, with the arm."""
@@ -128,13 +149,13 @@ def test_standard_deviations_are_those_of_sampled_parameters(fitted):
     rng = np.random.default_rng(0)
     q, qd, qdd = rng.uniform(-1, 1, (3, 4, 3))
     draws = []
-    vector = ParameterVector(result.model)
+    vector = ParameterVector(posterior.model)
     x = vector.flatten(vector.initial)
     for noise in torch.from_numpy(rng.normal(size=(300, len(x)))):
         values, vectors = torch.linalg.eigh(small.covariance)
         vector.write(x + vectors @ (values.clamp(min=0).sqrt() * noise))
         with torch.no_grad():
-            model, states = result.model, list(map(torch.from_numpy, (q, qd, qdd)))
+            model, states = posterior.model, list(map(torch.from_numpy, (q, qd, qdd)))
             drawn = model.mass_matrix(states[0]), model.gravity(states[0]), model.inverse_dynamics(*states)
             draws.append(torch.cat([y.flatten() for y in (*drawn, model.armature)]).numpy())
     vector.write(x)
@@ -198,21 +219,15 @@ def test_train_states_the_intervals_of_the_fit(robots, fitted, tmp_path):
     module, urdf = tmp_path / "rpr.py", robots / "rpr.urdf"
     write_logs(tmp_path / "logs.parquet", logs[:2], ("joint1", "joint2", "joint3"))
     module.write_text(spelgen.generate(urdf, preset="closed-form"), encoding="utf-8")
-    command = [
-        "train",
-        module,
-        tmp_path / "logs.parquet",
-        "--robot",
-        urdf,
-        "-o",
-        tmp_path / "run",
-        "--format",
-        "json",
-    ]
+    command = ["train", module, "--data", tmp_path / "logs.parquet", "--robot", urdf, "-o", tmp_path / "run"]
+    command += ["--format", "json"]
     told = CliRunner().invoke(app, list(map(str, command)))
     assert told.exit_code == 0, told.output
     stated = json.loads(told.stdout)["posterior"]
-    assert stated["base_parameters"] == load_run(tmp_path / "run").posterior.to_dict()["base_parameters"]
+    for one, other in zip(
+        stated["base_parameters"], load_run(tmp_path / "run").posterior.base_parameters, strict=True
+    ):
+        assert one["name"] == other.name and one["high"] == pytest.approx(other.high, rel=1e-9)
 
 
 def test_intervals_of_positive_quantities_have_no_negative_end():

@@ -1,6 +1,6 @@
 """Elastic joints are named with the frequency of their resonance; logs of rigid joints are not doubted.
 
-The link moves as prescribed, torques are those of the URDF, and the motor is ahead of the link by the torque divided by
+The link moves as prescribed, torques are the URDF's, and the motor is ahead of the link by the torque divided by
 the stiffness of the spring between them (Spong's model). The log has motor positions and motor torques.
 """
 

@@ -63,7 +63,7 @@ def data(correlation_length: float, count: int) -> tuple[torch.Tensor, torch.Ten
 
 
 def test_what_the_samples_of_one_stretch_say_is_judged_on_others(hybrid):
-    """The first joint moves slowly through its range, and what is missed is another constant on each way."""
+    """The first joint moves slowly through its range, and the residual is another constant in each direction."""
     levels = torch.randn(10, 1, generator=torch.Generator().manual_seed(3)).double()
     missing = levels.repeat_interleave(200, dim=0) * torch.tensor([[1.0, 0.0]]).double()
     q = torch.stack([torch.linspace(-2, 2, 2000), torch.zeros(2000)], dim=1).double()
@@ -84,7 +84,7 @@ def test_neighbours_of_what_is_held_out_are_not_fitted_to(hybrid):
 
 
 def test_what_the_first_half_shows_has_to_hold_in_the_last(hybrid):
-    """All tenths gain by the mean of both halves; the last loses by what the first half shows."""
+    """All tenths gain by the mean of both halves; the last loses by the data of the first half."""
     t = torch.linspace(0, 200, 4000).double()
     q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
     missing = torch.stack([torch.sin(q[:, 0]), torch.zeros_like(t)], dim=1)
@@ -141,7 +141,7 @@ def test_a_stretch_that_goes_farther_than_all_others_hides_no_gain():
 
 
 def test_a_network_is_fitted_to_what_functions_of_joints_leave(robots, monkeypatch):
-    """Both networks are to give what is missed, beside the torque that functions of joints give already."""
+    """Both networks are to explain the residual of the functions of joints."""
     model = build(robots / "two_link.urdf", "hybrid", width=8)
     torch.nn.init.constant_(model.residuals.raw_torque_splines, 3.0)
     left = []
@@ -170,7 +170,7 @@ def test_gains_have_to_be_beyond_their_own_scatter():
 
 
 def test_samples_that_err_alike_count_once():
-    """Each sample twenty times, with errors that are the same, says what it says once."""
+    """Each sample twenty times, with equal errors, has the evidence of one."""
     draw = torch.Generator().manual_seed(0)
     x = torch.randn(300, 4, generator=draw).double()
     y = x @ torch.tensor([0.1, 0.0, -0.2, 0.3]).double() + torch.randn(300, generator=draw).double()
@@ -224,7 +224,7 @@ def test_intervals_of_errors_that_last_are_wider():
 
 @pytest.mark.parametrize("correlation", [1.0, 5.0])
 def test_the_first_noise_is_that_of_least_squares(correlation):
-    """Of two joints, one with three weights of its own: what is missed, with a sample fewer for every weight, and with
+    """Of two joints, one with three weights of its own: the residual, with a sample fewer for every weight, and with
     more where errors last.
     """
     draw = torch.Generator().manual_seed(0)

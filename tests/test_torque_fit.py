@@ -16,7 +16,8 @@ from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
-from spelgen.emission.build import build, load_module
+from spelgen.emission.build import build
+from spelgen.emission.loading import load_module
 from spelgen.emission.specify import generate
 from spelgen.errors import LogError
 from spelgen.fitting.fit import fit
@@ -133,7 +134,7 @@ def test_the_prior_shares_what_joints_share():
 
 
 def test_the_prior_shares_each_element_of_bristles():
-    """Of three elements at two joints: what an element has at one joint it has at the other, and no other element."""
+    """Of three elements at two joints: an element is equal at both joints, and independent of other elements."""
     prior = GaussianPrior(fractions=0.5, shared_fractions=2.0)
     found = prior_covariance(prior, {"fractions": torch.zeros(2, 3)}, {"fractions": "fractions"})
     expected = 0.25 * torch.eye(6) + 4.0 * torch.eye(3).repeat(2, 2)
@@ -141,7 +142,7 @@ def test_the_prior_shares_each_element_of_bristles():
 
 
 def test_the_prior_knows_every_weight(emitted):
-    """What it knows nothing of would be taken for something else in silence."""
+    """Unknown effects would be attributed to others without a message."""
     module = emitted["six_dof"][0]
     model = module.Model()
     rigid = ParameterVector(model)
@@ -285,7 +286,7 @@ def test_friction_has_the_effects_that_samples_show(emitted, shown):
 
 
 def test_compensation_belongs_to_the_input(emitted):
-    """It is added to what the torque does, and is no friction."""
+    """It is added to the torque, and is no friction."""
     model = drawn(emitted["six_dof"][0], seed=2)
     q, qd, qdd = (torch.rand(5, 6, dtype=torch.float64) for _ in range(3))
     tau, friction = model.inverse_dynamics(q, qd, qdd), model.friction_torque(q, qd)
@@ -570,7 +571,7 @@ def test_few_of_very_many_samples_come_near_first(emitted, monkeypatch):
 
 
 def test_friction_that_is_nearly_nothing_does_not_vary(robots):
-    """What looks like friction that varies by 30 % is that, or far more than ten times a friction next to nothing."""
+    """Friction that varies by 30 %, or far more than ten times a negligible friction."""
     t = torch.linspace(0, 60, 1200).double()[:, None] * torch.tensor([1.1, 1.7])
     noise = 0.01 * torch.randn(t.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     q, qd = t.sin(), t.cos()
@@ -613,7 +614,7 @@ def test_a_spring_is_found_that_bodies_pass_for(emitted, robots):
 
 
 def test_bodies_follow_a_torque_no_further_than_it_goes(emitted):
-    """What they follow is a part of it: under a noise that changed since, they could be taken to go beyond."""
+    """They absorb a part of it: with the covariance of an older noise the part could exceed it."""
     model = emitted["two_link"][0].Model()
     samples = TorqueSamples.of([recorded(model, 6.0, 0.05)])
     jacobian = TorqueJacobian(model, samples)
@@ -645,7 +646,7 @@ def test_a_spring_as_strong_as_gravity_does_not_drive_bodies_away(emitted, robot
 
 
 def test_no_friction_is_guessed_that_torques_do_not_have_room_for(emitted, robots):
-    """The efforts of the URDF are placeholders, a million times what the arm ever gives."""
+    """The efforts of the URDF are placeholders, a million times the torques of the arm."""
     true = drawn(emitted["two_link"][0], seed=3, deviation=0.3)
     model = build(robots / "two_link.urdf", "closed-form")
     model.friction.nominal *= 1e6

@@ -17,9 +17,10 @@ UNUSED = re.compile(
     re.IGNORECASE,
 )
 FRAGMENT = re.compile(r"^(What|Of|By|Whoever|Whether) ")
-# terms of mechanics, and the name of an option
+# terms of mechanics, the name of an option, and a cell of tables of results
 ALLOWED = re.compile(
-    r"\b(at|from|to) rest\b|--trust|trust=True|`trust`|hold(s|ing)? the arm|leaves? out|held samples|zero-order hold"
+    r"\b(at|from|to) rest\b|\|rest\||--trust|trust=True|`trust`|hold(s|ing)? the arm|leaves? out|held samples"
+    r"|zero-order hold"
 )
 CODE = re.compile(r"^```.*?^```$|^(?: {4}|\t)[^\n]*$|`[^`\n]*`|\]\([^)]*\)", re.MULTILINE | re.DOTALL)
 # texts for developers: the meaning of the numbers of a table

@@ -191,7 +191,7 @@ def _possible_gripper(robot: Robot, chain: Sequence[UrdfJoint]) -> tuple[Diagnos
     if turns or not _GRIPPER.search(last.child) or any(map(_GRIPPER.search, robot.joint)):
         return ()
     message = (
-        f"moves the link {last.child!r}, as the last joint of the arm: if it opens a gripper, leave it out by "
+        f"moves the link {last.child!r}, as the last joint of the arm: if it opens a gripper, exclude it by "
         f"'--tip {last.parent}', or by 'tip' in the settings"
     )
     return (_remark(last, "info", message),)

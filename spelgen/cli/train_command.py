@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import textwrap
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,12 +15,13 @@ from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
 from spelgen.cli.options import Accept, Data, Force, MappingFile, MoreData, RobotOption, TextOrJson
 from spelgen.cli.train_settings import TIME_LIMIT, Request, UsageError, new_run, read_assignments, resumed_run
-from spelgen.errors import ModuleError, OptionError
+from spelgen.errors import LogError, ModuleError, OptionError
 from spelgen.labels import counted
-from spelgen.settings.fits import Objective, Rollout, WindowConfig
+from spelgen.settings.fits import Objective, Rollout, TorqueFit, WindowConfig
 
 if TYPE_CHECKING:
     from spelgen.fitting.fitted import Fit
+    from spelgen.live.payload import Payload
     from spelgen.spec import ModelSpec
 
 
@@ -123,11 +125,36 @@ def train(
     except OptionError as error:
         option = "--objective" if error.option == "objective" else f"--set {error.option}"
         raise UsageError(f"{option}: {error.got}") from error
-    _report(fit, request, folder, format)
+    _report(fit, request, folder, format, _payload(fit, source))
 
 
-def _report(fit: Fit, request: Request, folder: Path, format: str) -> None:
-    """Print the outcome of the fit; exit with 130 if it was interrupted."""
+def _payload(fit: Fit, source: Path | None) -> Payload | None:
+    """Return the payload in the logs of a fit to a load, by the estimator of the adapted run; None if it has none.
+
+    A new fit gets its own noise levels, an adapted run has the noise levels of its source.
+    """
+    from spelgen.live.cross_validation import keep_levels, stored_levels
+    from spelgen.live.replay import carried_payload
+
+    if source is None:
+        try:
+            keep_levels(fit)
+        except LogError as error:
+            note(f"info: no estimator: {error}")
+        return None
+    from spelgen.fitting.fitted import load_run
+
+    original = load_run(source)
+    levels = stored_levels(original)
+    if levels is None:
+        return None
+    keep_levels(fit, levels)
+    is_load = isinstance(fit.config, TorqueFit) and fit.config.adapt == "load"
+    return carried_payload(original, fit.logs) if is_load else None
+
+
+def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payload | None) -> None:
+    """Print the outcome of the fit; exit with 130 if it was interrupted. payload: of the logs, None if unknown."""
     if TIME_LIMIT in request.values and TIME_LIMIT not in type(fit.config).model_fields:
         objective = fit.config.objective
         note(f"info: {TIME_LIMIT} limits fits to windows; these logs are fitted by {objective}")
@@ -144,8 +171,14 @@ def _report(fit: Fit, request: Request, folder: Path, format: str) -> None:
         "posterior": fit.posterior.to_dict() if fit.checkpoint.posterior else None,
         "findings": [finding.to_dict() for finding in fit.diagnostics],
     }
-    tables = [table.text() for table in fit.posterior.listings] if fit.checkpoint.posterior else []
-    answer(format, record, *_outcome(fit), *tables, f"run folder: {folder}")
+    outcome: list[str] = [*_outcome(fit)]
+    if payload is not None:
+        from spelgen.live.replay import payload_content, payload_sentence
+
+        record["payload"] = payload_content(payload)
+        outcome.append(textwrap.fill(f"in these logs: {payload_sentence(payload)}", 80))
+    outcome += [table.text() for table in fit.posterior.listings] if fit.checkpoint.posterior else []
+    answer(format, record, *outcome, f"run folder: {folder}")
     if fit.status == "interrupted":
         note("the best model so far is in the run folder; resume it by --resume")
         raise typer.Exit(INTERRUPTED)

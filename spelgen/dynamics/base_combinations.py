@@ -1,6 +1,6 @@
 """Base parameters of a model: the combinations of inertial parameters and armatures that determine its torques.
 
-They are those of `identification.base_parameters`, from the kinematics of the model only and without exact arithmetic.
+Equal to `identification.base_parameters`, but from the kinematics of the model only and without exact arithmetic.
 """
 
 from __future__ import annotations
@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from spelgen.dynamics.body_regressor import regressor_of
-from spelgen.dynamics.protocol import motors_of
-from spelgen.emission.assemble import ArmModel
 from spelgen.labels import BASE_ORDER, INERTIAL_PARAMETERS, parameter_name
+from spelgen.runtime.body_chain import BodyChain
 
 # Length of a column of the regressor, relative to the column, below which it depends on the columns before it.
 DEPENDENT = 1e-8
@@ -20,35 +19,35 @@ DEPENDENT = 1e-8
 ROUNDING = 1e-9
 
 
-def constants_regressor(model: ArmModel, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+def constants_regressor(chain: BodyChain, motors: Tensor, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
     """Return the derivative of joint torques with respect to the inertial parameters and armatures.
 
     Args:
-        model: of B rigid bodies.
+        chain: kinematics of B bodies.
+        motors: C, (n, n), the drives rotate at C qd.
         q, qd, qdd: motion of the joints, (T, n) [rad, m], per s, per s^2.
 
     Returns:
         (T, n, 10 B + n).
     """
-    motors = motors_of(model)
     rotors = (qdd @ motors.mT).unsqueeze(-2) * motors.mT
-    return torch.cat([regressor_of(model.chain, q, qd, qdd), rotors], dim=-1)
+    return torch.cat([regressor_of(chain, q, qd, qdd), rotors], dim=-1)
 
 
-def base_combinations(model: ArmModel) -> tuple[tuple[str, ...], Tensor]:
-    """Return names and coefficients (r, 10 B + n) of the base parameters of a model of B rigid bodies.
+def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...], Tensor]:
+    """Return names and coefficients (r, 10 B + n) of the base parameters; see `constants_regressor`.
 
     A column of the regressor at random states in the span of the columns before it is regrouped into these (Gautier and
     Khalil, IEEE T-RA 6:368, 1990).
     """
-    inertial = 10 * len(model.chain.parents)
+    n, inertial = len(motors), 10 * len(chain.parents)
     order = [
         10 * body + INERTIAL_PARAMETERS.index(name) for body in range(inertial // 10) for name in BASE_ORDER
     ]
-    order += range(inertial, inertial + model.n)
-    shape = (3, 2 * len(order) // model.n + 1, model.n)  # twice as many equations as parameters
+    order += range(inertial, inertial + n)
+    shape = (3, 2 * len(order) // n + 1, n)  # twice as many equations as parameters
     motion = torch.from_numpy(np.random.default_rng(0).uniform(-3.0, 3.0, shape))
-    columns = constants_regressor(model, *motion).flatten(0, 1)
+    columns = constants_regressor(chain, motors, *motion).flatten(0, 1)
     # norm of each column after projection onto the complement of all columns before it
     remainder = torch.linalg.qr(columns[:, order]).R.diagonal().abs()
     is_base = remainder > DEPENDENT * columns[:, order].norm(dim=0).clamp(min=1.0)

@@ -1,4 +1,4 @@
-"""Models in memory: ``build`` from a URDF, ``load_module`` from the file of a module, of which nothing is executed."""
+"""From a URDF to a model in memory: the function ``build``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from pathlib import Path
 from spelgen.arm.configured_arm import Arm
 from spelgen.design import Design
 from spelgen.emission.assemble import ArmModel, assemble
-from spelgen.emission.module_file import read_source, require_unedited
 from spelgen.emission.specify import make_spec
 from spelgen.urdf.robot import Assume
 
@@ -33,14 +32,3 @@ def build(
     Raises the errors of ``load_arm``, and SettingsError for an inconsistent design.
     """
     return assemble(make_spec(arm, preset, width=width, depth=depth, assume=assume), seed)
-
-
-def load_module(module: str | Path, *, seed: int = 0) -> ArmModel:
-    """Return the model of a module that `spelgen build` wrote, with the initial weights of ``seed``.
-
-    module: the file, or its text. Raises ModuleError for a file that was edited or is no such module.
-    """
-    is_text = isinstance(module, str) and "\n" in module
-    file = None if is_text else Path(module)
-    text = str(module) if file is None else read_source(file)
-    return assemble(require_unedited(text, file), seed)

@@ -71,6 +71,9 @@ class Collisions:
             pose[:3, :3], pose[:3, 3] = frame.rotation, frame.position
             self._add(shape.link, frame.body, pose @ shape.pose, _geometry(shape))
         links = len(self._bodies)
+        self._surroundings = (
+            " and surroundings" if surroundings.boxes or surroundings.floor is not None else ""
+        )
         if surroundings.floor is not None:
             self._add(FLOOR, -1, np.eye(4), coal.Halfspace(np.array([0.0, 0.0, 1.0]), surroundings.floor))
         for name, box in surroundings.boxes.items():
@@ -90,9 +93,10 @@ class Collisions:
 
     @property
     def statement(self) -> str:
-        """What is checked and what is not, in sentences."""
+        """Statement of the checked and unchecked collisions, in sentences."""
         pairs = counted(self.pairs, "pair")
-        text = f"Checked: {pairs} of links, floor and boxes, approach included; all keep {1e3 * self.clearance:g} mm."
+        clearance = f"approach included; all keep {1e3 * self.clearance:g} mm"
+        text = f"Checked: {pairs} of links{self._surroundings}, {clearance}."
         if self.ignored:
             text += f" Not checked, since their shapes overlap in most positions: {', '.join(self.ignored)}."
         if self.unread:

@@ -167,7 +167,7 @@ def _joint_values(name: str, values: float | Sequence[float], arm: Chain, *, pos
 
 
 def _collisions(arm: Arm, surroundings: Surroundings, limits: MotionBounds) -> tuple[Collisions | None, str]:
-    """Return distances of links and surroundings, None if they are unknown, and a statement of what is checked."""
+    """Return distances of links and surroundings, None if they are unknown, and a statement of the checks."""
     try:
         # imported here: Pinocchio is an extra
         from spelgen.excitation.collisions import Collisions

@@ -21,8 +21,8 @@ ADVICE = "View the motion, then run it slowly: a load, cables and anything else 
 class Excitation:
     """A proposed motion and its quality.
 
-    The motion starts and ends at rest. approach: motion to its first position. collisions: what is checked, and what is
-    not. parameters: number of base parameters, friction and armature included. condition: condition number of their
+    The motion starts and ends at rest. approach: motion to its first position. collisions: statement of the
+    checks. parameters: number of base parameters, friction and armature included. condition: condition number of their
     regressor with unit columns; first: of the first random motion. efforts: (n,) largest torque of the URDF's bodies,
     divided by the effort limit; NaN without limit or inertials. first_efforts: of the first random motion.
     """

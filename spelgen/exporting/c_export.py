@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from spelgen.errors import RunError
+from spelgen.exporting.c_estimator import CALLED, estimator_c_functions, estimator_texts
 from spelgen.exporting.c_source import FRICTION_STATES, CFunction, c_functions, write_c
 from spelgen.exporting.describe import Trained
+from spelgen.exporting.entry_points import ENTRY_POINTS
 from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.tuning import TUNING
@@ -35,14 +37,25 @@ def export_c(trained: Trained) -> Exported:
 
 def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
     """Return header and source by name, and a sentence with the result of the parity check."""
-    functions = c_functions(trained.described, trained.entry_points)
+    model, levels = trained.described, trained.levels
+    functions, texts = c_functions(model, trained.entry_points), {}
+    if levels is not None:
+        present = [function.entry.name for function in functions]
+        functions += c_functions(model, {name: ENTRY_POINTS[name] for name in CALLED if name not in present})
+        functions += estimator_c_functions(model, levels)
+        texts = estimator_texts(model, levels)
     checked = "Not checked: there is no C compiler"
     program = compiler()
     with tempfile.TemporaryDirectory() as folder:
-        source = write_c(trained.described, functions, Path(folder))
-        files = {path.name: path.read_bytes() for path in (source.with_suffix(".h"), source)}
+        source = write_c(model, functions, Path(folder))
+        sources = [source]
+        for name, text in texts.items():
+            Path(folder, name).write_text(text)
+            if name.endswith(".c"):
+                sources.append(Path(folder, name))
+        files = {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}
         if program is not None:
-            library = called_by_c(compile_library(source, program), functions)
+            library = called_by_c(compile_library(sources, program), functions)
             parity = check_parity(library, trained, list(trained.entry_points), TUNING.tolerance)
             checked = f"Checked when exported, compiled by {Path(program).name}: {parity.summary}"
     return files, checked
@@ -57,10 +70,11 @@ def compiler() -> str | None:
     return None
 
 
-def compile_library(source: Path, program: str, *flags: str) -> Path:
-    """Compile a C file to a shared library in its folder. Raises RunError with the messages of the compiler."""
-    library = source.with_suffix(".so")
-    command = [program, *_FLAGS, *flags, str(source), "-o", str(library), "-lm"]
+def compile_library(sources: Path | Sequence[Path], program: str, *flags: str) -> Path:
+    """Compile C files to a shared library. Raises RunError with the messages of the compiler."""
+    sources = [sources] if isinstance(sources, Path) else sources
+    library = sources[0].with_suffix(".so")
+    command = [program, *_FLAGS, *flags, *map(str, sources), "-o", str(library), "-lm"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode:
         raise RunError(f"{Path(program).name} refuses the exported C", do=result.stderr.strip()[:500])

@@ -17,7 +17,7 @@ from spelgen.exporting.model_expressions import expression_functions, residuals_
 from spelgen.templates import render
 
 _WIDTH = 118  # characters of a line
-FRICTION_STATES = ("z", "z_next", "z_start")
+FRICTION_STATES = ("z", "z_next", "z_start", "low", "high")
 """Inputs and outputs that are friction states, of type double; all others are of type ``real``."""
 # tanh occurs in friction states only
 _FORMS = {
@@ -57,7 +57,7 @@ class CFunction:
 def c_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> list[CFunction]:
     """Return entry points of a model in C."""
     expressions = expression_functions(model, entries)
-    return [_c_function(model, entry, expressions[name]) for name, entry in entries.items()]
+    return [c_function(model, entry, expressions[name]) for name, entry in entries.items()]
 
 
 def write_c(model: TrainedModel, functions: Sequence[CFunction], folder: Path) -> Path:
@@ -91,7 +91,8 @@ def c_texts(model: TrainedModel, functions: Sequence[CFunction]) -> dict[str, st
     }
 
 
-def _c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -> CFunction:
+def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -> CFunction:
+    """Return a function of an entry point in C."""
     # the statements use the residual terms
     residuals, calls = residual_calls(model, residuals_needed(function))
     variables, lines = _statements(function, list(entry.outputs))
@@ -102,11 +103,13 @@ def _c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -
         scalar = "double" if entry.name == "friction_step" else "real"
         body.append(f"{scalar} {', '.join((*residuals, *variables))};")
     body += calls + lines
-    real, size = f"{model.name}_real", f"{model.name.upper()}_N"
+    real = f"{model.name}_real"
     parameters: list[str] = []
     for name in entry.inputs:
         # a pointer, NULL without friction state: C has no empty arrays
-        parameters.append("const double *z" if name == "z" else f"const {real} {name}[{size}]")
+        size = function.numel_in(entry.inputs.index(name)) if name == "load" else f"{model.name.upper()}_N"
+        is_state = name in FRICTION_STATES
+        parameters.append(f"const double *{name}" if is_state else f"const {real} {name}[{size}]")
     shapes: dict[str, tuple[int, ...]] = {}
     results: list[str] = []
     for k, (name, unit) in enumerate(entry.outputs.items()):

@@ -15,16 +15,15 @@ import torch
 from scipy.interpolate import BSpline
 from torch import Tensor
 
-from spelgen.arm.arm import make_arm
-from spelgen.arm.chain import choose_chain
 from spelgen.arm.configured_arm import Arm
-from spelgen.arm.lump_links import lump_links
 from spelgen.dynamics.protocol import input_of, motors_of, residual_terms
 from spelgen.dynamics.tip import last_link, tip_kinematics
+from spelgen.dynamics.tip_frame import tip_frame
 from spelgen.errors import RunError
-from spelgen.exporting.description import Harmonics, Residuals, Servos, SigmoidNetwork, Tip, TrainedModel
+from spelgen.exporting.description import Harmonics, Residuals, Servos, SigmoidNetwork, TrainedModel
 from spelgen.exporting.entry_points import EntryPoint, entry_points
 from spelgen.listing import Listing
+from spelgen.live.noise import NoiseLevels
 from spelgen.runtime.friction_laws import FrictionConstants
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
@@ -45,6 +44,7 @@ class Trained:
     entries: names of the functions to export, for formats of functions; empty: all functions except derivatives.
     intervals: tables of the 95 % intervals of a fit, for the README.
     float32: numbers of ONNX and torch programs; otherwise float64.
+    levels: noise levels of the estimator; None: it is not exported.
     """
 
     model: ArmModel
@@ -52,6 +52,7 @@ class Trained:
     entries: tuple[str, ...] = ()
     intervals: tuple[Listing, ...] = ()
     float32: bool = False
+    levels: NoiseLevels | None = None
 
     @cached_property
     def described(self) -> TrainedModel:
@@ -166,28 +167,6 @@ def servos_of(model: ArmModel) -> Servos | None:
         return None
     kp, kd, limit, dead_zone = map(array, model.servo.prepare())
     return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
-
-
-def tip_frame(loaded: Arm) -> Tip:
-    """Return the frame of the tip link, with the unrounded angles of the URDF."""
-    names = loaded.chain.joint_names
-    link = loaded.tip or last_link(loaded.robot, names)
-    bodies = make_arm(loaded.robot, joints=names, angle_tolerance=0.0).bodies
-    return Tip(link, *link_poses(loaded)[link], bodies)
-
-
-def link_poses(loaded: Arm) -> dict[str, tuple[int, np.ndarray]]:
-    """Return, by link, the index of the body that carries it, -1: the root link, and the pose (4, 4) in its frame.
-
-    Angles are the unrounded angles of the URDF.
-    """
-    chain = choose_chain(loaded.robot, loaded.chain.joint_names, None)
-    poses: dict[str, tuple[int, np.ndarray]] = {}
-    for link, frame in lump_links(loaded.robot, chain, 0.0).frames.items():
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = frame.rotation, frame.position
-        poses[link] = frame.body, pose
-    return poses
 
 
 def _residuals(model: ArmModel) -> Residuals:

@@ -8,21 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import BSpline
 
-from spelgen.arm.arm import Body, Chain
-
-
-@dataclass(frozen=True, eq=False)
-class Tip:
-    """The frame of the tip link.
-
-    carrier: index of the body that carries the link; -1: the root link. pose: (4, 4), in the frame of this body.
-    bodies: of the arm with the unrounded angles of the URDF, since the tip is compared with other readers of the file.
-    """
-
-    link: str
-    carrier: int
-    pose: np.ndarray
-    bodies: tuple[Body, ...]
+from spelgen.arm.arm import Chain
+from spelgen.dynamics.tip_frame import Tip
 
 
 @dataclass(frozen=True, eq=False)

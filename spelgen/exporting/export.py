@@ -15,6 +15,7 @@ from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
 from spelgen.fitting.fitted import Fit, load_run, required_spec
 from spelgen.labels import listed
 from spelgen.listing import Listing
+from spelgen.live.cross_validation import stored_levels
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
@@ -55,7 +56,9 @@ def export(
     if isinstance(trained, str | Path):
         trained = load_run(trained)
     intervals: tuple[Listing, ...] = ()
+    levels = None
     if isinstance(trained, Fit):
+        levels = stored_levels(trained)
         if trained.checkpoint.posterior:
             intervals = trained.posterior.listings
         trained, arm = trained.model, arm or trained.urdf
@@ -73,7 +76,7 @@ def export(
         arm = arm_of_spec(required_spec(trained), arm)
     # imported here: the packages of a format may be extras that are not installed
     exported: Exported = pkgutil.resolve_name(exporter.function_name)(
-        Trained(trained, arm, tuple(entries), intervals, float32)
+        Trained(trained, arm, tuple(entries), intervals, float32, levels)
     )
     if path is not None:
         exported.write(path, force=force)

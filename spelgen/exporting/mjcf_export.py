@@ -14,8 +14,9 @@ from lxml import etree
 
 from spelgen.arm.arm import Chain, Coordinate, make_arm
 from spelgen.dynamics.body_regressor import about_center, quaternion
+from spelgen.dynamics.tip_frame import tip_frame
 from spelgen.emission.build import build
-from spelgen.exporting.describe import Trained, tip_frame
+from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import Servos
 from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.mjcf_shapes import add_shapes

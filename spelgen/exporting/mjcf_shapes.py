@@ -9,7 +9,7 @@ from lxml import etree
 
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.body_regressor import quaternion
-from spelgen.exporting.describe import link_poses
+from spelgen.dynamics.tip_frame import link_poses
 from spelgen.exporting.tuning import TUNING
 from spelgen.urdf.geometry import LinkShape, link_shapes
 
@@ -70,7 +70,7 @@ def _form(shape: LinkShape, assets: etree._Element) -> dict[str, str]:
 
 
 def _is_flat(vertices: np.ndarray) -> bool:
-    """Return whether a mesh with vertices (V, 3) has no convex hull in three dimensions."""
+    """True if a mesh with vertices (V, 3) has no convex hull in three dimensions."""
     extents = np.linalg.svd(vertices - vertices.mean(axis=0), compute_uv=False)
     return len(extents) < 3 or bool(extents[2] <= FLAT * extents[0])
 

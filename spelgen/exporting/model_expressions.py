@@ -41,15 +41,22 @@ def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint])
         expressions |= _derivatives(model, inputs, residuals)
     functions: dict[str, ca.Function] = {}
     for name, entry in entries.items():
-        outputs = list(map(ca.densify, expressions[name]))
-        arguments = {key: inputs[key] for key in entry.inputs}
-        for key, symbols in residuals.items():
-            if symbols.nnz() and ca.depends_on(ca.veccat(*outputs), symbols):
-                arguments[RESIDUAL + key] = symbols
-        labels = list(arguments), list(entry.outputs)
-        # cse: common subexpressions are computed once
-        functions[name] = ca.Function(name, list(arguments.values()), outputs, *labels, {"cse": True})
+        functions[name] = named_function(entry, expressions[name], inputs, residuals)
     return functions
+
+
+def named_function(
+    entry: EntryPoint, expressions: tuple[ca.SX, ...], inputs: Symbols, residuals: Symbols
+) -> ca.Function:
+    """Return the function of an entry point, of its inputs and the residual terms that it needs; outputs are dense."""
+    outputs = list(map(ca.densify, expressions))
+    arguments = {key: inputs[key] for key in entry.inputs}
+    for key, symbols in residuals.items():
+        if symbols.nnz() and ca.depends_on(ca.veccat(*outputs), symbols):
+            arguments[RESIDUAL + key] = symbols
+    labels = list(arguments), list(entry.outputs)
+    # cse: common subexpressions are computed once
+    return ca.Function(entry.name, list(arguments.values()), outputs, *labels, {"cse": True})
 
 
 def residuals_needed(function: ca.Function) -> list[str]:
@@ -83,12 +90,7 @@ def _expressions(
     if model.residuals.mass is not None:
         added_bias = added_gravity + coriolis(model, residuals, qd, derivatives=derivatives)
     bias = rigid_torque(model, frames, qd, standstill) + added_bias
-    # Power is equal on both sides of the gears: C^T drive_load = joint_load.
-    load = constant(np.linalg.inv(model.motors).T) @ rigid_gravity
-    drive_friction = friction_torque(model, motors @ qd, load, z)
-    for k, joint in enumerate(model.residuals.friction):
-        drive_friction[joint] *= ca.exp(residuals["factor"][k])
-    friction = motors.T @ drive_friction
+    friction = drive_friction(model, residuals, qd, rigid_gravity, z)
     compensation = constant(model.friction_compensation) * qd
     # one recursive Newton-Euler pass; M qdd + h would take two
     force = rigid_torque(model, frames, qd, qdd) + added_mass @ qdd + added_bias + friction - compensation
@@ -115,6 +117,17 @@ def _expressions(
     if model.servos is not None:
         outputs["servo_torque"] = _servo_torque(model.servos, u, q, qd)
     return {name: (output,) for name, output in outputs.items()}
+
+
+def drive_friction(model: TrainedModel, residuals: Symbols, qd: ca.SX, gravity: ca.SX, z: ca.SX) -> ca.SX:
+    """Return the friction torque of the joints, (n, 1) [Nm, N]; gravity: of the rigid bodies, (n, 1)."""
+    motors = constant(model.motors)
+    # Power is equal on both sides of the gears: C^T drive_load = joint_load.
+    load = constant(np.linalg.inv(model.motors).T) @ gravity
+    friction = friction_torque(model, motors @ qd, load, z)
+    for k, joint in enumerate(model.residuals.friction):
+        friction[joint] *= ca.exp(residuals["factor"][k])
+    return motors.T @ friction
 
 
 def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) -> ca.SX:

@@ -94,6 +94,44 @@ def rigid_torque(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.
     return joint_torques
 
 
+def rigid_momentum(model: TrainedModel, frames: list[tuple[ca.SX, ca.SX]], qd: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return M qd and d/dq of the kinetic energy of the rigid bodies, without armature, (n, 1) each.
+
+    The momentum of the bodies that a joint carries is projected onto its axis S, and onto dS/dt = twist x S.
+    """
+    bodies = model.arm.bodies
+    # angular velocity, and velocity of the origin, of the base, then of the bodies, in their frames
+    twists = [(ca.SX(3, 1), ca.SX(3, 1))]
+    momenta: list[tuple[ca.SX, ca.SX]] = []
+    for body, ten, (rotation, position) in zip(bodies, model.inertias, frames, strict=True):
+        w, v = twists[body.parent + 1]
+        w, v = rotation.T @ w, rotation.T @ (v + ca.cross(w, position))
+        speed = _Z * (float(body.multiplier) * qd[body.coordinate])
+        w, v = (w + speed, v) if body.joint_type == "revolute" else (w, v + speed)
+        twists.append((w, v))
+        m, x, y, z, xx, xy, xz, yy, yz, zz = ten.tolist()
+        moment = ca.SX(constant([x, y, z]))
+        inertia = ca.SX(constant([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+        momenta.append((m * v + ca.cross(w, moment), inertia @ w + ca.cross(moment, v)))
+    momentum, gradient = ca.SX(model.n, 1), ca.SX(model.n, 1)
+    for index in reversed(range(len(bodies))):
+        body, (linear, angular) = bodies[index], momenta[index]
+        w, v = twists[index + 1]
+        ratio = float(body.multiplier)
+        if body.joint_type == "revolute":
+            along, turned = angular[2], ca.dot(ca.cross(w, _Z), angular) + ca.dot(ca.cross(v, _Z), linear)
+        else:
+            along, turned = linear[2], ca.dot(ca.cross(w, _Z), linear)
+        momentum[body.coordinate] += ratio * along
+        gradient[body.coordinate] += ratio * turned
+        if body.parent >= 0:
+            rotation, position = frames[index]
+            linear = rotation @ linear
+            angular = rotation @ angular + ca.cross(position, linear)
+            momenta[body.parent] = momenta[body.parent][0] + linear, momenta[body.parent][1] + angular
+    return momentum, gradient
+
+
 def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return M, (n, n), and V, (1, 1) [J], of the rigid bodies at q (n, 1), by the recursion of `structure`."""
     positions = []

@@ -1,49 +1,141 @@
-"""--to ros2: a colcon package with the C files and a plugin of the package inverse_dynamics_solver."""
+"""--to ros2: a colcon package with the C files, a ros2_control controller and an inverse_dynamics_solver plugin."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterable
 from dataclasses import replace
+
+import numpy as np
 
 from spelgen.exporting.c_export import c_files
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.exported import Exported, with_readme
 from spelgen.templates import render
+from spelgen.urdf.values import UNLIMITED
 
 _CALLED = (
     "inverse_dynamics", "mass_matrix", "bias", "gravity", "friction", "friction_step", "friction_memory",
 )  # fmt: skip
-"""The functions that the plugin calls."""
+"""The functions that the plugins call."""
 
+_DEPENDENCIES = ("eigen", "inverse_dynamics_solver", "pluginlib", "rclcpp")
+_CONTROLLER_DEPENDENCIES = (
+    "controller_interface", "geometry_msgs", "hardware_interface", "rcl_interfaces", "rclcpp_lifecycle",
+    "sensor_msgs", "std_msgs", "trajectory_msgs",
+)  # fmt: skip
 _PATHS = {
     "package.xml": "package.xml",
     "CMakeLists.txt": "CMakeLists.txt",
-    "plugin.xml": "plugin.xml",
+    "solver.xml": "solver.xml",
     "solver.cpp": "src/solver.cpp",
+}
+_CONTROLLER_PATHS = {
+    "controller.xml": "controller.xml",
+    "controller.yaml": "config/controller.yaml",
+    "controller.cpp": "src/controller.cpp",
+    "control.hpp": "src/control.hpp",
 }
 
 
 def export_ros2(trained: Trained) -> Exported:
     """Return the package. Raises RunError if its C differs from the model."""
-    trained = replace(trained, entries=_CALLED)
-    model = trained.described
-    sources, checked = c_files(trained)
-    package = f"{model.name}_solver"
+    model, missing = trained.described, _missing_part(trained)
+    controller, estimator = missing is None or missing[0] != "controller", missing is None
+    entries = (*_CALLED, "tip_pose") if estimator else _CALLED
+    levels = trained.levels if estimator else None
+    sources, checked = c_files(replace(trained, entries=entries, levels=levels))
+    package = f"{model.name}_dynamics"
+    context = {"package": package, "controller": controller, "name": model.name, "upper": model.name.upper()}
+    context |= {"joints": ", ".join(model.identifiers), "estimator": estimator}
+    context["dependencies"] = sorted(_DEPENDENCIES + (_CONTROLLER_DEPENDENCIES if controller else ()))
+    paths = _PATHS
+    if controller:
+        paths = _PATHS | _CONTROLLER_PATHS
+        context |= _controller_numbers(trained)
     files = {f"src/{name}": content for name, content in sources.items()}
-    for template, path in _PATHS.items():
-        text = render(
-            f"ros2/{template}.jinja",
-            package=package,
-            name=model.name,
-            upper=model.name.upper(),
-            joints=", ".join(model.identifiers),
-        )
-        files[path] = text.encode()
-    use = (
-        f"Put this folder into a workspace, colcon build --packages-select {package}; "
-        f"the plugin {package}/Solver is an inverse_dynamics_solver::InverseDynamicsSolver."
-    )
+    for template, path in paths.items():
+        files[path] = render(f"ros2/{template}.jinja", **context).encode()
     about = (
         "getTorques includes friction, and updates its state by the positions of successive calls; "
         "initialize resets it."
     )
-    return with_readme(trained, "ros2", files, use=use, about=about, summary=[checked])
+    summary = [checked] if missing is None else [checked, f"no {missing[0]}: {missing[1]}"]
+    use = _use(package, model.name, controller=controller)
+    return with_readme(trained, "ros2", files, use=use, about=about, summary=summary)
+
+
+def _missing_part(trained: Trained) -> tuple[str, str] | None:
+    """Return the part that the package does not contain, controller or estimator, and the reason; None: none.
+
+    A package without controller has no estimator either.
+    """
+    model = trained.described
+    if model.servos is not None or not model.actuated.all():
+        return "controller", "it needs an effort interface of every joint"
+    if trained.levels is None:
+        return "estimator", "its noise levels are found from the training logs of a fit"
+    # its payload is in the frame of the last body, the published one in the frame of the tip link
+    if model.tip.carrier != len(model.arm.bodies) - 1:
+        return "estimator", "the tip link is not part of the last body"
+    return None
+
+
+def _use(package: str, name: str, *, controller: bool) -> str:
+    """Return the line of the README that describes the use of the package."""
+    use = (
+        f"Put this folder into a workspace and run colcon build --packages-select {package}. "
+        f"{package}/Solver is an inverse_dynamics_solver::InverseDynamicsSolver."
+    )
+    if controller:
+        use += (
+            f" {package}/Controller is a controller of ros2_control for effort interfaces: ros2 run controller_manager "
+            f"spawner {name}_controller --param-file install/{package}/share/{package}/config/controller.yaml "
+            f"compensates gravity; after ros2 param set /{name}_controller mode computed_torque it tracks the topic "
+            "~/reference (trajectory_msgs/JointTrajectoryPoint) or a preceding joint_trajectory_controller."
+        )
+    return use
+
+
+def _controller_numbers(trained: Trained) -> dict[str, object]:
+    """Return names, limits and the tip's pose as text of C++ and YAML. An absent effort limit is 0 and must be set."""
+    model, coordinates = trained.described, trained.arm.chain.coordinates
+    revolute = np.array([joint.joint_type == "revolute" for joint in coordinates])
+    continuous = [str(joint.continuous).lower() for joint in coordinates]
+    rotation = (f"{{{_listed(row)}}}" for row in model.tip.pose[:3, :3])
+    return {
+        "joint_names": ", ".join(map(cpp_string, trained.joint_names)),
+        # a JSON text is YAML
+        "yaml_joints": ", ".join(map(json.dumps, trained.joint_names)),
+        "yaml_references": ", ".join(json.dumps(f"{model.name}_controller/{x}") for x in trained.joint_names),
+        "efforts": _listed(joint.effort or 0.0 for joint in coordinates),
+        "velocities": _listed(_velocity_limit(joint.velocity) for joint in coordinates),
+        "position_errors": _listed(np.where(revolute, 0.2, 0.05)),
+        "frozen_travel": _listed(np.where(revolute, 1e-2, 1e-3)),
+        "continuous": ", ".join(continuous),
+        "tip_link": cpp_string(model.tip.link),
+        "tip_rotation": ", ".join(rotation),
+        "tip_position": _listed(model.tip.pose[:3, 3]),
+        "filled": lambda value: _listed([value] * model.n),
+    }
+
+
+def _velocity_limit(velocity: float | None) -> float:
+    """Return the velocity above which a joint is damped; references at the URDF's limit overshoot it a little."""
+    largest = UNLIMITED["velocity"]
+    return largest if velocity is None else min(float(f"{1.2 * velocity:.4g}"), largest)
+
+
+def _listed(numbers: Iterable[float] | np.ndarray) -> str:
+    """Return numbers, separated by commas, that read back exactly."""
+    return ", ".join(repr(float(number)) for number in numbers)
+
+
+def cpp_string(text: str) -> str:
+    """Return a C++ literal of a text from a file; all bytes except plain letters, digits and ``_-/`` are escaped."""
+    characters: list[str] = []
+    for character in text:
+        plain = character.isascii() and (character.isalnum() or character in "_-/")
+        # an octal escape has at most three digits, so that a digit may follow
+        characters.append(character if plain else "".join(f"\\{byte:03o}" for byte in character.encode()))
+    return f'"{"".join(characters)}"'

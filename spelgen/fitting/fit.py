@@ -129,6 +129,7 @@ class _Fitting:
             baselines=self.baselines,
             urdf=request.urdf,
             folder=request.folder,
+            logs=self._logs(),
         )
 
     def _resume(self, run: RunFolder) -> None:
@@ -186,11 +187,13 @@ class _Fitting:
             self.notes.append(Diagnostic("warning", "no-baselines", "run", None, message))
             return None
 
+    def _logs(self) -> list[Trajectory]:
+        """Return all logs, validation included."""
+        validation = self.request.validation
+        return [*self.request.logs, *(() if isinstance(validation, float) else validation)]
+
     def _fit_baselines(self, arm: Arm) -> None:
-        logs = list(self.request.logs)
-        if not isinstance(self.request.validation, float):
-            logs += self.request.validation
-        self.baselines = fit_baselines(arm, logs, self.record.preprocessing)
+        self.baselines = fit_baselines(arm, self._logs(), self.record.preprocessing)
         if self.run is not None:
             write_json(self.run.baseline, self.baselines)
 

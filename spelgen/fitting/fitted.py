@@ -41,6 +41,7 @@ class Fit:
     history: lines of metrics.jsonl, one per epoch. status: how the fit ended; None: not known, of a run that was
     loaded. record: content of config.json. checkpoint: content of checkpoint.pt. baselines: content of
     least_squares.json, {} without any. urdf: of the robot, None if unknown. folder: of the run, None without one.
+    logs: that it was fitted to, () of a run that was loaded.
     """
 
     model: ArmModel
@@ -52,6 +53,7 @@ class Fit:
     baselines: Content
     urdf: Path | None = None
     folder: Path | None = None
+    logs: Sequence[Trajectory] = ()
 
     @property
     def config(self) -> FitConfig:

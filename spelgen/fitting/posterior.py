@@ -6,8 +6,9 @@ function f is |df/dx R|^2 with the covariance R R^T. Torque predictions add the 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -88,9 +89,9 @@ class Posterior:
     def mass_matrix(self, q: np.ndarray) -> Uncertain:
         """Return M (T, n, n) at q (T, n), with standard deviations."""
         position, zero = torch.as_tensor(q), torch.zeros(len(q), self.model.n).double()
-        at_rest, columns = constants_regressor(self.model, position, zero, zero), []
+        at_rest, columns = self._regressor(position, zero, zero), []
         for unit in torch.eye(self.model.n).double():
-            columns.append(constants_regressor(self.model, position, zero, unit.expand_as(zero)) - at_rest)
+            columns.append(self._regressor(position, zero, unit.expand_as(zero)) - at_rest)
         with torch.no_grad():
             return self._linear(self.model.mass_matrix(position), torch.stack(columns, dim=-2))
 
@@ -98,9 +99,7 @@ class Posterior:
         """Return gravity torques (T, n) [Nm, N] at q (T, n), with standard deviations."""
         position, zero = torch.as_tensor(q), torch.zeros(len(q), self.model.n).double()
         with torch.no_grad():
-            return self._linear(
-                self.model.gravity(position), constants_regressor(self.model, position, zero, zero)
-            )
+            return self._linear(self.model.gravity(position), self._regressor(position, zero, zero))
 
     def torque(self, *motion: np.ndarray) -> Uncertain:
         """Return the torques (T, n) [Nm, N] that would be logged, with standard deviations.
@@ -138,17 +137,12 @@ class Posterior:
     @cached_property
     def bodies(self) -> tuple[Interval, ...]:
         """Mass [kg] and first moments [kg m] of each body that the logs can determine on their own."""
-        names, _ = self._base
-        value, root = self._constants
-        result = []
-        for index in range(10 * len(self.model.chain.parents)):
-            if (
-                index % 10 < 4 and parameter_name(index) in names
-            ):  # base parameters of several have the suffix R
-                unit, positive = ("kg", True) if index % 10 == 0 else ("kg m", False)
-                std = float(root[index].norm())
-                result.append(Interval(parameter_name(index), float(value[index]), std, unit, positive))
-        return tuple(result)
+        _, combination = self._base
+        alone = (combination.count_nonzero(dim=1) == 1).tolist()
+        pairs = zip(self.base_parameters, alone, strict=True)
+        return tuple(
+            replace(x, positive=x.name[0] == "m") for x, single in pairs if single and x.name[0] in "mh"
+        )
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
@@ -255,12 +249,15 @@ class Posterior:
 
     @cached_property
     def _base(self) -> tuple[tuple[str, ...], Tensor]:
-        return base_combinations(self.model)
+        return base_combinations(self.model.chain, motors_of(self.model))
 
     @cached_property
     def _constants(self) -> Propagated:
         """Inertial parameters of all bodies, then armatures, (10 B + n,)."""
         return self.propagate(lambda model: torch.cat([model.inertial_parameters.flatten(), model.armature]))
+
+    def _regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
+        return constants_regressor(self.model.chain, motors_of(self.model), q, qd, qdd)
 
     def _linear(self, value: Tensor, rows: Tensor) -> Uncertain:
         """Return a value (...) with the standard deviation of the constants' contribution, rows (..., 10 B + n)."""
@@ -287,27 +284,21 @@ def posterior_of(
         )  # fmt: skip
     vector = ParameterVector(model)
     count = len(vector.flatten(vector.initial))
-    covariance, torque_std = (
-        _tensor(content, "covariance", (count, count)),
-        _tensor(content, "torque_std", (model.n,)),
-    )
-    delay_std = content.get("delay_std")
+    covariance = _tensor(content, "covariance", (count, count))
+    torque_std, delay_std = _tensor(content, "torque_std", (model.n,)), content.get("delay_std")
     if covariance is None or torque_std is None or not isinstance(delay_std, float):
-        raise RunError(
-            "a posterior of another model",
-            file=file,
-            element="posterior",
-            do="restore it from a copy, or fit again",
-        )
+        do = "restore it from a copy, or fit again"
+        raise RunError("a posterior of another model", file=file, element="posterior", do=do)
     late = Interval("torque delay", delay, delay_std, "s") if delay else None
+    model = copy.deepcopy(model).double().cpu().requires_grad_(False)  # a user may change the model
     return Posterior(model, covariance, torque_std.numpy(), late)
 
 
 def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | None:
-    """Return a tensor by its name; None if it is absent, has another shape or type, or is not finite."""
+    """Return a tensor by its name; None if it is absent, has another shape or type, is zero or not finite."""
     tensor = content.get(name)
     if isinstance(tensor, Tensor) and tensor.shape == shape and tensor.dtype == torch.float64:
-        return tensor if bool(tensor.isfinite().all()) else None
+        return tensor if tensor.any() and tensor.isfinite().all() else None
     return None
 
 

@@ -28,7 +28,7 @@ class RunFolder:
     spec: specification of the model. urdf, settings: of its robot, where known. mapping: of logs with names and units
     of their own, as --mapping takes it. config: how it was trained. metrics: a line per epoch. checkpoint: everything
     needed to resume. weights: the best state_dict so far. evaluation: results of `evaluate`. baseline:
-    baselines fitted to the training logs, and the coverage of these.
+    baselines fitted to the training logs, and the coverage of these. estimator: noise levels of the estimator.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -43,6 +43,7 @@ class RunFolder:
         self.weights = self.path / "model.pt"
         self.evaluation = self.path / "evaluation.json"
         self.baseline = self.path / "least_squares.json"
+        self.estimator = self.path / "estimator.json"
 
     def require_free(self, *, force: bool) -> None:
         """Raise RunError if there is a run in the folder, unless it may be replaced."""
@@ -65,7 +66,7 @@ class RunFolder:
         # first the files that mark a run
         old_files = (
             self.config, self.urdf, self.settings, self.mapping, self.metrics, self.checkpoint, self.weights,
-            self.evaluation, self.baseline,
+            self.evaluation, self.baseline, self.estimator,
         )  # fmt: skip
         for old in old_files:
             remove(old)

@@ -201,9 +201,13 @@ def _with_gravity(problem: GeometryProblem, base: HypothesisFit) -> list[Hypothe
     fits = []
     if size:
         fits += _with_compensation(problem, base)
-    axes = [*np.eye(3), *-np.eye(3)]
+    axes = [
+        *-np.eye(3)[::-1],
+        *np.eye(3),
+    ]  # upright first: a prismatic vertical joint shows no sense of gravity
     starts = [_gravity(problem, base, (size or STANDARD_GRAVITY) * axis) for axis in axes]
-    best = min(starts, key=lambda fit: fit.cost)
+    lowest = min(fit.cost for fit in starts)
+    best = next(fit for fit in starts if fit.cost < lowest + GEOMETRY.rare)
     directions = [_best_direction(problem, start) for start in ((best, base) if size else (best,))]
     direction = min(directions, key=lambda fit: fit.cost)
     new = np.array(direction.hypothesis.gravity)

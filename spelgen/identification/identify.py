@@ -18,7 +18,7 @@ from spelgen.dynamics.regressor_dynamics import body_chain, regressor
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.identification import Identification, LeastSquares
-from spelgen.identification.intervals import BLOCKS, MIN_BLOCK, jackknife_covariance, student_scale
+from spelgen.identification.intervals import BLOCKS, jackknife_covariance, student_scale
 from spelgen.identification.least_squares import Columns, Solution, deviations, reduce, solve
 from spelgen.identification.torque_delay import TorqueDelay, find_torque_delay
 from spelgen.identification.tuning import TUNING
@@ -105,6 +105,10 @@ def least_squares(
     return _Equations(arm, samples, drives or Drives(identity, identity)).solved(method or LeastSquares())
 
 
+# Samples of a block of the jackknife, 2 s: without a prior, a shorter block determines some parameters on its own.
+MIN_BLOCK = 200
+
+
 class _Equations:
     """Linear equations of samples, one block at a time; the columns of the bodies are common to all friction models."""
 
@@ -186,7 +190,7 @@ class _Equations:
         combination = base.combination[:, base.columns]
         std = solution.deviations(triangles, used**2 * noise, combination)
         # without parameters that the samples do not determine at all
-        if solution.rank == len(base) and triangles.count > BLOCKS * MIN_BLOCK:
+        if solution.rank == len(base) and triangles.count >= BLOCKS * MIN_BLOCK:
             std = np.maximum(
                 std, student_scale(BLOCKS) * self._jackknife(method.friction, solution, used, combination)
             )

@@ -83,7 +83,7 @@ def interval_listing(title: str, intervals: Sequence[Interval], note: str = "") 
 
 
 def student_scale(blocks: int) -> float:
-    """Return the factor on standard deviations from so many blocks, for 95 % intervals of 1.96 standard deviations."""
+    """Return the factor on standard deviations from a few blocks for which 95 % intervals are 1.96 of them."""
     return float(stdtrit(blocks - 1, 0.975)) / QUANTILE
 
 

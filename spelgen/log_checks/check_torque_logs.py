@@ -36,12 +36,14 @@ from spelgen.logs.checks import Findings, run_checks
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_torques
+from spelgen.settings.log_mapping import CURRENTS
 
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
     from spelgen.settings.log_mapping import LogMapping
 
 COUPLED, WRONG_VELOCITY, WRONG_LINK = "coupled-motors", "velocity-is-no-derivative", "urdf-inertials"
+CURRENT = "current-without-gain"
 
 
 class TorqueLogs:
@@ -51,7 +53,7 @@ class TorqueLogs:
         self._arm, self._mapping, self._drives = arm, mapping, arm.actuation.drives()
         self._samples: list[np.ndarray] = []
         self._moving = DriveLog(arm.chain.joint_types, self._drives, Preprocessing())
-        self._flat = FlatTops()
+        self._flat: list[FlatTops] = []
         self._declared: list[set[str]] = []
         self._seconds, self._is_bag = 0.0, False
 
@@ -60,7 +62,7 @@ class TorqueLogs:
         require_torques([trajectory])
         self._samples.append(state_samples(trajectory, self._drives.inputs))
         self._moving.add(trajectory)
-        self._flat.add(trajectory.q, trajectory.tau @ self._drives.inputs.T)
+        self._flat.append(FlatTops.of(trajectory.q, trajectory.tau @ self._drives.inputs.T))
         self._declared.append(set(trajectory.accepted))
         self._seconds += trajectory.duration
         if trajectory.file is not None:
@@ -80,13 +82,17 @@ class TorqueLogs:
         evidence = list(map(JointEvidence, self._arm.chain.coordinates, completed))
         # with wrong velocities friction is wrong too, and hints about drives would be wrong with wrong torques
         is_sound = not summary.errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
+        unscaled = list(self._current_note())
+        summary.notes.extend(unscaled)
         moving = self._moving.samples()
         weightless: list[JointEvidence] = []
         if is_sound:
-            problem = self._problem(moving, motion)
+            # with torques of unknown factors another reading may seem better
+            problem = None if unscaled else self._problem(moving, motion)
             is_right = problem is None or self._is_within_limits(problem, accepted, summary)
             if problem is not None and is_right:
-                comparison = self._comparison(problem, evidence)
+                undeclared = [not self._is_declared(name) for name in self._arm.chain.joint_names]
+                comparison = compare_readings(problem, torque_factors(evidence, undeclared))
                 is_right = self._is_read_right(problem, comparison, accepted, summary)
                 if is_right:
                     weightless = _weightless(problem, evidence)
@@ -103,6 +109,25 @@ class TorqueLogs:
             for check, message in run_checks(CHECKS, joint, passed):
                 summary.add(check, message, f"{where}, tau" if check.severity == "error" else where)
         return completed, (*signal_tables(completed, QUANTITIES), _physics_table(completed))
+
+    def _current_note(self) -> Iterator[Diagnostic]:
+        """Yield a warning about motor currents with the gain 1 of a draft, unless a fit is to find their gains."""
+        settings, names = self._arm.settings.joints, []
+        for name in self._arm.chain.joint_names:
+            is_trained = name in settings and settings[name].gain == "trained"
+            if (
+                self._mapping.unit("tau", name) in CURRENTS
+                and self._mapping.joint(name).gain == 1.0
+                and not is_trained
+            ):
+                names.append(name)
+        if names:
+            message = (
+                "motor currents with a gain of 1: write 'gain', Nm per A at the joint, the gear included, under 'logs' "
+                "in the robot's YAML; until then, senses, order and zeros of the joints are not tested"
+            )
+            where = f"joint {', '.join(map(repr, names))}"
+            yield Diagnostic("warning", CURRENT, where, None, message)
 
     def _is_declared(self, joint: str) -> bool:
         """Whether the mapping states the unit of a joint's torque."""
@@ -123,16 +148,11 @@ class TorqueLogs:
 
     def _is_within_limits(self, problem: GeometryProblem, accepted: set[str], summary: Findings) -> bool:
         """Return True without an error that torques are clipped; add it, and warnings about mechanical stops."""
-        findings = find_limits(problem, self._flat)
+        findings = find_limits(problem, FlatTops.joined(self._flat))
         errors = [x for x in findings.errors if CLIPPED not in accepted]
         summary.errors.extend(errors)
         summary.notes.extend(findings.notes)
         return not errors
-
-    def _comparison(self, problem: GeometryProblem, joints: Sequence[JointEvidence]) -> HypothesisComparison:
-        """Return the comparison of the log with other readings of it."""
-        undeclared = [not self._is_declared(name) for name in self._arm.chain.joint_names]
-        return compare_readings(problem, torque_factors(joints, undeclared))
 
     def _is_read_right(
         self,

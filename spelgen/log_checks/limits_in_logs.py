@@ -1,4 +1,4 @@
-"""Find signals that stop at a limit although the motion goes on: clipped torques, positions at a mechanical stop.
+"""Find signals that stop at a limit although the motion continues: clipped torques, positions at a mechanical stop.
 
 A flat top of a signal is no proof: an arm that rests, or accelerates uniformly, has flat torques. It is a limit if the
 model that least squares finds on all other samples contradicts it.
@@ -7,7 +7,7 @@ model that least squares finds on all other samples contradicts it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,28 +22,30 @@ CLIPPED, AT_A_STOP = "torque-clipped", "at-a-stop"
 SIDES = np.array([-1.0, 1.0])
 
 
-@dataclass
-class FlatTops:
-    """Flat tops of the positions and torques of n joints, collected from trajectories.
+class FlatTops(NamedTuple):
+    """Flat bottoms and tops of the positions and torques of n joints.
 
-    levels: by "q" and "tau", (2, n): the most extreme flat bottom and top, NaN without one. shares: likewise, samples
-    there as a fraction of all samples.
+    q, tau: values (2, n) [rad, m; Nm, N] of the most extreme ones, NaN without one. shares: (2, n), fraction of the
+    samples that are at the one of tau.
     """
 
-    levels: dict[str, np.ndarray] = field(default_factory=dict)
-    shares: dict[str, np.ndarray] = field(default_factory=dict)
-    _samples: int = 0
+    q: np.ndarray
+    tau: np.ndarray
+    shares: np.ndarray
 
-    def add(self, q: np.ndarray, tau: np.ndarray) -> None:
-        """Take in the positions and joint torques (T, n) of a trajectory."""
-        total = self._samples + len(q)
-        for name, values in (("q", q), ("tau", tau)):
-            levels, shares = flat_tops(values)
-            if name in self.levels:
-                levels = SIDES[:, None] * np.fmax(*(SIDES[:, None] * x for x in (self.levels[name], levels)))
-                shares = (self.shares[name] * self._samples + shares * len(q)) / total
-            self.levels[name], self.shares[name] = levels, shares
-        self._samples = total
+    @classmethod
+    def of(cls, q: np.ndarray, tau: np.ndarray) -> FlatTops:
+        """Return the flat tops of one trajectory, (T, n) each."""
+        return cls(flat_tops(q)[0], *flat_tops(tau))
+
+    @classmethod
+    def joined(cls, trajectories: Sequence[FlatTops]) -> FlatTops:
+        """Return the flat tops of several trajectories together."""
+        q, tau, shares = map(np.stack, zip(*trajectories, strict=True))
+        sides = SIDES[:, None]
+        return cls(
+            sides * np.fmax.reduce(sides * q), sides * np.fmax.reduce(sides * tau), shares.mean(axis=0)
+        )
 
 
 def flat_tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -65,7 +67,7 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
     """Return an error for each joint with clipped torques, or else a warning for each one that rests at a stop."""
     problem, findings = problem.thinned(GEOMETRY.confirming_samples), Findings()
     samples = problem.unchanged.signals(problem.samples)
-    at_torque, at_position = (_at_levels(flat.levels[name], getattr(samples, name)) for name in ("tau", "q"))
+    at_torque, at_position = (_at_levels(*x) for x in ((flat.tau, samples.tau), (flat.q, samples.q)))
     free = ~(at_torque | at_position).any(axis=0)
     if free.all():
         return findings
@@ -78,7 +80,7 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
         np.square(residual * free).sum(axis=0) / np.maximum(free.sum(axis=0) - TUNING.free_samples, 1e-9)
     )
     for k, coordinate in enumerate(problem.arm.coordinates):
-        unit, levels = UNITS[coordinate.joint_type].torque, flat.levels["tau"][:, k]
+        unit, levels = UNITS[coordinate.joint_type].torque, flat.tau[:, k]
         sides = zip(SIDES, at_torque[..., k], strict=True)
         doubt = TUNING.certain * deviation[:, k]
         excess = np.array([_median((side * residual[:, k] - doubt)[rows]) for side, rows in sides])
@@ -89,14 +91,14 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
             limits = " and ".join(f"{x:.4g}" for x in levels[is_clipped])
             needed = np.abs(residual + samples.tau)[at_torque[is_clipped, :, k].any(axis=0), k].max()
             got = (
-                f"torques that stop at {limits} {unit} in {flat.shares['tau'][is_clipped, k].sum():.1%} of the "
+                f"torques that stop at {limits} {unit} in {flat.shares[is_clipped, k].sum():.1%} of the "
                 f"samples, in which the motion needs up to {needed:.4g} {unit} by least squares on the others"
             )
             do = f"log torques without this limit, or record slower motion; --accept {CLIPPED} if it is right"
             where = f"joint {coordinate.name!r}, tau"
             findings.errors.append(LogError(got, element=where, expected="the torques that moved it", do=do))
     for k, coordinate in enumerate(problem.arm.coordinates if not findings.errors else ()):
-        for level, rows in zip(flat.levels["q"][:, k], at_position[..., k], strict=True):
+        for level, rows in zip(flat.q[:, k], at_position[..., k], strict=True):
             difference = _median((np.abs(residual) - TUNING.certain * deviation)[rows, k])
             if difference > TUNING.certain * noise[k] + 2 * abs(friction[k]):
                 message = (

@@ -28,7 +28,7 @@ def find_elastic(signals: JointSignals) -> str | None:
     rigid = _relative_error(np.stack([np.ones_like(frequency), frequency**-2.0], axis=1), inertia)[0]
     candidates = []
     for resonance in np.geomspace(frequency[0], TUNING.beyond * frequency[-1], TUNING.candidates):
-        # multiplied by the denominator: a band next to the resonance must not decide alone
+        # multiplied by the denominator: a band next to the resonance must not decide by itself
         factor = 1 - (frequency / resonance) ** 2
         error, (motor, link) = _relative_error(
             np.stack([factor, np.ones_like(factor)], axis=1), factor * inertia

@@ -54,8 +54,8 @@ class Panel:
 class JointRow:
     """One chart per joint.
 
-    axis: label of the y axis. quantity: position, velocity or torque, whose unit the y axis has. columns: label,
-    values (T, n) and style of each curve. height: without the numbers of the time axis [pixels].
+    axis: label of the y axis. quantity: position, velocity or torque, whose unit the y axis has; "": none. columns:
+    label, values (T, n) and style of each curve. height: without the numbers of the time axis [pixels].
     """
 
     title: str
@@ -77,8 +77,8 @@ class JointRow:
         lines = [Line(label, t, values[:, k], style) for label, values, style in self.columns]
         # The plot areas of all charts of a column have the same height.
         height = self.height + (MARGINS.bottom - MARGINS.bare if time else 0)
-        title, axis = f"{self.title} of {joint.name}", joint.axis(self.quantity, self.axis)
-        return line_chart(lines, title, time, axis, motion=motion, height=height)
+        axis = joint.axis(self.quantity, self.axis) if self.quantity else self.axis
+        return line_chart(lines, f"{self.title} of {joint.name}", time, axis, motion=motion, height=height)
 
 
 def stacks(

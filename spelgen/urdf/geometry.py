@@ -48,7 +48,7 @@ class LinkShape:
 
 @dataclass(frozen=True, eq=False)
 class LinkShapes:
-    """The shapes of links that were read, and those that were not: name of the link -> names of files, or kind."""
+    """The shapes of links that were read, and the unread ones: name of the link -> names of files, or kind."""
 
     shapes: tuple[LinkShape, ...]
     unread: dict[str, tuple[str, ...]]
@@ -134,7 +134,7 @@ def _numbers(text: str, count: int) -> tuple[float, ...]:
 
 
 def _meshes(urdf: Path, shapes: Sequence[LinkShape], faces: int) -> dict[tuple[str, tuple[float, ...]], Mesh]:
-    """Return meshes by file and scale, without those that cannot be read."""
+    """Return meshes by file and scale, without unreadable ones."""
     paths: dict[tuple[str, tuple[float, ...]], str] = {}
     for shape in shapes:
         with suppress(FileNotFoundError):

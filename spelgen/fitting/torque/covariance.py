@@ -33,8 +33,8 @@ def parameter_covariance(estimate: TorqueEstimate) -> ParameterCovariance:
     contiguous blocks of samples measures both, but from few blocks. The result is the larger one in every direction,
     scaled such that 1.96 standard deviations are the 95 % interval of Student's t with blocks - 1 degrees of freedom.
 
-    95 % intervals of 47 arms of `benchmarks/truth.py` hold 97 % of base parameters and 95 % of g(q), those of the
-    posterior covariance 93 and 89 %.
+    95 % intervals of 47 arms of `benchmarks/truth.py` contain 97 % of base parameters and 95 % of g(q); intervals
+    of the posterior covariance 93 and 89 %.
     """
     problem, x, free = estimate.problem, estimate.state.x, estimate.problem.free
     # a new Jacobian measures logged torques relative to the gains that were written

@@ -48,8 +48,8 @@ class JointFunction:
     groups: (P,) index of the weights' group, which has one prior precision.
     friction: (T,) friction torque that the term multiplies; its weights are then the ones of the factor's logarithm,
         and columns @ weights is its torque to first order. None: the term is a torque.
-    visit_length: number of samples per visit of a position: a joint visits a position anew after it has moved by the
-        distance between two splines.
+    visit_length: number of samples per visit of a position: a new visit begins after a motion by the distance of two
+        splines.
     """
 
     parameter: str

@@ -8,18 +8,15 @@ from itertools import compress
 
 import numpy as np
 import torch
-from torch.autograd.functional import jacobian
 
 from spelgen.dynamics.parameters import idle_residuals
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, Severity
-from spelgen.fitting.functional_model import evaluate_with
+from spelgen.fitting.posterior import Posterior
 from spelgen.fitting.torque.fit import TorqueSolution
-from spelgen.fitting.torque.parameters import ParameterVector
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
-from spelgen.identification.intervals import QUANTILE
 from spelgen.runtime.inputs import MotorInputs
 
 TERM_NAMES = {
@@ -34,6 +31,7 @@ TERM_NAMES = {
 def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSolution) -> Iterator[Diagnostic]:
     """Yield the notes of a fit of rigid bodies to samples."""
     names = np.array(model.joint_names)
+    posterior = Posterior(model, solution.covariance, solution.torque_std.numpy())
     # the log-Cholesky parameters of a body are logarithms of its mass and radii
     factor = float(np.exp(solution.prior.bodies))
     message = f"prior standard deviation of URDF masses: factor {factor:.2g}"
@@ -58,17 +56,17 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
     if unsupported.any():
         yield _few_data(samples, solution, names[unsupported])
     if isinstance(model.inputs, MotorInputs) and len(model.inputs.gain_rows):
-        yield _trained_gains(model, model.inputs, solution, names)
+        yield _trained_gains(posterior)
     if solution.compensated.any():
         yield _compensation(model, solution, names)
     if residual_terms(model) is not None:
         message = _selected_terms(solution, names)
         if solution.selected_terms and not samples.recordings.any():
-            message += "; all of them rest on one recording: test them on another motion"
+            message += "; all of them were selected in one recording: test them on another motion"
         yield Diagnostic("info", "residuals", "model", None, message)
     subset = samples.subsampled(TUNING.report_positions).columns
-    inertia, deviation = _inertia(model, subset.q, solution.covariance)
-    undetermined = deviation > TUNING.undetermined
+    inertia, std = posterior.uncertain(lambda other: _mean_inertia(other, subset.q))
+    undetermined = std > TUNING.undetermined * inertia
     if undetermined.any():
         joints = ", ".join(names[undetermined])
         message = f"these logs do not determine the inertia at {joints}; its value is mostly the prior"
@@ -89,32 +87,20 @@ def _few_data(samples: TorqueSamples, solution: TorqueSolution, joints: np.ndarr
     # the error of the parameters is inversely proportional to the duration of the motion
     enough = math.ceil(seconds * nmse / TUNING.unsupported)
     message = (
-        f"the torque of held-out seconds is predicted hardly better than by a constant at {', '.join(joints)} (nMSE "
+        f"torques that were not fitted are predicted no better than by a constant at {', '.join(joints)} (nMSE "
         f"{nmse:.2g}): {seconds:.2g} s of this motion do not support a fit, the values of the URDF or of a ridge "
         f"regression may be as good; record about {enough} s in which all joints move"
     )
     return Diagnostic("warning", "few-data", "logs", None, message)
 
 
-def _trained_gains(
-    model: ArmModel, inputs: MotorInputs, solution: TorqueSolution, names: np.ndarray
-) -> Diagnostic:
+def _trained_gains(posterior: Posterior) -> Diagnostic:
     """Return the trained motor gains with 95 % intervals, as a warning if the logs do not determine one of them."""
-    trained = ParameterVector(model).mask("gains")
-    # of the logarithm of a gain
-    deviation = solution.covariance.diagonal()[trained].clamp(min=0).sqrt().numpy()
-    rows = inputs.gain_rows.numpy()
-    parts = []
-    for name, gain, factor in zip(
-        names[rows],
-        inputs.gains().detach().numpy()[rows].sum(axis=1),
-        np.exp(QUANTILE * deviation),
-        strict=True,
-    ):
-        parts.append(f"{name} {gain:.4g} ({gain / factor:.4g} to {gain * factor:.4g})")
+    gains = posterior.drives["gain"]
+    parts = [f"{x.name} {x.value:.4g} ({x.low:.4g} to {x.high:.4g})" for x in gains]
     message = f"joint torque per logged torque, with 95 % intervals: {', '.join(parts)}"
-    undetermined = names[rows][deviation > TUNING.undetermined_gain]
-    if not undetermined.size:
+    undetermined = [x.name for x in gains if x.std > TUNING.undetermined_gain * x.value]
+    if not undetermined:
         return Diagnostic("info", "trained-gains", "motors", None, message)
     message += (
         f"; the gain of {', '.join(undetermined)} is not determined: friction and inertia scale with it"
@@ -173,24 +159,7 @@ def terms_in_use(model: ArmModel) -> list[str]:
     return terms
 
 
-def _inertia(model: ArmModel, q: torch.Tensor, covariance: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Return the diagonal of M, averaged over positions, and the standard deviation of its logarithm, both (n,).
-
-    Args:
-        model: fitted model.
-        q: (T, n) positions [rad, m].
-        covariance: (K, K) of the rigid parameters, propagated to first order.
-    """
-    parameters = ParameterVector(model).initial
-
-    def diagonal(*tensors: torch.Tensor) -> torch.Tensor:
-        """Return the mean diagonal of M, (n,), for parameters in the order of their names."""
-        named = dict(zip(parameters, tensors, strict=True))
-        mass: torch.Tensor = evaluate_with(model, named, lambda other: other.mass_matrix(q))
-        return mass.diagonal(dim1=-2, dim2=-1).mean(dim=0)
-
-    value = diagonal(*parameters.values()).detach()
-    blocks = jacobian(diagonal, tuple(parameters.values()))
-    log_jacobian = torch.cat([block.flatten(1) for block in blocks], dim=1) / value.unsqueeze(-1)
-    variance = torch.einsum("jk,kl,jl->j", log_jacobian, covariance, log_jacobian)
-    return value.numpy(), variance.clamp(min=0).sqrt().numpy()
+def _mean_inertia(model: ArmModel, q: torch.Tensor) -> torch.Tensor:
+    """Return the diagonal of M, (n,) [kg m^2, kg], averaged over positions q (T, n)."""
+    mass: torch.Tensor = model.mass_matrix(q)
+    return mass.diagonal(dim1=-2, dim2=-1).mean(dim=0)

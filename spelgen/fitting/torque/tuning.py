@@ -35,7 +35,7 @@ class TorqueTuning:
     # [s] Segments from which the correlation time is estimated.
     segment: float = 1.0
     # [1] Largest estimated prior width: masses and armatures are known to a factor of 20, torque offsets to three times
-    # the typical friction. Logs that need a wider prior are not those of the URDF, or not in Nm.
+    # the typical friction. Logs that need a wider prior are not of the URDF's arm, or not in Nm.
     max_width: float = 3.0
     # [1] Outer iterations of noise and prior after the initial fit.
     iterations: int = 5
@@ -47,7 +47,7 @@ class TorqueTuning:
     effects_evidence: float = 2.0
     # [1] Largest number of steps before noise and prior are estimated.
     initial_steps: int = 60
-    # [1] Largest number of iterations in which the noise is lowered to that of least squares.
+    # [1] Largest number of iterations in which the noise is lowered to the least-squares level.
     annealing_iterations: int = 12
     # [1] Noise of these iterations, as a fraction of the torque residual (a low_cost_robot with placeholder
     # inertials: error of M(q) 0.44 -> 0.005).
@@ -83,7 +83,7 @@ class TorqueTuning:
     min_explained: float = 0.1
     # [1] Standard deviations by which the coefficient of friction compensation must differ from zero.
     min_significance: float = 4.0
-    # [1] Smallest standard deviation of friction compensation, as a fraction of that of the torque: delays of
+    # [1] Smallest standard deviation of friction compensation, as a fraction of the torque's: delays of
     # milliseconds have a similar but smaller effect.
     min_compensation: float = 0.05
     # [1] Samples of one block: some 100 MB for seven joints with their derivatives.

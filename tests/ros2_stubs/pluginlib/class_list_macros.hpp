@@ -1,5 +1,10 @@
-// In place of a class loader: a function that makes the one plugin.
+// In place of a class loader: a function that makes the plugin of an interface.
 #pragma once
+template <typename Base>
+Base * make_plugin();
 #define PLUGINLIB_EXPORT_CLASS(type, base) \
-  base * make_plugin();                    \
-  base * make_plugin() { return new type(); }
+  template <>                              \
+  base * make_plugin<base>()               \
+  {                                        \
+    return new type();                     \
+  }

@@ -1,0 +1,1 @@
+"""Estimator of payload, friction drift and contact that runs on a robot."""

@@ -1,0 +1,96 @@
+"""External torques by a first-order momentum observer (De Luca and Mattone, ICRA 2005), with thresholds per joint."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from spelgen.live.momentum import Balance
+from spelgen.live.noise import NoiseLevels
+from spelgen.live.payload import Payload
+from spelgen.live.tuning import TUNING
+
+
+class Contact(NamedTuple):
+    """External torques and their thresholds, (n,) [Nm, N]; touched: joints above, (n,); force: at the tip, (3,) [N]."""
+
+    external_torque: np.ndarray
+    threshold: np.ndarray
+    touched: np.ndarray
+    force: np.ndarray
+
+
+class ContactObserver:
+    """Low-passed momentum balance, at the rate of the samples.
+
+    Each low-passed term is a state: the torque, friction and momenta of the arm, (5, n), and the payload's regressor,
+    (n, 10).
+    """
+
+    def __init__(self, levels: NoiseLevels, alarms_per_minute: float) -> None:
+        self.levels, self.factor = levels, levels.thresholds(alarms_per_minute)
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin with the next sample."""
+        n = len(self.factor)
+        self.t: float | None = None
+        self.inputs, self.load_inputs = np.zeros((5, n)), np.zeros((n, 10))
+
+    def step(self, t: float, qd: np.ndarray, at: Balance, payload: Payload, scale: np.ndarray) -> Contact:
+        """Use the terms of a sample; scale: friction scale minus one, (n,)."""
+        signal, variance = self.residual(t, qd, at, payload, scale)
+        threshold = self.factor * np.sqrt(variance)
+        touched = np.abs(signal) > threshold
+        force = tip_force(at.jacobian, -signal, variance) if touched.any() else np.zeros(3)
+        return Contact(-signal, threshold, touched, force)
+
+    def residual(
+        self, t: float, qd: np.ndarray, at: Balance, payload: Payload, scale: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the low-passed torque that model, payload and drift do not explain, and its variance, (n,)."""
+        rate = TUNING.bandwidth
+        inputs = np.stack(
+            [
+                at.torque - at.friction + rate * at.momentum,
+                at.friction,
+                at.uncertainty,
+                at.momentum,
+                at.momentum,
+            ]
+        )
+        load = at.load_torque + rate * at.load_momentum
+        if self.t is None:
+            # as after constant inputs
+            self.low, self.load = inputs.copy(), load.copy()
+        else:
+            step = t - self.t
+            slow, fast = 1 - np.exp(-rate * step), 1 - np.exp(-2 * rate * step)
+            gains = np.array([slow, slow, slow, slow, fast])
+            self.low += gains[:, None] * (0.5 * (inputs + self.inputs) - self.low)
+            self.load += slow * (0.5 * (load + self.load_inputs) - self.load)
+        self.t, self.inputs, self.load_inputs = t, inputs, load
+        # the regressor of the payload, Phi, (n, 10), as of a block
+        regressor = rate * at.load_momentum - self.load
+        signal = self.low[0] - rate * at.momentum - regressor @ payload.parameters - self.low[1] * scale
+        jerk = 2 * rate * (at.momentum - self.low[4]) - rate * (at.momentum - self.low[3])
+        resting = TUNING.resting_friction * self.levels.coulomb * np.exp(-np.abs(qd) / self.levels.rest_speed)
+        variance = self.levels.observer**2 + resting**2 + jerk**2 + TUNING.uncertainty * self.low[2] ** 2
+        variance += np.einsum("ji,ik,jk->j", regressor, payload.covariance, regressor)
+        return signal, variance
+
+
+def tip_force(jacobian: np.ndarray, torque: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Return the force at the tip that is nearest to external torques, (3,) [N], in root axes.
+
+    Args:
+        jacobian: of the tip, (3, n).
+        torque, variance: (n,).
+    """
+    weighted = jacobian / variance
+    matrix = weighted @ jacobian.T
+    # a force that no joint torque depends on is zero
+    matrix += 1e-3 * np.trace(matrix) / 3 * np.eye(3)
+    force: np.ndarray = np.linalg.solve(matrix, weighted @ torque)
+    return force

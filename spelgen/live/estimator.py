@@ -1,0 +1,195 @@
+"""The estimator: payload, friction drift and external torques, sample by sample, without accelerations."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from spelgen.dynamics.bristles import bristle_reach
+from spelgen.dynamics.protocol import is_stateful
+from spelgen.errors import RunError
+from spelgen.fitting.fitted import Fit
+from spelgen.live.blocks import Block, Blocks, joined
+from spelgen.live.contact import Contact, ContactObserver
+from spelgen.live.cross_validation import noise_levels
+from spelgen.live.filters import DriftFilter
+from spelgen.live.hypotheses import PayloadEstimate
+from spelgen.live.intake import IGNORED, Intake, Refusal
+from spelgen.live.momentum import Balance, balance, load_torque
+from spelgen.live.noise import NoiseLevels
+from spelgen.live.payload import NO_REPORT, Payload, find_payload
+from spelgen.live.tuning import TUNING
+from spelgen.logs.trajectory import Trajectory
+from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatorState:
+    """Result of a step; vectors are (n,).
+
+    t [s]. refusal: "used", or why the sample was not. contact: see `Contact`. payload: as reported last.
+    load_changed: whether the payload became another one in this step. friction_scale: friction of now relative to the
+    model [1]. disturbance: slow torque that neither model nor payload explains [Nm, N].
+    """
+
+    t: float
+    refusal: Refusal
+    contact: Contact
+    payload: Payload
+    load_changed: bool
+    friction_scale: np.ndarray
+    disturbance: np.ndarray
+
+
+class Estimator:
+    """The estimator of a fitted arm with rigid bodies under torques.
+
+    ``step`` takes one measured sample; ``replay`` takes a log. Samples that are not finite or out of order,
+    and jumps, are refused and counted in ``refused``.
+    """
+
+    def __init__(
+        self,
+        fit: Fit,
+        *,
+        levels: NoiseLevels | None = None,
+        alarms_per_minute: float = TUNING.alarms_per_minute,
+    ) -> None:
+        """Take a fit; levels: default: of the fit. alarms_per_minute: rate of false alarms of contact.
+
+        Raises RunError for a model without rigid bodies or with position servos, and for a fit without noise levels.
+        """
+        self.model = torque_model(fit)
+        self.levels = noise_levels(fit) if levels is None else levels
+        self.alarms_per_minute = alarms_per_minute
+        self.reach = bristle_reach(self.model)
+        self.reset()
+
+    def reset(self) -> None:
+        """Start again: payload, friction drift and friction state are unknown."""
+        n = self.model.n
+        self.intake = Intake(self.levels, self.reach)
+        self.blocks = Blocks(n, self.levels.rest_speed)
+        self.estimate = PayloadEstimate(self.levels)
+        self.drift = DriftFilter(self.levels.drift)
+        self.observer = ContactObserver(self.levels, self.alarms_per_minute)
+        self.payload = NO_REPORT
+        self.half: Block | None = None
+        self.reported = 0.0
+        self.contact = Contact(np.zeros(n), np.zeros(n), np.zeros(n, dtype=bool), np.zeros(3))
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Numbers of samples by reason that were refused or only partly used."""
+        return {reason: count for reason, count in self.intake.counts.items() if count and reason != "used"}
+
+    def step(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> EstimatorState:
+        """Use a sample: time [s], positions, velocities and measured torques, (n,); return the estimate."""
+        (state,) = self.steps(np.array([t]), *(np.array([x], dtype=float) for x in (q, qd, tau)))
+        return state
+
+    def replay(self, log: Trajectory) -> list[EstimatorState]:
+        """Return the estimates along a log."""
+        return list(self.steps(log.t, log.q, log.qd, log.tau))
+
+    def steps(
+        self, t: np.ndarray, q: np.ndarray, qd: np.ndarray, tau: np.ndarray
+    ) -> Iterator[EstimatorState]:
+        """Use samples, (T,) and (T, n); return their estimates."""
+        checked: list[Refusal] = []
+        bounds: list[tuple[np.ndarray, np.ndarray]] = []
+        for sample in zip(t.tolist(), q, qd, tau, strict=True):
+            checked.append(self.intake.accept(*sample))
+            bounds.append((self.intake.low, self.intake.high))
+        used = [k for k, refusal in enumerate(checked) if refusal not in IGNORED]
+        low, high = (np.array([pair[side] for pair in bounds]) for side in (0, 1))
+        rows: Iterator[tuple[np.ndarray, ...]] = iter(())
+        if used:
+            bounded = [x[used] for x in (low, high)]
+            terms = balance(self.model, self.levels.point, [x[used] for x in (q, qd, tau)], bounded)
+            rows = iter(zip(*terms, strict=True))
+        for k, refusal in enumerate(checked):
+            changed = False
+            if refusal not in IGNORED:
+                changed = self._advance(float(t[k]), qd[k], Balance(*next(rows)), refusal)
+            a, d = self.drift.a, self.drift.d
+            yield EstimatorState(float(t[k]), refusal, self.contact, self.payload, changed, 1 + a, d)
+
+    def _advance(self, t: float, qd: np.ndarray, at: Balance, refusal: Refusal) -> bool:
+        """Use the terms of a sample; return True if the load became another one."""
+        if refusal != "used":
+            self.blocks.restart()
+            self.half = None
+            if refusal == "gap":
+                self.observer.restart()
+        theta = self.payload.parameters
+        self.contact = self.observer.step(t, qd, at, self.payload, self.drift.a)
+        if refusal != "saturated":
+            block = self.blocks.add(t, qd, at)
+            if block is not None:
+                self.drift.update(block, theta)
+                if self.half is None:
+                    self.half = block
+                else:
+                    self.estimate.start(joined(self.half, block))
+                    self.half = None
+        self.estimate.step()
+        changed, self.estimate.changed = self.estimate.changed, False
+        if changed or self.estimate.moved - self.reported >= TUNING.report:
+            self.report()
+        return changed
+
+    def report(self) -> Payload:
+        """Find the payload, and use it from the next step on; ``step`` does this after each second of motion."""
+        main = self.estimate.filters[0]
+        self.reported = self.estimate.moved
+        before, self.payload = (
+            self.payload,
+            find_payload(main.x[:10], main.P[:10, :10], self.levels.load_variance),
+        )
+        if (before.status == "payload") != (self.payload.status == "payload"):
+            # torques of the load were confounded with drift
+            n = self.model.n
+            joints = np.arange(10, 10 + n)
+            self.drift = DriftFilter(self.levels.drift)
+            self.drift.a = main.x[joints].copy()
+            self.drift.P[0] = main.P[joints, joints]
+        return self.payload
+
+    def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, ahead: float = 0.0) -> np.ndarray:
+        """Return the torques that give qdd with the payload and the friction of now, (n,) [Nm, N].
+
+        Args:
+            q, qd, qdd: (n,).
+            ahead: time until the motion [s]; the disturbance decays, and is omitted beyond 0.3 s.
+        """
+        at = [torch.as_tensor(x, dtype=torch.float64) for x in (q, qd, qdd)]
+        z = torch.from_numpy((self.intake.low + self.intake.high) / 2)
+        past = (z,) if is_stateful(self.model) else ()
+        with torch.no_grad():
+            torque = self.model.inverse_dynamics(*at, *past)
+            friction = self.model.friction_torque(*at[:2], *past)
+            q_, qd_, qdd_ = (x.unsqueeze(0) for x in at)
+            load = load_torque(self.model, q_, qd_, qdd_, torch.from_numpy(self.payload.parameters))[0]
+            a, d = map(torch.from_numpy, self.drift.ahead(ahead))
+            at_configuration = self.model.at(at[0])
+            return (torque + self.model.input_torque(at_configuration, load + a * friction + d)).numpy()
+
+
+def torque_model(fit: Fit) -> RigidBodyDynamics:
+    """Return the model of a fit in double precision. Raises RunError if it cannot be estimated with."""
+    model = fit.model
+    if not isinstance(model, RigidBodyDynamics):
+        raise RunError(
+            "a model without rigid bodies", element="estimator", expected="a fit of closed-form or hybrid",
+            do="build the module with --preset hybrid and fit it",
+        )  # fmt: skip
+    if model.servo is not None:
+        raise RunError(
+            "a fit to position commands", element="estimator", expected="a fit to measured torques"
+        )
+    return copy.deepcopy(model).double().cpu().requires_grad_(False).eval()

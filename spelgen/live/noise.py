@@ -1,0 +1,84 @@
+"""Noise levels of an arm, which are found from its training logs and stored with the run as estimator.json."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
+
+from spelgen.live.tuning import TUNING
+
+
+def _vector(values: object) -> np.ndarray:
+    array = np.array(values, dtype=float)
+    if array.ndim != 1 or np.isnan(array).any():
+        raise ValueError("a list of numbers is expected")
+    return array
+
+
+Vector = Annotated[
+    np.ndarray, BeforeValidator(_vector), PlainSerializer(lambda x: [float(f"{v:.6g}") for v in x.tolist()])
+]
+"""Numbers of the joints, (n,)."""
+
+
+class BlockNoise(BaseModel):
+    """Noise of the momentum balance over blocks of one length.
+
+    white, disturbance: standard deviations of white noise and of a stationary Ornstein-Uhlenbeck process, (n,) [Nm, N].
+    time_constant: of the process, (n,) [s].
+    """
+
+    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")
+
+    white: Vector
+    disturbance: Vector
+    time_constant: Vector
+
+
+class NoiseLevels(BaseModel):
+    """All that the estimator knows of an arm besides its model; vectors are (n,).
+
+    drift, load: noise of blocks of both filters. observer: standard deviation of the momentum observer of a moving
+    joint [Nm, N]. peak_start, peak_scale: exponential tail of the peaks of the normalised observer, beyond the
+    largest fifth. load_variance: factor on the covariance of payloads. coulomb: friction at low speed [Nm, N]. speed:
+    largest of the training logs [rad/s, m/s]. encoder: step of positions [rad, m]. effort: torque limit [Nm, N].
+    minutes: duration of the training logs. point: tip in the frame of the last body, (3,) [m].
+    """
+
+    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")
+
+    drift: BlockNoise
+    load: BlockNoise
+    observer: Vector
+    peak_start: Vector
+    peak_scale: Vector
+    load_variance: float
+    coulomb: Vector
+    speed: Vector
+    encoder: Vector
+    effort: Vector
+    minutes: float
+    point: Vector
+
+    @property
+    def rest_speed(self) -> np.ndarray:
+        """Speed below which a joint is at rest, (n,) [rad/s, m/s]."""
+        return TUNING.rest * self.speed
+
+    @property
+    def supported_alarms(self) -> float:
+        """Lowest rate of false alarms [1/min] that the training logs support: one in their whole duration."""
+        return 1 / self.minutes
+
+    def thresholds(self, alarms_per_minute: float) -> np.ndarray:
+        """Return the thresholds of the normalised observer, (n,), for a rate of false alarms of all joints."""
+        windows = 60 / TUNING.window * TAIL * len(self.observer)
+        tail = self.peak_start + self.peak_scale * math.log(windows / alarms_per_minute)
+        return math.sqrt(TUNING.variance) * np.maximum(tail, 1.0)
+
+
+TAIL = 0.2
+"""Fraction of the peaks to which the exponential tail is fitted."""

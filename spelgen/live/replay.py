@@ -1,0 +1,193 @@
+"""The estimator along recorded logs: payload, contacts and drift, as `spelgen estimate` reports them."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from spelgen.errors import LogError
+from spelgen.fitting.fitted import Fit
+from spelgen.listing import WIDTH
+from spelgen.live.estimator import Estimator, EstimatorState
+from spelgen.live.payload import Payload
+from spelgen.live.tuning import TUNING
+from spelgen.logs.trajectory import Trajectory, require_torques
+
+MERGED = 0.2  # [s] contacts closer than this are one
+
+
+@dataclass(frozen=True)
+class ContactEvent:
+    """A contact: begin and end from the start of the log [s], joints, their largest torques [Nm, N], force [N]."""
+
+    begin: float
+    end: float
+    joints: tuple[str, ...]
+    torques: tuple[float, ...]
+    force: float
+
+
+@dataclass(frozen=True, eq=False)
+class LogEstimate:
+    """The estimates along a log.
+
+    states: of each sample. payload: at the end. since: time of its first report [s], None without one. changes: times
+    of changed loads [s]. drift: friction at the end relative to the model, per joint [%]. refused: counts of samples
+    by reason.
+    """
+
+    log: Trajectory
+    joints: tuple[str, ...]
+    states: list[EstimatorState]
+    payload: Payload
+    since: float | None
+    changes: tuple[float, ...]
+    contacts: tuple[ContactEvent, ...]
+    drift: dict[str, float]
+    refused: dict[str, int]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of the JSON result."""
+        return {
+            "log": self.log.name,
+            "seconds": self.log.duration,
+            "payload": payload_content(self.payload),
+            "payload_since": self.since,
+            "load_changes": list(self.changes),
+            "contacts": [vars(contact) for contact in self.contacts],
+            "friction_drift_percent": self.drift,
+            "refused": self.refused,
+        }
+
+    def text(self) -> str:
+        """Return the lines of the text result."""
+        lines = [f"{self.log.name}: {payload_sentence(self.payload)}"]
+        if self.since is not None:
+            lines.append(f"  reported first at {self.since:.1f} s")
+        lines += [f"  another load at {at:.1f} s" for at in self.changes]
+        for contact in self.contacts:
+            pairs = zip(contact.joints, contact.torques, strict=True)
+            torques = ", ".join(f"{joint} {torque:+.3g}" for joint, torque in pairs)
+            lines.append(
+                f"  contact at {contact.begin:.2f} to {contact.end:.2f} s: {torques} Nm, N; "
+                f"{contact.force:.3g} N at the tip"
+            )
+        if not self.contacts:
+            lines.append("  no contact")
+        drift = ", ".join(f"{joint} {percent:+.1f} %" for joint, percent in self.drift.items())
+        lines.append(f"  friction at the end, relative to the model: {drift}")
+        if self.refused:
+            refused = ", ".join(f"{count} {reason}" for reason, count in self.refused.items())
+            lines.append(f"  samples that were not used, or only in part: {refused}")
+        return "\n".join(textwrap.fill(line, WIDTH, subsequent_indent="    ") for line in lines)
+
+
+def payload_content(payload: Payload) -> dict[str, Any]:
+    """Return a payload as JSON."""
+    content: dict[str, Any] = {"status": payload.status, "log_odds_of_no_payload": payload.log_odds}
+    if np.isfinite(payload.limit):
+        content["mass_limit"] = payload.limit
+    if payload.status == "payload":
+        for name in ("mass", "center", "inertia"):
+            value, interval = getattr(payload, name), getattr(payload, f"{name}_interval")
+            content[name] = np.asarray(value).tolist()
+            content[f"{name}_interval"] = np.asarray(interval).tolist()
+        content["parameters"] = payload.parameters.tolist()
+    return content
+
+
+def payload_sentence(payload: Payload) -> str:
+    """Return mass and centre of mass with their 95 % intervals, or why there are none."""
+    if payload.status == "payload":
+        low, high = payload.mass_interval
+        center = ", ".join(
+            f"{value:.3f} ({first:.3f} to {last:.3f})"
+            for value, (first, last) in zip(payload.center, payload.center_interval, strict=True)
+        )
+        return f"payload of {payload.mass:.2f} kg ({low:.2f} to {high:.2f}), centre of mass {center} m"
+    limit = f"at most {payload.limit:.2g} kg" if np.isfinite(payload.limit) else "record motion of the joints"
+    if payload.status == "no payload":
+        return f"no payload ({limit})"
+    return f"not determined yet whether there is a payload ({limit})"
+
+
+def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None = None) -> list[LogEstimate]:
+    """Return the estimates along logs, each from its start.
+
+    Args:
+        fit: of an arm under torques.
+        logs: of this arm.
+        alarms_per_minute: rate of false alarms of contact; None: default.
+    """
+    require_torques(logs)
+    estimator = Estimator(fit, alarms_per_minute=alarms_per_minute or TUNING.alarms_per_minute)
+    results = []
+    for log in logs:
+        if log.q.shape[1] != fit.model.n:
+            raise LogError(
+                f"{log.q.shape[1]} joints", file=log.file, expected=f"{fit.model.n}, as the model has"
+            )
+        estimator.reset()
+        results.append(_along(estimator, log, fit.model.joint_names))
+    return results
+
+
+def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
+    """Return the payload that an arm carries in all of these logs, one after the other."""
+    estimator, begin = Estimator(fit), 0.0
+    for log in logs:
+        t = log.t - log.t[0] + begin
+        # further apart than the longest gap
+        begin = float(t[-1]) + 2 * TUNING.gap
+        for _ in estimator.steps(t, log.q, log.qd, log.tau):
+            pass
+    return estimator.report()
+
+
+def _along(estimator: Estimator, log: Trajectory, joints: tuple[str, ...]) -> LogEstimate:
+    states = estimator.replay(log)
+    reported = [state.t for state in states if state.payload.status == "payload"]
+    scale = states[-1].friction_scale
+    return LogEstimate(
+        log=log,
+        joints=joints,
+        states=states,
+        payload=states[-1].payload,
+        since=reported[0] - float(log.t[0]) if reported else None,
+        changes=tuple(state.t - float(log.t[0]) for state in states if state.load_changed),
+        contacts=tuple(contact_events(states, joints)),
+        drift={joint: round(100 * (s - 1), 2) for joint, s in zip(joints, scale.tolist(), strict=True)},
+        refused=estimator.refused,
+    )
+
+
+def contact_events(states: Sequence[EstimatorState], joints: Sequence[str]) -> list[ContactEvent]:
+    """Return the contacts of estimates in a row."""
+    groups: list[list[EstimatorState]] = []
+    for state in states:
+        if not state.contact.touched.any():
+            continue
+        if groups and state.t - groups[-1][-1].t <= MERGED:
+            groups[-1].append(state)
+        else:
+            groups.append([state])
+    events = []
+    for group in groups:
+        torques = np.array([state.contact.external_torque for state in group])
+        touched = np.array([state.contact.touched for state in group])
+        peaks = np.where(touched, np.abs(torques), 0.0).argmax(axis=0)
+        named = np.flatnonzero(touched.any(axis=0)).tolist()
+        events.append(
+            ContactEvent(
+                begin=group[0].t - states[0].t,
+                end=group[-1].t - states[0].t,
+                joints=tuple(joints[k] for k in named),
+                torques=tuple(float(torques[peaks[k], k]) for k in named),
+                force=float(max(np.linalg.norm(state.contact.force) for state in group)),
+            )
+        )
+    return events

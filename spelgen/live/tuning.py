@@ -1,0 +1,88 @@
+"""Constants of the estimator; noise levels are found from the training logs (`live.levels`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class LiveTuning:
+    """Constants of the estimator, chosen by `benchmarks/live.py`."""
+
+    # Blocks and friction state (`live.estimator`).
+
+    # [s] Length of a block of the drift filter; the payload filter has blocks of twice this length.
+    block: float = 0.1
+    # [s] Longest time between two samples of a block; a gap makes the friction state unknown.
+    gap: float = 0.25
+    # [1] A sample whose positions change faster than this multiple of the largest speed of the training logs is
+    # refused.
+    jump: float = 10.0
+    # [1] Refused samples in a row after which the estimator restarts at the new positions.
+    restart: int = 5
+    # [1] A joint is at rest below this fraction of its largest speed in the training logs.
+    rest: float = 0.01
+
+    # Filters (`live.filters`).
+
+    # [kg, kg m, kg m^2] Prior standard deviations of mass, first moments and inertia of a payload: of 20 kg.
+    load_mass: float = 20.0
+    load_moment: float = 4.0
+    load_inertia: float = 0.8
+    # [1] Prior standard deviation of the friction scale.
+    friction: float = 0.03
+    # [1/s] Variance per second of its random walk.
+    friction_walk: float = 1e-5
+    # [1] Prior standard deviation of the torque offset, relative to the effort limit.
+    offset: float = 0.01
+    # [1] Factor on the variance of the noise: models err more on other days than between training logs.
+    variance: float = 1.5
+    # [1] Residuals beyond this number of standard deviations have a larger noise (Huber, Robust Statistics, 1981).
+    outlier: float = 3.0
+    # [1] Factor on the variance of friction whose state is unknown: a uniform distribution has 1/3 of the squared
+    # half width; friction within it is correlated over a block.
+    uncertainty: float = 3.0
+
+    # Changed loads (`live.estimator`).
+
+    # [1] Standard deviations of the squared residuals of a block from which on another load is considered.
+    surprise: float = 3.0
+    # [1] Factor on the standard deviation of the disturbance under the hypothesis of a contact.
+    contact_disturbance: float = 8.0
+    # [1] Log likelihood ratio, and [s] motion, from which on another load is accepted.
+    changed: float = 30.0
+    changed_after: float = 1.0
+    # [s] Motion after which the hypotheses are dropped; earlier, after `changed_after`, if the log likelihood ratio
+    # is below this.
+    unlikely: float = -8.0
+    dropped_after: float = 4.0
+
+    # Contacts (`live.contact`).
+
+    # [1/s] Bandwidth of the momentum observer.
+    bandwidth: float = 20.0
+    # [1] Standard deviation of the friction of a joint that is nearly at rest, relative to its Coulomb friction.
+    resting_friction: float = 0.6
+    # [1/min] Default rate of false alarms.
+    alarms_per_minute: float = 1.0
+    # [s] Window of the peaks from which thresholds are found.
+    window: float = 0.5
+
+    # Payload (`live.payload`).
+
+    # [s] Motion between two reports.
+    report: float = 1.0
+    # [m] Radius of gyration and distance along z of the prior mean of a payload.
+    radius: float = 0.2
+    distance: float = 0.05
+    # [kg] Masses of the prior means that are compared.
+    scales: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+    # [1] Log odds of "no payload" below which a payload is reported, and above which there is none.
+    payload_odds: float = -5.0
+    no_payload_odds: float = 3.0
+
+    # [s] Predictions up to this time ahead contain the disturbance.
+    disturbance_ahead: float = 0.3
+
+
+TUNING = LiveTuning()

@@ -1,0 +1,65 @@
+"""The page of `spelgen estimate`: payload, external torques and friction drift over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from spelgen.files import write_text
+from spelgen.fitting.fitted import Fit
+from spelgen.labels import named_joints
+from spelgen.live.noise import NoiseLevels
+from spelgen.live.replay import LogEstimate, payload_sentence
+from spelgen.render.charts import Band, Chart, Line, Mark, line_chart
+from spelgen.render.page import render_page
+from spelgen.render.plots import JointRow, Panel, stacks
+
+
+def write_estimate(fit: Fit, levels: NoiseLevels, results: Sequence[LogEstimate], path: Path) -> Path:
+    """Write the page; return its path."""
+    sections = [
+        (result, payload_sentence(result.payload), mass_chart(result), joint_panels(fit, result))
+        for result in results
+    ]
+    text = render_page("estimate.html.jinja", robot=fit.record.robot, sections=sections, levels=levels)
+    return write_text(path, text)
+
+
+def mass_chart(result: LogEstimate) -> Chart:
+    """Return the mass of the payload with its interval over time."""
+    mass = np.array([state.payload.mass for state in result.states])
+    low, high = np.array([state.payload.mass_interval for state in result.states]).T
+    t = _times(result)
+    # a band has a corner for each sample: only where the payload changes, twice
+    corners = np.flatnonzero(np.diff(mass, prepend=np.nan) != 0)
+    rows = np.unique(np.concatenate([corners, np.maximum(corners - 1, 0), [len(t) - 1]]))
+    marks: list[Mark] = [
+        Band("95 % interval", t[rows], low[rows], high[rows], "c2"),
+        Line("mass", t, mass, "model"),
+    ]
+    return line_chart(marks, "Mass of the payload", "t [s]", "mass [kg]", width=820)
+
+
+def joint_panels(fit: Fit, result: LogEstimate) -> list[Panel]:
+    """Return external torque with its thresholds, and friction relative to the model, per joint."""
+    contacts = [state.contact for state in result.states]
+    threshold = np.array([contact.threshold for contact in contacts])
+    torque = [
+        ("external torque", np.array([contact.external_torque for contact in contacts]), "model"),
+        ("threshold of contact", threshold, "hold"),
+        ("threshold, other direction", -threshold, "hold"),
+    ]
+    scale = 100 * (np.array([state.friction_scale for state in result.states]) - 1)
+    rows = [
+        JointRow("external torque", "external torque", "torque", torque),
+        JointRow(
+            "friction relative to the model", "friction [%]", "", [("friction drift", scale, "c3")], 100
+        ),
+    ]
+    return stacks(_times(result), rows, named_joints(result.joints, fit.model.joint_types))
+
+
+def _times(result: LogEstimate) -> np.ndarray:
+    return np.array([state.t for state in result.states]) - result.states[0].t

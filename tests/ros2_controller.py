@@ -1,0 +1,184 @@
+"""The exported ros2_control controller, compiled against substitutes of the ROS 2 headers, and a simulated arm."""
+
+import ctypes
+import subprocess
+from pathlib import Path
+
+import numpy as np
+
+from spelgen.exporting.c_export import called_by_c, compile_library, compiler
+from spelgen.exporting.c_source import c_functions, write_c
+from spelgen.exporting.describe import Trained
+
+STUBS = Path(__file__).parent / "ros2_stubs"
+PERIOD = 1e-3
+TEXT = ctypes.c_char_p
+
+
+def array(values):
+    """Numbers as an argument of the library."""
+    values = np.ascontiguousarray(values, dtype=float)
+    return values.ctypes.data_as(ctypes.c_void_p), values
+
+
+def compiled(package: Path, folder: Path, *flags: str) -> ctypes.CDLL:
+    """The controller of an exported package and its harness as a library; no warning is accepted."""
+    (name,) = (path.stem for path in (package / "src").glob("*.c") if not path.stem.endswith("_estimator"))
+    include, library = [f"-I{STUBS}", f"-I{package / 'src'}"], folder / "controller.so"
+    warnings = ["-O1", "-fPIC", "-Wall", "-Wextra", "-Werror"]
+    objects = []
+    for source in sorted((package / "src").glob(f"{name}*.c")):
+        objects.append(folder / f"{source.stem}.o")
+        subprocess.run(["gcc", "-std=c99", *warnings, "-c", source, "-o", objects[-1]], check=True)
+    sources = [package / "src" / "controller.cpp", STUBS / "harness.cpp"]
+    command = ["g++", "-std=c++17", *warnings, "-Wpedantic", "-shared", "-Wl,-Bsymbolic", *flags, *include]
+    done = subprocess.run(
+        [*command, *sources, *objects, "-o", library, "-lm"], capture_output=True, text=True, check=False
+    )
+    assert not done.returncode, done.stderr
+    loaded = ctypes.CDLL(str(library))
+    texts = "start interfaces set set_text set_flag ranges parameters state log joint_state wrench payload"
+    for function in texts.split():
+        getattr(loaded, f"harness_{function}").restype = TEXT
+    loaded.harness_new.restype = ctypes.c_void_p
+    loaded.harness_update.restype = ctypes.c_long
+    return loaded
+
+
+class Controller:
+    """A controller with n joints; ``parameters`` are read as from a file. An error of the start is raised."""
+
+    def __init__(self, library, n, **parameters):
+        self.library, self.n = library, n
+        self.handle = ctypes.c_void_p(library.harness_new(b"arm"))
+        self.time = 1.7e9
+        self.commands = np.zeros(n)
+        self.allocations = 0
+        for name, value in parameters.items():
+            if isinstance(value, str):
+                self.call("text", name.encode(), value.encode())
+            elif isinstance(value, bool):
+                self.call("flag", name.encode(), int(value))
+            else:
+                pointer, values = array(np.atleast_1d(value))
+                self.call("numbers", name.encode(), pointer, len(values) if np.ndim(value) else -1)
+        error = self.call("start")
+        if error is not None:
+            raise ValueError(error.decode())
+
+    def call(self, name, *arguments):
+        return getattr(self.library, f"harness_{name}")(self.handle, *arguments)
+
+    def update(self, q, qd, effort=None, period=PERIOD, available=True):
+        """Return the commanded torques of a cycle."""
+        self.time += period
+        states = [q, qd] if effort is None else [q, qd, effort]
+        pointer, _states = array(np.concatenate([np.asarray(x, float) for x in states]))
+        commands, self.commands = array(np.full(self.n, np.nan))
+        time, duration = ctypes.c_double(self.time), ctypes.c_double(period)
+        count = self.call("update", time, duration, pointer, int(available), commands)
+        assert count >= 0, "the controller reported an error"
+        self.allocations += count
+        return self.commands
+
+    def reference(self, q, qd=(), qdd=()):
+        """Publish a reference."""
+        arguments = []
+        for values in (q, qd, qdd):
+            pointer, kept = array(values)
+            arguments += [pointer, len(kept)]
+        self.call("reference", *arguments)
+
+    def write(self, *values):
+        """Write positions, then velocities, then accelerations of the reference interfaces."""
+        for index, value in enumerate(np.concatenate(values)):
+            self.call("write", index, ctypes.c_double(value))
+
+    def set(self, name, value):
+        """Set a parameter; return the reason of a refusal, or None."""
+        if isinstance(value, str):
+            reason = self.call("set_text", name.encode(), value.encode())
+        else:
+            pointer, values = array(np.atleast_1d(value))
+            reason = self.call("set", name.encode(), pointer, len(values) if np.ndim(value) else -1)
+        return None if reason is None else reason.decode()
+
+    def text(self, name):
+        """The result of a function without arguments: state, interfaces, ranges or log."""
+        return self.call(name).decode()
+
+    def joint_state(self, topic):
+        """Return the efforts of the last message of a topic, joint name to effort."""
+        self.text("state")
+        pointer, efforts = array(np.zeros(self.n))
+        return dict(
+            zip(self.call("joint_state", topic.encode(), pointer).decode().split(), efforts, strict=False)
+        )
+
+    def wrench(self):
+        """Frame and values of the last tip wrench, (6,)."""
+        self.text("state")
+        pointer, values = array(np.zeros(6))
+        return self.call("wrench", pointer).decode(), values
+
+    def payload(self):
+        """Frame and values of the last payload: mass, centre, inertia, interval of the mass; None without one."""
+        self.text("state")
+        pointer, values = array(np.zeros(12))
+        frame = self.call("payload", pointer)
+        return None if frame is None else (frame.decode(), values)
+
+    def deactivate(self):
+        """Deactivate the controller; return the last commands."""
+        pointer, commands = array(np.full(self.n, np.nan))
+        assert self.call("deactivate", pointer)
+        return commands
+
+    def activate(self):
+        """Activate the controller again."""
+        assert self.call("activate")
+
+
+class SimulatedArm:
+    """An arm simulated with the C export of a model; semi-implicit Euler, torques are constant over a period."""
+
+    def __init__(self, model, arm, folder: Path):
+        names = ["forward_dynamics", "friction_step", "friction_memory"]
+        self.folder = folder
+        (folder / "plant").mkdir()
+        trained = Trained(model, arm, tuple(names))
+        functions = c_functions(trained.described, trained.entry_points)
+        program = compiler()
+        assert program
+        source = write_c(trained.described, functions, folder / "plant")
+        self.call = called_by_c(compile_library(source, program), functions)
+
+    def evaluate(self, name, **inputs):
+        """The first output of a function."""
+        (value,) = self.call(name, {"q": np.zeros((1, 1))} | {k: x[None] for k, x in inputs.items()}).values()
+        return value[0]
+
+    def start(self, q, qd=None):
+        """Set the state, with friction states of joints that have moved at qd."""
+        self.q = np.array(q, dtype=float)
+        self.qd = np.zeros_like(self.q) if qd is None else np.array(qd, dtype=float)
+        self.z = self.evaluate("friction_memory", qd=self.qd)
+
+    def step(self, tau, period=PERIOD, substeps=4):
+        """Apply torques for a period."""
+        for _ in range(substeps):
+            qdd = self.evaluate("forward_dynamics", q=self.q, qd=self.qd, tau=tau, z=self.z)
+            self.qd = self.qd + period / substeps * qdd
+            moved = period / substeps * self.qd
+            self.q, self.z = self.q + moved, self.evaluate("friction_step", z=self.z, dq=moved)
+
+    def run(self, controller, seconds, at_each=None, period=PERIOD):
+        """Control the arm; return positions, velocities and torques, (T, n) each. at_each: called before each cycle."""
+        rows = []
+        for cycle in range(round(seconds / period)):
+            if at_each is not None:
+                at_each(cycle * period)
+            tau = controller.update(self.q, self.qd, period=period)
+            rows.append((self.q, self.qd, tau))
+            self.step(tau, period)
+        return [np.array(values) for values in zip(*rows, strict=True)]

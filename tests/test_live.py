@@ -1,0 +1,402 @@
+"""The estimator finds a payload, contacts and friction that were added to torques; its equations hold."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from compiled_estimator import nominal_levels
+from emitted import ROBOTS
+from exported_runs import COUPLED, MOTORS, arm_of, moved_model, saved_run
+from motions import smooth_motion
+from scipy.optimize import minimize
+from typer.testing import CliRunner
+
+from spelgen.cli.main import app
+from spelgen.dynamics.body_regressor import chain_regressor, pseudo_inertia
+from spelgen.dynamics.bristles import bristle_reach, bristles_along
+from spelgen.emission.build import build
+from spelgen.errors import RunError
+from spelgen.fitting.fitted import load_run
+from spelgen.live.blocks import Block
+from spelgen.live.estimator import Estimator
+from spelgen.live.levels import block_noise
+from spelgen.live.momentum import balance, load_axes, load_torque
+from spelgen.live.payload import LOAD_PRIOR, find_payload
+from spelgen.live.tuning import TUNING
+from spelgen.logs.read import write_logs
+from spelgen.logs.trajectory import Trajectory
+
+EFFORT = np.array([150.0, 150.0, 100.0, 30.0, 30.0, 30.0])
+PAYLOAD = np.array([2.0, 0.1, -0.06, 0.2, 0.03, 0.002, -0.01, 0.035, 0.004, 0.02])
+RATE = 200.0
+
+
+def numbers(*arrays):
+    return [torch.from_numpy(np.ascontiguousarray(x)) for x in arrays]
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """A model with hysteresis, 12 s of motion at 200 Hz, its torques, and a run of it."""
+    model = moved_model("six_dof", "closed-form", 0.1).double()
+    t = np.arange(0.0, 12.0, 1 / RATE)
+    coarse = np.arange(0.0, 13.0, 0.01)
+    fine = [
+        np.stack([np.interp(t, coarse, column) for column in x.T], axis=1)
+        for x in smooth_motion(model.n, 13.0, np.random.default_rng(3))
+    ]
+    q, qd, qdd = fine
+    z = bristles_along(q, bristle_reach(model))
+    with torch.no_grad():
+        tau = model.inverse_dynamics(*numbers(q, qd, qdd, z)).numpy()
+    noise = 1e-3 * EFFORT * np.random.default_rng(0).standard_normal(q.shape)
+    return model, Trajectory(t, q, qd, tau + noise), qdd
+
+
+@pytest.fixture(scope="module")
+def levels(arm):
+    model, log, _ = arm
+    return nominal_levels(EFFORT, np.abs(log.qd).max(axis=0), model.coulomb.detach().numpy())
+
+
+@pytest.fixture(scope="module")
+def run(arm, levels, tmp_path_factory):
+    """A run folder of the model, with noise levels."""
+    folder = saved_run(arm[0], ROBOTS / "six_dof.urdf", tmp_path_factory.mktemp("live"))
+    folder.estimator.write_text(json.dumps(levels.model_dump(mode="json")))
+    config = json.loads(folder.config.read_text())
+    folder.config.write_text(json.dumps(config | {"joints": list(arm[0].joint_names)}))
+    return folder.path
+
+
+def loaded(model, log, qdd, theta):
+    """The torques of a log with a payload: by the regressor of the last body."""
+    rows = chain_regressor(model.chain, log.q, log.qd, qdd)[:, :, -10:]
+    return log.tau + rows @ theta
+
+
+def estimates(run, levels, log, tau):
+    estimator = Estimator(load_run(run), levels=levels)
+    return estimator, estimator.replay(dataclasses.replace(log, tau=tau))
+
+
+def coupled(folder):
+    (folder / "arm.urdf").write_text(COUPLED)
+    (folder / "arm.yaml").write_text(MOTORS)
+    return folder / "arm.urdf"
+
+
+@pytest.mark.parametrize("robot", ["six_dof", "rpr", "coupled"])
+def test_momentum_balance_is_the_inverse_dynamics(robot, tmp_path):
+    """d/dt p = torque - friction along any motion, also of mimic and prismatic joints and coupled motors."""
+    urdf = coupled(tmp_path) if robot == "coupled" else ROBOTS / f"{robot}.urdf"
+    model = build(urdf, "hybrid").double()
+    random = np.random.default_rng(1)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.1 * torch.from_numpy(random.standard_normal(parameter.shape))
+    model.requires_grad_(False)
+    q, qd, qdd = random.standard_normal((3, 5, model.n))
+    z = np.zeros((5, model.n, model.elements))
+    tau = model.inverse_dynamics(*numbers(q, qd, qdd, z)).numpy()
+    step = 1e-5
+    states = [(q + s * qd + s * s / 2 * qdd, qd + s * qdd) for s in (-step, 0.0, step)]
+    before, at, after = (balance(model, np.zeros(3), (*state, tau), (z, z)) for state in states)
+    rate = (after.momentum - before.momentum) / (2 * step)
+    passive = ~model.actuated.numpy().astype(bool)
+    error = rate - (at.torque - at.friction)
+    assert np.abs(error[:, ~passive]).max() < 1e-6 * np.abs(rate).max()
+    regressor = chain_regressor(model.chain, q, qd, qdd)[:, :, -10:]
+    by_momentum = (after.load_momentum - before.load_momentum) / (2 * step) - at.load_torque
+    np.testing.assert_allclose(by_momentum, regressor, atol=1e-6 * np.abs(regressor).max())
+    torque = load_torque(model, *numbers(q, qd, qdd, PAYLOAD)).numpy()
+    np.testing.assert_allclose(torque, regressor @ PAYLOAD, atol=1e-11)
+
+
+def test_the_jacobian_is_the_velocity_of_the_tip(arm):
+    """J qd is the derivative of the tip's position, which pytorch-kinematics computes."""
+    from spelgen.dynamics.tip import tip_kinematics
+    from spelgen.dynamics.tip_frame import tip_frame
+
+    model, log, _ = arm
+    robot = arm_of("six_dof")
+    tip = tip_frame(robot)
+    assert tip.carrier == len(robot.chain.bodies) - 1
+    q, qd = numbers(log.q[::400], log.qd[::400])
+    jacobian = load_axes(model, q, qd).jacobian(torch.from_numpy(tip.pose[:3, 3]))
+    expected = tip_kinematics(robot).jacobian(q)[:, :3]
+    assert (jacobian - expected).abs().max() < 1e-5
+
+
+def test_no_payload_is_reported_without_one(arm, levels, run):
+    _model, log, _ = arm
+    estimator, states = estimates(run, levels, log, log.tau)
+    assert {state.payload.status for state in states} <= {"not yet", "no payload"}
+    assert states[-1].payload.status == "no payload"
+    assert 0 < states[-1].payload.limit < 0.3
+    assert estimator.refused == {}
+    assert not any(state.load_changed for state in states)
+
+
+def test_a_payload_is_found_with_its_intervals(arm, levels, run):
+    model, log, qdd = arm
+    _, states = estimates(run, levels, log, loaded(model, log, qdd, PAYLOAD))
+    first = next(state.t for state in states if state.payload.status == "payload")
+    assert first < 5.0
+    payload = states[-1].payload
+    assert payload.mass_interval[0] < 2.0 < payload.mass_interval[1]
+    assert abs(payload.mass - 2.0) < 0.05
+    np.testing.assert_allclose(payload.center, PAYLOAD[1:4] / 2.0, atol=0.01)
+    inside = (payload.center_interval[:, 0] < PAYLOAD[1:4] / 2) & (
+        PAYLOAD[1:4] / 2 < payload.center_interval[:, 1]
+    )
+    assert inside.sum() >= 2
+    # physically consistent
+    assert np.linalg.eigvalsh(pseudo_inertia(torch.from_numpy(payload.parameters)).numpy())[0] > 0
+
+
+def test_the_torque_of_the_estimator_carries_the_payload(arm, levels, run):
+    model, log, qdd = arm
+    tau = loaded(model, log, qdd, PAYLOAD)
+    estimator, _ = estimates(run, levels, log, tau)
+    k = len(log) - 1
+    expected = tau[k]
+    found = estimator.torque(log.q[k], log.qd[k], qdd[k])
+    bare = model.inverse_dynamics(*numbers(log.q[k], log.qd[k], qdd[k])).numpy()
+    assert np.abs(found - expected).max() < 0.25 * np.abs(bare - expected).max()
+    # beyond 0.3 s without the disturbance
+    later = estimator.torque(log.q[k], log.qd[k], qdd[k], ahead=1.0)
+    np.testing.assert_allclose(found - later, estimator.drift.d, atol=1e-9)
+
+
+def test_a_changed_load_is_found_and_a_contact_is_none(arm, levels, run):
+    model, log, qdd = arm
+    with_load = loaded(model, log, qdd, PAYLOAD)
+    picked = np.where(log.t[:, None] < 6.0, log.tau, with_load)
+    _, states = estimates(run, levels, log, picked)
+    (change,) = [state.t for state in states if state.load_changed]
+    assert 6.0 < change < 9.0
+    assert abs(states[-1].payload.mass - 2.0) < 0.2
+    touched = log.tau + np.outer((log.t > 6.0) & (log.t < 8.0), 0.1 * EFFORT * (np.arange(6) == 1))
+    _, states = estimates(run, levels, log, touched)
+    assert not any(state.load_changed or state.payload.status == "payload" for state in states)
+
+
+def test_contacts_are_found_at_their_joint_with_their_force(arm, levels, run):
+    """A force of 40 N at the tip for half a second."""
+    model, log, _ = arm
+    axes = load_axes(model, *numbers(log.q, log.qd))
+    force = np.array([0.0, 30.0, -27.0])
+    torque = np.einsum("tij,i->tj", axes.jacobian(torch.from_numpy(levels.point)).numpy(), force)
+    begin, end = 7.0, 7.5
+    acts = ((log.t >= begin) & (log.t < end))[:, None]
+    # an external torque lowers the measured one
+    _, states = estimates(run, levels, log, log.tau - acts * torque)
+    touched = np.array([state.t for state in states if state.contact.touched.any()])
+    assert begin < touched[0] < begin + 0.06
+    assert ((touched >= begin) & (touched < end + 0.3)).all()
+    at = np.searchsorted(log.t, end) - 2
+    np.testing.assert_allclose(states[at].contact.external_torque, torque[at], atol=0.02 * EFFORT.max())
+    assert np.linalg.norm(states[at].contact.force - force) < 0.25 * np.linalg.norm(force)
+
+
+def test_friction_drift_is_found(arm, levels, run):
+    """Friction is 4 % larger, or smaller, than in the model; the prior standard deviation is 3 %."""
+    model, log, _ = arm
+    z = bristles_along(log.q, bristle_reach(model))
+    friction = model.friction_torque(*numbers(log.q, log.qd, z)).numpy()
+    visible = np.abs(friction).mean(axis=0) > 5 * levels.drift.white
+    assert visible.sum() >= 2
+    for drift in (0.04, -0.04):
+        _, states = estimates(run, levels, log, log.tau + drift * friction)
+        found = states[-1].friction_scale[visible] - 1
+        assert (found / drift > 0.4).all() and (found / drift < 1.3).all()
+
+
+def test_samples_that_cannot_be_used_are_refused_and_counted(arm, levels, run):
+    _model, log, _ = arm
+    estimator = Estimator(load_run(run), levels=levels)
+
+    def step(k, t=None, q=None, tau=None):
+        sample = (
+            log.t[k] if t is None else t,
+            log.q[k] if q is None else q,
+            log.qd[k],
+            log.tau[k] if tau is None else tau,
+        )
+        return estimator.step(*sample).refusal
+
+    assert step(0) == "used"
+    assert step(1, q=np.full(6, np.nan)) == "not finite"
+    assert step(1, t=np.inf) == "not finite"
+    assert step(1, t=log.t[0]) == "repeated"
+    assert step(1, t=log.t[0] - 1) == "reversed"
+    assert step(1, q=log.q[1] + 3.0) == "jump"
+    assert step(1, tau=2 * EFFORT) == "saturated"
+    assert step(2) == "used"
+    assert step(100) == "gap"
+    assert estimator.refused == {
+        "not finite": 2, "repeated": 1, "reversed": 1, "jump": 1, "saturated": 1, "gap": 1,
+    }  # fmt: skip
+    # a clock that was set back for good
+    for k in range(TUNING.restart - 1):
+        assert step(101 + k, t=0.001 * k) == "reversed"
+    assert step(110, t=0.1) == "gap"
+    assert step(111, t=0.1 + 1 / RATE) == "used"
+
+
+def test_hostile_samples_give_finite_estimates(arm, levels, run):
+    """NaN, jumps, zero and negative steps and saturated torques, one in three samples."""
+    _model, log, _ = arm
+    random = np.random.default_rng(5)
+    t, q, qd, tau = (x.copy() for x in (log.t, log.q, log.qd, log.tau))
+    kinds = random.integers(0, 15, len(t))
+    q[kinds == 0, 2] = np.nan
+    tau[kinds == 1] = np.inf
+    q[kinds == 2] += random.standard_normal((int((kinds == 2).sum()), 6)) * 1e3
+    t[kinds == 3] -= 0.1
+    t[1:][kinds[1:] == 4] = t[:-1][kinds[1:] == 4]
+    tau[kinds == 5] = 1e9
+    estimator = Estimator(load_run(run), levels=levels)
+    states = list(estimator.steps(t, q, qd, tau))
+    for state in states:
+        numbers = (*state.contact, state.friction_scale, state.disturbance, state.payload.parameters)
+        assert all(np.isfinite(x).all() for x in numbers)
+    counts = estimator.refused
+    assert counts["not finite"] == ((kinds == 0) | (kinds == 1)).sum()
+    assert min(counts[reason] for reason in ("repeated", "reversed", "jump", "saturated")) > 50
+
+
+def test_one_log_has_one_result(arm, levels, run):
+    """Sample by sample as along the log; the same bytes each time."""
+    _model, log, _ = arm
+    short = log[:600]
+    _, states = estimates(run, levels, short, short.tau)
+    _, again = estimates(run, levels, short, short.tau)
+    estimator = Estimator(load_run(run), levels=levels)
+    for k in range(0, len(short)):
+        single = estimator.step(short.t[k], short.q[k], short.qd[k], short.tau[k])
+    assert states[-1].contact.external_torque.tobytes() == again[-1].contact.external_torque.tobytes()
+    np.testing.assert_allclose(single.disturbance, states[-1].disturbance, rtol=1e-9)
+    np.testing.assert_allclose(single.contact.external_torque, states[-1].contact.external_torque, atol=1e-9)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.5], ids=["consistent", "outside of the cone"])
+def test_the_payload_is_the_map_estimate(offset):
+    """Its cost is as low as by a general solver, also if the likelihood is largest far outside of the cone."""
+    random = np.random.default_rng(2)
+    root = random.standard_normal((10, 10)) * LOAD_PRIOR * 2e-3
+    covariance = np.linalg.inv(np.linalg.inv(root @ root.T) + np.diag(LOAD_PRIOR**-2.0))
+    mean = PAYLOAD.copy()
+    mean[[4, 7, 9]] -= offset
+    payload = find_payload(mean, covariance, 1.0)
+    assert payload.status == "payload"
+    precision = np.linalg.inv(covariance)
+    linear, precision = precision @ mean, precision - np.diag(LOAD_PRIOR**-2.0)
+
+    def cost(factor):
+        """Of a triangular root of the pseudo-inertia, for the prior mean of 2 kg; always consistent."""
+        triangle = np.zeros((4, 4))
+        triangle[np.tril_indices(4)] = factor
+        inertia = triangle @ triangle.T + 1e-12 * np.eye(4)
+        half = np.trace(inertia[:3, :3])
+        moments = half * np.eye(3) - inertia[:3, :3]
+        theta = np.array([inertia[3, 3], *inertia[:3, 3], *moments[np.triu_indices(3)]])
+        width = 2.0 * np.diag([0.2**2 / 5, 0.2**2 / 5, 0.2**2 / 5 + 0.05**2, 1.0])
+        width[2, 3] = width[3, 2] = 2.0 * 0.05
+        prior = 3 * np.trace(np.linalg.solve(width, inertia)) - 0.5 * np.linalg.slogdet(inertia)[1]
+        return 0.5 * theta @ precision @ theta - linear @ theta + prior
+
+    from spelgen.live.payload import _at_scale
+
+    theta, _, _ = _at_scale(precision, linear, 2.0, None)
+    ours = cost(np.linalg.cholesky(pseudo_inertia(torch.from_numpy(theta)).numpy())[np.tril_indices(4)])
+    best = min(
+        minimize(cost, 0.3 * random.standard_normal(10), method="BFGS", options={"maxiter": 2000}).fun
+        for _ in range(3)
+    )
+    assert ours < best + 1e-4 * abs(best)
+
+
+def test_noise_levels_are_those_of_the_residuals():
+    """White noise and an Ornstein-Uhlenbeck process of known size, under drifting friction and an offset."""
+    random = np.random.default_rng(0)
+    white, disturbance, constant = np.array([0.3, 1.0]), np.array([0.6, 1e-9]), 0.8
+    decay = np.exp(-0.1 / constant)
+    state, blocks = disturbance * random.standard_normal(2), []
+    for k in range(3000):
+        state = decay * state + np.sqrt(1 - decay**2) * disturbance * random.standard_normal(2)
+        friction = 5 * np.sin(0.3 * k * np.ones(2))
+        y = 0.05 * friction + 0.2 + state + white * random.standard_normal(2)
+        blocks.append(Block(0.1, y, np.zeros((2, 10)), friction, np.zeros(2), np.ones(2, dtype=bool)))
+    found = block_noise([blocks])
+    np.testing.assert_allclose(found.white, white, rtol=0.15)
+    assert abs(found.disturbance[0] - 0.6) < 0.12
+    assert found.disturbance[1] < 0.3
+    assert 0.4 <= found.time_constant[0] <= 1.6
+
+
+def test_models_that_it_cannot_use_are_refused(arm, levels, tmp_path):
+    networks = saved_run(build(ROBOTS / "two_link.urdf", "spel").double(), ROBOTS / "two_link.urdf", tmp_path)
+    with pytest.raises(RunError, match=r"without rigid bodies.*closed-form or hybrid"):
+        Estimator(load_run(networks.path))
+    plain = saved_run(arm[0], ROBOTS / "six_dof.urdf", tmp_path / "plain")
+    with pytest.raises(RunError, match=r"no noise levels.*estimator\.json.*train"):
+        Estimator(load_run(plain.path))
+    plain.estimator.write_text('{"minutes": "many"}')
+    with pytest.raises(RunError, match=r"estimator\.json"):
+        Estimator(load_run(plain.path))
+
+
+def test_training_from_a_run_prints_the_load(arm, run, tmp_path):
+    model, log, qdd = arm
+    lifted = dataclasses.replace(log, tau=loaded(model, log, qdd, PAYLOAD), name="lifted")
+    write_logs(tmp_path / "logs.parquet", [lifted], model.joint_names)
+    arguments = [
+        "train",
+        "--from",
+        str(run),
+        "--data",
+        str(tmp_path / "logs.parquet"),
+        "-o",
+        str(tmp_path / "run"),
+    ]
+    result = CliRunner().invoke(app, [*arguments, "--format", "json"])
+    assert result.exit_code == 0, result.output
+    payload = json.loads(result.stdout)["payload"]
+    assert payload["status"] == "payload"
+    assert payload["mass_interval"][0] < 2.0 < payload["mass_interval"][1]
+    # the noise levels of the run, for an estimator with this load as part of the arm
+    assert (tmp_path / "run" / "estimator.json").exists()
+
+
+def test_the_command_prints_payload_contacts_and_drift(arm, levels, run, tmp_path):
+    model, log, qdd = arm
+    tau = loaded(model, log, qdd, PAYLOAD)
+    tau[(log.t > 9) & (log.t < 9.5), 1] += 25.0
+    write_logs(
+        tmp_path / "logs.parquet", [dataclasses.replace(log, tau=tau, name="lifted")], model.joint_names
+    )
+    arguments = [
+        "estimate",
+        str(run),
+        "--data",
+        str(tmp_path / "logs.parquet"),
+        "-o",
+        str(tmp_path / "page.html"),
+    ]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert "payload of 2.0" in result.output
+    assert "contact at 9.0" in result.output
+    assert "friction at the end" in result.output
+    page = (tmp_path / "page.html").read_text()
+    assert "Mass of the payload" in page
+    result = CliRunner().invoke(app, [*arguments, "--format", "json"])
+    (content,) = json.loads(result.stdout)["logs"]
+    assert content["payload"]["status"] == "payload"
+    assert content["payload"]["mass_interval"][0] < 2.0 < content["payload"]["mass_interval"][1]
+    assert any(abs(contact["begin"] - 9.0) < 0.1 for contact in content["contacts"])
+    assert set(content["friction_drift_percent"]) == set(model.joint_names)

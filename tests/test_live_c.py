@@ -1,0 +1,226 @@
+"""The C estimator equals the Python one along recorded logs, keeps its times, and survives hostile samples."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from compiled_estimator import Columns, CompiledEstimator, nominal_levels
+from exported_runs import COUPLED, MOTORS, moved_model, saved_run
+from motions import smooth_motion
+
+from spelgen.arm.configured_arm import load_arm
+from spelgen.dynamics.bristles import bristle_reach, bristles_along
+from spelgen.emission.build import build
+from spelgen.exporting.export import export
+from spelgen.fitting.fitted import load_run
+from spelgen.live.estimator import Estimator, EstimatorState
+from spelgen.live.intake import REFUSALS
+from spelgen.logs.read import read_logs
+from spelgen.logs.trajectory import Trajectory
+
+pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
+SHARED = Path(__file__).parents[1] / ".." / "shared"
+RECORDED = {
+    "ur10e": ("logs/ur10e/ur10e.urdf", "logs/ur10e/20_01_31_load.parquet"),
+    "panda": ("arms/panda_erd.urdf", "logs/panda/exciting_traj1.parquet"),
+    "shanghai": ("logs/shanghai/shanghai.urdf", "logs/shanghai/traj1.parquet"),
+    "xmate3": ("logs/xmate3/xmate3.urdf", "logs/xmate3/excit.parquet"),
+    "ar5": ("logs/ar5/ar5.urdf", "logs/ar5/real.parquet"),
+    "airbot": ("logs/airbot/airbot.urdf", "logs/airbot/opt.parquet"),
+}
+SAMPLES = 2500
+STATUSES = {"not yet": 0, "no payload": 1, "payload": 2}
+
+
+def randomised(urdf, preset="hybrid"):
+    """A model with all terms: its parameters moved by small random numbers."""
+    model = build(urdf, preset).double()
+    random = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.05 * torch.randn(parameter.shape, dtype=torch.float64, generator=random)
+    return model.requires_grad_(False)
+
+
+def levels_of(model, log, noise_ratio=2e-3):
+    effort = 2.0 * np.abs(log.tau).max(axis=0) + 1e-3
+    levels = nominal_levels(effort, np.abs(log.qd).max(axis=0) + 1e-3, model.coulomb.numpy(), noise_ratio)
+    return levels.model_copy(update={"encoder": np.full(model.n, 1e-5)})
+
+
+def require_equal(found: Columns, states: list[EstimatorState], tolerance: float) -> None:
+    pairs = {
+        "external_torque": [state.contact.external_torque for state in states],
+        "threshold": [state.contact.threshold for state in states],
+        "force": [state.contact.force for state in states],
+        "friction_scale": [state.friction_scale for state in states],
+        "disturbance": [state.disturbance for state in states],
+        "mass": [state.payload.mass for state in states],
+        "mass_interval": [state.payload.mass_interval for state in states],
+        "center": [state.payload.center for state in states],
+        "parameters": [state.payload.parameters for state in states],
+        "log_odds": [state.payload.log_odds for state in states],
+    }
+    for name, expected in pairs.items():
+        values, expected = getattr(found, name), np.array(expected)
+        size = np.abs(found.external_torque if name == "disturbance" else expected).max()
+        assert np.abs(values - expected).max() <= tolerance * size, name
+    np.testing.assert_array_equal(found.status, [STATUSES[state.payload.status] for state in states])
+    np.testing.assert_array_equal(found.changed, [state.load_changed for state in states])
+    np.testing.assert_array_equal(found.refusal, [REFUSALS.index(state.refusal) for state in states])
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_c_equals_python_along_recordings(name, tmp_path):
+    """With a model that is not fitted, and noise as large as its residuals: every part of the estimator is busy."""
+    urdf, file = (SHARED / x for x in RECORDED[name])
+    if not file.exists():
+        pytest.skip(f"no {file.name}: the folder of recordings is not here")
+    model, arm = randomised(urdf), load_arm(urdf)
+    (log,) = read_logs([file], model.joint_names)
+    log = log[:SAMPLES]
+    levels = levels_of(model, log, 0.02)
+    estimator = Estimator(load_run(saved_run(model, urdf, tmp_path).path), levels=levels)
+    compiled = CompiledEstimator(model, arm, levels)
+    found = compiled.run(log.t, log.q, log.qd, log.tau)
+    require_equal(found, estimator.replay(log), 1e-9)
+    at = log.q[-1], log.qd[-1], 0.5 * log.qd[-1]
+    for ahead in (0.0, 0.1, 1.0):
+        expected = estimator.torque(*at, ahead)
+        np.testing.assert_allclose(compiled.torque(*at, ahead), expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_c_equals_python_with_couplings_and_hostile_samples(tmp_path):
+    """A mimic joint, a prismatic one, coupled motors and a passive joint, under unusable samples."""
+    (tmp_path / "arm.urdf").write_text(COUPLED)
+    (tmp_path / "arm.yaml").write_text(MOTORS)
+    model = randomised(tmp_path / "arm.urdf", "closed-form")
+    log = hostile(motion_of(model, 20.0))
+    levels = levels_of(model, motion_of(model, 20.0), 0.02)
+    compiled = CompiledEstimator(model, load_arm(tmp_path / "arm.urdf"), levels)
+    found = compiled.run(*log)
+    fit = load_run(saved_run(model, tmp_path / "arm.urdf", tmp_path / "run").path)
+    estimator = Estimator(fit, levels=levels)
+    require_equal(found, list(estimator.steps(*log)), 1e-9)
+    assert compiled.refused() == estimator.intake.counts
+    assert min(estimator.intake.counts.values()) > 0
+
+
+def motion_of(model, seconds: float) -> Trajectory:
+    """A smooth motion with the torques of the model."""
+    q, qd, qdd = smooth_motion(model.n, seconds, np.random.default_rng(3))
+    z = bristles_along(q, bristle_reach(model))
+    with torch.no_grad():
+        tau = model.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd, z))).numpy()
+    return Trajectory(
+        0.01 * np.arange(len(q)), q, qd, tau + 0.01 * np.random.default_rng(0).standard_normal(q.shape)
+    )
+
+
+def hostile(log: Trajectory, count: int | None = None) -> tuple[np.ndarray, ...]:
+    """Samples of a log, repeated to a number of samples, of which one in five is not usable."""
+    random = np.random.default_rng(5)
+    rows = np.arange(count or len(log)) % len(log)
+    laps = np.arange(len(rows)) // len(log)
+    t = log.t[rows] + laps * (log.duration + 0.01)
+    q, qd, tau = (x[rows].copy() for x in (log.q, log.qd, log.tau))
+    kinds = random.integers(0, 40, len(t))
+    kinds[:100] = 99
+    q[kinds == 0, 0] = np.nan
+    qd[kinds == 1, -1] = -np.inf
+    tau[kinds == 2] = np.nan
+    q[kinds == 3] += 1e3 * random.standard_normal((int((kinds == 3).sum()), q.shape[1]))
+    qd[kinds == 4] = 1e6
+    t[kinds == 5] -= 0.5
+    t[1:][kinds[1:] == 6] = t[:-1][kinds[1:] == 6]
+    tau[kinds == 7] = 1e9
+    t[len(t) // 2 :] += 3.0  # a gap
+    t[2 * len(t) // 3 :] -= 5.0  # a clock that is set back
+    return t, q, qd, tau
+
+
+def test_a_million_hostile_samples_give_finite_estimates():
+    model = moved_model("six_dof", "closed-form", 0.1).double()
+    log = motion_of(model, 30.0)
+    levels = levels_of(model, log)
+    from exported_runs import arm_of
+
+    compiled = CompiledEstimator(model, arm_of("six_dof"), levels)
+    t, q, qd, tau = hostile(log, 10**6)
+    total = 0
+    for start in range(0, len(t), 10**5):
+        rows = slice(start, start + 10**5)
+        found = compiled.run(t[rows], q[rows], qd[rows], tau[rows])
+        for name, values in vars(found).items():
+            # an upper limit of the mass is infinite before the first report
+            assert np.isfinite(values[found.limit < np.inf] if name == "limit" else values).all(), name
+        total += len(found.mass)
+    counts = compiled.refused()
+    assert sum(counts.values()) == total == 10**6
+    assert counts["not finite"] > 5e4
+    assert min(counts[reason] for reason in ("repeated", "reversed", "jump", "saturated")) > 1e4
+
+
+def test_float_is_close_to_double():
+    model = moved_model("six_dof", "closed-form", 0.1).double()
+    log = motion_of(model, 10.0)
+    levels = levels_of(model, log)
+    from exported_runs import arm_of
+
+    double, single = (
+        CompiledEstimator(model, arm_of("six_dof"), levels, *flags).run(log.t, log.q, log.qd, log.tau)
+        for flags in ((), ("-DSIX_DOF_FLOAT",))
+    )
+    scale = np.abs(double.threshold).mean(axis=0)
+    assert (np.abs(double.external_torque - single.external_torque).max(axis=0) < 0.1 * scale).all()
+    np.testing.assert_array_equal(double.status, single.status)
+
+
+def test_a_saved_state_is_restored_and_a_damaged_one_is_not():
+    model = moved_model("six_dof", "closed-form", 0.1).double()
+    log = motion_of(model, 10.0)
+    from exported_runs import arm_of
+
+    compiled = CompiledEstimator(model, arm_of("six_dof"), levels_of(model, log))
+    before = compiled.run(log.t, log.q, log.qd, log.tau)
+    state = compiled.saved()
+    compiled.start()
+    assert compiled.restore(state)
+    # a clock that starts again, with all that was found
+    after = compiled.run(log.t[:50], log.q[:50], log.qd[:50], log.tau[:50])
+    assert (after.refusal == 0).all()
+    np.testing.assert_array_equal(after.status[0], before.status[-1])
+    np.testing.assert_array_equal(after.friction_scale[0], before.friction_scale[-1])
+    for position in (0, 9, 200, len(state) - 1):
+        damaged = bytearray(state.raw)
+        damaged[position] ^= 1
+        state.raw = bytes(damaged)
+        assert not compiled.restore(state)
+        damaged[position] ^= 1
+        state.raw = bytes(damaged)
+    assert compiled.restore(state)
+
+
+def test_a_run_with_noise_levels_exports_the_estimator(tmp_path):
+    model = moved_model("six_dof", "closed-form", 0.1).double()
+    folder = saved_run(model, Path(__file__).parents[1] / "robots" / "six_dof.urdf", tmp_path)
+    plain = export(folder.path, "c")
+    assert not any("estimator" in name for name in plain.files)
+    folder.estimator.write_text(levels_of(model, motion_of(model, 5.0)).model_dump_json())
+    files = export(folder.path, "c").files
+    assert {"six_dof.h", "six_dof.c", "six_dof_estimator.h", "six_dof_estimator.c"} <= set(files)
+    assert files == export(folder.path, "c").files
+
+
+def test_step_and_report_take_microseconds(tmp_path):
+    """At most 5 us a step of seven joints and 1 ms a report on a desktop; ten times as long on a loaded machine."""
+    urdf = Path(__file__).parents[1] / "robots" / "panda.urdf"
+    model = randomised(urdf, "closed-form")
+    log = motion_of(model, 20.0)
+    t = np.arange(0, log.duration, 0.001)
+    q, qd, tau = (np.stack([np.interp(t, log.t, x) for x in y.T], axis=1) for y in (log.q, log.qd, log.tau))
+    found = CompiledEstimator(model, load_arm(urdf), levels_of(model, log)).run(t, q, qd, tau)
+    assert np.quantile(found.step_seconds, 0.99) < 50e-6
+    assert np.median(found.report_seconds[found.report_seconds > 0]) < 10e-3
