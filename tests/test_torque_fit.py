@@ -562,7 +562,7 @@ def test_few_of_very_many_samples_come_near_first(emitted, monkeypatch):
     found = fit_torque(quick, samples)
     assert found.steps != expected.steps
     # the cost depends on the noise, and so on the correlation time, which is estimated before the final fit
-    np.testing.assert_allclose(found.correlation_time, expected.correlation_time, rtol=0.05)
+    np.testing.assert_allclose(found.correlation_time, expected.correlation_time, rtol=0.1)
     assert found.cost == pytest.approx(expected.cost, rel=0.05)
     np.testing.assert_allclose(found.rms_residual, expected.rms_residual, rtol=1e-3)
     assert [stage.name for stage in found.stages][-1] == "final fit"
