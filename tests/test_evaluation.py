@@ -124,7 +124,7 @@ def test_the_tip_is_the_end_of_the_fixed_links(cart):
     expected = torch.stack([x, torch.zeros_like(x), z], dim=-1)
     for tip in (None, "weight"):
         position = tip_kinematics(cart, tip, joints=("slide", "swing")).position
-        torch.testing.assert_close(position(q), expected, atol=1e-6, rtol=0)
+        torch.testing.assert_close(position(q), expected, atol=1e-12, rtol=0)
     with pytest.raises(ValueError, match="the joints swing do not lead to cart"):
         tip_kinematics(cart, "cart", joints=("slide", "swing"))
 

@@ -116,7 +116,7 @@ def test_momentum_balance_is_the_inverse_dynamics(robot, tmp_path):
 
 
 def test_the_jacobian_is_the_velocity_of_the_tip(arm):
-    """J qd is the derivative of the tip's position, which pytorch-kinematics computes."""
+    """J qd is the derivative of the tip's position, which `TipKinematics` computes."""
     from spelgen.dynamics.tip import tip_kinematics
     from spelgen.dynamics.tip_frame import tip_frame
 

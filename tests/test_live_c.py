@@ -21,6 +21,7 @@ from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
+PACKAGE = Path(__file__).parents[1] / "spelgen"
 SHARED = Path(__file__).parents[1] / ".." / "shared"
 RECORDED = {
     "ur10e": ("logs/ur10e/ur10e.urdf", "logs/ur10e/20_01_31_load.parquet"),
@@ -108,12 +109,24 @@ def test_c_equals_python_with_couplings_and_hostile_samples(tmp_path):
     assert min(estimator.intake.counts.values()) > 0
 
 
+def test_c_equals_python_for_friction_without_a_state(tmp_path):
+    preset = (PACKAGE / "presets" / "closed-form.yaml").read_text()
+    (tmp_path / "plain.yaml").write_text(preset.replace("memory: bristles", "memory: none"))
+    urdf = Path(__file__).parents[1] / "robots" / "six_dof.urdf"
+    model = randomised(urdf, tmp_path / "plain.yaml")
+    log = motion_of(model, 8.0)
+    levels = levels_of(model, log, 0.02)
+    found = CompiledEstimator(model, load_arm(urdf), levels).run(log.t, log.q, log.qd, log.tau)
+    estimator = Estimator(load_run(saved_run(model, urdf, tmp_path / "run").path), levels=levels)
+    require_equal(found, estimator.replay(log), 1e-9)
+
+
 def motion_of(model, seconds: float) -> Trajectory:
     """A smooth motion with the torques of the model."""
     q, qd, qdd = smooth_motion(model.n, seconds, np.random.default_rng(3))
-    z = bristles_along(q, bristle_reach(model))
+    state = [bristles_along(q, bristle_reach(model))] if model.elements else []
     with torch.no_grad():
-        tau = model.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd, z))).numpy()
+        tau = model.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd, *state))).numpy()
     return Trajectory(
         0.01 * np.arange(len(q)), q, qd, tau + 0.01 * np.random.default_rng(0).standard_normal(q.shape)
     )

@@ -146,7 +146,7 @@ LIFT += "".join(
     <inertia ixx="0.3" ixy="0.02" ixz="0" iyy="0.2" iyz="0.01" izz="0.25"/></inertial></link>"""
     for k, name in enumerate(("stage1", "stage2", "rod1", "rod2", "finger1", "finger2"), start=1)
 )
-# a colour as Gazebo has it, which pytorch-kinematics' own parser refuses
+# a colour as Gazebo has it, which other parsers refuse
 LIFT = LIFT.replace(
     '<link name="stage1">', '<link name="stage1"><visual><material>Gazebo/Red</material></visual>', 1
 )

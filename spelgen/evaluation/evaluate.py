@@ -17,7 +17,7 @@ from spelgen.dynamics.parameters import used_parameter_count, without_idle_resid
 from spelgen.dynamics.protocol import RigidDynamics, input_of
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.emission.assemble import ArmModel
-from spelgen.errors import Diagnostic, LogError, in_one_line
+from spelgen.errors import Diagnostic, LogError, SpelgenError, in_one_line
 from spelgen.evaluation.horizons import (
     EvaluatedLogs,
     Horizon,
@@ -229,7 +229,7 @@ def _tip(tested: Subject, notes: list[Diagnostic]) -> TipPosition | None:
     try:
         tip = tested.spec.options.tip if tested.spec else None
         return tip_kinematics(tested.urdf, tip, joints=tested.joints).position
-    except Exception as error:  # pytorch-kinematics raises many kinds; the evaluation continues without it
+    except (ValueError, SpelgenError) as error:  # the evaluation continues without it
         message = f"no tip errors: {in_one_line(error)}"
         notes.append(Diagnostic("info", "no-tip", tested.urdf.name, None, message))
         return None

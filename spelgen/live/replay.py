@@ -5,7 +5,6 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -50,7 +49,7 @@ class LogEstimate:
     drift: dict[str, float]
     refused: dict[str, int]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the content of the JSON result."""
         return {
             "log": self.log.name,
@@ -86,16 +85,15 @@ class LogEstimate:
         return "\n".join(textwrap.fill(line, WIDTH, subsequent_indent="    ") for line in lines)
 
 
-def payload_content(payload: Payload) -> dict[str, Any]:
+def payload_content(payload: Payload) -> dict[str, object]:
     """Return a payload as JSON."""
-    content: dict[str, Any] = {"status": payload.status, "log_odds_of_no_payload": payload.log_odds}
+    content: dict[str, object] = {"status": payload.status, "log_odds_of_no_payload": payload.log_odds}
     if np.isfinite(payload.limit):
         content["mass_limit"] = payload.limit
     if payload.status == "payload":
         for name in ("mass", "center", "inertia"):
-            value, interval = getattr(payload, name), getattr(payload, f"{name}_interval")
-            content[name] = np.asarray(value).tolist()
-            content[f"{name}_interval"] = np.asarray(interval).tolist()
+            for field in (name, f"{name}_interval"):
+                content[field] = np.asarray(vars(payload)[field]).tolist()
         content["parameters"] = payload.parameters.tolist()
     return content
 

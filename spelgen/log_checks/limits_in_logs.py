@@ -52,7 +52,7 @@ def flat_tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the values (2, n) of the flat bottoms and tops of signals (T, n), NaN without one, and their shares.
 
     Many more samples are next to the extreme value than in three times as wide a band below it; the peaks of a
-    sinusoid have as many in both.
+    sinusoid have equal numbers in both.
     """
     upright = SIDES[:, None, None] * values
     tops = upright.max(axis=1)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from spelgen.logs.joint_signals import JointSignals
+from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import split_at_gaps
 from spelgen.logs.tuning import RESONANCE as TUNING
 
@@ -20,7 +21,12 @@ def find_elastic(signals: JointSignals) -> str | None:
     piece = max(split_at_gaps(signals.trajectory), key=len)
     rate, k = piece.sample_rate, signals.number
     length = round(TUNING.segment * rate)
-    if not piece.tau.size or len(piece) < TUNING.segments * length or not np.ptp(piece.tau[:, k]):
+    if (
+        not piece.tau.size
+        or not shows_accelerations(rate)
+        or len(piece) < TUNING.segments * length
+        or not np.ptp(piece.tau[:, k])
+    ):
         return None
     frequency, inertia = _apparent_inertia(piece.qd[:, k], piece.tau[:, k], rate, length)
     if len(frequency) < TUNING.fewest_bands:
