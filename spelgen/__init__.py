@@ -27,9 +27,11 @@ if TYPE_CHECKING:
     from spelgen.fitting.fit import RunOptions as RunOptions
     from spelgen.fitting.fit import fit as fit
     from spelgen.fitting.fit import load_run as load_run
+    from spelgen.fitting.posterior import Posterior as Posterior
     from spelgen.identification.identification import Identification as Identification
     from spelgen.identification.identification import LeastSquares as LeastSquares
     from spelgen.identification.identify import identify as identify
+    from spelgen.identification.intervals import Interval as Interval
     from spelgen.live.estimator import Estimator as Estimator
     from spelgen.live.estimator import EstimatorState as EstimatorState
     from spelgen.log_checks.check_logs import check_logs as check_logs
@@ -63,10 +65,12 @@ _MODULES = {
     "excitation.design": "excite",
     "identification.identify": "identify",
     "identification.identification": "LeastSquares Identification",
+    "identification.intervals": "Interval",
     "dynamics.friction": "FrictionModel",
     "fitting.fit": "fit",
     "fitting.fitted": "Fit load_run",
     "fitting.objective": "RunOptions",
+    "fitting.posterior": "Posterior",
     "settings.fits": "GaussianPrior TorqueFit MomentumFit Rollout",
     "evaluation.rollout": "rollout",
     "evaluation.evaluate": "evaluate",

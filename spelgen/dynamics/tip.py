@@ -1,12 +1,11 @@
-"""Kinematics of the tip of an arm."""
+"""Kinematics of the tip of an arm by pytorch-kinematics."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -14,9 +13,12 @@ from spelgen.dynamics.constraint import mimic_constraint
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Robot, UrdfJoint
 
+if TYPE_CHECKING:
+    from pytorch_kinematics import SerialChain
+
 
 class TipKinematics:
-    """Pose and Jacobian of a link in the frame of the root link, as functions of q (..., n) [rad, m].
+    """Pose and Jacobian of a link in the frame of the root link by pytorch-kinematics, functions of q (..., n) [rad, m].
 
     Mimic joints move with their leaders, all other joints are at zero. Angles are the unrounded angles of the URDF.
     Results have the type of q.
@@ -24,26 +26,12 @@ class TipKinematics:
 
     def __init__(self, robot: Robot, joints: Sequence[str], link: str) -> None:
         self.link = link
+        path = robot.path_to(link)
+        self._chains = {
+            dtype: _serial_chain(robot.root, path, dtype) for dtype in (torch.float64, torch.float32)
+        }
         constraint = mimic_constraint(robot, joints)
-        rows: list[int] = []
-        self._placements: list[
-            torch.Tensor
-        ] = []  # of each moving joint, after the one before it, then of the tip
-        self._revolute: list[bool] = []
-        axes: list[np.ndarray] = []
-        self._generators: list[torch.Tensor] = []
-        placement = np.eye(4)
-        for joint in robot.path_to(link):
-            placement = placement @ _placement(joint)
-            if joint.moves:
-                rows.append(constraint.names.index(joint.name))
-                axes.append(np.array(joint.axis) / np.linalg.norm(joint.axis))
-                self._revolute.append(joint.type != "prismatic")
-                self._generators.append(torch.from_numpy(_generator(axes[-1], self._revolute[-1])))
-                self._placements.append(torch.from_numpy(placement))
-                placement = np.eye(4)
-        self._placements.append(torch.from_numpy(placement))
-        self._axes = torch.from_numpy(np.reshape(axes, (-1, 3)))
+        rows = [constraint.names.index(joint.name) for joint in path if joint.moves]
         self._jacobian = torch.from_numpy(constraint.jacobian[rows])  # (joints of the path, n)
         self._offset = torch.from_numpy(constraint.offset[rows])
         missing = [name for name, column in zip(joints, self._jacobian.T, strict=True) if not column.any()]
@@ -52,7 +40,8 @@ class TipKinematics:
 
     def pose(self, q: torch.Tensor) -> torch.Tensor:
         """Return the homogeneous transform, (..., 4, 4)."""
-        return self._frames(q)[-1]
+        poses: torch.Tensor = self._chains[q.dtype].forward_kinematics_tensor(self._rows(q))[-1]
+        return poses.reshape(*q.shape[:-1], 4, 4)
 
     def position(self, q: torch.Tensor) -> torch.Tensor:
         """Return the origin of the link, (..., 3) [m]."""
@@ -60,46 +49,36 @@ class TipKinematics:
 
     def jacobian(self, q: torch.Tensor) -> torch.Tensor:
         """Return the Jacobian, (..., 6, n), in root axes: linear [m/s], then angular velocity [rad/s] per qd."""
-        *frames, tip = self._frames(q)
-        columns: list[torch.Tensor] = []
-        for frame, axis, revolute in zip(frames, self._axes.to(q), self._revolute, strict=True):
-            along = (frame[..., :3, :3] * axis).sum(dim=-1)  # the axis, (..., 3)
-            lever = tip[..., :3, 3] - frame[..., :3, 3]
-            velocities = (torch.linalg.cross(along, lever, dim=-1), along) if revolute else (along, 0 * along)
-            columns.append(torch.cat(velocities, dim=-1))
-        return torch.stack(columns, dim=-1) @ self._jacobian.to(q)
+        jacobian: torch.Tensor = self._chains[q.dtype].jacobian_tensor(self._rows(q)) @ self._jacobian.to(q)
+        return jacobian.reshape(*q.shape[:-1], 6, q.shape[-1])
 
-    def _frames(self, q: torch.Tensor) -> list[torch.Tensor]:
-        """Return the poses (..., 4, 4) of the moving joints after their motion, and of the tip."""
-        *placements, end = (placement.to(q) for placement in self._placements)
-        positions = q @ self._jacobian.to(q).mT + self._offset.to(q)
-        pose = torch.eye(4).to(q)
-        frames: list[torch.Tensor] = []
-        for k, (placement, revolute) in enumerate(zip(placements, self._revolute, strict=True)):
-            x, generator = positions[..., k, None, None], self._generators[k].to(q)
-            # the matrix exponential of x times the generator (Rodrigues); the square is zero for a translation
-            first, second = (x.sin(), 1 - x.cos()) if revolute else (x, 0 * x)
-            motion = torch.eye(4).to(q) + first * generator + second * (generator @ generator)
-            pose = pose @ placement @ motion
-            frames.append(pose)
-        return [*frames, pose @ end]
+    def _rows(self, q: torch.Tensor) -> torch.Tensor:
+        """Return the positions of the joints of the path, (states, joints)."""
+        return (q @ self._jacobian.to(q).mT + self._offset.to(q)).reshape(-1, len(self._offset))
 
 
-def _generator(axis: np.ndarray, revolute: bool) -> np.ndarray:
-    """Return the derivative (4, 4) of a rotation about, or of a translation along, a unit axis (3,)."""
-    generator = np.zeros((4, 4))
-    if revolute:
-        generator[:3, :3] = np.cross(axis, np.eye(3)).T
-    else:
-        generator[:3, 3] = axis
-    return generator
+def _serial_chain(root: str, path: Sequence[UrdfJoint], dtype: torch.dtype) -> SerialChain:
+    """Return the chain of pytorch-kinematics for a path of joints from the root link.
 
+    Its frames are made from the values of the file: the URDF parser of pytorch-kinematics rounds them to float32.
+    """
+    import pytorch_kinematics as pk  # imports matplotlib, which takes long
+    from pytorch_kinematics.frame import Frame, Joint, Link
 
-def _placement(joint: UrdfJoint) -> np.ndarray:
-    """Return the pose (4, 4) of the frame of a joint at zero in the frame of its parent link."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = Rotation.from_euler("xyz", joint.rpy).as_matrix(), joint.xyz
-    return pose
+    first = last = Frame(root, Link(root), Joint())
+    for joint in path:
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = torch.from_numpy(Rotation.from_euler("xyz", joint.rpy).as_matrix())
+        pose[:3, 3] = torch.tensor(joint.xyz)
+        kind = "fixed" if not joint.moves else "prismatic" if joint.type == "prismatic" else "revolute"
+        axis = torch.tensor(joint.axis, dtype=torch.float64)
+        offset = pk.Transform3d(matrix=pose[None].to(dtype), dtype=dtype)
+        frame = Frame(
+            joint.child, Link(joint.child), Joint(joint.name, offset, kind, axis / axis.norm(), dtype)
+        )
+        last.add_child(frame)
+        last = frame
+    return pk.SerialChain(pk.Chain(first, dtype=dtype), last.name, dtype=dtype)
 
 
 def tip_kinematics(

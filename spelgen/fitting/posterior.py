@@ -61,8 +61,9 @@ class Propagated(NamedTuple):
 class Posterior:
     """Posterior of a model that was fitted to torques.
 
-    covariance: (K, K) of the rigid-body, drive and friction parameters. torque_std: (n,) RMS torque residual of samples
-    that were held out [Nm, N], below the cutoff of the fit's filter. delay: of the torques relative to the positions.
+    covariance: (K, K) of the rigid-body, drive and friction parameters. torque_std: (n,) RMS torque residual of blocks
+    of samples that were not fitted [Nm, N], below the cutoff of the fit's filter. delay: of the torques relative to the
+    positions.
     """
 
     model: ArmModel
@@ -104,8 +105,8 @@ class Posterior:
     def torque(self, *motion: np.ndarray) -> Uncertain:
         """Return the torques (T, n) [Nm, N] that would be logged, with standard deviations.
 
-        motion: q, qd, qdd (T, n), and z and direction where known. The standard deviation includes the torque residual
-        of held-out samples, that is noise and errors of the model.
+        motion: q, qd, qdd (T, n), and z and direction where known. The standard deviation includes noise and errors
+        of the model, from the torque residual of blocks of samples that were not fitted.
         """
         q, *motion_and_state = (torch.as_tensor(np.ascontiguousarray(x)) for x in motion)
         model, root, of_bodies = self.model, self._root.clone(), self._vector.mask("bodies")

@@ -29,7 +29,7 @@ class ParameterCovariance(NamedTuple):
 def parameter_covariance(estimate: TorqueEstimate) -> ParameterCovariance:
     """Return the covariance of an estimate, which has been written into its model.
 
-    The posterior covariance assumes a correlation time, and errors that are the same in all motions. The jackknife over
+    The posterior covariance assumes correlation times, and errors that are the same in all motions. The jackknife over
     contiguous blocks of samples measures both, but from few blocks. The result is the larger one in every direction,
     scaled such that 1.96 standard deviations are the 95 % interval of Student's t with blocks - 1 degrees of freedom.
 
