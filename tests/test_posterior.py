@@ -25,7 +25,6 @@ from spelgen.fitting.fit import fit, load_run
 from spelgen.fitting.posterior import Posterior
 from spelgen.fitting.run_folder import RunFolder, write_state
 from spelgen.fitting.torque import fit as torque_fit
-from spelgen.fitting.torque import problem as torque_problem
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.parameters import ParameterVector
 from spelgen.identification.base_parameters import base_parameters
@@ -92,8 +91,7 @@ def logged(model, seconds, seed, correlation=0.98, noise=0.05):
 
 
 def test_intervals_hold_the_truth_if_errors_last_longer_than_the_fit_assumes(robots, monkeypatch):
-    """Errors of 0.5 s: intervals of the posterior covariance are too narrow if it assumes 0.2 s."""
-    monkeypatch.setattr(torque_problem, "TUNING", replace(torque_problem.TUNING, correlation_weight=np.inf))
+    """Errors of 0.5 s: intervals of the posterior covariance, which assumes 0.2 s, are too narrow."""
     estimates, ratios, ratios_by_posterior = [], [], []  # errors divided by half intervals
     measured = torque_fit.parameter_covariance
 
