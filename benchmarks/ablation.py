@@ -124,8 +124,8 @@ def mechanisms() -> list[Mechanism]:
     """Return all mechanisms."""
     return [
         Mechanism("filter transients excluded", tuned(SAMPLES, unsettled=0.0)),
-        Mechanism("correlated errors (0.2 s)", tuned(TUNING, correlation_time=0.02)),
-        Mechanism("correlation time from the residual", tuned(TUNING, correlation_weight=1e9)),
+        Mechanism("correlated errors", tuned(TUNING, correlation_time=0.02, correlation_weight=NEVER)),
+        Mechanism("correlation time from the data", tuned(TUNING, correlation_weight=NEVER)),
         Mechanism("shorter correlation at reversals", tuned(TUNING, reversal_correlation_time=0.2)),
         Mechanism("bounded prior widths", tuned(TUNING, max_width=NEVER)),
         Mechanism("steps at the least-squares noise", tuned(TUNING, initial_steps=0)),
@@ -154,7 +154,11 @@ def mechanisms() -> list[Mechanism]:
         Mechanism("residual terms", tuned(SELECTION, standard_errors=NEVER)),
         Mechanism("orthogonalization of terms", ((RigidProjection, "orthogonalize", not_orthogonalized),)),
         Mechanism("significance of residual terms", tuned(SELECTION, standard_errors=0.0)),
-        Mechanism("higher significance with one recording", tuned(SELECTION, standard_errors_of_one=2.82)),
+        Mechanism("strong evidence from one recording", tuned(SELECTION, standard_errors_of_one=2.82)),
+        Mechanism(
+            "plausible torques of one recording",
+            tuned(SELECTION, max_torque_fraction=NEVER, min_load_fraction=0.0),
+        ),
         Mechanism("gaps between blocks", tuned(SELECTION, gap=0.0)),
         Mechanism("minimum error reduction", tuned(SELECTION, min_reduction=0.0)),
         Mechanism("networks in residual terms", ((stages, "select_networks", lambda *_: iter(())),)),

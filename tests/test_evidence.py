@@ -136,9 +136,9 @@ def test_one_recording_supports_only_a_part_of_the_torque(hybrid):
     t = torch.linspace(0, 200, 4000).double()
     q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
     samples = residual_of(torch.stack([torch.sin(2 * q[:, 0]), torch.zeros_like(t)], dim=1), q)
-    lengths, one, two = torch.full((2,), 5.0), torch.zeros(4000).long(), (torch.arange(4000) >= 2000).long()
+    lengths, one, three = torch.full((2,), 5.0), torch.zeros(4000).long(), torch.arange(4000) * 3 // 4000
     spread = float(samples.torque_residual[:, 0].std())
-    for recordings, ratio, selected in ((one, 5.0, True), (one, 1.2, False), (two, 1.2, True)):
+    for recordings, ratio, selected in ((one, 5.0, True), (one, 1.2, False), (three, 1.2, True)):
         std = torch.full((2,), ratio * spread).double()
         found = select_functions(hybrid, samples, Unabsorbed(), [], lengths, recordings, std)
         assert bool(found) == selected

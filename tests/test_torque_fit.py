@@ -196,7 +196,7 @@ def test_a_urdf_that_is_wrong_is_given_up_and_that_is_said(emitted):
     wrong = fit_torque(found, few, certain.model_copy(update={"degrees_of_freedom": 8.0}))
     assert wrong.prior.bodies > 0.6
     assert nmse(found, test) < 0.5 * nmse(fixed, test)
-    right = fit_torque(module.Model(), [recorded(module.Model(), 3.0, 0.02, seed=1)])
+    right = fit_torque(module.Model(), [recorded(module.Model(), 6.0, 0.02, seed=1)])
     assert right.prior.bodies < 0.35
     samples = TorqueSamples.of(few)
     told = [next(torque_notes(found, samples, each)).message for each in (wrong, right)]
@@ -561,7 +561,9 @@ def test_few_of_very_many_samples_come_near_first(emitted, monkeypatch):
     monkeypatch.setattr(torque_fit, "TUNING", TorqueTuning(initial_samples=200))
     found = fit_torque(quick, samples)
     assert found.steps != expected.steps
-    assert found.cost == pytest.approx(expected.cost, rel=1e-3)
+    # the cost depends on the noise, and so on the correlation time, which is estimated before the final fit
+    np.testing.assert_allclose(found.correlation_time, expected.correlation_time, rtol=0.1)
+    assert found.cost == pytest.approx(expected.cost, rel=0.05)
     np.testing.assert_allclose(found.rms_residual, expected.rms_residual, rtol=1e-3)
     assert [stage.name for stage in found.stages][-1] == "final fit"
     few = TorqueSamples.of(samples, 2).subsampled(300)
@@ -579,7 +581,8 @@ def test_friction_that_is_nearly_nothing_does_not_vary(robots):
         samples = ResidualSamples(q, qd, 0 * q, missing, friction * qd.sign())
         still = (torch.zeros(0, 0).double(),) * 2
         bodies = RigidProjection((torch.zeros(len(q), 0).double(),) * 2, still)
-        found = select_functions(model, samples, bodies, [], 5.0)
+        lengths, recordings, std = torch.full((2,), 5.0), torch.zeros(len(q)).long(), torch.full((2,), 1.0)
+        found = select_functions(model, samples, bodies, [], lengths, recordings, std)
         varied = [x.error_reduction for x in found if x.name == FRICTION]
         assert varied == [] if gain is None else min(varied) > gain and len(varied) == 2
 

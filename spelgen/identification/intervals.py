@@ -111,10 +111,11 @@ def larger_covariance(covariance: Tensor, lower_bound: Tensor) -> Tensor:
     In coordinates in which the bound is the identity, eigenvalues of the covariance below one become one.
     """
     scale = lower_bound.diagonal().sqrt()  # parameters have different units
-    correlation = lower_bound / scale.outer(scale) + 1e-12 * torch.eye(len(scale)).to(scale)
-    root = scale.unsqueeze(-1) * torch.linalg.cholesky(correlation)
-    half = torch.linalg.solve_triangular(root, covariance, upper=False)
-    relative = torch.linalg.solve_triangular(root, half.mT, upper=False)
+    # the bound of samples without noise is singular to rounding
+    variances, axes = torch.linalg.eigh(lower_bound / scale.outer(scale))
+    deviations = variances.clamp(min=1e-12).sqrt()
+    root, inverse = scale.unsqueeze(-1) * axes * deviations, (axes / deviations / scale.unsqueeze(-1)).mT
+    relative = inverse @ covariance @ inverse.mT
     values, vectors = torch.linalg.eigh((relative + relative.mT) / 2)
     scaled: Tensor = root @ vectors * values.clamp(min=1.0).sqrt()
     return scaled @ scaled.mT

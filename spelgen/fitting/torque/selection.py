@@ -2,10 +2,10 @@
 
 With several recordings one recording is held out at a time; with one, one of ten contiguous blocks, with a gap on both
 sides, since successive errors are correlated. A candidate is accepted if its mean relative error reduction over ten
-blocks is significant (one-sided t test, 1 %, or 0.1 % for one recording), and if, fitted to the first half, it also
-lowers the error on the last half: often one motion repeats errors that another motion does not have. With one
-recording its torque must be plausible, too (`max_torques`). If no candidate of a joint is accepted, both tests are
-repeated with the held-out samples at positions within the range of the fitted samples, since splines do not
+blocks is significant (one-sided t test, 1 %, or 0.1 % for one or two recordings), and if, fitted to the first half, it
+also lowers the error on the last half: often one motion repeats errors that another motion does not have. With one or
+two recordings its torque must be plausible, too (`max_torques`). If no candidate of a joint is accepted, both tests
+are repeated with the held-out samples at positions within the range of the fitted samples, since splines do not
 extrapolate. Of the accepted candidates of a joint the one with the largest error reduction is selected.
 """
 
@@ -92,7 +92,8 @@ def select_functions(
     for candidate in joint_functions(model, samples, projection):
         if (candidate.parameter, candidate.joint) not in selected:
             candidates[candidate.joint].append(candidate)
-    limits = None if recordings.any() else max_torques(model, samples.q, torque_std)
+    # two recordings repeat a motion only once: their ten blocks are not independent
+    limits = None if int(recordings.max()) > 1 else max_torques(model, samples.q, torque_std)
     best = (
         _best(of_joint, samples.torque_residual, noise, float(length), recordings, limits)
         for of_joint, length in zip(candidates, correlation_length, strict=True)
@@ -127,7 +128,7 @@ def _best(
 ) -> SelectedTerm | None:
     """Return the accepted candidate of one joint with the largest error reduction, or None.
 
-    torque_residual: (T, n). noise: (n,). recordings: (T,). limits: `max_torques` of one recording; None: several.
+    torque_residual: (T, n). noise: (n,). recordings: (T,). limits: `max_torques`; None: no bounds.
     """
     significance = SELECTION.standard_errors if limits is None else SELECTION.standard_errors_of_one
     first, last = split_halves(len(torque_residual), correlation_length)
