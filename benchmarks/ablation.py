@@ -1,4 +1,4 @@
-"""Switch off each mechanism of the torque fits, one after the other, and print what it is worth.
+"""Switch off each mechanism of the torque fits, one after the other, and print the change of the error.
 
     python benchmarks/ablation.py [--recordings FOLDER] [--arms-folder URDFS] [--only NAME] [--case NAME]
 
@@ -205,7 +205,7 @@ def simulated_cases(folder: Path) -> Iterator[tuple[str, Callable[[], dict[str, 
 
 
 def effect_cases() -> Iterator[tuple[str, Callable[[], dict[str, float]]]]:
-    """Fits to a simulated UR10e that has what rigid bodies do not."""
+    """Fits to a simulated UR10e with torques that rigid bodies do not explain."""
     for effect, logs, test in arms.with_effects():
 
         def run(logs: Any = logs, test: Any = test) -> dict[str, float]:

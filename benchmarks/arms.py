@@ -1,4 +1,5 @@
-"""Arm by baseline by preset: torques and states ahead on real logs, and torques of an arm with what rigid bodies miss.
+"""Errors per arm, baseline and preset: torques and states ahead on real logs, and torques of a simulated UR10e with
+effects in addition to rigid bodies.
 
     python benchmarks/arms.py [FOLDER]
 
@@ -6,7 +7,7 @@ FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/reco
 error by the torque's variance, mean of the joints, pauses included. The presets are fitted as `spelgen train` does,
 everything else to the same samples. The networks are the ones of `rivals.py`; `+ network` is a network for the torque
 residual of least squares. States 0.1, 0.5 and 1 s ahead: error relative to the motion, as `spelgen
-evaluate` has it, open loop and with the disturbance held that a momentum observer finds.
+evaluate` has it, open loop and with a constant disturbance from a momentum observer.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ def table(cases: Iterator[Case]) -> None:
 
 
 def states_ahead(folder: Path) -> None:
-    """What `spelgen evaluate` says of each arm."""
+    """Print the errors of `spelgen evaluate` for each arm."""
     predictors = (CONSTANT_VELOCITY, MODEL, observed(MODEL))
     print(f"{'':30}" + "".join(f"{f'{name}, {ahead:g} s':>30}" for ahead in AHEAD for name in predictors))
     for name, urdf, training, tests in splits(folder):
@@ -151,7 +152,7 @@ def real(folder: Path) -> Iterator[Case]:
 
 
 def simulated() -> Iterator[Case]:
-    """A UR10e other than its URDF says, with one effect and with all of them."""
+    """Print the errors for a simulated UR10e that differs from its URDF, with each effect and with all effects."""
     for name, logs, test in with_effects():
         models = {}
         for preset in PRESETS:
@@ -176,7 +177,10 @@ def with_effects() -> Iterator[tuple[str, list[DynamicsSamples], DynamicsSamples
 
 
 def recorded(model: Any, effects: Sequence[str], seed: int, noise: float = 0.0) -> DynamicsSamples:
-    """30 s of a smooth random motion with the model's torque and what else acts; noise by the torque's deviation."""
+    """Return 30 s of a smooth random motion.
+
+    The torque is the one of the model, with added torques and noise in proportion to its standard deviation.
+    """
     rng = np.random.default_rng(seed)
     q, qd, qdd = smooth_motion(model.n, 30.0, rng)
     z = bristles_along(q, bristle_reach(model))
@@ -196,7 +200,7 @@ def recorded(model: Any, effects: Sequence[str], seed: int, noise: float = 0.0) 
 
 
 def of_the_urdf(urdf: Path, arm: Chain) -> Torque:
-    """The URDF as it is, with the settings' drives where there are any."""
+    """Return the torque function of the URDF, with the drives of the settings if they have any."""
     names = [x.name for x in arm.coordinates]
     dynamics = urdf_dynamics(urdf, names, drives=drives_known(urdf, names))
     return torque_of(dynamics)

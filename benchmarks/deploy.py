@@ -1,10 +1,10 @@
-"""Exports beside the torch module and beside one another: parity at 10,000 states, latencies of one call on one core.
+"""Exports compared with the torch module and each other: parity at 10,000 states, latencies of one call on one core.
 
     python benchmarks/deploy.py [--parity] [--latency]
 
 Needs the extras deploy and simulate and a C compiler. Models: the six arms of robots/, both presets that go to C, every
-weight moved by a normal number so that no part is idle; latencies also of hybrid as fits mostly leave it, with nothing
-beside its bodies.
+parameter changed by a normal number, so that every part has an effect; latencies also of hybrid without selected
+residual terms, which is the result of most fits.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ FLAGS = ("-O2",)
 
 
 def trained(robot: str, preset: str, size: float = 0.05, *, residuals: bool = True) -> Trained:
-    """A model of an arm whose weights have all moved; without ``residuals`` those of its bodies and drives alone."""
+    """Return a model of an arm with changed parameters; without ``residuals`` only of its bodies and drives."""
     arm = load_arm(ROBOTS / f"{robot}.urdf")
     model, random = build(arm, preset), torch.Generator().manual_seed(0)
     with torch.no_grad():
@@ -90,7 +90,7 @@ def parity() -> None:
 
 def _largest(found: Parity) -> float:
     """Return the largest difference of all entry points."""
-    # what the tip is compared with rounds to single precision
+    # the reference of the tip rounds to single precision
     return max(value for name, value in found.differences.items() if not name.startswith("tip_"))
 
 
@@ -202,7 +202,7 @@ def latency(robot: str = "ur10e") -> None:
 
 
 def time_c(model: TrainedModel, *, beside_casadi: bool) -> None:
-    """Compile a program that times the model's C, and CasADi's of the same expressions, and show what it prints."""
+    """Compile a program that times the C of the model and CasADi's C of the same expressions, and show its output."""
     name, runs, include, sources = model.name, [], "", [f"{model.name}.c", "timed.c"]
     given = {"q": "q", "qd": "qd", "qdd": "x", "tau": "x", "z": "z", "dq": "qd"}
     for entry in ENTRIES.values():

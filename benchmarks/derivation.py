@@ -1,6 +1,6 @@
-"""How long the derivation takes: the panda from its URDF, and random geometry, beside sympy's Lagrange equations.
+"""Times of the derivation, of the panda from its URDF and of random geometry, compared with sympy's Lagrange equations.
 
-Medians of repeats in one run. Sympy gets the smallest arms only: it is what a user would do by hand.
+Medians of repeats in one run. Sympy derives only the smallest arms, as a user would by hand.
 """
 
 from __future__ import annotations

@@ -32,7 +32,12 @@ CONFIG = {
     "has_joint_offset": True,
     "is_joint_torques": True,
 }
-EXTRAS = ("fv", "fs", "ia", "off")  # the columns of each joint behind those of the bodies, in figaroh's order
+EXTRAS = (
+    "fv",
+    "fs",
+    "ia",
+    "off",
+)  # the columns of each joint after the columns of the bodies, in figaroh's order
 OURS = [
     0,
     1,
@@ -112,7 +117,7 @@ def figaroh_dynamics(arm: Chain, settings: Any, samples: Sequence[DynamicsSample
         np.concatenate([getattr(x, name) for x in samples]) for name in ("q", "qd", "qdd", "tau")
     )
     full = builder.build_basic_regressor(q, qd, qdd, {"act_idxv": range(n)})
-    torque = tau.T.ravel()  # joint by joint, as its rows
+    torque = tau.T.ravel()  # one joint after the other, in the order of the rows of W
     names = dict.fromkeys(map(str, range(full.shape[1])), 0.0)
     reduced, columns = eliminate_non_dynaffect(full, names)
     decomposer = QRDecomposer()
@@ -127,7 +132,7 @@ def figaroh_dynamics(arm: Chain, settings: Any, samples: Sequence[DynamicsSample
 
 
 def main() -> None:
-    """Identify an arm, and print the error of its torques by joint."""
+    """Identify an arm, and print the torque error per joint."""
     from spelgen.logs.dynamics_samples import dynamics_samples
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])

@@ -2,7 +2,7 @@
 
     python benchmarks/interval_differences.py ARM.urdf LOGS... [--preset hybrid] [--parts 1]
 
-Each recording, or each of its parts, is fitted alone. For each pair of fits and each quantity (base parameters,
+Each recording, or each of its parts, is fitted separately. For each pair of fits and each quantity (base parameters,
 constants of the drives, diagonal of M and gravity torque at positions within 30 % of the joints' ranges), the
 difference is compared with both half intervals, added as squares. Printed is the share of differences inside, per
 quantity.
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def parts_of(logs: list[spelgen.Trajectory], count: int) -> Iterator[spelgen.Trajectory]:
-    """Yield each recording in so many parts of equal length."""
+    """Yield each recording in `count` parts of equal length."""
     for log in logs:
         edges = np.linspace(0, len(log), count + 1).astype(int)
         for start, stop in pairwise(edges):

@@ -60,6 +60,7 @@ def interval_ratios(
     truths = [x.ravel() for x in (true.base, true.friction, diagonal, true.gravity)]
 
     def quantities(model: ArmModel) -> torch.Tensor:
+        """Return base parameters, friction, diagonal of M and gravity in one vector, (K,)."""
         base = combination @ torch.cat([model.inertial_parameters.flatten(), model.armature])
         mass = model.mass_matrix(positions).diagonal(dim1=-2, dim2=-1)
         friction, gravity = _sliding_friction(model, sliding), model.gravity(positions)

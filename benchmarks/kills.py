@@ -1,10 +1,10 @@
-"""Kills a training at random times and resumes it, over and over: the weights in the end are those of one never killed.
+"""Kill a training at random times and resume it: the final weights equal the weights of an uninterrupted training.
 
     python benchmarks/kills.py [--kills 50] [--servos]
 
-AdamW on few windows, so that training ends by its epochs and not of itself; or position servos, whose fit has an end of
-its own. Each kill is a SIGKILL, which nothing can catch, after a random time since the process began to write.
-`make bench` takes 5 kills.
+AdamW on few windows, so that training ends at the number of epochs and not by convergence; or position servos, whose
+fit ends by convergence. Each kill is a SIGKILL, which cannot be caught, after a random time since the process began to
+write. `make bench` takes 5 kills.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def main() -> None:
 
 
 def _killed(command: list[str], run: Path, after: float) -> bool:
-    """Whether the process was killed before it ended: so many seconds after it first wrote to the run folder."""
+    """Kill the process some seconds after it first wrote to the run folder; return False if it ended before."""
     before = _writes(run)
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ)
     while process.poll() is None and _writes(run) == before:

@@ -94,7 +94,7 @@ class Fold:
 
     @property
     def durations(self) -> tuple[float, ...]:
-        """Return those of `SECONDS` that are shorter than the training recordings, and infinity for all."""
+        """Return the durations of `SECONDS` that are shorter than the training recordings, and infinity for all."""
         total = sum(log.duration for log in self.training)
         return tuple(x for x in SECONDS if x < 0.95 * total or np.isinf(x))
 
@@ -157,6 +157,7 @@ def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> T
     friction = FrictionModel()
 
     def columns(x: DynamicsSamples) -> np.ndarray:
+        """Return the regressor of bodies and friction, (T, n, K)."""
         return np.concatenate([regressor(chain, x.q, x.qd, x.qdd), friction.columns(x.qd, x.qdd)], axis=2)
 
     tau = np.concatenate([x.tau for x in samples])
@@ -169,6 +170,7 @@ def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> T
     grams = np.stack([x.T @ x for x in blocks])
 
     def solution(gram: np.ndarray, penalty: float) -> np.ndarray:
+        """Return the ridge solution (K,) for the Gram matrix (K + 1, K + 1) of columns and torque."""
         return np.linalg.solve(gram[:-1, :-1] + penalty * np.eye(len(length)), gram[:-1, -1])
 
     def held_out_error(penalty: float) -> float:
@@ -204,6 +206,7 @@ def by_preset(preset: str) -> Method:
         posterior = fit.posterior
 
         def std(x: DynamicsSamples) -> np.ndarray:
+            """Return standard deviations of the torque, (T, n) [Nm]."""
             past = [state for state in (x.z, x.direction) if state is not None]
             return posterior.torque(x.q, x.qd, x.qdd, *past).std
 

@@ -90,7 +90,7 @@ def changes(
     now: Mapping[Cell, Mapping[str, float]],
     methods: Iterable[str],
 ) -> list[str]:
-    """Return lines about each method's errors divided by those of other results, cell by cell."""
+    """Return lines about the errors of each method divided by the errors of other results, per cell."""
     lines = []
     for name in methods:
         ratios = {

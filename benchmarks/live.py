@@ -223,7 +223,10 @@ def times_of(case: Case, log: Trajectory, samples: DynamicsSamples, pauses: bool
 
 
 def contacts(case: Case, theta: np.ndarray | None = None) -> None:
-    """Steps of external torque of 0.5 s at each joint in turn, every 2 s, after 10 s of motion with a payload."""
+    """Print alarms, and detected steps of external torque of 0.5 s at each joint in turn, every 2 s.
+
+    theta: (10,) inertial parameters of a payload, after 10 s of motion with it; None: without payload.
+    """
     effort, n = case.levels.effort, len(case.levels.effort)
     alarms = minutes = 0.0
     found: dict[float, list[float]] = {0.1: [], 0.05: []}

@@ -74,7 +74,7 @@ def draw_errors(rng: np.random.Generator) -> RealErrors:
 
 
 class ErrorProcess:
-    """Errors of one arm with n joints: levels, and what is random once per arm."""
+    """Errors of one arm with n joints: levels, and the values that are random once per arm."""
 
     def __init__(self, errors: RealErrors, dry: np.ndarray, rng: np.random.Generator) -> None:
         """dry: (n,) nominal dry friction [Nm, N]."""

@@ -1,11 +1,11 @@
-"""Real logs beside published baselines: every figure of docs/real_logs.md in one command.
+"""Errors on real logs, compared with published baselines: every figure of docs/real_logs.md in one command.
 
     python benchmarks/real_logs.py [FOLDER]
 
 FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. Torque errors are nMSE (mean
 squared error by the torque's variance, mean of the joints), once over the samples that move and once with the pauses
-between motions; the second is how the baselines' published figures were made. Nothing is chosen here: the settings are
-the defaults of spelgen, and fits are those of `spelgen train`, with the delay of torques that it finds; least squares
+between motions; the published figures of the baselines include pauses. Nothing is chosen here: the settings are
+the defaults of spelgen, and fits are made by `spelgen train`, with the delay of torques that it finds; least squares
 has the same samples.
 """
 
@@ -128,7 +128,7 @@ def payload(fit: Fit, logs: dict[str, Trajectory]) -> None:
 
 
 def other_days(fit: Fit, logs: dict[str, Trajectory]) -> None:
-    """The nine are of other days than the training: what friction and torque offsets of the day are worth."""
+    """Print the effect of friction and torque offsets of the day: tests and training are of different days."""
     print(
         "Friction and torque offsets fitted to the first 10 s of each, judged on the rest, pauses included\n"
     )
@@ -144,7 +144,7 @@ def other_days(fit: Fit, logs: dict[str, Trajectory]) -> None:
 
 
 def adapted(fit: Fit, log: Trajectory, adapt: Any) -> Fit:
-    """What `spelgen train --from` makes of a log."""
+    """Return the fit of `spelgen train --from` to a log."""
     return spelgen.fit(copy.deepcopy(fit.model), log, spelgen.TorqueFit(adapt=adapt), arm=fit.urdf)
 
 
@@ -222,7 +222,7 @@ def characters(folder: Path, scratch: Path) -> None:
 def _torques(
     model: Any, q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The torque, and what of it is Coriolis and centrifugal."""
+    """Return the torque, and its Coriolis and centrifugal part, both (T, n) [Nm]."""
     with torch.no_grad():
         steady, still = (model.inverse_dynamics(q, x, torch.zeros_like(q)) for x in (qd, torch.zeros_like(q)))
         friction = model.friction_torque(q, qd)
@@ -230,7 +230,7 @@ def _torques(
 
 
 def trained(urdf: Path, logs: Sequence[Trajectory], preset: str = "closed-form") -> Fit:
-    """What `spelgen train` makes of these logs."""
+    """Return the fit of `spelgen train` to the logs."""
     return spelgen.fit(build(urdf, preset), logs, arm=urdf)
 
 

@@ -71,7 +71,7 @@ def write_log(path: Path, t: np.ndarray, joints: Sequence[str], **quantities: np
 
 
 def numbers(content: bytes, delimiter: str | None = ",", skiprows: int = 0) -> np.ndarray:
-    """Return the table of numbers in a text file."""
+    """Return the table of numbers in a text file, (rows, columns)."""
     return np.loadtxt(io.BytesIO(content), delimiter=delimiter, skiprows=skiprows)
 
 
@@ -408,7 +408,7 @@ def folder_of(argument: str | Path | None) -> Path:
 
 
 def panda_urdf(folder: Path) -> Path:
-    """Return the URDF of the Panda: beside its recording, or in a folder of arms beside the recordings."""
+    """Return the URDF of the Panda: in the folder of its recording, or in a folder of arms next to the recordings."""
     urdf = folder / "panda" / "panda.urdf"
     return urdf if urdf.exists() else folder.parent / "arms" / "panda_erd.urdf"
 

@@ -109,6 +109,7 @@ def mujoco_sysid(problem: Problem) -> Prediction:
     parameters.add(sysid.Parameter("offset", 0 * scale, -10 * scale, 10 * scale))
 
     def torque(x: DynamicsSamples, values: Any) -> np.ndarray:
+        """Return the torque of MuJoCo with these parameters, (T, n) [Nm]."""
         changed = sysid.apply_param_modifiers(values, spec.copy())
         data, rows = mujoco.MjData(changed), []
         for q, qd, qdd in zip(x.q, x.qd, x.qdd, strict=True):
@@ -188,6 +189,7 @@ def gaussian_process(problem: Problem) -> Prediction:
     mean, scale = training.tau.mean(axis=0), np.maximum(training.tau.std(axis=0), 1e-9)
 
     def inputs(x: DynamicsSamples) -> tuple[Tensor, Tensor, Tensor]:
+        """Return positions, scaled velocities and scaled accelerations, each (T, n)."""
         q, qd, qdd = tensors(x)
         # one scale per kind of motion: products of velocities have the unit of accelerations
         return q, qd / float(deviation[0].max()), qdd / float(deviation[1].max())
@@ -273,6 +275,7 @@ def network(training: Sequence[DynamicsSamples], known: Torque | None = None) ->
     residuals = [x.tau if known is None else x.tau - known(x) for x in training]
 
     def make(settings: NetworkSettings) -> tuple[nn.Module, Callable[..., Tensor]]:
+        """Return weights, and the function of q, qd and qdd (T, n) with scaled torques (T, n)."""
         layers = mlp(inputs.shape[1], residuals[0].shape[1], settings.width, nn.Tanh)
         return layers, lambda q, qd, qdd: layers((torch.cat([q, qd, qdd], dim=-1) - mean) / scale)
 
@@ -305,6 +308,7 @@ class DeepLagrangian(nn.Module):
         """Return the torque, (..., n)."""
 
         def lagrangian(x: Tensor) -> Tensor:
+            """Return the sum of the Lagrangians at positions x, (..., n)."""
             kinetic = 0.5 * torch.einsum("...i,...ij,...j->...", qd, self.mass(x), qd)
             return (kinetic - self.potential(torch.cat([x.cos(), x.sin()], dim=-1))[..., 0]).sum()
 
@@ -318,6 +322,7 @@ def deep_lagrangian(training: Sequence[DynamicsSamples]) -> Torque:
     """Return a Deep Lagrangian network fitted to torques."""
 
     def make(settings: NetworkSettings) -> tuple[nn.Module, Callable[..., Tensor]]:
+        """Return weights, and the function of q, qd and qdd (T, n) with scaled torques (T, n)."""
         model = DeepLagrangian(training[0].q.shape[1], settings.width)
         return model, model
 
@@ -335,7 +340,10 @@ def best_of(
     training: Sequence[DynamicsSamples],
     torques: Sequence[np.ndarray],
 ) -> Torque:
-    """Return the network of `SETTINGS` with the smallest error in held-out blocks of time."""
+    """Return the network of `SETTINGS` with the smallest error in held-out blocks of time.
+
+    torques: (T, n) of each recording [Nm].
+    """
     states = [np.concatenate([getattr(x, k) for x in training]) for k in ("q", "qd", "qdd")]
     y = np.concatenate(torques)
     mean, scale = y.mean(axis=0), y.std(axis=0) + 1e-9
@@ -354,6 +362,7 @@ def best_of(
     chosen = best
 
     def torque(x: DynamicsSamples) -> np.ndarray:
+        """Return the torque, (T, n) [Nm]."""
         with torch.no_grad():
             return np.asarray(chosen(*tensors(x)).numpy() * scale + mean)
 
@@ -363,7 +372,10 @@ def best_of(
 def early_stopped(
     weights: nn.Module, model: Callable[..., Tensor], seen: list[Tensor], held: list[Tensor], decay: float
 ) -> float:
-    """Fit a network by AdamW with early stopping; return its smallest held-out error, with the weights at it."""
+    """Fit a network by AdamW with early stopping; return its smallest held-out error, with the weights at it.
+
+    seen, held: q, qd, qdd and the scaled torque of training and held-out samples, each (T, n).
+    """
     optimizer = torch.optim.AdamW(weights.parameters(), lr=1e-3, weight_decay=decay)
     best, kept, waits = np.inf, weights.state_dict(), 0
     for _ in range(EPOCHS):

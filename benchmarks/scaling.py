@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def compare_fits() -> None:
-    """Print what fits to torques cost, beside what is asked."""
+    """Print time and memory of fits to torques, compared with the goals."""
     costs = {}
     for joints, samples in ((6, 10_000), (6, 1_000_000), (8, 20_000), (16, 20_000)):
         command = [sys.executable, __file__, "--fit", str(joints), str(samples)]
@@ -164,12 +164,13 @@ def _rate(model: ArmModel, batch: int) -> float:
 
 
 def _memory(model: ArmModel) -> float:
-    """Bytes that a window more keeps for the gradient."""
+    """Return the bytes that one more window keeps for the gradient."""
     held = []
     for count in (64, 128):
         kept: dict[int, int] = {}
 
         def keep(x: torch.Tensor, kept: dict[int, int] = kept) -> torch.Tensor:
+            """Record the size of a saved tensor, (...,) of any shape."""
             kept[x.untyped_storage().data_ptr()] = x.untyped_storage().nbytes()
             return x
 

@@ -26,7 +26,7 @@ GOALS = {"train closed-form": 2.0, "train hybrid": 4.0, "evaluate": 3.0, "report
 
 
 def main() -> None:
-    """Print each ratio beside its goal."""
+    """Print each ratio and its goal."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", nargs="?", type=Path)
     parser.add_argument("--repeats", type=int, default=5)

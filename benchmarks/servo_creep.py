@@ -27,7 +27,10 @@ SHORTEST = 5.0  # s
 
 
 def holds(t: np.ndarray, command: np.ndarray) -> Iterator[slice]:
-    """Yield the rows in which a joint should rest under a constant command, a minute of them at most."""
+    """Yield the rows in which a joint should rest under a constant command, at most a minute each.
+
+    t: (T,) [s]. command: (T,) [rad].
+    """
     changes = np.flatnonzero(np.diff(command)) + 1
     for start, stop in zip([0, *changes], [*changes, len(t)], strict=True):
         first, last = np.searchsorted(t, (t[start] + AT_REST, t[start] + AT_REST + MINUTE))
@@ -37,7 +40,10 @@ def holds(t: np.ndarray, command: np.ndarray) -> Iterator[slice]:
 
 
 def creep(log: spelgen.Trajectory, q: np.ndarray, step: float) -> list[tuple[int, float, float]]:
-    """Return, of each hold, the joint and the farthest that the measured and the predicted one go [rad]."""
+    """Return the joint, and the largest measured and predicted displacement [rad], of each hold.
+
+    q: (T, n) predicted positions [rad]. step: of the replay [s].
+    """
     assert log.u is not None
     found = []
     for joint, command in enumerate(log.u.T):
@@ -49,7 +55,7 @@ def creep(log: spelgen.Trajectory, q: np.ndarray, step: float) -> list[tuple[int
 
 
 def main() -> None:
-    """Fit the model, replay every log, and print creep by joint."""
+    """Fit the model, replay every log, and print the creep per joint."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

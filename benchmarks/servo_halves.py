@@ -1,4 +1,4 @@
-"""Whether the intervals of a fit of servos say how far two fits differ: to either half of the training motions.
+"""Compare differences between fits of servos to either half of the training motions with their intervals.
 
     python benchmarks/servo_halves.py ARM.urdf LOGS... [--preset hybrid] [--halvings 5]
 
@@ -22,7 +22,7 @@ RATIOS = ("kd", "armature", "dry", "static_error", "dead_zone")
 
 
 def main() -> None:
-    """Fit both halves of each halving, and print differences beside intervals."""
+    """Fit both halves of each halving, and print differences and intervals."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -45,14 +45,14 @@ def main() -> None:
 
 
 def fitted_servos(urdf: Path, preset: str, logs: Sequence[Path]) -> dict[str, Any]:
-    """Fit the model to logs; return what its record says of servos."""
+    """Fit the model to logs; return the servos of its record."""
     arm = spelgen.load_arm(urdf)
     fit = spelgen.fit(spelgen.build(arm, preset), spelgen.read_logs(logs, arm))
     return dict(fit.record.servo)
 
 
 def compared(first: dict[str, Any], second: dict[str, Any]) -> Iterator[bool]:
-    """Print differences beside intervals; yield whether each lies inside."""
+    """Print differences and intervals; yield True for each difference within its interval."""
     delays = [half["delay"] for half in (first, second)]
     difference = delays[0]["value"] - delays[1]["value"]
     yield abs(difference) <= math.hypot(*(delay["half"] for delay in delays))

@@ -44,7 +44,7 @@ HARD = [2e-3, 1.0]  # of constraints: a time constant [s], and no rebound
 SHARE, DAMPING = (
     0.02,
     2e-4,
-)  # of a joint of backlash: armature divided by that of its drive, damping by kp [s]
+)  # of a joint of backlash: armature divided by the armature of its drive, damping relative to kp [s]
 FIT_STEP = 5e-3  # [s] at most, of fitted actuators; frictionloss is as hard as twice this allows
 WINDOWS, ITERATIONS = 60, 8  # half a minute of fitting
 DIFFERENCE = 1e-4  # finite-difference step of the unknowns
@@ -61,7 +61,7 @@ def arm_with_servos(
 ) -> mujoco.MjModel:
     """Return the URDF's arm without shapes under position servos.
 
-    ratios: kd, armature and dry friction, divided by kp. limit: (n,) torque [Nm]. backlash: half of it [rad].
+    ratios: kd, armature and dry friction, each relative to kp. limit: (n,) torque [Nm]. backlash: half of it [rad].
     """
     text = re.sub(r"<(visual|collision)>.*?</\1>", "", urdf.read_text(), flags=re.DOTALL)
     spec = mujoco.MjSpec.from_string(text)
@@ -125,7 +125,7 @@ class PositionActuators:
     )
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """See `CommandFollower`."""
+        """Return predicted positions (T, n) of each part, from q and qd (parts, n); see `CommandFollower`."""
         model = self.model()
         positions: list[np.ndarray] = []
         for k, (log, rows) in enumerate(parts):
@@ -204,8 +204,8 @@ def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -
     windows = replace(windows, steps=steps)
     q, qd = windows.q.numpy(), windows.qd.numpy()
 
-    # unknowns: logarithms of the drives and offsets of commands, (5, n), and the delay, all in one vector
     def actuators(x: np.ndarray) -> PositionActuators:
+        """Return actuators of the unknowns (5 n + 1,): logarithms of drives, offsets of commands, delay."""
         drives, offset = np.split(x[:-1].reshape(5, n), [4])
         drives = np.exp(drives)
         drives[0, is_known] = start[0, is_known]
@@ -221,10 +221,14 @@ def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -
         return error[:, windows.burn_in :].ravel()
 
     def residuals(x: np.ndarray) -> np.ndarray:
+        """Return the errors (samples n, columns) of each column of x, (5 n + 1, columns)."""
         return np.stack([errors(column) for column in x.T], axis=1)
 
     def jacobian(x: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-        """Return finite differences; an unknown of all joints is changed at once, as it hardly affects other joints."""
+        """Return finite differences, (samples n, 5 n + 1).
+
+        One unknown is changed at all joints at once, since it affects other joints only slightly.
+        """
         derivatives = np.zeros((len(residuals) // n, n, len(x)))
         for columns in (*np.arange(5 * n).reshape(5, n), 5 * n):
             changed = x.ravel().copy()

@@ -1,12 +1,12 @@
-"""What a fit of servos finds of simulated arms of which it knows the URDF alone: ratios to kp beside the truth.
+"""Ratios to kp from fits of servos to simulated arms, compared with the true ratios; fits use the URDF and the logs.
 
     python benchmarks/servo_recovery.py ARM.urdf [--seeds 40] [--seconds 16] [--mujoco [--backlash 0.0025]]
 
 For each seed three recordings at 50 Hz (other commands, the same arm: servos, armatures, dry friction, delay, encoders
-of twelve bits, the URDF's effort limits, a dead zone of the servos where --dead-zone says so) are fitted as
-`spelgen train` does, and the truth is held against the intervals of 95 %. The arm is integrated by itself:
-semi-implicit Euler in steps of a millisecond, dry friction as impulses; the bodies' M and bias are those of the URDF.
-With --mujoco it is MuJoCo that simulates, where gears may have backlash, with a mass of their own before it.
+of twelve bits, the URDF's effort limits, a dead zone of the servos with --dead-zone) are fitted as
+`spelgen train` does, and the truth is compared with the 95 % intervals. The arm is integrated in this file by
+semi-implicit Euler in steps of a millisecond, with dry friction as impulses, and M and bias of the URDF.
+With --mujoco MuJoCo simulates the arm; gears may have backlash then, with a mass on the side of the motor.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from spelgen.logs.trajectory import Trajectory
 
 RATE, STEP, RECORDINGS = 50, 1e-3, 3  # Hz; s
 KP, LAG, ARMATURE, DRY, DELAY = 20.0, 0.06, 1.4e-3, 8e-3, 0.02  # Nm/rad; s, s^2, rad: ratios to kp; s
-SMALLEST = 0.4  # drives get smaller along the arm, down to so much
+SMALLEST = 0.4  # drives get smaller along the arm, down to this factor
 ENCODER = 2 * np.pi / 4096
 
 

@@ -1,12 +1,12 @@
-"""How long a training step takes: every preset beside PHNODE, and beside its own networks alone.
+"""Times of a training step: every preset, compared with PHNODE and with only the networks of the preset.
 
-PHNODE stands here three times: as published, which takes dM^-1/dt by one automatic derivative for each entry; with one
-jvp in their place, as a user who knows torch would write it; and as `phnode`, with derivatives written out.
+PHNODE has three rows: as published, with one automatic derivative of dM^-1/dt for each entry; with one jvp in place of
+these, as a user who knows torch would write it; and as `phnode`, with explicit derivatives.
 
 Six joints, 256 windows of 5 samples, hidden layers of 64 units, rk4 with one step from sample to sample, forward
-and backward (the update of the weights is left out). Medians of repeats, taken in turns in one run, on one thread.
-"bound" is the part of a step that keeps M positive definite: what the step gains where M is taken as it comes.
-PHNODE as published gets its windows in four parts: in one its graph needs 9 GB and takes as long.
+and backward (without the update of the weights). Medians of repeats, alternated in one run, on one thread. "bound" is
+the part of a step that keeps M positive definite: the time saved by a step without the bound.
+PHNODE as published has its windows in four parts: in one part its graph needs 9 GB and takes the same time.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Data:
 
 
 def rk4(rate: Callable[..., tuple[Tensor, Tensor]], q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """q and p one step later, and q' at the start."""
+    """Return q and p one step later, and q' at the start, each (..., n)."""
     k1 = rate(q, p)
     k2 = rate(*(torch.add(x, k, alpha=STEP / 2) for x, k in zip((q, p), k1, strict=True)))
     k3 = rate(*(torch.add(x, k, alpha=STEP / 2) for x, k in zip((q, p), k2, strict=True)))
@@ -143,7 +143,7 @@ def seconds(work: Callable[[], None]) -> float:
 
 
 def sizes(model: ArmModel) -> str:
-    """Outputs of the networks of M, D, G and V, and inputs of that of M."""
+    """Outputs of the networks of M, D, G and V, and inputs of the network of M."""
     if not hasattr(model, "mass"):
         return ""
     mass, friction = (getattr(part, "network", None) for part in (model.mass, model.friction))

@@ -15,9 +15,9 @@ g error: root mean square divided by the one of g*; base parameters: likewise, e
 torque along the test motion; friction error: likewise, without offsets; torque nMSE on another motion without noise,
 unfiltered and after a low-pass of 8 Hz.
 
-Truth is what the sensors show without noise: with errors of units and zeros, M*, g* and the torque are the ones of the
-logged torques at the logged positions, and the true base parameters are the least-squares solution for the rigid torque
-of the test motion (the pseudo-true parameters of a misspecified model; White, Econometrica 50:1, 1982).
+Truth is the output of the sensors without noise: with errors of units and zeros, M*, g* and the torque are the ones of
+the logged torques at the logged positions, and the true base parameters are the least-squares solution for the rigid
+torque of the test motion (the pseudo-true parameters of a misspecified model; White, Econometrica 50:1, 1982).
 
 Intervals: 95 % intervals of the default preset, see `intervals.py`. Residuals: correlation and spectrum, compared with
 the ones of recordings if their folder is given.
@@ -62,7 +62,9 @@ from spelgen.fitting.posterior import Posterior
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.logs.dynamics_samples import dynamics_samples
 
-ARMS = Path(__file__).parents[2] / "shared" / "arms"  # a folder of URDFs beside the checkout, if there is one
+ARMS = (
+    Path(__file__).parents[2] / "shared" / "arms"
+)  # a folder of URDFs next to the checkout, if there is one
 FRICTIONS = ("none", "coulomb", "stribeck", "bristles", "load", "asymmetric")
 FINE = 1000.0  # Hz: the grid on which truth is computed; logs take samples of it
 POSITION_NOISE = 1e-5  # rad, m: of an encoder of 18 bits

@@ -72,7 +72,7 @@ class Posterior:
     delay: Interval | None = None
 
     def uncertain(self, function: Callable[[ArmModel], Tensor]) -> Uncertain:
-        """Return a function of the model, such as ``lambda model: model.armature``, with standard deviations."""
+        """Return a function of the model, (...,), with standard deviations: ``lambda model: model.armature``."""
         value, root = self.propagate(function)
         return Uncertain(value.numpy(), root.norm(dim=-1).numpy())
 
@@ -80,6 +80,7 @@ class Posterior:
         """Return a function of the model, (...), and its derivative times R."""
 
         def at(x: Tensor) -> Tensor:
+            """Return the function at parameters x, (K,)."""
             return evaluate_with(self.model, self._vector.unflatten(x), function)
 
         with torch.no_grad():
@@ -163,6 +164,7 @@ class Posterior:
         load, factor = self._loads()
 
         def constants(model: ArmModel) -> Tensor:
+            """Return the quantities of all joints, (4, n) or (5, n)."""
             rows = [model.armature, *_friction_line(model.friction, load, factor), model.torque_offset]
             if isinstance(model.inputs, MotorInputs) and trained:
                 rows.append(model.inputs.gains().sum(dim=1))

@@ -82,6 +82,7 @@ def joined(first: Block, second: Block) -> Block:
     weight = second.duration / duration
 
     def mean(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return the mean of a and b (n, ...), weighted by duration."""
         average: np.ndarray = a + weight * (b - a)
         return average
 

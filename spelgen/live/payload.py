@@ -165,6 +165,7 @@ def _described(theta: np.ndarray, covariance: np.ndarray, log_odds: float, limit
     half = _NORMAL * math.sqrt(covariance[0, 0])
 
     def interval(values: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+        """Return 95 % intervals (K, 2) of values (K,) with derivatives (K, 10)."""
         widths = _NORMAL * np.sqrt(np.einsum("ki,ij,kj->k", jacobian, covariance, jacobian))
         return np.stack([values - widths, values + widths], axis=1)
 
