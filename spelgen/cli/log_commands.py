@@ -24,6 +24,7 @@ from spelgen.cli.options import (
 )
 from spelgen.errors import SpelgenErrors
 from spelgen.files import write_text
+from spelgen.labels import counted
 
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
@@ -172,7 +173,8 @@ def simulate(
     for path, trajectories in zip(paths.values(), (logs.train, logs.test), strict=True):
         if trajectories:
             write_logs(path, trajectories, names)
-            say(f"wrote {path}: {len(trajectories)} trajectories, {sum(map(len, trajectories))} samples")
+            count = counted(len(trajectories), "trajectory")
+            say(f"wrote {path}: {count}, {sum(map(len, trajectories))} samples")
 
 
 def logs(
