@@ -186,6 +186,8 @@ def _possible_gripper(robot: Robot, chain: Sequence[UrdfJoint]) -> tuple[Diagnos
 
     No jaw opens by half a turn: a joint with a larger range turns the gripper.
     """
+    if not chain:
+        return ()
     last = chain[-1]
     turns = last.lower is not None and last.upper is not None and last.upper - last.lower > math.pi
     if turns or not _GRIPPER.search(last.child) or any(map(_GRIPPER.search, robot.joint)):

@@ -200,7 +200,11 @@ def new_record(request: FitRequest, prepared: PreparedLogs) -> Record:
         mapping=request.options.mapping or LogMapping(input=input_of(model)),
         device=request.options.device,
         threads=request.options.threads,
-        warnings=[f"{note.where}: {note.message}" for note in notes if note.severity == "warning"],
+        warnings=[
+            f"{note.where}: {note.message}"
+            for note in notes
+            if note.severity == "warning" and note.where != "run"
+        ],
     )
     if prepared.scales is None:
         return record

@@ -147,7 +147,7 @@ def _meshes(urdf: Path, shapes: Sequence[LinkShape], faces: int) -> dict[tuple[s
         return {}
     # ASCII JSON on stdin: arguments of a process are limited to the characters of the locale
     meshes = [(path, scale) for (_, scale), path in paths.items()]
-    task = json.dumps({"faces": max(1, faces // len(paths)), "meshes": meshes}).encode()
+    task = json.dumps({"faces": max(1, faces // len(shapes)), "meshes": meshes}).encode()
     command = [sys.executable, "-P", "-m", mesh_child.__name__]
     try:
         # a process with limits: a mesh may declare any size, and may name a file without an end
