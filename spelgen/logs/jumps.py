@@ -153,6 +153,8 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     units, None for joints that do not turn) and powers of two of them. Each one is applied, and the best has fewest
     jumps left, then the smoothest signal.
     """
+    if len(values) < 4:  # no usual step to compare a jump with
+        return None
     steps = np.diff(values)
     limit = 0.4 * float(np.ptp(values))
     rows = np.flatnonzero(np.abs(steps) > limit)
