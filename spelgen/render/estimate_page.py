@@ -27,9 +27,11 @@ def write_estimate(fit: Fit, levels: NoiseLevels, results: Sequence[LogEstimate]
     return write_text(path, text)
 
 
-def mass_chart(result: LogEstimate) -> Chart:
-    """Return the mass of the payload with its interval over time."""
+def mass_chart(result: LogEstimate) -> Chart | None:
+    """Return the mass of the payload with its interval over time; None if no payload was found."""
     mass = np.array([state.payload.mass for state in result.states])
+    if not mass.any():
+        return None
     low, high = np.array([state.payload.mass_interval for state in result.states]).T
     t = _times(result)
     # a band has a corner for each sample: only where the payload changes, twice
