@@ -76,7 +76,7 @@ def test_a_tip_in_the_settings_applies_to_every_command(robots, tmp_path, monkey
 def test_the_commands_of_the_readme_work(robots, tmp_path, monkeypatch):
     """The block of commands, unchanged; a reader provides arm.urdf and two folders of logs."""
     settings = yaml.safe_load((robots / "two_link.yaml").read_text())
-    settings |= {"simulation": SHORT, "training": FEW_STEPS}
+    settings |= {"simulation": SHORT | {"duration": 10.0}, "training": FEW_STEPS}
     (tmp_path / "arm.urdf").write_bytes((robots / "two_link.urdf").read_bytes())
     (tmp_path / "arm.yaml").write_text(yaml.safe_dump(settings))
     monkeypatch.chdir(tmp_path)
@@ -85,7 +85,7 @@ def test_the_commands_of_the_readme_work(robots, tmp_path, monkeypatch):
     readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
     commands = re.findall(r"^    spelgen ([^#\n]+)", readme, re.MULTILINE)
     assert [shlex.split(command)[0] for command in commands] == [
-        *("excite", "logs", "build", "train", "evaluate", "report", "export")
+        *("excite", "logs", "build", "train", "evaluate", "report", "estimate", "export")
     ]
     for command in commands:
         spelgen(*shlex.split(command))

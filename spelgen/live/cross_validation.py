@@ -42,7 +42,7 @@ def noise_levels(fit: Fit) -> NoiseLevels:
     if not fit.logs:
         raise RunError(
             "no noise levels of the estimator", file=fit.folder, expected="a run with estimator.json",
-            do="fit it again by `spelgen train`, which finds them",
+            do=f"fit it again by `spelgen train` to torques, with at least {MIN_SAMPLES} samples of motion",
         )  # fmt: skip
     levels = cross_validated_levels(fit)
     keep_levels(fit, levels)

@@ -153,7 +153,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     units, None for joints that do not turn) and powers of two of them. Each one is applied, and the best has fewest
     jumps left, then the smoothest signal.
     """
-    if len(values) < 4:  # no usual step to compare a jump with
+    if len(values) < 4:  # the median step, with which a jump is compared, would be a jump itself
         return None
     steps = np.diff(values)
     limit = 0.4 * float(np.ptp(values))
