@@ -205,7 +205,7 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[HeldOut]) -> NoiseLevel
     times, signal, variance, moving = (np.array(column) for column in zip(*signals, strict=True))
     # of a moving joint: 0.455 is the median of the squared standard normal distribution
     squares = np.nanmedian(np.where(moving, np.square(signal), np.nan), axis=0) / 0.455
-    observer_level = np.sqrt(np.maximum(squares, 1e-6 * levels.effort**2))
+    observer_level = np.maximum(np.sqrt(squares), TUNING.min_observer_noise * levels.effort)
     ratio = np.abs(signal) / np.sqrt(variance + observer_level**2)
     window = np.concatenate([[0], np.cumsum(np.abs(np.diff(times // TUNING.window)) > 0)])
     starts = np.flatnonzero(np.diff(window, prepend=-1))

@@ -61,6 +61,9 @@ class LiveTuning:
 
     # [1/s] Bandwidth of the momentum observer.
     bandwidth: float = 20.0
+    # [1] Smallest standard deviation of the momentum observer, relative to the effort of a joint: logs without noise
+    # give positive thresholds.
+    min_observer_noise: float = 1e-3
     # [1] Standard deviation of the friction of a joint that is nearly at rest, relative to its Coulomb friction.
     resting_friction: float = 0.6
     # [1/min] Default rate of false alarms.

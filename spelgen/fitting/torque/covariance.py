@@ -54,9 +54,7 @@ def parameter_covariance(estimate: TorqueEstimate) -> ParameterCovariance:
     for jacobian, step in zip(_blocks(estimate, blocks), steps, strict=True):
         held_out = jacobian.curved_step(x, torch.zeros_like(x).masked_scatter(free, step))
         squares += jacobian.squared_residual(held_out)
-    covariance = torch.zeros_like(problem.prior.precision)
-    covariance[free[:, None] & free] = posterior.flatten()
-    return ParameterCovariance(covariance, (squares / count).sqrt())
+    return ParameterCovariance(problem.of_all_parameters(posterior), (squares / count).sqrt())
 
 
 def _blocks(estimate: TorqueEstimate, blocks: int) -> Iterator[TorqueJacobian]:

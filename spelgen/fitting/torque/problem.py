@@ -131,6 +131,11 @@ class TorqueProblem:
         """Estimator of the noise of these samples."""
         return NoiseEstimator.of(self.jacobian, self.correlation_time)
 
+    @property
+    def correlation_length(self) -> torch.Tensor:
+        """Number of samples per independent error, (n,)."""
+        return self.noise_estimator.correlation_length
+
     def with_least_squares_noise(self, x: torch.Tensor) -> TorqueProblem:
         """Return the problem under the noise of unconstrained least squares, linearized at x (K,).
 
@@ -180,8 +185,12 @@ class TorqueProblem:
 
     def covariance(self, curvature: torch.Tensor) -> torch.Tensor:
         """Return the posterior covariance (K, K), zero for fixed parameters, from the curvature of the free ones."""
+        return self.of_all_parameters(torch.linalg.inv(curvature))
+
+    def of_all_parameters(self, free_covariance: torch.Tensor) -> torch.Tensor:
+        """Return the covariance (K, K) of all parameters, zero for fixed ones, from the free ones' (k, k)."""
         covariance = torch.zeros_like(self.prior.precision)
-        covariance[self.free[:, None] & self.free] = torch.linalg.inv(curvature).flatten()
+        covariance[self.free[:, None] & self.free] = free_covariance.flatten()
         return covariance
 
     def updated(self, state: State, covariance: torch.Tensor) -> TorqueProblem:
@@ -223,8 +232,8 @@ class TorqueEstimate:
             self.problem.jacobian.model, samples.segments(TUNING.segment, TUNING.initial_samples)
         )
         segments = self.with_current_covariance().with_jacobian(jacobian)
-        length = segments.problem.noise_estimator.correlation_length
-        noise = self.problem.noise * (length / self.problem.noise_estimator.correlation_length).sqrt()
+        length = segments.problem.correlation_length
+        noise = self.problem.noise * (length / self.problem.correlation_length).sqrt()
         return replace(segments, problem=replace(segments.problem, noise=noise))
 
     def linearize(self) -> tuple[ResidualSamples, RigidProjection]:

@@ -95,9 +95,8 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     slope = products / samples.qd.square().sum(dim=0).clamp(min=1e-300)
     # share of the squared residual that the regression line explains (coefficient of determination)
     explained = slope * products / residual.square().sum(dim=0).clamp(min=1e-300)
-    deviations = (
-        explained * estimator.errors / (1 - explained)
-    ).sqrt()  # by which the slope differs from zero
+    # standard deviations by which the slope differs from zero
+    deviations = (explained * estimator.errors / (1 - explained)).sqrt()
     decreasing = (slope < 0) & (deviations > 1) & ~problem.compensated
     if problem.compensated.any():
         return decreasing
@@ -195,7 +194,7 @@ def fit_residual_terms(
     if samples is not estimate.problem.jacobian.samples:
         estimate = refine(estimate, samples)
     estimate.problem.jacobian.rigid.write(estimate.state.x)
-    correlation_length = estimate.problem.noise_estimator.correlation_length
+    correlation_length = estimate.problem.correlation_length
     if not can_split(samples.count, float(correlation_length.max())):
         return estimate, []
     rigid_only = estimate
@@ -218,10 +217,7 @@ def _refit(
     estimate: TorqueEstimate, samples: TorqueSamples, selected: Sequence[SelectedTerm]
 ) -> TorqueEstimate:
     """Refit the selected single-joint terms and the rigid-body parameters, with torques of position eliminated."""
-    model, correlation_length = (
-        estimate.problem.jacobian.model,
-        estimate.problem.noise_estimator.correlation_length,
-    )
+    model, correlation_length = estimate.problem.jacobian.model, estimate.problem.correlation_length
     projected = refit_terms(model, *estimate.linearize(), _keys(selected), correlation_length)
     estimate = refine(estimate, samples, projected.terms)
     jacobian, x = estimate.problem.jacobian, estimate.state.x
@@ -253,10 +249,7 @@ def _losing_joints(
     rigid_only: TorqueEstimate, estimate: TorqueEstimate, selected: Sequence[SelectedTerm]
 ) -> list[int]:
     """Return the joints at which the terms do not lower the error on the last half, after fits to the first half."""
-    jacobian, correlation_length = (
-        estimate.problem.jacobian,
-        estimate.problem.noise_estimator.correlation_length,
-    )
+    jacobian, correlation_length = estimate.problem.jacobian, estimate.problem.correlation_length
     model, samples = jacobian.model, jacobian.samples
     first, last = (
         samples.select(rows) for rows in split_halves(samples.count, float(correlation_length.max()))
