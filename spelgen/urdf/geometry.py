@@ -18,6 +18,7 @@ from typing import Literal
 import numpy as np
 from lxml import etree
 
+from spelgen.labels import counted
 from spelgen.urdf import mesh_child
 from spelgen.urdf.document import urdf_bytes
 
@@ -52,8 +53,10 @@ class LinkShapes:
 
     @property
     def unread_text(self) -> str:
-        """The links and files of the shapes that were not read; empty without any."""
-        return ", ".join(f"{link} ({', '.join(names)})" for link, names in self.unread.items())
+        """The first two links and files of the shapes that were not read, and the number of others; empty if none."""
+        named = [f"{link} ({', '.join(names)})" for link, names in self.unread.items()]
+        others = [counted(len(named) - 2, "more link")] if len(named) > 2 else []
+        return ", ".join([*named[:2], *others])
 
 
 def link_shapes(
