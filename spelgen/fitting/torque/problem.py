@@ -117,7 +117,7 @@ class TorqueProblem:
         rigid = jacobian.rigid
         correlation_time = torch.full_like(jacobian.torque_std, TUNING.correlation_time)
         noise = NoiseEstimator.of(jacobian, correlation_time).upper_bound()
-        prior = ParameterPrior(rigid, widths, widths, rigid.flatten(rigid.initial))
+        prior = ParameterPrior.of(rigid, widths)
         compensated = rigid.initial[rigid.compensation] != 0
         return cls(jacobian, noise, prior, adapt, compensated, correlation_time)
 
