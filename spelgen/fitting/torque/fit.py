@@ -17,13 +17,12 @@ import torch
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.levenberg_marquardt import Termination
-from spelgen.fitting.torque.covariance import parameter_covariance
+from spelgen.fitting.torque.covariance import held_out_nmse, parameter_covariance
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import limit_friction
 from spelgen.fitting.torque.problem import (
     TorqueEstimate,
     TorqueProblem,
-    held_out_nmse,
     refine,
     with_correlation_time,
 )
@@ -57,9 +56,10 @@ class TorqueSolution:
     """Result of a fit.
 
     rms_residual: (n,) root mean square torque residual [Nm, N]. steps, cost: of the solver, at the end. prior: standard
-    deviations as estimated. covariance, torque_std: see `ParameterCovariance`. compensated: (n,) joints whose drives
-    compensate friction. correlation_time: (n,) of the torque errors [s]. held_out_nmse: (n,) mean squared error of
-    held-out segments, divided by the variance of the torque. selected_terms: residual terms. stages: in order.
+    deviations as estimated. covariance: (K, K) of the parameters. compensated: (n,) joints whose drives compensate
+    friction. correlation_time: (n,) of the torque errors [s]. held_out_nmse: (n,) mean squared error of held-out
+    segments, divided by the variance of the torque; torque_std: (n,) its root [Nm, N]. selected_terms: residual terms.
+    stages: in order.
     """
 
     rms_residual: np.ndarray
@@ -102,18 +102,18 @@ def fit_torque(
     estimate, selected, stages = _run_stages(problem, samples)
     state, jacobian = estimate.state, estimate.problem.jacobian
     jacobian.rigid.write(state.x)
-    uncertainty = parameter_covariance(estimate)
-    rms = (state.residual / samples.count).sqrt() / jacobian.logged_scale(state.x)
+    scale, nmse = jacobian.logged_scale(state.x), held_out_nmse(estimate, samples)
+    rms = (state.residual / samples.count).sqrt() / scale
     return TorqueSolution(
         rms_residual=rms.numpy(),
         steps=state.steps,
         cost=state.cost,
         prior=estimate.problem.prior.widths,
-        covariance=uncertainty.covariance,
-        torque_std=uncertainty.torque_std,
+        covariance=parameter_covariance(estimate),
+        torque_std=nmse.sqrt() * estimate.problem.noise_estimator.torque_std / scale,
         compensated=estimate.problem.compensated.numpy(),
         correlation_time=estimate.problem.correlation_time.numpy(),
-        held_out_nmse=held_out_nmse(estimate, samples).numpy(),
+        held_out_nmse=nmse.numpy(),
         selected_terms=tuple(selected),
         stages=tuple(stages),
     )

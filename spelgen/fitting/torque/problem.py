@@ -30,7 +30,6 @@ from spelgen.fitting.torque.linearization import (
     NO_TERMS,
     LinearTerms,
     RigidProjection,
-    concatenate_blocks,
     least_squares_residual,
 )
 from spelgen.fitting.torque.parameters import ParameterPrior, update_widths
@@ -293,25 +292,3 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     mean = (weight * observed + prior_mean) / (weight + 1)
     noise = problem.noise * (mean / problem.correlation_time).sqrt()
     return replace(estimate, problem=replace(problem, noise=noise, correlation_time=mean))
-
-
-def held_out_nmse(estimate: TorqueEstimate, samples: TorqueSamples) -> torch.Tensor:
-    """Return the mean squared error (n,) of held-out segments, divided by the variance of the torque.
-
-    A fit to all other segments has the residual (1 - H)^-1 r on a segment, with its residual r and its block H of the
-    hat matrix of all joints, to first order in the change of the parameters.
-    """
-    segments, size = estimate.on_segments(samples), samples.segment_length(TUNING.segment)
-    jacobian, x, noise = segments.problem.jacobian, segments.state.x, segments.problem.noise
-    weighted = torch.zeros(len(noise), jacobian.samples.count, len(x)).double()
-    for joint, columns, of_joint, _ in concatenate_blocks(jacobian.joint_rows(x), len(noise)):
-        weighted[joint, :, columns] = of_joint / noise[joint]
-    weighted = weighted @ jacobian.theta_jacobian(x)
-    residual = (jacobian.residual_samples(x).torque_residual * jacobian.logged_scale(x) / noise).mT
-    error = torch.zeros_like(residual)
-    for start in range(0, residual.shape[1], size):
-        rows = slice(start, start + size)
-        block = weighted[:, rows].flatten(0, 1)
-        kept = torch.eye(len(block)).double() - block @ segments.covariance @ block.mT
-        error[:, rows] = torch.linalg.solve(kept, residual[:, rows].flatten()).view(len(noise), -1)
-    return error.square().mean(dim=1) * (noise / estimate.problem.noise_estimator.torque_std).square()
