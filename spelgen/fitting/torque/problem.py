@@ -22,7 +22,6 @@ from spelgen.fitting.levenberg_marquardt import (
     NormalEquations,
     SolverResult,
     SolverState,
-    Termination,
     levenberg_marquardt,
 )
 from spelgen.fitting.torque.jacobian import ResidualSamples, TorqueJacobian
@@ -213,7 +212,6 @@ class TorqueEstimate:
     problem: TorqueProblem
     state: State
     covariance: torch.Tensor
-    termination: Termination
 
     def with_jacobian(self, jacobian: TorqueJacobian) -> TorqueEstimate:
         """Return the same parameters on other samples, or with other residual terms or friction models."""
@@ -260,7 +258,7 @@ def alternate(problem: TorqueProblem, state: State, iterations: int) -> TorqueEs
         previous, problem = problem, problem.updated(state, covariance)
         if number + 1 >= iterations and (problem.noise > TUNING.noise_converged * previous.noise).all():
             break
-    return TorqueEstimate(problem, state, covariance, result.termination)
+    return TorqueEstimate(problem, state, covariance)
 
 
 def refine(

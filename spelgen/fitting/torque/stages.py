@@ -136,7 +136,8 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
     index = rigid.unflatten(torch.arange(len(estimate.state.x)))
     effects = torch.stack([index[name] for name in rigid.names(*EFFECT_GROUPS)], dim=-1)  # (n, effects)
     plain = _without(estimate, effects.flatten())
-    rejected = _rejected(log_likelihood_ratio(estimate, plain) - TUNING.effects_evidence)
+    # Akaike's criterion, for one parameter (IEEE Trans. Autom. Control 19:716, 1974)
+    rejected = _rejected(log_likelihood_ratio(estimate, plain) - 2)
     if rejected.all():
         return plain
     return _without(estimate, effects[rejected].flatten()) if rejected.any() else estimate

@@ -42,9 +42,6 @@ class TorqueTuning:
     # [1] Twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773,
     # 1995).
     strong_evidence: float = 6.0
-    # [1] Twice the log likelihood ratio that adds the Stribeck effect, saturation or load dependence to a joint: 2 per
-    # parameter (Akaike, IEEE Trans. Autom. Control 19:716, 1974).
-    effects_evidence: float = 2.0
     # [1] Largest number of steps before noise and prior are estimated.
     initial_steps: int = 60
     # [1] Largest number of iterations in which the noise is lowered to the least-squares level.
@@ -72,8 +69,6 @@ class TorqueTuning:
     validation_windows: int = 2**8
     # [1] Samples for the selection of residual terms.
     residual_samples: int = 2**14
-    # [1] Directions with less than this fraction of the largest curvature are not determined by the samples.
-    min_relative_curvature: float = 1e-10
     # [1] Smallest noise, as a fraction of a torque's range: noise-free samples are fitted to four digits.
     min_noise: float = 1e-4
     # [1] Smallest fraction of independent errors that remains, however many parameters are determined.
@@ -103,8 +98,6 @@ class TorqueTuning:
     wrong_urdf: float = 5.0
     # [1] Torque residual divided by the inertial torque of a joint, above which the predicted motion is unreliable.
     weak_acceleration: float = 2.0
-    # [1] Positions at which inertias are evaluated.
-    report_positions: int = 50
     # [1] Priors about the run that is adapted, by what is adapted. load: mass known to a factor of twenty (with 10 in
     # place of 3 half a second of motion has an error of 27 times the variance of the torque, UR10e). friction: warmth
     # changes the friction of all joints by tens of per cent, of a single joint less (Bittencourt and Gunnarsson, J.
@@ -140,10 +133,6 @@ class ResidualTuning:
     # [1] A later term is preferred to the best one so far only if its residual is below this fraction of the residual
     # of the best one.
     preference_ratio: float = 0.9
-    # [1] Largest number of fixed-point iterations of the marginal likelihood.
-    max_iter: int = 30
-    # [1] Relative change of the noise at which these iterations end.
-    tolerance: float = 1e-3
     # [1] Samples to which networks are fitted.
     network_samples: int = 2**12
     # [1] Evaluations of the loss after which a network without error reduction is discarded.
