@@ -117,7 +117,9 @@ def _trained_gains(posterior: Posterior) -> Diagnostic:
     undetermined = [x.name for x in gains if x.std > TUNING.undetermined_gain * x.value]
     if not undetermined:
         return Diagnostic("info", "trained-gains", "motors", None, message)
-    message += f"; the gain of {', '.join(undetermined)} is not determined: friction and inertia scale with it"
+    message += (
+        f"; the gain of {', '.join(undetermined)} is not determined: friction and inertia scale with it"
+    )
     return _warning("trained-gains", message, "motors")
 
 
@@ -129,7 +131,11 @@ def _selected_terms(samples: TorqueSamples, solution: TorqueSolution, names: np.
     for term in solution.selected_terms:
         joint = "" if term.joint is None else f" at {names[term.joint]}"
         parts.append(f"{TERM_NAMES[term.name]}{joint} ({term.error_reduction:.1%})")
-    one = "" if samples.recordings.any() else "; all of them were selected in one recording: test them on another motion"
+    one = (
+        ""
+        if samples.recordings.any()
+        else "; all of them were selected in one recording: test them on another motion"
+    )
     return (
         "residual terms selected by cross-validation, with the decrease of the mean squared torque residual: "
         f"{', '.join(parts)}{one}"
