@@ -105,7 +105,7 @@ def without_idle_residuals(model: Model) -> Model:
 
 
 def _is_idle(network: Network | None) -> bool:
-    """Return whether a network is zero for all inputs; a network that does not exist is."""
+    """Return True if a network is zero for all inputs; a network that does not exist is."""
     if not isinstance(network, MaskedMLP):
         return network is None
     # Only the last layer counts: hidden layers start at random weights.

@@ -165,6 +165,6 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
 
 
 def drives_known(urdf: Path, joints: Sequence[str]) -> bool:
-    """Return whether the settings of a URDF specify rotors or friction of these joints."""
+    """Return True if the settings of a URDF specify rotors or friction of these joints."""
     drives = load_settings(urdf).joints
     return any(x.rotor_inertia or x.viscous or any(x.coulomb) for k, x in drives.items() if k in joints)

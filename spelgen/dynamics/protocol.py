@@ -65,7 +65,7 @@ def residual_terms(model: object) -> ResidualTerms | None:
 
 
 def is_stateful(dynamics: object) -> TypeGuard[FrictionState]:
-    """Return whether friction depends on the state z of bristles, the last argument of all calls."""
+    """Return True if friction depends on the state z of bristles, the last argument of all calls."""
     return isinstance(dynamics, FrictionState) and dynamics.elements > 0
 
 

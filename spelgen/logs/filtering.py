@@ -102,6 +102,6 @@ def derivative(q: np.ndarray, rate: float, order: int) -> np.ndarray:
 
     samples = q.shape[-2]
     width = 2 * round(TUNING.derivative_span * rate / 2) + 1
-    # an odd width, at least five samples for a cubic, at most the number of samples
+    # the width is uneven, at least five samples for a cubic, and at most the number of samples
     width = min(max(5, width), samples - 1 + samples % 2)
     return np.asarray(savgol_filter(q, width, 3, deriv=order, delta=1 / rate, axis=-2))

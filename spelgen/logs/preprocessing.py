@@ -64,7 +64,7 @@ class Preprocessing:
 
     @property
     def filtered(self) -> bool:
-        """Whether windows are cut from filtered logs; the options must be ``resolved``."""
+        """True if windows are cut from filtered logs; the options must be ``resolved``."""
         return bool(self.cutoff)
 
     @property

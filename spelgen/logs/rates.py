@@ -9,10 +9,10 @@ FAST = 1 + TUNING.clock_error
 
 
 def shows_accelerations(rate: float) -> bool:
-    """Return whether logs of this rate [Hz] determine accelerations: the filter's cutoff is below Nyquist's bound."""
+    """Return True if logs of this rate [Hz] determine accelerations: the filter's cutoff is below Nyquist's bound."""
     return rate * FAST >= SLOWEST
 
 
 def is_dense(rate: float) -> bool:
-    """Return whether linear interpolation between samples suffices at this rate [Hz]."""
+    """Return True if linear interpolation between samples suffices at this rate [Hz]."""
     return rate * FAST >= TUNING.dense_rate

@@ -164,7 +164,7 @@ def missing_columns(
 
 
 def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequence[str]) -> bool:
-    """Return whether a log has commands of all joints and no torques."""
+    """Return True if a log has commands of all joints and no torques."""
     commands = {mapping.column("u", joint) for joint in joints}
     torques = {mapping.column("tau", joint) for joint in joints}
     return commands <= set(columns) and torques.isdisjoint(columns)
@@ -189,7 +189,7 @@ def _renaming(
 
 
 def names_joint(column: str, joint: str) -> bool:
-    """Return whether a column's name contains a joint's name as a separate word: `q_1` has 1, `q_12` has not."""
+    """Return True if a column's name contains a joint's name as a separate word: `q_1` has 1, `q_12` has not."""
     return re.search(rf"(?<![0-9a-z]){re.escape(joint)}(?![0-9a-z])", column, re.IGNORECASE) is not None
 
 

@@ -24,7 +24,7 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
     """Return the columns of a layout (T, C) in SI units. start: time that becomes 0. rows: row numbers in the file.
 
     Rows of another topic or publisher (see `foreign_rows`) contain NaN. Raises LogError, with row and column, for
-    values that are not numbers, or impossible for an arm.
+    values that are not numbers, or beyond the range of any arm.
     """
     times, unit = _clock(table, layout)
     if start is not None:
@@ -138,7 +138,7 @@ def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray
 
 
 def is_number(text: str) -> bool:
-    """Return whether a text is a number in Python's notation."""
+    """Return True if a text is a number in Python's notation."""
     try:
         float(text)
     except ValueError:
