@@ -69,9 +69,7 @@ def short_torque_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Torque fits take two steps in few outer iterations, for tests of files, commands and messages."""
     from spelgen.fitting.torque.tuning import TorqueTuning
 
-    tuning = TorqueTuning(
-        iterations=1, initial_steps=2, final_iterations=1, max_extension=1, iteration_steps=2
-    )
+    tuning = TorqueTuning(iterations=1, initial_steps=2, iteration_steps=2)
     for module in ("problem", "stages"):
         monkeypatch.setattr(f"spelgen.fitting.torque.{module}.TUNING", tuning)
 

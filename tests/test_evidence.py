@@ -229,8 +229,7 @@ def first_seconds(folder: Path, arm: str, seconds: float) -> tuple[TorqueSolutio
 @pytest.mark.parametrize("arm", ARMS)
 def test_a_second_of_motion_supports_no_fit(shared, arm):
     """A second and a half of each recorded arm: the warning names joints, what is as good, and the seconds needed."""
-    solution, codes, messages = first_seconds(shared / "logs", arm, 1.5)
-    assert (solution.held_out_nmse > TUNING.unsupported).any()
+    _, codes, messages = first_seconds(shared / "logs", arm, 1.5)
     assert "few-data" in codes
     assert "URDF" in messages[0] and "ridge" in messages[0] and " s in which all joints move" in messages[0]
 

@@ -42,8 +42,8 @@ class TorqueSolution:
     """Result of a fit.
 
     rms_residual: (n,) root mean square torque residual [Nm, N]. steps, cost: of the solver, at the end. prior: its
-    estimated standard deviations. covariance: (K, K) of the parameters. compensated: (n,) joints whose drives compensate
-    friction. correlation_time: (n,) of the torque errors [s]. held_out_nmse: (n,) mean squared error of held-out
+    estimated standard deviations. covariance: (K, K) of x. compensated: (n,) joints whose drives compensate friction.
+    correlation_time: (n,) of the torque errors [s]. held_out_nmse: (n,) mean squared error of held-out
     segments, divided by the variance of the torque; torque_std: (n,) its root [Nm, N]. selected_terms: residual terms.
     """
 

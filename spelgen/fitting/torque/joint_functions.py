@@ -7,7 +7,7 @@ regression (Frisch and Waugh, Econometrica 1:387, 1933).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -117,14 +117,6 @@ class ProjectedTerms(NamedTuple):
             joint, count = candidate.joint, candidate.columns.shape[1]
             candidate.write(model.residuals, weights[joint][:count])
             weights[joint] = weights[joint][count:]
-
-
-def clear_terms(model: ArmModel, joints: Iterable[int]) -> None:
-    """Set all residual terms of single joints to zero for these joints."""
-    terms = model.residuals
-    with torch.no_grad():
-        for weights in (terms.raw_torque_splines, terms.raw_friction_splines, terms.raw_torque_ripple):
-            weights[list(joints)] = 0.0
 
 
 def refit_terms(

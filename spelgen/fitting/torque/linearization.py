@@ -10,8 +10,6 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 
-from spelgen.fitting.torque.tuning import TUNING
-
 
 class JointRows(NamedTuple):
     """Jacobian rows of one joint's torque: residual(theta + s) = residual - jacobian @ s[columns].
@@ -87,7 +85,7 @@ class RigidProjection(NamedTuple):
         for joint, (jacobian, gain) in enumerate(zip(self.jacobian, self.posterior_gain, strict=True)):
             rows = jacobian.unflatten(0, (-1, size))
             values, vectors = torch.linalg.eigh(torch.eye(size).double() - rows @ gain @ rows.mT)
-            scale = values.clamp(min=TUNING.min_error_fraction).rsqrt().unsqueeze(-1)
+            scale = values.clamp(min=0.01).rsqrt().unsqueeze(-1)  # zero but for rounding: nothing remains
             errors[..., joint] = (vectors @ (scale * (vectors.mT @ errors[..., joint : joint + 1])))[..., 0]
         return errors
 

@@ -8,7 +8,6 @@ single joint.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -204,8 +203,8 @@ class ParameterPrior:
 
     @property
     def plausible(self) -> bool:
-        """Whether the width of the bodies' parameters is that of a URDF of this arm."""
-        return math.exp(self.widths.bodies) <= TUNING.wrong_urdf
+        """Whether the bodies' parameters are near the ones of the URDF, on average over the bodies."""
+        return float(self.body_widths.square().mean().sqrt().exp()) <= TUNING.wrong_urdf
 
     @cached_property
     def precision(self) -> torch.Tensor:

@@ -82,7 +82,8 @@ class NoiseEstimator:
             effective_parameters: number of parameters that each joint's torque determines, (n,): each reduces the
                 degrees of freedom of the residual by one independent error.
         """
-        fraction = (1.0 - effective_parameters / self.errors).clamp(min=TUNING.min_error_fraction)
+        # a joint cannot determine more parameters than it has errors, except by the shares' inequality
+        fraction = (1.0 - effective_parameters / self.errors).clamp(min=0.01)
         rms = (squared_residual / self.count / fraction).sqrt()
         return torch.maximum(rms, TUNING.min_noise * self.torque_std) * self.correlation_length.sqrt()
 
@@ -143,8 +144,8 @@ class TorqueProblem:
         """
         estimator = self.noise_estimator
         noise, rows = estimator.upper_bound(), list(self.jacobian.joint_rows(x))
-        # iterated: the solution depends on the noise, which weights the joints, and the noise on the solution
-        for _ in range(TUNING.final_iterations):
+        # twice: the noise is the weight of the joints, whose torques have common parameters
+        for _ in range(2):
             noise = estimator.estimate(*least_squares_residual(rows, noise, self.free))
         return replace(self, noise=noise)
 
@@ -248,20 +249,19 @@ class TorqueEstimate:
         return jacobian.residual_samples(x), projection
 
 
-def alternate(problem: TorqueProblem, state: State, iterations: int) -> TorqueEstimate:
-    """Alternate Levenberg-Marquardt steps with updates of noise and prior.
+def alternate(problem: TorqueProblem, state: State) -> TorqueEstimate:
+    """Alternate Levenberg-Marquardt steps with updates of noise and prior until the noise has converged.
 
     Args:
         problem: with initial noise and prior.
         state: first iterate.
-        iterations: number of outer iterations. While the noise of any joint decreases they continue, up to
-            `TUNING.max_extension` times this number.
     """
-    for number in range(TUNING.max_extension * iterations):
+    for number in range(TUNING.iterations):
         result = problem.minimize(state, TUNING.iteration_steps)
         state, covariance = result.state, problem.covariance(result.normal_equations.curvature)
         previous, problem = problem, problem.updated(state, covariance)
-        if number + 1 >= iterations and (problem.noise > TUNING.noise_converged * previous.noise).all():
+        # the first update replaces a noise of other samples or of another model
+        if number and (problem.noise > TUNING.noise_converged * previous.noise).all():
             break
     return TorqueEstimate(problem, state, covariance)
 
@@ -272,7 +272,7 @@ def refine(
     """Return the estimate refitted to other samples or residual terms, with the given one as warm start."""
     estimate = estimate.with_jacobian(TorqueJacobian(estimate.problem.jacobian.model, samples, terms))
     noise = estimate.problem.noise_estimator.estimate(estimate.state.residual)
-    return alternate(replace(estimate.problem, noise=noise), estimate.state, TUNING.final_iterations)
+    return alternate(replace(estimate.problem, noise=noise), estimate.state)
 
 
 def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> TorqueEstimate:

@@ -8,6 +8,7 @@ from itertools import compress
 
 import numpy as np
 import torch
+from scipy.special import gammaincinv
 
 from spelgen.dynamics.parameters import idle_residuals
 from spelgen.dynamics.protocol import residual_terms
@@ -39,8 +40,9 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
             "the torque offsets exceed three times the friction that is expected of drives of this effort; check the "
             "effort limits of the URDF, the zeros of the torques and their unit",
         )
-    if (solution.held_out_nmse > TUNING.unsupported).any():
-        yield _few_data(samples, solution, names)
+    nmse = _likely_nmse(samples, solution)
+    if (nmse > TUNING.unsupported).any():
+        yield _few_data(samples, nmse, names)
     if isinstance(model.inputs, MotorInputs) and len(model.inputs.gain_rows):
         yield _trained_gains(posterior)
     if solution.compensated.any():
@@ -95,15 +97,26 @@ def _urdf_prior(solution: TorqueSolution) -> Diagnostic:
     return _warning("urdf-prior", message, "bodies")
 
 
-def _few_data(samples: TorqueSamples, solution: TorqueSolution, names: np.ndarray) -> Diagnostic:
-    """Return the warning that the samples do not support the parameters of some joints."""
-    nmse, seconds = float(np.nanmax(solution.held_out_nmse)), samples.count * samples.interval
-    joints = ", ".join(names[solution.held_out_nmse > TUNING.unsupported])
+def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray:
+    """Return the nMSE of held-out segments (n,), median-unbiased: most means of few squares are too small.
+
+    The sum of the squared errors of S segments is taken to be chi-squared with S degrees of freedom, whose median is
+    below S.
+    """
+    segments = samples.count * samples.interval / TUNING.segment
+    median = 2 * float(gammaincinv(segments / 2, 0.5))
+    return np.asarray(solution.held_out_nmse * segments / median)
+
+
+def _few_data(samples: TorqueSamples, nmse: np.ndarray, names: np.ndarray) -> Diagnostic:
+    """Return the warning that the samples do not support the parameters of some joints; nmse: (n,) of all joints."""
+    seconds, joints = samples.count * samples.interval, ", ".join(names[nmse > TUNING.unsupported])
     # the error of the parameters is inversely proportional to the duration of the motion
-    enough = math.ceil(seconds * nmse / TUNING.unsupported)
+    enough = math.ceil(seconds * float(np.nanmax(nmse)) / TUNING.unsupported)
     return _warning(
         "few-data",
-        f"torques that were not fitted are predicted no better than by a constant at {joints} (nMSE {nmse:.2g}): "
+        "torques that were not fitted are predicted no better than by a constant at "
+        f"{joints} (nMSE {np.nanmax(nmse):.2g}): "
         f"{seconds:.2g} s of this motion do not support a fit, the values of the URDF or of a ridge regression may be "
         f"as good; record about {enough} s in which all joints move",
     )

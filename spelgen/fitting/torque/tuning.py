@@ -37,8 +37,8 @@ class TorqueTuning:
     # [1] Largest estimated prior width: masses and armatures are known to a factor of 20, torque offsets to three times
     # the typical friction. Logs that need a wider prior are not of the URDF's arm, or not in Nm.
     max_width: float = 3.0
-    # [1] Outer iterations of noise and prior after the initial fit.
-    iterations: int = 5
+    # [1] Largest number of outer iterations, which alternate steps with estimates of noise and prior.
+    iterations: int = 20
     # [1] Twice the logarithm of a likelihood ratio: strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90:773,
     # 1995).
     strong_evidence: float = 6.0
@@ -49,10 +49,6 @@ class TorqueTuning:
     # [1] Noise of these iterations, as a fraction of the torque residual (a low_cost_robot with placeholder
     # inertials: error of M(q) 0.44 -> 0.005).
     annealing_fraction: float = 0.03
-    # [1] Outer iterations of a final fit, and of unconstrained least squares.
-    final_iterations: int = 2
-    # [1] Factor on the number of outer iterations while the noise of a joint decreases.
-    max_extension: int = 4
     # [1] Noise divided by the noise of the previous iteration, above which the noise has converged.
     noise_converged: float = 0.98
     # [1] Largest number of steps in an outer iteration.
@@ -71,11 +67,6 @@ class TorqueTuning:
     residual_samples: int = 2**14
     # [1] Smallest noise, as a fraction of a torque's range: noise-free samples are fitted to four digits.
     min_noise: float = 1e-4
-    # [1] Smallest fraction of independent errors that remains, however many parameters are determined.
-    min_error_fraction: float = 0.1
-    # [1] Fraction of the squared residual that friction compensation by a drive (torque that increases with velocity)
-    # must explain.
-    min_explained: float = 0.1
     # [1] Standard deviations by which the coefficient of friction compensation must differ from zero.
     min_significance: float = 4.0
     # [1] Smallest standard deviation of friction compensation, as a fraction of the torque's: delays of
