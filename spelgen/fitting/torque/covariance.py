@@ -33,6 +33,7 @@ def parameter_covariance(estimate: TorqueEstimate) -> torch.Tensor:
     model, samples = problem.jacobian.model, problem.jacobian.samples
     # a new Jacobian measures logged torques relative to the gains that were written
     noise = problem.noise / problem.jacobian.logged_scale(x)
+    # shorter blocks than these would be as correlated with their neighbours as within
     blocks = max(1, min(BLOCKS, samples.count // MIN_BLOCK))
     equations = []
     for rows in np.array_split(np.arange(samples.count), blocks):
@@ -43,6 +44,8 @@ def parameter_covariance(estimate: TorqueEstimate) -> torch.Tensor:
     covariance = torch.linalg.inv(curvature.sum(dim=0) + prior)
     if blocks > 1:
         jackknife = jackknife_covariance(curvature, descent[:, free], prior)[1]
+        # either alone is too small in some directions: of ten blocks some agree by chance, and the posterior covariance
+        # does not know of differences between motions
         covariance = larger_covariance(jackknife, covariance) * student_scale(blocks) ** 2
     return problem.of_all_parameters(covariance)
 
@@ -55,6 +58,7 @@ def held_out_nmse(estimate: TorqueEstimate, samples: TorqueSamples) -> torch.Ten
     """
     segments, size = estimate.on_segments(samples), samples.segment_length(TUNING.segment)
     jacobian, x, noise = segments.problem.jacobian, segments.state.x, segments.problem.noise
+    # rows of all joints together: parameters of a body change the torques of all joints before it
     weighted = torch.zeros(len(noise), jacobian.samples.count, len(x)).double()
     for joint, columns, of_joint, _ in concatenate_blocks(jacobian.joint_rows(x), len(noise)):
         weighted[joint, :, columns] = of_joint / noise[joint]
@@ -64,6 +68,7 @@ def held_out_nmse(estimate: TorqueEstimate, samples: TorqueSamples) -> torch.Ten
     for start in range(0, residual.shape[1], size):
         rows = slice(start, start + size)
         block = weighted[:, rows].flatten(0, 1)
+        # solved, not inverted: a joint that only this segment moves has an eigenvalue near zero
         kept = torch.eye(len(block)).double() - block @ segments.covariance @ block.mT
         error[:, rows] = torch.linalg.solve(kept, residual[:, rows].flatten()).view(len(noise), -1)
     return error.square().mean(dim=1) * (noise / estimate.problem.noise_estimator.torque_std).square()

@@ -79,6 +79,7 @@ def fit_torque(
     samples = samples.subsampled(_max_samples(model))
     subset = samples.subsampled(TUNING.initial_samples)
     if adapt is None:
+        # not of an adapted model: its friction was fitted before
         limit_friction(model, subset.columns)
     if prior is None:
         prior = TUNING.priors[adapt] if adapt else GaussianPrior()
@@ -115,10 +116,12 @@ def _run_stages(
     estimate = initial_fit(problem)
     if model.elements:
         estimate = choose_friction_state(estimate)
+    # the errors of a wrong friction model last longer than those of the chosen one
     estimate = with_correlation_time(choose_friction_effects(estimate), samples)
     selected: Sequence[SelectedTerm] = ()
     if residual_terms(model) is not None:
         estimate, selected = fit_residual_terms(estimate, samples.subsampled(TUNING.residual_samples))
+    # residual terms were selected on fewer samples
     return refine(estimate, samples), selected
 
 

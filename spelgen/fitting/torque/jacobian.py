@@ -79,6 +79,7 @@ class TorqueJacobian:
         self._affects = self._motors != 0  # (n, n): whether a drive affects a joint's torque
         self._affected = self._affected_joints()
         self._colours = _colour(self._affects.double().mT @ self._affects.double() > 0)
+        # regressors do not depend on x: once per object, in blocks because of the copies of `_compressed_jacobian`
         self._blocks = [self._with_regressors(block) for block in samples.blocks(TUNING.block)]
 
     @cached_property
@@ -95,6 +96,7 @@ class TorqueJacobian:
         parameters = self.rigid.unflatten(x)
         with torch.no_grad():
             blocks = [self._torque_residual(parameters, block)[0] for block in self._blocks]
+        # concatenated: eliminated terms are linear maps of all samples of a joint
         residual = torch.cat(blocks) * self.logged_scale(x)
         squared_residual = residual.square().sum(dim=0)
         for joint, terms in self.terms.items():
@@ -122,6 +124,7 @@ class TorqueJacobian:
         if self.terms:
             rows = self._projected(rows)
         curvature, descent = linearization.normal_equations(rows, noise, len(x))
+        # the products are formed in theta and transformed once, (K, K) instead of (T, K)
         change = self.theta_jacobian(x)
         return change.mT @ curvature @ change, change.mT @ descent
 
@@ -190,6 +193,7 @@ class TorqueJacobian:
         """
         change = self.theta_jacobian(x)
         covariance = change @ covariance @ change.mT
+        # in theta the torque is linear, so that the projection also holds for large torques
         rows = concatenate_blocks(self.joint_rows(x), len(noise))
         gains = []
         for joint, columns, _, _ in rows:
@@ -206,6 +210,7 @@ class TorqueJacobian:
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)
         for name in self.rigid.names(*LOGARITHMIC_GROUPS):
+            # log(c + c step) = log c + log1p(step): the same to first order, and straight in c
             parameters[name] = (
                 parameters[name]
                 - change[name]
@@ -221,6 +226,7 @@ class TorqueJacobian:
         model, q, qd, qdd = self.model, block.q, block.qd, block.qdd
         zero = torch.zeros_like(q)
         with torch.no_grad():
+            # the friction model has the load of gravity only, not of acceleration
             gravity_regressor = regressor_of(model.chain, q, zero, zero)
             return _RegressorBlock(
                 samples=block,

@@ -41,6 +41,7 @@ class LinearTerms:
     @cached_property
     def ridge(self) -> torch.Tensor:
         """Ridge estimator (P, T): weights per torque."""
+        # small (P, P): one factorization serves all columns of the Jacobian
         gram = self.features.mT @ self.features + self.penalty.diag()
         ridge: torch.Tensor = torch.linalg.solve(gram, self.features.mT)
         return ridge
@@ -135,6 +136,7 @@ def least_squares_residual(
     """
     curvature, descent = normal_equations(rows, noise, len(free))
     inverse = torch.zeros_like(curvature)
+    # pseudo-inverse: bodies have directions that no torque depends on, and there is no prior here
     inverse[free[:, None] & free] = _pseudo_inverse(curvature[free][:, free]).flatten()
     step = inverse @ descent
     squared_residual, gamma = torch.zeros(2, len(noise)).double()
@@ -195,6 +197,7 @@ def bayesian_ridge(
     size, variance = member.sum(dim=0), square / count  # variance: 1 / alpha
     feature_square = (member.mT @ gram.diagonal() / count / size).clamp(min=1e-300)
     # initially each group has 10 % of the variance of the target
+    # a start at zero weights would be a fixed point
     lambda_ = 10 * feature_square * size / max(variance, 1e-300)
     n_iter, converged = 0, False
     while n_iter < 30 and not converged:

@@ -161,6 +161,7 @@ class TorqueProblem:
 
     def normal_equations(self, x: torch.Tensor, residual: torch.Tensor) -> NormalEquations:
         """Return Gauss-Newton Hessian (k, k) and negative gradient (k,) with respect to the k free parameters."""
+        # of all parameters first: common factors of the prior couple free and fixed ones
         curvature, descent = self.jacobian.normal_equations(x, self.noise)
         penalty_gradient = self.prior.precision @ (x - self.prior.mean)
         curvature = (curvature + self.prior.precision)[self.free][:, self.free]
@@ -172,6 +173,7 @@ class TorqueProblem:
         step: (k,) of the free parameters.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
+        # the first one is cheaper, and as good near the optimum; far from it bodies need the second
         yield x + change
         yield self.jacobian.curved_step(x, change)
 
@@ -199,6 +201,7 @@ class TorqueProblem:
         equal shares.
         """
         free, joints = self.free, len(state.residual)
+        # of all joints together: a parameter of a body is determined by the torques of several joints
         gamma = float(free.sum() - (covariance * self.prior.precision)[free][:, free].sum())
         noise = self.noise_estimator.estimate(state.residual, gamma / joints)
         # one body is too little data for the widths of a load
@@ -235,6 +238,7 @@ class TorqueEstimate:
         )
         segments = self.with_current_covariance().with_jacobian(jacobian)
         length = segments.problem.correlation_length
+        # fewer samples per error have less noise each, so that an error keeps its weight
         noise = self.problem.noise * (length / self.problem.correlation_length).sqrt()
         return replace(segments, problem=replace(segments.problem, noise=noise))
 
@@ -271,6 +275,7 @@ def refine(
 ) -> TorqueEstimate:
     """Return the estimate refitted to other samples or residual terms, with the given one as warm start."""
     estimate = estimate.with_jacobian(TorqueJacobian(estimate.problem.jacobian.model, samples, terms))
+    # the former noise is that of other samples, or without these terms
     noise = estimate.problem.noise_estimator.estimate(estimate.state.residual)
     return alternate(replace(estimate.problem, noise=noise), estimate.state)
 
@@ -291,6 +296,7 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     interval, size = segments.problem.jacobian.samples.interval, samples.segment_length(TUNING.segment)
     errors = projection.errors(residual.torque_residual, size)
     observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * interval
+    # the mean of two estimates, each with the weight of its independent errors
     weight = len(residual.q) * interval / prior_mean / TUNING.correlation_weight
     mean = (weight * observed + prior_mean) / (weight + 1)
     noise = problem.noise * (mean / problem.correlation_time).sqrt()

@@ -106,6 +106,7 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
     """
     friction = estimate.problem.jacobian.model.friction
     friction.memoryless.fill_(0.0)
+    # the noise of rate-only friction is too large for bristles, which explain more
     problem, state = _least_squares_noise_fit(estimate.problem, estimate.state)
     hysteretic = alternate(problem, state)
     evidence = log_likelihood_ratio(hysteretic, estimate) - fraction_occam_factor(hysteretic)
@@ -114,6 +115,7 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
     if rate_only.all():
         return estimate
     if rate_only.any():
+        # the friction state changed in the model: the residual is recomputed
         mixed = hysteretic.with_jacobian(hysteretic.problem.jacobian)
         return alternate(mixed.problem, mixed.state)
     return hysteretic
@@ -139,6 +141,7 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
 def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
     """Return the estimate with negligible coefficients, in x and in the prior mean, at these indices (k,)."""
     problem, x, mean = estimate.problem, estimate.state.x.clone(), estimate.problem.prior.mean.clone()
+    # in the prior mean, too: otherwise the prior would restore them
     mean[indices] = x[indices] = NEGLIGIBLE
     problem = replace(problem, prior=replace(problem.prior, mean=mean))
     state = replace(estimate.state, x=x, residual=problem.residual(x))
@@ -148,6 +151,7 @@ def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
 def log_likelihood_ratio(estimate: TorqueEstimate, other: TorqueEstimate) -> torch.Tensor:
     """Return twice the log likelihood ratio of two estimates per joint (n,), with the noise maximized out."""
     samples = estimate.problem.jacobian.samples
+    # the noise maximized out: log of the ratio of squares, per independent error
     errors = samples.count * min(1.0, samples.interval / TUNING.reversal_correlation_time)
     return errors * (other.state.residual / estimate.state.residual).log()
 
@@ -199,6 +203,7 @@ def fit_residual_terms(
         estimate = _refit(estimate, samples, selected).with_current_covariance()
     residual_samples = estimate.problem.jacobian.residual_samples(estimate.state.x)
     selected += select_networks(model, residual_samples, float(correlation_length.max()))
+    # friction factors and networks are not eliminated, so that alternations are needed
     for _ in range(TUNING.alternations if selected else 0):
         estimate = _refit(estimate.with_current_covariance(), samples, selected)
     return estimate, selected
