@@ -312,8 +312,5 @@ def _colour(coupled: torch.Tensor) -> list[int]:
     colours: list[int] = []
     for row in coupled.tolist():
         used = {colour for colour, shared in zip(colours, row, strict=False) if shared}
-        colour = 0
-        while colour in used:
-            colour += 1
-        colours.append(colour)
+        colours.append(min(set(range(len(row))) - used))
     return colours

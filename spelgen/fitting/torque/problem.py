@@ -82,8 +82,8 @@ class NoiseEstimator:
             effective_parameters: number of parameters that each joint's torque determines, (n,): each reduces the
                 degrees of freedom of the residual by one independent error.
         """
-        # a joint cannot determine more parameters than it has errors, except by the shares' inequality
-        fraction = (1.0 - effective_parameters / self.errors).clamp(min=0.01)
+        # at least one error remains: equal shares can exceed the errors of a joint
+        fraction = (self.errors - effective_parameters).clamp(min=1.0) / self.errors
         rms = (squared_residual / self.count / fraction).sqrt()
         return torch.maximum(rms, TUNING.min_noise * self.torque_std) * self.correlation_length.sqrt()
 
