@@ -12,7 +12,6 @@ from spelgen.exporting.c_source import CFunction, c_function
 from spelgen.exporting.description import TrainedModel
 from spelgen.exporting.estimator_expressions import ENTRIES, estimator_functions
 from spelgen.live.noise import TAIL, NoiseLevels
-from spelgen.live.payload import EVIDENCE, ITERATIONS, LOAD_PRIOR, WEIGHTS
 from spelgen.live.tuning import TUNING
 from spelgen.templates import render
 
@@ -29,7 +28,7 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
 def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
     """Return header and source of the estimator, by name of the file."""
     tables: dict[str, Iterable[float]] = {
-        "load_prior": LOAD_PRIOR,
+        "load_prior": TUNING.load_prior,
         "load_white": levels.load.white,
         "load_disturbance": levels.load.disturbance,
         "load_time_constant": levels.load.time_constant,
@@ -56,9 +55,9 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         "tuning": TUNING,
         "supported": f"{levels.supported_alarms:.2g} per minute",
         "windows": repr(60 / TUNING.window * TAIL * model.n),
-        "evidence": repr(EVIDENCE),
-        "iterations": ITERATIONS,
-        "weights": WEIGHTS,
+        "evidence": repr(TUNING.evidence),
+        "iterations": TUNING.iterations,
+        "weights": TUNING.weights,
         "tables": {name: _numbers(row) for name, row in tables.items()},
         "motors": list(map(_numbers, model.motors)),
         "inverse_inputs": list(map(_numbers, np.linalg.inv(model.inputs + np.diag(1 - model.actuated)))),
