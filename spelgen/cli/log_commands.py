@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -29,60 +29,68 @@ from spelgen.labels import counted
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
 
-Acceleration = Annotated[
-    str | None,
-    typer.Option(
-        metavar="X|X,X,X", help="Largest acceleration, of all joints or per joint [rad/s^2, m/s^2]."
-    ),
-]
-Start = Annotated[
-    str | None,
-    typer.Option(
-        "--from",
-        metavar="X,X,X",
-        help="Position before the motion [rad, m]. Default: zero, or the middle of a range without zero.",
-    ),
-]
-SurroundingsFile = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.yaml", help="Floor, boxes and clearance, which the motion respects."),
-]
-TrajectoryFile = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="Also write approach and motion as a JointTrajectory of ROS 2, in JSON or YAML.",
-    ),
-]
 
+@dataclass(frozen=True)
+class MotionOptions:
+    """The arguments of `spelgen.excite`, as options of a command."""
 
-def excite(
-    robot: Robot,
-    output: Annotated[Path, options.output_option("FILE.csv", "Output file of the motion.")],
-    joints: Joints = None,
-    tip: Tip = None,
-    angle_tolerance: AngleTolerance = 2e-3,
-    duration: Annotated[float, typer.Option(min=2.0, max=600.0, help="Duration [s].")] = 30.0,
-    sample_rate: Annotated[float, typer.Option(min=1.0, max=10000.0, help="Sample rate [Hz].")] = 100.0,
+    duration: Annotated[float, typer.Option(min=2.0, max=600.0, help="Duration [s].")] = 30.0
+    sample_rate: Annotated[float, typer.Option(min=1.0, max=10000.0, help="Sample rate [Hz].")] = 100.0
     harmonics: Annotated[
         int | None,
         typer.Option(min=2, max=100, help="Number of harmonics; default: 0.4 per second, at least 5."),
-    ] = None,
+    ] = None
     reach: Annotated[
         float, typer.Option(min=0.05, max=1.0, help="Fraction of the position range to use.")
-    ] = 0.9,
+    ] = 0.9
     speed: Annotated[
         float, typer.Option(min=0.05, max=1.0, help="Fraction of the velocity limits to use.")
-    ] = 0.7,
-    acceleration: Acceleration = None,
-    start: Start = None,
-    surroundings: SurroundingsFile = None,
-    trajectory: TrajectoryFile = None,
+    ] = 0.7
+    acceleration: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X|X,X,X", help="Largest acceleration, of all joints or per joint [rad/s^2, m/s^2]."
+        ),
+    ] = None
+    start: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="X,X,X",
+            help="Position before the motion [rad, m]. Default: zero, or the middle of a range without zero.",
+        ),
+    ] = None
+    surroundings: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.yaml", help="Floor, boxes and clearance, which the motion respects."),
+    ] = None
+    trials: Annotated[int, typer.Option(min=1, help="Candidates of the search, after random ones.")] = 100
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments, with numbers in place of text."""
+        acceleration = options.numbers(self.acceleration, "--acceleration")
+        return vars(self) | {"acceleration": acceleration, "start": options.numbers(self.start, "--from")}
+
+
+@options.grouped
+def excite(
+    robot: Robot,
+    output: Annotated[Path, options.output_option("FILE.csv", "Output file of the motion.")],
+    design: MotionOptions,
+    joints: Joints = None,
+    tip: Tip = None,
+    angle_tolerance: AngleTolerance = 2e-3,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Also write approach and motion as a JointTrajectory of ROS 2, in JSON or YAML.",
+        ),
+    ] = None,
     html: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Also write a page that shows the motion.")
     ] = None,
-    trials: Annotated[int, typer.Option(min=1, help="Candidates of the search, after random ones.")] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
     force: Force = False,
     format: TextOrJson = "text",
 ) -> None:
@@ -97,20 +105,7 @@ def excite(
             options.require_free(path, force=force)  # checked first: the search takes minutes
     arm = options.load(robot, joints, tip, angle_tolerance)
     with progress_bar("searching") as progress:
-        motion = design_motion(
-            arm,
-            duration=duration,
-            sample_rate=sample_rate,
-            harmonics=harmonics,
-            reach=reach,
-            speed=speed,
-            acceleration=options.numbers(acceleration, "--acceleration"),
-            start=options.numbers(start, "--from"),
-            surroundings=surroundings,
-            trials=trials,
-            seed=seed,
-            progress=progress,
-        )
+        motion = design_motion(arm, progress=progress, **design.arguments())
     written = [str(write_text(output, motion.csv()))]
     if trajectory is not None:
         written.append(str(write_text(trajectory, motion.joint_trajectory())))

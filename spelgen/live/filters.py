@@ -38,10 +38,11 @@ class Block(NamedTuple):
         """Return the block of this one and the next one."""
         duration = self.duration + later.duration
         # means over time, so that the longer block counts more
-        means = [
-            a + later.duration / duration * (b - a) for a, b in zip(self[1:-1], later[1:-1], strict=True)
-        ]
-        return Block(duration, *means, self.moving & later.moving)
+        weight = later.duration / duration
+        y, load, friction, uncertainty = (
+            a + weight * (b - a) for a, b in zip(self[1:5], later[1:5], strict=True)
+        )
+        return Block(duration, y, load, friction, uncertainty, self.moving & later.moving)
 
 
 class Blocks:
