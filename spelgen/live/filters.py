@@ -145,21 +145,19 @@ class JointFilters:
     """
 
     def __init__(
-        self, deviations: np.ndarray, white: np.ndarray, time_constant: np.ndarray, *, friction_walk: float,
-        follow_at_rest: bool,
-    ) -> None:  # fmt: skip
+        self, deviations: np.ndarray, white: np.ndarray, time_constant: np.ndarray, *, drifts: bool = False
+    ) -> None:
         """Begin with x = 0.
 
         Args:
             deviations: prior standard deviations of the states, of d also the stationary one, (..., n, K).
             white: standard deviations of white noise, (..., n).
             time_constant: of d, (..., n) [s].
-            friction_walk: variance per second of the random walk of a [1/s].
-            follow_at_rest: whether d is updated for joints at rest.
+            drifts: whether a is a random walk, and d is updated for joints at rest, too.
         """
         self.x, self.P = np.zeros_like(deviations), deviations[..., None] ** 2 * np.eye(deviations.shape[-1])
         self.disturbance, self.white, self.time_constant = deviations[..., -1] ** 2, white**2, time_constant
-        self.friction_walk, self.follow_at_rest = friction_walk, follow_at_rest
+        self.drifts = drifts
 
     @classmethod
     def of_drift(cls, noise: BlockNoise) -> JointFilters:
@@ -168,10 +166,7 @@ class JointFilters:
         deviations = np.stack(
             [np.full_like(noise.white, TUNING.friction), factor * noise.disturbance], axis=-1
         )
-        return cls(
-            deviations, factor * noise.white, noise.time_constant,
-            friction_walk=TUNING.friction_walk, follow_at_rest=True,
-        )  # fmt: skip
+        return cls(deviations, factor * noise.white, noise.time_constant, drifts=True)
 
     def update(self, block: Block, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Advance the state by a block, and use its torque that the payload does not explain, (n,) [Nm, N].
@@ -183,7 +178,7 @@ class JointFilters:
         decay[..., -1] = np.exp(-block.duration / self.time_constant)
         self.x = self.x * decay
         self.P = self.P * decay[..., None] * decay[..., None, :]
-        self.P[..., 0, 0] += self.friction_walk * block.duration
+        self.P[..., 0, 0] += self.drifts * TUNING.friction_walk * block.duration
         self.P[..., -1, -1] += (1 - decay[..., -1] ** 2) * self.disturbance
         row = np.ones_like(self.x)
         row[..., 0] = block.friction
@@ -192,7 +187,7 @@ class JointFilters:
         residual = torque - (row * self.x).sum(axis=-1)
         variance = np.maximum(expected, residual**2 / TUNING.outlier**2)
         used = np.repeat(block.moving[:, None], self.x.shape[-1], axis=1)
-        used[:, -1] |= self.follow_at_rest
+        used[:, -1] |= self.drifts
         gain = np.where(used, covariance / variance[..., None], 0.0)
         self.x = self.x + gain * residual[..., None]
         # Joseph's form, for a gain that is optimal in some states and zero in the others

@@ -166,7 +166,7 @@ def find_levels(
     levels = NoiseLevels(
         drift=noise,
         load=noise,
-        observer=unknown,
+        observer=0 * unknown,
         peak_start=unknown,
         peak_scale=unknown,
         load_variance=TUNING.variance,
@@ -241,7 +241,7 @@ def _likelihood(
     prior = np.stack([np.full_like(scale, TUNING.friction), 4 * scale, scale * ratio], axis=-1)
     for blocks in segments:
         # joints at rest determine no noise of motion
-        filters = JointFilters(prior, scale, constant, friction_walk=0.0, follow_at_rest=False)
+        filters = JointFilters(prior, scale, constant)
         for block in blocks:
             residual, expected = filters.update(block, block.y)
             squared = np.minimum(np.square(residual) / expected, TUNING.outlier**2)
@@ -254,9 +254,11 @@ def _likelihood(
 def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]]) -> NoiseLevels:
     """Return levels with the noise of the momentum observer and the tails of its peaks."""
     signals: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
-    zero = levels.model_copy(update={"observer": np.zeros_like(levels.observer)})
     for samples in tested:
-        observer, drift = ContactObserver(zero, TUNING.alarms_per_minute), JointFilters.of_drift(levels.drift)
+        observer, drift = (
+            ContactObserver(levels, TUNING.alarms_per_minute),
+            JointFilters.of_drift(levels.drift),
+        )
         for t, qd, at, is_resumed, block in samples:
             if is_resumed:
                 observer.restart()
