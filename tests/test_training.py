@@ -23,9 +23,8 @@ from spelgen.emission.module_file import read_spec
 from spelgen.errors import LogError, ModuleError, RunError
 from spelgen.evaluation.evaluate import evaluate
 from spelgen.evaluation.subject import read_test_logs
-from spelgen.fitting.dataset import TrainingData, prepare_data
+from spelgen.fitting.dataset import FitRequest, TrainingData, prepare_data
 from spelgen.fitting.fit import RunOptions, fit
-from spelgen.fitting.objective import FitRequest
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW
 from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.rollout import (
@@ -444,15 +443,18 @@ def test_a_changed_urdf_stays_out_of_the_run(logs, tmp_path):
 
 
 def prepared(logs: Path) -> TrainingData:
-    return prepare_data(read_logs([logs], JOINTS), JOINTS, ("revolute", "revolute"), Preprocessing())
+    return prepare_data(request_of(logs, QUICK), 5, 1)
 
 
-def loop_of(logs: Path, config: Rollout) -> RolloutObjective:
-    request = FitRequest(
+def request_of(logs: Path, config: Rollout) -> FitRequest:
+    return FitRequest(
         Model(), read_logs([logs], JOINTS), config, Preprocessing(), 0.25, 0, None, RunOptions(),
         time.monotonic(), None,
     )  # fmt: skip
-    loop = RolloutObjective(request)
+
+
+def loop_of(logs: Path, config: Rollout) -> RolloutObjective:
+    loop = RolloutObjective(request_of(logs, config))
     loop.prepare()
     loop.begin()
     loop._start_clock()

@@ -10,9 +10,8 @@ from pathlib import Path
 
 from spelgen.emission.loading import load_module
 from spelgen.errors import Diagnostic, ModuleError, RunError
-from spelgen.fitting.fit import AUTOMATIC, QUIET, RunOptions, fit, sample_rates
+from spelgen.fitting.fit import AUTOMATIC, QUIET, FitOptions, RunOptions, choose_config, fit, sample_rates
 from spelgen.fitting.fitted import Fit
-from spelgen.fitting.objectives import FitOptions, choose_config
 from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import BoundedLogs, read_bounded_logs

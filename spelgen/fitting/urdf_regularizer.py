@@ -5,7 +5,6 @@ The variation of M with q is compared, not its mean: rotors and loads that the U
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +12,7 @@ import torch
 
 from spelgen.dynamics.pinocchio_dynamics import urdf_dynamics
 from spelgen.emission.assemble import ArmModel
+from spelgen.errors import Diagnostic
 from spelgen.fitting.tuning import TUNING
 from spelgen.logs.windows import Windows
 
@@ -41,38 +41,46 @@ class UrdfRegularizer(NamedTuple):
         return UrdfRegularizer(*(x.to(device) for x in self))
 
 
-def urdf_regularizer(urdf: Path, joints: Sequence[str], model: ArmModel, windows: Windows) -> UrdfRegularizer:
+def urdf_regularizer(
+    urdf: Path | None, model: ArmModel, windows: Windows, notes: list[Diagnostic]
+) -> UrdfRegularizer | None:
+    """Return the regularizer towards a URDF; None without one, or with a note if it cannot be read."""
+    if urdf is None or not urdf.exists():
+        return None
+    try:
+        return _at_random_positions(urdf, model, windows)
+    # Pinocchio and its parser raise many types; the fit continues without a regularizer
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        message = f"fitted without the URDF's regularizer: {reason}"
+        notes.append(Diagnostic("info", "no-regularizer", urdf.name, None, message))
+        return None
+
+
+def _at_random_positions(urdf: Path, model: ArmModel, windows: Windows) -> UrdfRegularizer:
     """Return the regularizer of a URDF at random positions in the range of a log.
 
     Args:
         urdf: file.
-        joints: names of the model's n joints.
         model: its mean M before the fit is the unit of M.
         windows: positions (W, K, n) [rad, m], whose range is widened.
 
     Raises:
         ImportError: without Pinocchio, whose own errors are raised too.
     """
-    dynamics = urdf_dynamics(urdf, joints)
+    dynamics = urdf_dynamics(urdf, model.joint_names)
     positions = windows.q.flatten(0, 1)
     low, high = positions.amin(dim=0), positions.amax(dim=0)
-    low, high = (
-        low - TUNING.regularizer_margin * (high - low),
-        high + TUNING.regularizer_margin * (high - low),
-    )
-    generator = torch.Generator().manual_seed(0)
-    q = low + (high - low) * torch.rand(
-        TUNING.regularizer_points, len(joints), dtype=positions.dtype, generator=generator
-    )
+    margin = TUNING.regularizer_margin * (high - low)
+    low, high = low - margin, high + margin
+    generator, shape = torch.Generator().manual_seed(0), (TUNING.regularizer_points, model.n)
+    q = low + (high - low) * torch.rand(shape, dtype=positions.dtype, generator=generator)
     with torch.no_grad():
         whitening = torch.linalg.inv(torch.linalg.cholesky(model.mass_matrix(q).mean(dim=0)))
     gravity = dynamics.gravity(q)
     scale = gravity.square().mean(dim=0).sqrt()
-    largest = scale.max().item()
-    floor = TUNING.min_gravity_scale * largest
-    if not largest:
-        floor = 1.0  # no gravity torque at any joint: the unit is arbitrary
-    scale = scale.clamp(min=floor)
+    # without a gravity torque at any joint the unit is arbitrary
+    scale = scale.clamp(min=TUNING.min_gravity_scale * scale.max().item() or 1.0)
     return UrdfRegularizer(q, whitening, _variation(dynamics.mass_matrix(q), whitening), gravity, scale)
 
 

@@ -19,9 +19,9 @@ import torch
 
 from spelgen.dynamics.bristles import encoder_step
 from spelgen.errors import Diagnostic
-from spelgen.fitting.dataset import digest
+from spelgen.fitting.dataset import FitRequest, PreparedLogs, digest
 from spelgen.fitting.levenberg_marquardt import SolverState, initial_state, levenberg_marquardt
-from spelgen.fitting.objective import FitRequest, Objective, PreparedLogs, Status
+from spelgen.fitting.objective import Objective, Status
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.initial_guess import set_initial_guess
 from spelgen.fitting.servo.laws import select_dead_zones, without_small_dead_zones
@@ -69,14 +69,11 @@ class ServoObjective(Objective):
         notes = check(self._logs, model.joint_names, model.joint_types)
         self._windows = servo_windows(self._logs, request.preprocessing)
         return PreparedLogs(
-            config=request.config,
             preprocessing=request.preprocessing,
             digest=digest(self._logs),
-            training=[log.name for log in self._logs],
-            validation=[],
-            training_windows=len(self._windows.q),
-            validation_windows=0,
-            notes=notes,
+            training_names=[log.name for log in self._logs],
+            window_counts=(len(self._windows.q), 0),
+            diagnostics=notes,
         )
 
     def begin(self) -> list[Diagnostic]:

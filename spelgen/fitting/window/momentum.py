@@ -11,18 +11,19 @@ from typing import ClassVar
 import torch
 
 from spelgen.errors import Diagnostic
-from spelgen.fitting.dataset import Validation
-from spelgen.fitting.objective import FitRequest, PreparedLogs, Status, TorqueLogObjective
+from spelgen.fitting.dataset import FitRequest, PreparedLogs, Validation, prepare_data
+from spelgen.fitting.objective import Objective, Status
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW, WindowOptimizer
 from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.rollout import momentum_loss
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.tuning import TUNING
+from spelgen.fitting.urdf_regularizer import urdf_regularizer
 from spelgen.logs.windows import Windows
 from spelgen.settings.fits import DEFAULTS, Solver, WindowConfig
 
 
-class MomentumObjective(TorqueLogObjective):
+class MomentumObjective(Objective):
     """Steps on the weak form, kept if they lower the validation loss. All windows are in memory.
 
     best_loss, best_weights: of the model with the lowest validation loss so far. substeps: of the integrator between
@@ -46,11 +47,13 @@ class MomentumObjective(TorqueLogObjective):
 
     def prepare(self) -> PreparedLogs:
         """See `Objective`."""
-        self.data = self._cut_windows(self.config.window, self.config.stride)
+        self.data = prepare_data(self.request, self.config.window, self.config.stride)
         self.config = self.config.resolved(len(self.data.training))
-        # relative to the model before any fit, also in a resumed run
-        self.regularizer = self._regularizer(self.data, self.config.urdf_weight, self.notes)
-        return self._prepared(self.data, self.config)
+        self.regularizer = None
+        if self.config.urdf_weight:
+            # relative to the model before any fit, also in a resumed run
+            self.regularizer = urdf_regularizer(self.request.urdf, self.model, self.data.training, self.notes)
+        return self.data
 
     def begin(self) -> list[Diagnostic]:
         """Validate the initial model."""
