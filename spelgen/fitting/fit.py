@@ -16,6 +16,7 @@ from spelgen.errors import Diagnostic, OptionError, RunError, SettingsError, Spe
 from spelgen.files import write_json
 from spelgen.fitting.dataset import FitRequest, RunOptions
 from spelgen.fitting.fitted import Fit, load_run, required_spec
+from spelgen.fitting.momentum_objective import MomentumObjective
 from spelgen.fitting.objective import Objective, Status, new_record
 from spelgen.fitting.process import (
     TrainingProgress,
@@ -24,12 +25,11 @@ from spelgen.fitting.process import (
     termination_as_interrupt,
     threads_of_torch,
 )
+from spelgen.fitting.rollout_objective import RolloutObjective
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_record import Checkpoint
 from spelgen.fitting.servo.objective import ServoObjective
 from spelgen.fitting.torque.objective import TorqueObjective
-from spelgen.fitting.window.momentum import MomentumObjective
-from spelgen.fitting.window.rollout import RolloutObjective
 from spelgen.logs.dynamics_samples import SHORTEST
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.rates import shows_accelerations

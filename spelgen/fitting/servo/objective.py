@@ -1,6 +1,6 @@
 """The objective servo: fit position servos, friction and gravity load of an arm to positions under its commands.
 
-The initial guess is the least-squares solution of the command error (`initial_guess`). Outer iterations then minimize
+The initial guess is the least-squares solution of the command error (`least_squares`). Outer iterations then minimize
 the error of predicted windows (`problem`): each recomputes the load of the bodies along the predicted motion and the
 scale of the errors. Dead zones are selected after the first iteration (`laws`); the last one uses all windows.
 """
@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -22,24 +22,20 @@ from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import FitRequest, PreparedLogs, digest
 from spelgen.fitting.levenberg_marquardt import SolverState, initial_state, levenberg_marquardt
 from spelgen.fitting.objective import Objective, Status
+from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.run_record import Content
-from spelgen.fitting.servo.initial_guess import set_initial_guess
 from spelgen.fitting.servo.laws import select_dead_zones, without_small_dead_zones
-from spelgen.fitting.servo.linear_servos import fit_linear_servos
+from spelgen.fitting.servo.least_squares import fit_linear_servos, set_initial_guess
 from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
 from spelgen.fitting.servo.report import servo_record, solution
 from spelgen.fitting.servo.rollouts import ServoRollouts
-from spelgen.fitting.servo.tuning import ServoSolverTuning
+from spelgen.fitting.servo.tuning import TUNING
 from spelgen.fitting.servo.windows import servo_windows
 from spelgen.fitting.tuning import TUNING as DAMPING
 from spelgen.logs.checks import check
 from spelgen.logs.trajectory import require_commands, require_joints
 
-if TYPE_CHECKING:
-    from spelgen.fitting.process import TrainingProgress
-
-TUNING = ServoSolverTuning()
 # On few windows with half the integration steps; on few windows with dead zones; on all windows.
 OUTER_ITERATIONS = 3
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,20 +11,13 @@ from torch.autograd.functional import jacobian
 
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.dynamics.parameters import parameters_of_kind
+from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.functional_model import evaluate_with
-from spelgen.fitting.servo.tuning import ServoPriorTuning
+from spelgen.fitting.servo.tuning import TUNING
 
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-
-TUNING = ServoPriorTuning()
 DEAD_ZONE = "servo.dead_zone"
 COULOMB = "friction.raw_coulomb"
 STRIBECK_VELOCITY = "friction.raw_stribeck_velocity"
-# Prior standard deviation of a parameter that is not fitted.
-FIXED = 1e-9
-# Smallest effect of a direction of the body parameters on gravity, relative to the largest effect.
-MIN_EFFECT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +65,7 @@ class ParameterMap:
 
     def __init__(self, model: ArmModel, q: torch.Tensor) -> None:
         self._model, self._n = model, model.n
-        tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
+        tensors = dict(model.named_parameters()) | dict(model.named_buffers())
         # without raw_viscous: logs of positions determine only the sum of viscous friction and kd, which is fitted as
         # kd
         rows = [
@@ -118,7 +110,7 @@ class ParameterMap:
 
     def precision(self, x: ServoParameters) -> torch.Tensor:
         """Return the precision of the prior, (k,): inverse variances of independent parameters."""
-        joints = torch.where(x.active, self._deviations, FIXED)
+        joints = torch.where(x.active, self._deviations, TUNING.fixed)
         shared = torch.tensor([1.0] * len(x.bodies) + [TUNING.delay]).double()
         return torch.cat([joints.flatten(), shared]) ** -2
 
@@ -151,6 +143,6 @@ class ParameterMap:
                 self._mean_bodies.numel(), -1
             )
         _, effects, directions = torch.linalg.svd(gravity.flatten(0, 1), full_matrices=False)
-        strong = effects[: TUNING.body_directions] > MIN_EFFECT * effects[:1].clamp(min=1e-12)
+        strong = effects[: TUNING.body_directions] > TUNING.min_effect * effects[:1].clamp(min=1e-12)
         result: torch.Tensor = TUNING.bodies * directions[: len(strong)][strong].mT
         return result

@@ -19,11 +19,7 @@ import torch
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo.parameters import ParameterMap, ServoParameters
 from spelgen.fitting.servo.rollouts import ServoRollouts
-from spelgen.fitting.servo.tuning import ServoCostTuning
-
-TUNING = ServoCostTuning()
-# Largest step of any parameter; most are logarithms.
-MAX_STEP = 1.0
+from spelgen.fitting.servo.tuning import TUNING
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +114,7 @@ class ServoProblem:
 
     def candidates(self, x: ServoParameters, step: torch.Tensor) -> Iterable[ServoParameters]:
         """Return the parameters after a step (k,), which is clamped; see `LeastSquaresProblem`."""
-        return [x.after(step.clamp(-MAX_STEP, MAX_STEP))]
+        return [x.after(step.clamp(-TUNING.max_step, TUNING.max_step))]
 
     def normal_equations(self, x: ServoParameters, errors: torch.Tensor) -> NormalEquations:
         """Return Gauss-Newton Hessian (k, k) and negative gradient (k,) at x, of errors (W, K', n) and the prior."""

@@ -8,27 +8,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from scipy.special import stdtrit
 
+from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.laws import sliding_friction
 from spelgen.fitting.servo.parameters import DEAD_ZONE, ServoParameters
 from spelgen.fitting.servo.problem import ServoProblem
-from spelgen.fitting.servo.tuning import ServoIntervalTuning
+from spelgen.fitting.servo.tuning import TUNING
 from spelgen.identification.intervals import jackknife_covariance
 from spelgen.listing import Listing, number
 
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-
-TUNING = ServoIntervalTuning()
-# Of Student's t, since there are few blocks: a two-sided 95 % interval.
-QUANTILE = 0.975
 RATIOS = {
     "kd": ("kd/kp", "s"),
     "lag": ("lag", "s"),
@@ -74,7 +68,8 @@ class ServoSolution:
     @property
     def quantile(self) -> float:
         """Half the width of an interval, in standard deviations."""
-        return float(stdtrit(max(1, len(self.blocks.curvature) - 1), QUANTILE))
+        # of Student's t, since there are few blocks: a two-sided 95 % interval
+        return float(stdtrit(max(1, len(self.blocks.curvature) - 1), 0.975))
 
 
 def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, ServoSolution]:
@@ -176,7 +171,7 @@ def ratios_with_deviations(
 def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Content:
     """Return the content for config.json: delay [s], RMS errors [rad, m], and per joint kp and the ratios to kp.
 
-    Intervals are of 95 %. determined: whether an interval is narrower than a factor of `ServoIntervalTuning`.
+    Intervals are of 95 %. determined: whether an interval is narrower than a factor of `ServoTuning`.
     """
     return {
         "delay": {"value": x.delay, "half": solution.quantile * float(solution.covariance[-1, -1].sqrt())},

@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 
 from spelgen.dynamics.servo_rollout import Load, ServoDrives, advanced, balanced, servo_drives
+from spelgen.emission.assemble import ArmModel
 from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.servo.parameters import ParameterMap, ServoParameters
-from spelgen.fitting.servo.tuning import ServoCostTuning
+from spelgen.fitting.servo.tuning import TUNING
 from spelgen.fitting.servo.windows import BodyLoad, MidpointMotion, ServoWindows, body_load
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-
-# Number of samples for the directions of the body parameters.
-GRAVITY_SAMPLES = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,13 +32,13 @@ class ServoRollouts:
     motion: MidpointMotion
     load: BodyLoad
     inertial: torch.Tensor
-    difference_step: float = ServoCostTuning().difference_step
+    difference_step: float = TUNING.difference_step
 
     @classmethod
     def of(cls, model: ArmModel, windows: ServoWindows) -> ServoRollouts:
         """Return the rollouts under the load of the model along the measured motion."""
         q = windows.q.flatten(0, 1)
-        parameters = ParameterMap(model, q[:: max(1, len(q) // GRAVITY_SAMPLES)])
+        parameters = ParameterMap(model, q[:: max(1, len(q) // TUNING.gravity_samples)])
         motion = windows.motion()
         inertial = parameters.inertial(parameters.prior_mean.bodies)
         return cls(model, windows, parameters, motion, body_load(model, motion), inertial)

@@ -8,27 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from spelgen.dynamics.body_regressor import regressor_of
+from spelgen.emission.assemble import ArmModel
 from spelgen.errors import LogError
-from spelgen.fitting.servo.tuning import ServoWindowTuning
+from spelgen.fitting.servo.tuning import TUNING
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 from spelgen.logs.filtering import derivative, velocities
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
-
-if TYPE_CHECKING:
-    from spelgen.emission.assemble import ArmModel
-
-TUNING = ServoWindowTuning()
-# Smallest number of samples of a window.
-MIN_SAMPLES = 8
-# Number of samples whose load is computed at once.
-BATCH = 2**13
 
 
 class MidpointMotion(NamedTuple):
@@ -119,7 +111,7 @@ def servo_windows(
     rate = float(np.median([segment.sample_rate for segment in segments]))
     length = min(round(TUNING.length * rate), max(map(len, segments)))
     burn_in = min(round(TUNING.burn_in * rate), length // 2)
-    if length < MIN_SAMPLES:
+    if length < TUNING.min_samples:
         raise LogError(f"at most {length} samples without a gap", expected="a second of motion or more")
     rows: list[LogRows] = []
     for segment in segments:
@@ -156,7 +148,7 @@ def body_load(model: ArmModel, motion: MidpointMotion) -> BodyLoad:
     batches: list[BodyLoad] = []
     with torch.no_grad():
         prepared, armature = model.prepare(), model.armature
-        flat = [x.flatten(0, 1).split(BATCH) for x in motion]
+        flat = [x.flatten(0, 1).split(TUNING.batch) for x in motion]
         for q, qd, qdd in zip(*flat, strict=True):
             configuration = model.configuration(q, prepared)
             mass = configuration.mass
