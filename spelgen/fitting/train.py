@@ -86,21 +86,25 @@ def robot_of(
         path = module.parent / spec.urdf
     else:
         return None, []
-    if not path.is_file():
-        if urdf is not None:
-            raise RunError("no such file", file=path, expected="the URDF the module was built from")
-        message = (
-            f"no {spec.urdf} beside the module; pass it by --robot. Without it, evaluation has no baseline with the "
-            "URDF's values, and the run cannot be exported"
-        )
-        return None, [Diagnostic("warning", "no-urdf", "run", None, message)]
-    if hashlib.sha256(urdf_bytes(path)).hexdigest() == spec.urdf_sha256:
+    exists = path.is_file()
+    if exists and hashlib.sha256(urdf_bytes(path)).hexdigest() == spec.urdf_sha256:
         return path, []
+    if urdf is not None and exists:
+        do = "build the module again"
+        raise ModuleError("another URDF than the module was built from", file=path, do=do)
     if urdf is not None:
-        raise ModuleError(
-            "another URDF than the module was built from", file=path, do="build the module again"
-        )
-    message = (
-        f"{spec.urdf} beside the module has changed since the module was built; it is left out of the run"
+        raise RunError("no such file", file=path, expected="the URDF the module was built from")
+    # a file beside the module was not asked for: the fit goes on without it
+    code, message = (
+        "changed-urdf",
+        (f"{spec.urdf} beside the module has changed since the module was built; it is left out of the run"),
     )
-    return None, [Diagnostic("warning", "changed-urdf", "run", None, message)]
+    if not exists:
+        code, message = (
+            "no-urdf",
+            (
+                f"no {spec.urdf} beside the module; pass it by --robot. Without it, evaluation has no baseline with the "
+                "URDF's values, and the run cannot be exported"
+            ),
+        )
+    return None, [Diagnostic("warning", code, "run", None, message)]
