@@ -95,16 +95,15 @@ def robot_of(
     if urdf is not None:
         raise RunError("no such file", file=path, expected="the URDF the module was built from")
     # a file beside the module was not asked for: the fit goes on without it
-    code, message = (
-        "changed-urdf",
-        (f"{spec.urdf} beside the module has changed since the module was built; it is left out of the run"),
-    )
-    if not exists:
-        code, message = (
-            "no-urdf",
-            (
-                f"no {spec.urdf} beside the module; pass it by --robot. Without it, evaluation has no baseline with the "
-                "URDF's values, and the run cannot be exported"
-            ),
+    if exists:
+        code = "changed-urdf"
+        message = (
+            f"{spec.urdf} beside the module has changed since the module was built; it is left out of the run"
+        )
+    else:
+        code = "no-urdf"
+        message = (
+            f"no {spec.urdf} beside the module; pass it by --robot. Without it, evaluation has no baseline with the "
+            "URDF's values, and the run cannot be exported"
         )
     return None, [Diagnostic("warning", code, "run", None, message)]

@@ -10,9 +10,8 @@ import torch
 from torch.autograd.functional import jacobian
 
 from spelgen.dynamics.body_regressor import regressor_of
-from spelgen.dynamics.parameters import parameters_of_kind
+from spelgen.dynamics.parameters import evaluate_with, parameters_of_kind
 from spelgen.emission.assemble import ArmModel
-from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.servo.tuning import TUNING
 
 DEAD_ZONE = "servo.dead_zone"

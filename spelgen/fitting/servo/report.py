@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import torch
 from scipy.special import stdtrit
 
+from spelgen.dynamics.parameters import evaluate_with
 from spelgen.emission.assemble import ArmModel
-from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.laws import sliding_friction

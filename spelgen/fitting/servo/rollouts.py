@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from spelgen.dynamics.parameters import evaluate_with
 from spelgen.dynamics.servo_rollout import Load, ServoDrives, advanced, balanced, servo_drives
 from spelgen.emission.assemble import ArmModel
-from spelgen.fitting.functional_model import evaluate_with
 from spelgen.fitting.servo.parameters import ParameterMap, ServoParameters
 from spelgen.fitting.servo.tuning import TUNING
 from spelgen.fitting.servo.windows import BodyLoad, MidpointMotion, ServoWindows, body_load
