@@ -145,7 +145,7 @@ class MomentumObjective(Objective):
         optimizer = self._new_optimizer(torch.Generator().manual_seed(self.request.seed))
 
         def loss(windows: Windows) -> torch.Tensor:
-            """Return the loss of the windows, (): momentum steps and regularization."""
+            """Return the momentum loss of the windows plus the regularization loss, ()."""
             return momentum_loss(self.model, windows, self.scales) + self.penalty()
 
         for start in range(0, steps, call):

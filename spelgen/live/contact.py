@@ -13,7 +13,7 @@ from spelgen.live.tuning import TUNING
 
 
 class ContactState(NamedTuple):
-    """External torques and their thresholds, (n,) [Nm, N]; touched: joints above, (n,); force: at the tip, (3,) [N]."""
+    """External torques and thresholds, (n,) [Nm, N]; touched: mask (n,) of torques above; force: at the tip [N]."""
 
     external_torque: np.ndarray
     threshold: np.ndarray
@@ -22,7 +22,7 @@ class ContactState(NamedTuple):
 
 
 class ContactObserver:
-    """Low-passed momentum balance, at the rate of the samples.
+    """First-order low-pass filter of the momentum balance, updated with each sample.
 
     Each low-passed term is a state, (15, n): torque, friction, its uncertainty, the momenta of the arm at two
     bandwidths, and the regressor of the payload.
@@ -33,14 +33,14 @@ class ContactObserver:
         self.restart()
 
     def restart(self) -> None:
-        """Begin with the next sample."""
+        """Discard the filter states; the next sample initialises them."""
         self.t: float | None = None
         self.inputs = self.low = np.zeros((15, len(self.factor)))
 
     def step(
         self, t: float, qd: np.ndarray, at: Balance, payload: Payload, scale: np.ndarray
     ) -> ContactState:
-        """Use the terms of a sample; scale: friction scale minus one, (n,)."""
+        """Return the external torques after a sample. at: its terms; scale: friction scale minus one, (n,)."""
         signal, variance = self.residual(t, qd, at, payload, scale)
         threshold = self.factor * np.sqrt(variance)
         touched = np.abs(signal) > threshold
@@ -50,13 +50,13 @@ class ContactObserver:
     def residual(
         self, t: float, qd: np.ndarray, at: Balance, payload: Payload, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the low-passed torque that model, payload and drift do not explain, and its variance, (n,)."""
+        """Return the low-pass filtered torque residual of model, payload and drift, and its variance, (n,) each."""
         rate = TUNING.bandwidth
         load = at.load_torque + rate * at.load_momentum
         free = at.torque - at.friction + rate * at.momentum
         inputs = np.stack([free, at.friction, at.uncertainty, at.momentum, at.momentum, *load.T])
         if self.t is None:
-            # as after constant inputs
+            # the steady state for constant inputs
             self.low = inputs
         else:
             gains = np.full((len(inputs), 1), 1 - np.exp(-rate * (t - self.t)))
@@ -65,7 +65,7 @@ class ContactObserver:
             self.low = self.low + gains * (0.5 * (inputs + self.inputs) - self.low)
         self.t, self.inputs = t, inputs
         torque, friction, uncertainty, slow, fast = self.low[:5]
-        # the regressor of the payload, Phi, (n, 10), as of a block
+        # regressor Phi of the payload, (n, 10), as in `Block`
         regressor = rate * at.load_momentum - self.low[5:].T
         signal = torque - rate * at.momentum - regressor @ payload.parameters - friction * scale
         jerk = 2 * rate * (at.momentum - fast) - rate * (at.momentum - slow)
@@ -76,11 +76,11 @@ class ContactObserver:
 
 
 def tip_force(jacobian: np.ndarray, torque: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Return the force at the tip that is nearest to external torques, (3,) [N], in root axes.
+    """Return the weighted least-squares estimate of a force at the tip, (3,) [N], in root axes, from external torques.
 
     Args:
         jacobian: of the tip, (3, n).
-        torque, variance: (n,).
+        torque, variance: external torques [Nm, N] and their variances, (n,).
     """
     weighted = jacobian / variance
     matrix = weighted @ jacobian.T
