@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import ClassVar, Literal
@@ -65,6 +66,13 @@ class Objective(ABC):
     def checkpoint(self) -> Content:
         """Return the content of checkpoint.pt: the keys of `run_record.Checkpoint`, and states for `resume`."""
         return self._checkpoint
+
+    def _make_checkpoint(self, loss: float, seconds: float, substeps: int, step: int = 0) -> None:
+        """Make a checkpoint with the current weights of the model, for an objective without epochs."""
+        self._checkpoint = {
+            "epoch": 0, "step": step, "best_epoch": 0, "best_loss": loss, "seconds": seconds, "substeps": substeps,
+            "best_weights": copy.deepcopy(self.model.state_dict()),
+        }  # fmt: skip
 
 
 def new_record(request: FitRequest, config: FitConfig, prepared: PreparedLogs) -> Record:

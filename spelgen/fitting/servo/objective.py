@@ -157,19 +157,11 @@ class ServoObjective(Objective):
 
     def _update_checkpoint(self, rms: float) -> None:
         """Set the content of checkpoint.pt; rms: of the position errors [rad, m]."""
-        self._checkpoint = {
-            "epoch": 0,
-            "step": self._steps,
-            "best_epoch": 0,
-            "best_loss": rms,
-            "best_weights": copy.deepcopy(self.model.state_dict()),
-            "seconds": time.monotonic() - self._since,
-            "substeps": self._windows.steps,
-            "servo": {
-                "start": self._initial_weights,
-                "rounds": [vars(x) for x in self._iterates],
-                "steps": self._first_steps,
-            },
+        self._make_checkpoint(rms, time.monotonic() - self._since, self._windows.steps, self._steps)
+        self._checkpoint["servo"] = {
+            "start": self._initial_weights,
+            "rounds": [vars(x) for x in self._iterates],
+            "steps": self._first_steps,
         }
 
 

@@ -80,8 +80,8 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     """
     # dead zones of all joints: fixed at zero, they would make dry friction seem better determined
     free, errors = replace(x, active=torch.ones_like(x.active)), problem.residual(x)
-    blocks = problem.window_equations(free, errors)
-    blocks = sum_by_block(blocks, problem.rollouts.windows.blocks(TUNING.min_logs, TUNING.min_blocks))
+    numbers = problem.rollouts.windows.blocks(TUNING.min_logs, TUNING.min_blocks)
+    blocks = NormalEquations(*(_sums(x, numbers) for x in problem.window_equations(free, errors)))
     precision = problem.parameters.precision(free)
     step = problem.with_prior(blocks, x).step()
     # at the end of the fit the gradients of all windows and of the prior add up to zero
@@ -95,15 +95,9 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
 
-def sum_by_block(windows: NormalEquations, numbers: torch.Tensor) -> NormalEquations:
-    """Return sums of normal equations, (W, k, k) and (W, k), over the windows of each block, by number (W,)."""
-
-    def summed(terms: torch.Tensor) -> torch.Tensor:
-        """Return the sums of the terms per log, (logs, ...)."""
-        sums = terms.new_zeros(int(numbers.max()) + 1, *terms.shape[1:])
-        return sums.index_add(0, numbers, terms)
-
-    return NormalEquations(*map(summed, windows))
+def _sums(terms: torch.Tensor, numbers: torch.Tensor) -> torch.Tensor:
+    """Return the sums of terms (W, ...) over the windows of each block, (B, ...); numbers: of the blocks, (W,)."""
+    return terms.new_zeros(int(numbers.max()) + 1, *terms.shape[1:]).index_add(0, numbers, terms)
 
 
 def identifiable(blocks: NormalEquations, precision: torch.Tensor, indices: torch.Tensor) -> torch.Tensor:
@@ -212,41 +206,28 @@ def servo_summary(record: Content | None) -> FitSummary | None:
     """Return the summary of a `servo_record`; None if the fit has not finished, or if the arm has no servos."""
     if record is None:
         return None
-    listing = _listing(record)
-    delay = f"{1000 * record['delay']['value']:.1f} ms, +- {1000 * record['delay']['half']:.1f} ms"
-    errors = ", ".join(number(1000 * rms) for rms in record["rms"])
-    undetermined = _undetermined(record)
-    text = f"delay {delay}\nerrors on training windows, RMS by joint: {errors} mrad\n{listing.text()}\n{undetermined}"
-    listing = replace(listing, note=f"{listing.note} {undetermined}.")
-    return FitSummary(text, listing, (delay, "delay of the commands"))
-
-
-def _listing(record: Content) -> Listing:
-    """Return a table of kp and the ratios to kp per joint; half dead zones are a column if any joint has one."""
     columns = [ratio for ratio in RATIOS if any(ratio in joint for joint in record["joints"])]
-    rows = []
+    rows, open_ratios = [], []
     for joint in record["joints"]:
-        cells = [_cell(joint.get(column)) for column in columns]
+        cells = []
+        for column in columns:
+            interval = joint.get(column)
+            if interval is None:  # a dead zone that this joint does not have
+                cells.append("none")
+            elif interval["determined"]:
+                width = 100 * (interval["high"] / interval["value"] - 1)
+                cells.append(f"{number(interval['value'])} +- {width:.2g} %")
+            else:
+                cells.append("open")
+                open_ratios.append((column, joint["joint"]))
         rows.append((joint["joint"], number(joint["kp"]["value"]), *cells))
     head = ("joint", "kp [Nm/rad]", *("{} [{}]".format(*RATIOS[column]) for column in columns))
-    return Listing("Servos", head, tuple(rows), f"All columns but kp are {ABOUT}.")
-
-
-def _undetermined(record: Content) -> str:
-    """Return a sentence that lists the ratios that the logs do not determine, except for dead zones."""
-    names = []
-    for joint in record["joints"]:
-        for ratio, (label, _) in RATIOS.items():
-            if ratio != "dead_zone" and ratio in joint and not joint[ratio]["determined"]:
-                names.append(f"{label} of {joint['joint']}")
-    if not names:
-        return "All ratios are determined"
-    return f"Not determined by these logs: {', '.join(names)}"
-
-
-def _cell(interval: Content | None) -> str:
-    if interval is None:
-        return "none"
-    if not interval["determined"]:
-        return "open"
-    return f"{number(interval['value'])} +- {100 * (interval['high'] / interval['value'] - 1):.2g} %"
+    listing = Listing("Servos", head, tuple(rows), f"All columns but kp are {ABOUT}.")
+    # a dead zone that is open makes dry friction open, too, which is named
+    names = [f"{RATIOS[column][0]} of {joint}" for column, joint in open_ratios if column != "dead_zone"]
+    end = f"Not determined by these logs: {', '.join(names)}" if names else "All ratios are determined"
+    delay = f"{1000 * record['delay']['value']:.1f} ms, +- {1000 * record['delay']['half']:.1f} ms"
+    errors = ", ".join(number(1000 * rms) for rms in record["rms"])
+    text = f"delay {delay}\nerrors on training windows, RMS by joint: {errors} mrad\n{listing.text()}\n{end}"
+    listing = replace(listing, note=f"{listing.note} {end}.")
+    return FitSummary(text, listing, (delay, "delay of the commands"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -83,16 +82,9 @@ class TorqueObjective(Objective):
         subset = replace(self.data, validation=thinned(self.data.validation, TUNING.validation_windows))
         validation = Validation(without_idle_residuals(model), subset, self.request.options.device)
         substeps = validation.substeps()
-        self._checkpoint = {
-            "epoch": 0,
-            "step": 0,
-            "best_epoch": 0,
-            "best_loss": validation.loss(substeps),
-            "best_weights": copy.deepcopy(model.state_dict()),
-            "seconds": time.monotonic() - self.request.began,
-            "substeps": substeps,
-            "torque_nmse": torque_nmse(model, samples),
-        }
+        loss = validation.loss(substeps)
+        self._make_checkpoint(loss, time.monotonic() - self.request.began, substeps)
+        self._checkpoint["torque_nmse"] = torque_nmse(model, samples)
         if solution is not None and not self.config.adapt:  # an adapted model has parameters of two fits
             self._checkpoint["posterior"] = {
                 "covariance": solution.covariance,
