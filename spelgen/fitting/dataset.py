@@ -134,6 +134,7 @@ def prepare_data(request: FitRequest, window: int, stride: int) -> TrainingData:
     return TrainingData(
         training=training,
         validation=validation,
+        # of training windows only: validation logs must not change the loss
         scales=loss_scales(training, model.joint_types),
         preprocessing=resolved,
         training_names=[x.name for x in split.training],

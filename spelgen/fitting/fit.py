@@ -107,6 +107,7 @@ def fit(
     if run is not None and not options.resume:
         # Before the logs are filtered and cut, which may take minutes.
         run.require_free(force=options.force)
+    # locked after the request was checked: a wrong option leaves no folder
     with threads_of_torch(options.threads), termination_as_interrupt(), locked(folder):
         require_device(options.device)
         return _Fitting(request, objective, run).fitted()
@@ -171,6 +172,7 @@ class _Fitting:
         """Write the checkpoint, the best weights and the history."""
         if self.run is not None:
             checkpoint = self.objective.checkpoint()
+            # the checkpoint is last: a resumed run drops the lines of epochs after it
             self.run.write_metrics(self.objective.history)
             self.run.save(checkpoint["best_weights"], checkpoint)
 

@@ -126,6 +126,7 @@ def levenberg_marquardt(
         min_relative_decrease: likewise relative to the cost after the step.
         callback: is called with the state after each accepted step.
     """
+    # also without a step: a result has the normal equations of its state
     normal = problem.normal_equations(state.x, state.residual)
     for number in range(max_steps):
         if number:

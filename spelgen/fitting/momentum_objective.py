@@ -84,6 +84,7 @@ class MomentumObjective(Objective):
     def _set_up(self) -> None:
         """Validate the current model."""
         device, config = self.request.options.device, self.config
+        # the time to read and prepare the logs is part of the allowed time
         self.seconds = time.monotonic() - self.request.began
         self.model.to(device)
         self.training, self.scales = self.data.training.to(device), self.data.scales.to(device)
@@ -133,6 +134,7 @@ class MomentumObjective(Objective):
         """Return the learning rate at a fraction of the training: a linear warm-up times a cosine decay."""
         cosine = (1 + math.cos(math.pi * min(fraction, 1.0))) / 2
         decay = TUNING.final_rate + (1 - TUNING.final_rate) * cosine
+        # 1e-3: the first step has a learning rate above zero
         warm_up = min(1.0, (fraction + 1e-3) / TUNING.warm_up)
         return (self.config.learning_rate or DEFAULTS.learning_rate) * warm_up * decay
 

@@ -97,6 +97,7 @@ def new_record(request: FitRequest, config: FitConfig, prepared: PreparedLogs) -
         mapping=options.mapping or LogMapping(input=input_of(model)),
         device=options.device,
         threads=options.threads,
+        # of logs and links; diagnostics of the run are about the command, and do not describe the model
         warnings=[f"{note.where}: {note.message}" for note in notes if note.where != "run"],
     )
     known: Content = {}

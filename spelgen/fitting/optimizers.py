@@ -133,6 +133,7 @@ class LBFGS(WindowOptimizer):
             self._parameters,
             history_size=TUNING.lbfgs_history,
             line_search_fn="strong_wolfe",
+            # simulated logs are fitted to many digits: `stalled` ends the fit, not torch
             tolerance_grad=1e-12,
             tolerance_change=1e-15,
         )

@@ -96,6 +96,7 @@ def position_difference(
     """
     revolute = torch.tensor([kind == "revolute" for kind in joint_types], device=predicted.device)
     difference = predicted - measured
+    # constant in the derivatives: the wrapped angle has slope one
     turns = torch.round(difference.detach() / (2 * math.pi))
     return difference - 2 * math.pi * torch.where(revolute, turns, 0.0)
 
@@ -139,6 +140,7 @@ def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
 def _scale(mean_square: torch.Tensor) -> torch.Tensor:
     """Return the root of mean squares (..., n), at least 1 % of the largest one."""
     root = mean_square.sqrt()
+    # above zero even if nothing varies: errors are divided by the scale
     smallest = (1e-2 * root.amax(dim=-1, keepdim=True)).clamp(min=1e-9)
     return torch.maximum(root, smallest)
 

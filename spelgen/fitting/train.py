@@ -56,6 +56,7 @@ def train(
         if preprocessing is AUTOMATIC:
             preprocessing = record.preprocessing
         options = replace(options, mapping=options.mapping or record.mapping)
+        # its weights come from the checkpoint
         model = run.untrained_model()
     else:
         model = load_module(module) if module is not None else fitted_model(RunFolder(source or folder))

@@ -73,6 +73,7 @@ def _at_random_positions(urdf: Path, model: ArmModel, windows: Windows) -> UrdfR
     low, high = positions.amin(dim=0), positions.amax(dim=0)
     margin = TUNING.regularizer_margin * (high - low)
     low, high = low - margin, high + margin
+    # a fixed seed: the same fit twice has the same regularizer
     generator, shape = torch.Generator().manual_seed(0), (TUNING.regularizer_points, model.n)
     q = low + (high - low) * torch.rand(shape, dtype=positions.dtype, generator=generator)
     with torch.no_grad():
