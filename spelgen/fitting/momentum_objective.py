@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import ClassVar
 
 import torch
+from torch import Tensor
 
 from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import FitRequest, PreparedLogs, Validation, prepare_data
@@ -124,7 +125,7 @@ class MomentumObjective(Objective):
             return LBFGS(self.model, decay)
         return MiniBatchAdamW(self.model, self.batch, decay, generator)
 
-    def penalty(self) -> torch.Tensor | float:
+    def penalty(self) -> Tensor | float:
         """Return the regularization loss, ()."""
         if self.regularizer is None:
             return 0.0
@@ -146,7 +147,7 @@ class MomentumObjective(Objective):
         call, steps = TUNING.epoch_steps, self.config.momentum_steps
         optimizer = self._new_optimizer(torch.Generator().manual_seed(self.request.seed))
 
-        def loss(windows: Windows) -> torch.Tensor:
+        def loss(windows: Windows) -> Tensor:
             """Return the momentum loss of the windows plus the regularization loss, ()."""
             return momentum_loss(self.model, windows, self.scales) + self.penalty()
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import ClassVar
 
 import torch
+from torch import Tensor
 
 from spelgen.dynamics.parameters import idle_residuals
 from spelgen.errors import Diagnostic, RunError
@@ -94,7 +95,7 @@ class RolloutObjective(MomentumObjective):
             parameter.requires_grad_(name not in self.fixed)
         return self._new_optimizer(self.generator)
 
-    def _rollout_loss(self, windows: Windows) -> torch.Tensor:
+    def _rollout_loss(self, windows: Windows) -> Tensor:
         scales, solver = self.scales, self.config.solver
         return rollout_loss(self.model, windows, scales, self.substeps, solver) + self.penalty()
 

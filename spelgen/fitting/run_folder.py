@@ -9,6 +9,7 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import torch
+from torch import Tensor
 
 from spelgen.emission.assemble import ArmModel, assemble
 from spelgen.errors import ModuleError, RunError
@@ -164,7 +165,7 @@ def _require_unpacked_size(path: Path) -> None:
 def _require_finite(weights: Content, path: Path) -> None:
     """Raise RunError if a weight is not finite: all results of the model would be NaN."""
     for name, tensor in weights.items():
-        if not isinstance(tensor, torch.Tensor):
+        if not isinstance(tensor, Tensor):
             continue
         stored = tensor.untyped_storage()
         # a shape may repeat a few numbers to any size

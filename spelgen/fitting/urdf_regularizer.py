@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from spelgen.dynamics.pinocchio_dynamics import urdf_dynamics
 from spelgen.emission.assemble import ArmModel
@@ -24,13 +25,13 @@ class UrdfRegularizer(NamedTuple):
     (S, n, n) of M, whitened. gravity: (S, n) [Nm, N]. gravity_scale: (n,) [Nm, N], unit of its errors.
     """
 
-    q: torch.Tensor
-    whitening: torch.Tensor
-    variation: torch.Tensor
-    gravity: torch.Tensor
-    gravity_scale: torch.Tensor
+    q: Tensor
+    whitening: Tensor
+    variation: Tensor
+    gravity: Tensor
+    gravity_scale: Tensor
 
-    def loss(self, model: ArmModel) -> torch.Tensor:
+    def loss(self, model: ArmModel) -> Tensor:
         """Return the mean squared difference of the model in M and in the gravity torque, (), both without unit."""
         variation = _variation(model.mass_matrix(self.q), self.whitening) - self.variation
         gravity = (model.gravity(self.q) - self.gravity) / self.gravity_scale
@@ -85,6 +86,6 @@ def _at_random_positions(urdf: Path, model: ArmModel, windows: Windows) -> UrdfR
     return UrdfRegularizer(q, whitening, _variation(dynamics.mass_matrix(q), whitening), gravity, scale)
 
 
-def _variation(mass: torch.Tensor, whitening: torch.Tensor) -> torch.Tensor:
+def _variation(mass: Tensor, whitening: Tensor) -> Tensor:
     """Return W (M - mean M) W^T, (S, n, n), of M (S, n, n) and the whitening W (n, n)."""
     return whitening @ (mass - mass.mean(dim=0)) @ whitening.mT

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo.parameters import COULOMB, DEAD_ZONE, ServoParameters
@@ -39,7 +40,7 @@ def without_small_dead_zones(problem: ServoProblem, x: ServoParameters) -> Servo
     return replace(x, joints=joints, active=active)
 
 
-def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, torch.Tensor]:
+def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, Tensor]:
     """Minimize the cost of each joint over its own parameters; return the parameters and the costs, (n,).
 
     The n joints have independent Levenberg-Marquardt solvers in one batch, each with its own damping and termination:
@@ -87,7 +88,7 @@ def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) 
     return replace(x, joints=joints, active=torch.ones_like(x.active))
 
 
-def sliding_friction(friction: FrictionLaws, qd: torch.Tensor, gravity: torch.Tensor) -> torch.Tensor:
+def sliding_friction(friction: FrictionLaws, qd: Tensor, gravity: Tensor) -> Tensor:
     """Return the mean of the dry friction magnitude of each joint over its path, (n,) [Nm, N].
 
     Args:
@@ -97,5 +98,5 @@ def sliding_friction(friction: FrictionLaws, qd: torch.Tensor, gravity: torch.Te
     """
     speed = qd.abs() + 1e-9  # so that the mean of joints at rest is defined
     dry = friction.prepare().dry(qd, gravity) * speed
-    mean: torch.Tensor = dry.flatten(0, -2).sum(dim=0) / speed.flatten(0, -2).sum(dim=0)
+    mean: Tensor = dry.flatten(0, -2).sum(dim=0) / speed.flatten(0, -2).sum(dim=0)
     return mean

@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 from scipy.optimize import least_squares, minimize_scalar
+from torch import Tensor
 
 from spelgen.baselines.linear_servos import LinearServos, linear_response
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
@@ -55,7 +56,7 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
         model.raw_offset.copy_((kp * offset / friction.nominal).clamp(-2.0, 2.0))
 
 
-def _regression(columns: torch.Tensor, errors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
     """Return the least-squares coefficients of each joint, and their ratios to the standard deviations, (n, 5) each.
 
     The K samples of a window count as one independent error.

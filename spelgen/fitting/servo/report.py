@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from scipy.special import stdtrit
+from torch import Tensor
 
 from spelgen.dynamics.parameters import evaluate_with
 from spelgen.emission.assemble import ArmModel
@@ -62,8 +63,8 @@ class ServoSolution:
     """
 
     blocks: NormalEquations
-    precision: torch.Tensor
-    covariance: torch.Tensor
+    precision: Tensor
+    covariance: Tensor
 
     @property
     def quantile(self) -> float:
@@ -95,12 +96,12 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
 
-def _sums(terms: torch.Tensor, numbers: torch.Tensor) -> torch.Tensor:
+def _sums(terms: Tensor, numbers: Tensor) -> Tensor:
     """Return the sums of terms (W, ...) over the windows of each block, (B, ...); numbers: of the blocks, (W,)."""
     return terms.new_zeros(int(numbers.max()) + 1, *terms.shape[1:]).index_add(0, numbers, terms)
 
 
-def identifiable(blocks: NormalEquations, precision: torch.Tensor, indices: torch.Tensor) -> torch.Tensor:
+def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) -> Tensor:
     """Test by variance inflation factors if the logs distinguish parameters from all others; return (m,) booleans.
 
     Derivatives of the errors with respect to a dead zone and to dry friction are proportional at joints without gravity
@@ -113,11 +114,11 @@ def identifiable(blocks: NormalEquations, precision: torch.Tensor, indices: torc
     """
     curvature = blocks.curvature.sum(dim=0)
     inverse = torch.linalg.inv(curvature + torch.diag(precision))
-    inflation: torch.Tensor = (curvature.diagonal() * inverse.diagonal())[indices]
+    inflation: Tensor = (curvature.diagonal() * inverse.diagonal())[indices]
     return inflation < TUNING.variance_inflation
 
 
-def ratios(model: ArmModel, qd: torch.Tensor, gravity: torch.Tensor) -> dict[str, torch.Tensor]:
+def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
     """Return the ratios to kp by name, (n,) each.
 
     Args:
@@ -139,7 +140,7 @@ def ratios(model: ArmModel, qd: torch.Tensor, gravity: torch.Tensor) -> dict[str
 
 def ratios_with_deviations(
     problem: ServoProblem, solution: ServoSolution
-) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+) -> dict[str, tuple[Tensor, Tensor]]:
     """Return the ratios to kp by name, and the standard deviations of their logarithms, (n,) each."""
     rollouts, parameters = problem.rollouts, problem.parameters
     tensors = {name: x.detach().clone().requires_grad_() for name, x in parameters.tensors.items()}
