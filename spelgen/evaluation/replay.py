@@ -105,7 +105,10 @@ def replays(
 def _replay(
     name: str, predictors: Mapping[str, CommandFollower], parts: Sequence[LogRows], qd: np.ndarray
 ) -> tuple[Replay, list[np.ndarray]]:
-    """Return the errors of each predictor from initial velocities qd (parts, n), and the errors of the model (K, n)."""
+    """Return the errors per predictor, and the position errors (K, n) of the model on each part.
+
+    qd: (parts, n) initial velocities [rad/s, m/s].
+    """
     q = np.stack([log.q[rows.start] for log, rows in parts])
     errors: dict[str, list[np.ndarray]] = {}
     for predictor, follower in predictors.items():

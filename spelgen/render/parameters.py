@@ -128,7 +128,7 @@ def base_table(
 
 
 def _number(value: float) -> str:
-    """Return four digits; "" for NaN."""
+    """Return the text of a number with four digits; "" for NaN."""
     return f"{value:.4g}".replace("nan", "")
 
 
