@@ -166,7 +166,7 @@ class Solver:
 
 
 def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
-    """Return the solver with the fewest steps per sample interval for which doubling the steps changes nothing."""
+    """Return the solver with the fewest steps per sample interval that suffice: twice as many change little."""
     windows = thinned(probe, TUNING.probed_windows)
     motion = (windows.qd - windows.qd[:, :1]).square().mean().sqrt().clamp(min=1e-9)
     solver = Solver(dynamics, 1)

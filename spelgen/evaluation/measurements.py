@@ -60,5 +60,5 @@ class Measurements:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, object]) -> Self:
-        """Return the measurements of a `to_dict`. Raises ValueError for other content."""
+        """Return the measurements with this JSON form, see `to_dict`. Raises ValueError for other content."""
         return TypeAdapter(cls).validate_python(content)
