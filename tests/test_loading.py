@@ -11,10 +11,9 @@ import torch
 from emitted import built
 from planar_model import write_module
 
+from spelgen.emission.assemble import load_module
 from spelgen.emission.build import build
-from spelgen.emission.loading import load_module
-from spelgen.emission.module_file import read_spec
-from spelgen.emission.text import module_text
+from spelgen.emission.text import module_text, read_spec
 from spelgen.errors import ModuleError
 
 ROBOTS = Path(__file__).parents[1] / "robots"
@@ -160,7 +159,7 @@ def test_loading_needs_no_symbolic_algebra(module):
         "import sys\n"
         "for name in ('sympy', 'flint', 'spelgen.structure', 'spelgen.emission.plan', 'spelgen.arm.arm'):\n"
         "    sys.modules[name] = None\n"
-        "import spelgen.emission.loading as loading\n"
+        "import spelgen.emission.assemble as loading\n"
         "print(loading.load_module(sys.argv[1]).n)\n"
     )
     command = [sys.executable, "-c", program, str(module)]

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from spelgen.dynamics.protocol import residual_terms
-from spelgen.runtime.masked_mlp import MaskedMLP
-from spelgen.runtime.parts import Network
-from spelgen.runtime.residual_dynamics import ResidualDynamics
+from spelgen.runtime.networks import MaskedMLP, MaskedNetwork
+from spelgen.runtime.residual_terms import ResidualDynamics
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ def without_idle_residuals(model: Model) -> Model:
     return reduced
 
 
-def _is_idle(network: Network | None) -> bool:
+def _is_idle(network: MaskedNetwork | None) -> bool:
     """Return whether a network is zero for all inputs; a network that does not exist is."""
     if not isinstance(network, MaskedMLP):
         return network is None

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from spelgen.dynamics.bristles import moved_bristles
 from spelgen.runtime.friction_laws import FrictionConstants
+from spelgen.runtime.motors import ServoConstants, beyond
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
-from spelgen.runtime.position_servo import ServoConstants, beyond
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 # Passes over the joints, which influence one another through M, to find which bristles slide.

@@ -20,8 +20,15 @@ from spelgen.dynamics.protocol import input_of, motors_of, residual_terms
 from spelgen.dynamics.tip import last_link, tip_kinematics
 from spelgen.dynamics.tip_frame import tip_frame
 from spelgen.errors import RunError
-from spelgen.exporting.description import Harmonics, Residuals, Servos, SigmoidNetwork, TrainedModel
-from spelgen.exporting.entry_points import EntryPoint, entry_points
+from spelgen.exporting.description import (
+    EntryPoint,
+    Harmonics,
+    Residuals,
+    Servos,
+    SigmoidNetwork,
+    TrainedModel,
+    entry_points,
+)
 from spelgen.listing import Listing
 from spelgen.live.noise import NoiseLevels
 from spelgen.runtime.friction_laws import FrictionConstants
@@ -30,7 +37,7 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 if TYPE_CHECKING:
     from spelgen.dynamics.prepared import PreparedModel
     from spelgen.emission.assemble import ArmModel
-    from spelgen.runtime.encoding import JointEncoding
+    from spelgen.runtime.networks import JointEncoding
     from spelgen.runtime.parts import Layers
     from spelgen.runtime.residual_terms import ResidualTerms
 

@@ -17,7 +17,7 @@ from spelgen.dynamics.prepared import batched_jacobians
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import RunError
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.entry_points import ENTRY_POINTS
+from spelgen.exporting.description import ENTRY_POINTS
 from spelgen.exporting.tuning import TUNING
 from spelgen.structure.nominal import working_range
 

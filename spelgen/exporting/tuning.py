@@ -34,6 +34,8 @@ class ExportTuning:
     friction_speeds: int = 25
     # [1] Triangles of all meshes of an MJCF together.
     faces: int = 20_000
+    # [1] Thickness of a mesh, relative to its size, below which MuJoCo refuses it.
+    flat: float = 1e-5
 
 
 TUNING = ExportTuning()

@@ -32,7 +32,7 @@ from spelgen.labels import UNITS, parameter_name
 from spelgen.listing import Listing
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.runtime.friction_laws import FrictionLaws
-from spelgen.runtime.inputs import MotorInputs
+from spelgen.runtime.motors import MotorInputs
 
 # Finite difference, in standard deviations of the parameters.
 STEP = 1e-4
