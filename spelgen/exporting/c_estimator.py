@@ -17,7 +17,7 @@ from spelgen.exporting.description import EntryPoint, TrainedModel
 from spelgen.exporting.model_expressions import drive_friction, joint_mass, named_function
 from spelgen.exporting.residual_expressions import residual_symbols
 from spelgen.exporting.rigid_expressions import RigidBodies, constant, frame_kinematics
-from spelgen.live.noise import TAIL, NoiseLevels
+from spelgen.live.noise import TAIL, BlockNoise, NoiseLevels
 from spelgen.live.payload import EVIDENCE, ITERATIONS, LOAD_PRIOR, WEIGHTS
 from spelgen.live.tuning import TUNING
 from spelgen.templates import render
@@ -83,27 +83,19 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
 
 def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
     """Return header and source of the estimator, by name of the file."""
+    # C has no empty arrays
+    breakaway = model.breakaway.ravel() if model.memory else [0.0]
     tables: dict[str, Iterable[float]] = {
         "load_prior": LOAD_PRIOR,
-        "load_white": levels.load.white,
-        "load_disturbance": levels.load.disturbance,
-        "load_time_constant": levels.load.time_constant,
-        "drift_white": levels.drift.white,
-        "drift_disturbance": levels.drift.disturbance,
-        "drift_time_constant": levels.drift.time_constant,
-        "observer": levels.observer,
-        "peak_start": levels.peak_start,
-        "peak_scale": levels.peak_scale,
-        "load_variance": [levels.load_variance],
-        "coulomb": levels.coulomb,
-        "speed": levels.speed,
-        "rest_speed": levels.rest_speed,
-        "encoder": levels.encoder,
-        "effort": levels.effort,
         "scales": TUNING.scales,
-        # C has no empty arrays
-        "breakaway": model.breakaway.ravel() if model.memory else [0.0],
+        "breakaway": breakaway,
     }
+    tables["rest_speed"] = levels.rest_speed
+    for name, level in levels:
+        if isinstance(level, BlockNoise):
+            tables |= {f"{name}_{key}": row for key, row in level}
+        elif name not in ("minutes", "point"):
+            tables[name] = np.ravel(level)
     values = {
         "name": model.name,
         "upper": model.name.upper(),

@@ -262,8 +262,9 @@ def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: A
     omitted: dict[str, None] = {}
     poses = link_poses(arm)
     for kind, attributes in _CONTACTS.items():
-        element = "visual" if kind == "visual" else "collision"
-        found = link_shapes(arm.robot.path, element, names, TUNING.faces)
+        found = link_shapes(
+            arm.robot.path, "visual" if kind == "visual" else "collision", names, TUNING.faces
+        )
         omitted |= dict.fromkeys(found.unread)
         for shape in found.shapes:
             if shape.mesh is not None and _is_flat(shape.mesh[0]):

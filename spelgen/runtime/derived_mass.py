@@ -27,12 +27,12 @@ class LinearMass(nn.Module):
         entries: Entries,
         *,
         constants: Sequence[Constant],
-        functions: Sequence[Function] = (),
+        functions: Sequence[Function] | None = None,
     ) -> None:
         super().__init__()
         self.entries = entries
         self.constant_scale = nn.Buffer(vector(x.scale for x in constants))
-        if functions:
+        if functions is not None:
             self.function_mean = nn.Buffer(vector(f.mean for f in functions))
             self.function_scale = nn.Buffer(vector(f.scale for f in functions))
         self.raw_constants = nn.Parameter(vector(x.initial / x.scale for x in constants))
