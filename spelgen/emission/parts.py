@@ -15,8 +15,6 @@ from spelgen.spec import ConstantSpec, JointSpec, LinkSpec, ModelSpec, OutputSpe
 
 GENERATOR, JOINTS, LINKS = Code("generator"), Code("JOINTS"), Code("LINKS")
 FUNCTIONS, CONSTANTS, MASS_ENTRIES = Code("FUNCTIONS"), Code("CONSTANTS"), Code("mass_entries")
-_FRICTION_AXES = {"dense-n": 1, "dense-3n": 3}
-_IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,7 @@ def _link(spec: ModelSpec, link: LinkSpec) -> Call:
     }
     shown = _unless(
         fields,
-        rotation=link.rotation == _IDENTITY,
+        rotation=np.array_equal(link.rotation, np.eye(3)),
         ratio=link.ratio == 1,
         offset=link.offset == 0,
         joint_type=link.joint_type == joint.joint_type,
@@ -219,7 +217,7 @@ def _friction(spec: ModelSpec) -> Call:
         width = TUNING.friction_units * n
         network = _network(spec, outputs, (scale, scale, speeds, ones), width=width, depth=1)
         return call("JointFriction", JOINTS, network=network)
-    axes = _FRICTION_AXES[spec.design.dissipation]
+    axes = 3 if spec.design.dissipation == "dense-3n" else 1
     rows = axes * n
     network = _network(spec, (spec.joint_names,) * (rows * (rows + 1) // 2), (scale, scale, ones))
     return call("DenseFriction", JOINTS, axes=axes, network=network)

@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from spelgen.runtime.parts import Layers
     from spelgen.runtime.residual_terms import ResidualTerms
 
-_MAX_NAME_LENGTH = 40
-
 
 @dataclass(frozen=True, eq=False)
 class Trained:
@@ -159,13 +157,13 @@ def unique_identifiers(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _letters_and_digits(text: str) -> str:
-    return re.sub(r"[^0-9a-z]+", "_", text.lower()).strip("_")[:_MAX_NAME_LENGTH]
+    # compilers may compare only the first 63 characters of a name, to which functions add a suffix
+    return re.sub(r"[^0-9a-z]+", "_", text.lower()).strip("_")[:40]
 
 
 def array(value: Tensor) -> np.ndarray:
     """Return a copy of a tensor (...,) as a float64 array of the same shape."""
-    values: np.ndarray = value.detach().double().cpu().numpy().copy()
-    return values
+    return np.array(value.detach().double().cpu())
 
 
 def servos_of(model: ArmModel) -> Servos | None:
@@ -210,10 +208,7 @@ def _network(
     """
     if layers is None or not any(tensor.any() for tensor in layers[-1]):
         return None
-    weights, biases = [], []
-    for weight, bias in layers:
-        weights.append(array(weight))
-        biases.append(array(bias))
+    weights, biases = (list(map(array, tensors)) for tensors in zip(*layers, strict=True))
     # inputs become (cos q, sin q, q) of all joints
     first, second = np.hsplit(weights[0], 2)
     slopes, revolute = first * array(encoding.slope), array(encoding.revolute)

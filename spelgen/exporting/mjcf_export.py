@@ -194,8 +194,7 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
     omitted = _add_shapes(root, elements, projection.arm)
     # indented for people
     etree.indent(root)
-    text: bytes = etree.tostring(root, xml_declaration=True, encoding="utf-8")
-    return text + b"\n", omitted
+    return bytes(etree.tostring(root, xml_declaration=True, encoding="utf-8")) + b"\n", omitted
 
 
 def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> dict[str, object]:

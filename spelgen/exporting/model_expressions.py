@@ -153,8 +153,7 @@ def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) ->
         slow = slow * slow
     dry = constants.coulomb + constants.load_dependence * load + constants.stribeck * slow
     viscous = constants.viscous * qd + constants.saturation * _smooth_sign(qd, constants.saturation_velocity)
-    torque: ca.SX = viscous + dry * direction
-    return torque
+    return ca.SX(viscous + dry * direction)
 
 
 def _smooth_sign(velocity: ca.SX, width: np.ndarray) -> ca.SX:
@@ -165,8 +164,7 @@ def _smooth_sign(velocity: ca.SX, width: np.ndarray) -> ca.SX:
 def sliding_bristles(model: TrainedModel, qd: ca.SX) -> ca.SX:
     """Return z, (n K, 1), of motors that have moved at qd (n, 1) for a long time."""
     direction = ca.tanh(qd / model.friction.coulomb_smoothing_velocity)
-    z: ca.SX = _per_element(model.breakaway, direction) * model.breakaway.ravel()
-    return z
+    return ca.SX(_per_element(model.breakaway, direction) * model.breakaway.ravel())
 
 
 def bristle_step(breakaway: np.ndarray, z: ca.SX, dq: ca.SX) -> ca.SX:
@@ -178,8 +176,7 @@ def bristle_step(breakaway: np.ndarray, z: ca.SX, dq: ca.SX) -> ca.SX:
         dq: displacements, (n, 1).
     """
     limit = breakaway.ravel()
-    z_next: ca.SX = ca.fmin(ca.fmax(z + _per_element(breakaway, dq), -limit), limit)
-    return z_next
+    return ca.SX(ca.fmin(ca.fmax(z + _per_element(breakaway, dq), -limit), limit))
 
 
 def _per_element(breakaway: np.ndarray, values: ca.SX) -> ca.SX:

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.base_combinations import base_combinations, constants_regressor
+from spelgen.dynamics.body_regressor import base_combinations, constants_regressor
 from spelgen.dynamics.parameters import friction_factor
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel

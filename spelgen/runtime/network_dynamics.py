@@ -14,12 +14,6 @@ from spelgen.runtime.parts import Friction, Inputs, Intermediates, Layers, Mass,
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
 from spelgen.runtime.rows import Joint, vector
 
-# Initial velocity below which dry friction goes to zero, relative to the typical speed, and its lower bound.
-SMOOTHING = 0.03
-MIN_SMOOTHING = 0.001
-# Initial diagonal of L, relative to the root of typical friction per typical speed.
-INITIAL_FACTOR = 0.35
-
 
 class NetworkConfiguration(NamedTuple):
     """All that depends on q only."""
@@ -167,7 +161,8 @@ class JointFriction(nn.Module):
 
     def prepare(self) -> JointFrictionParameters:
         """Return the parameter cache."""
-        smoothing = self.speed**2 * (MIN_SMOOTHING**2 + (SMOOTHING * self.raw_smoothing.exp()) ** 2)
+        # velocity below which dry friction goes to zero, relative to the typical speed: at first 0.03
+        smoothing = self.speed**2 * (0.001**2 + (0.03 * self.raw_smoothing.exp()) ** 2)
         start = torch.full_like(self.speed, -2.0)
         layers = self.network.prepare(torch.diag(0 * start + 1), start)
         return JointFrictionParameters(layers, self.viscous(), smoothing)
@@ -200,7 +195,8 @@ class DenseFriction(nn.Module):
         # from the entries of a lower triangle, rows in sequence, to the matrix: (rows, rows, entries)
         spread = torch.eye(rows * rows).double()[:, rows * row + column].reshape(rows, rows, -1)
         self.entries = nn.Buffer(spread[axes - 1 :: axes])
-        self.initial = nn.Buffer(INITIAL_FACTOR * torch.eye(rows).double()[axes - 1 :: axes])
+        # of L, relative to the root of typical friction per typical speed
+        self.initial = nn.Buffer(0.35 * torch.eye(rows).double()[axes - 1 :: axes])
         self.network = network
 
     def prepare(self) -> Layers:

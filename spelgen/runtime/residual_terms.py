@@ -22,10 +22,6 @@ SPLINES = 34
 HARMONICS = 64
 # Bound of the logarithm of the friction factor: the factor stays between 0.1 and 10.
 LARGEST = math.log(10.0)
-# Fraction of the armature that the residual of M may subtract at most.
-PART = 0.9
-# Bound of a function in an entry of M that does not contain it.
-NEVER = 1e30
 
 
 class ResidualParameters(NamedTuple):
@@ -109,9 +105,10 @@ class ResidualTerms(nn.Module):
         self.mass, self.potential = network, potential
         self.scale = nn.Buffer(torch.full((1, 1), potential_scale, dtype=torch.float64))
         size = self._by_entry(torch.ones(functions + constants, dtype=torch.float64)).abs()
-        # one divided by the coefficient of each function and constant in an entry; NEVER if it is zero
-        self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, NEVER))
-        self.part = PART / float((size > 0).sum(dim=(0, 2)).max())  # divided among all terms in a row of M
+        # one divided by the coefficient of each function and constant in an entry; no bound if it is zero
+        self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, 1e30))
+        # at most 90 % of the armature may be subtracted
+        self.part = 0.9 / float((size > 0).sum(dim=(0, 2)).max())  # divided among all terms in a row of M
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
     def _by_entry(self, sizes: Tensor) -> Tensor:

@@ -51,8 +51,7 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
 
 def _with_settings(path: Path, settings: dict[str, object], arm: Arm) -> Arm:
     """Return the arm of a URDF after writing its settings, with the angles rounded as those of ``arm``."""
-    text: str = yaml.safe_dump(settings, sort_keys=False, allow_unicode=True)
-    write_text(path.with_suffix(".yaml"), text)
+    write_text(path.with_suffix(".yaml"), yaml.safe_dump(settings, sort_keys=False, allow_unicode=True))
     return load_arm(path, angle_tolerance=arm.angle_tolerance)
 
 
@@ -151,8 +150,7 @@ def perturbed_urdf(robot: Path, error: float, seed: int) -> bytes:
     rng = np.random.default_rng(seed)
     for inertial in tree.iterfind(".//link/inertial"):
         _perturb(inertial, error * rng.normal(size=2), error * rng.normal(size=3))
-    text: bytes = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
-    return text
+    return bytes(etree.tostring(tree, xml_declaration=True, encoding="utf-8"))
 
 
 def _perturb(inertial: etree._Element, log_factors: np.ndarray, displacement: np.ndarray) -> None:
