@@ -13,7 +13,7 @@ import numpy as np
 
 from spelgen.errors import RunError
 from spelgen.exporting.c_estimator import CALLED, estimator_c_functions, estimator_texts
-from spelgen.exporting.c_source import FRICTION_STATES, CFunction, c_functions, c_texts
+from spelgen.exporting.c_source import FRICTION_STATES, CFunction, c_functions, write_c
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import ENTRY_POINTS
 from spelgen.exporting.exported import Exported, with_readme
@@ -45,16 +45,15 @@ def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
     if levels is not None:
         functions += estimator_c_functions(model, levels)
         texts = estimator_texts(model, levels)
-    texts |= {f"{model.name}{suffix}": text for suffix, text in c_texts(model, functions).items()}
-    files = {name: texts[name].encode() for name in sorted(texts)}
-    program = compiler()
-    if program is None:
-        return files, "Not checked: there is no C compiler"
     with tempfile.TemporaryDirectory() as folder:
-        for name, content in files.items():
-            Path(folder, name).write_bytes(content)
-        library = compile_library(sorted(Path(folder).glob("*.c")), program)
-        called = called_by_c(library, functions)
+        write_c(model, functions, Path(folder))
+        for name, text in texts.items():
+            Path(folder, name).write_text(text)
+        files = {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}
+        program = compiler()
+        if program is None:
+            return files, "Not checked: there is no C compiler"
+        called = called_by_c(compile_library(sorted(Path(folder).glob("*.c")), program), functions)
         parity = check_parity(called, trained, list(trained.entry_points), TUNING.tolerance)
     return files, f"Checked when exported, compiled by {Path(program).name}: {parity.summary}"
 

@@ -157,7 +157,7 @@ def unique_identifiers(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _letters_and_digits(text: str) -> str:
-    # compilers may compare only the first 63 characters of a name, to which functions add a suffix
+    # all functions and macros of an export start with it: 40 characters keep their lines readable
     return re.sub(r"[^0-9a-z]+", "_", text.lower()).strip("_")[:40]
 
 
