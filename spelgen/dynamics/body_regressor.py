@@ -16,7 +16,7 @@ from spelgen.runtime.port_hamiltonian import applied
 
 
 def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return mass, centre of mass and the tensor about it, (3, 3), of ten parameters about the joint, in its frame."""
+    """Return mass, centre of mass and inertia about it, (3, 3), from the ten parameters in the joint's frame."""
     mass = inertia[0]
     center = inertia[1:4] / mass
     xx, xy, xz, yy, yz, zz = inertia[4:]
@@ -103,7 +103,8 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     columns = constants_regressor(chain, motors, *motion).flatten(0, 1)
     # norm of each column after projection onto the complement of all columns before it
     remainder = torch.linalg.qr(columns[:, order]).R.diagonal().abs()
-    # linearly dependent: shorter than 1e-8 of the column, above rounding errors of random states of order one
+    # linearly dependent if the part orthogonal to all columns before it is shorter than 1e-8 of the column: above
+    # rounding errors
     is_base = remainder > 1e-8 * columns[:, order].norm(dim=0).clamp(min=1.0)
     base = torch.tensor(order)[is_base]
     combination = torch.linalg.lstsq(columns[:, base], columns).solution

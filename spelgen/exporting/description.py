@@ -118,7 +118,7 @@ class TrainedModel:
 
     @property
     def input_inverse(self) -> np.ndarray:
-        """Inputs per generalised force, (n, n); of a passive joint, the torque that it would need."""
+        """Inputs per generalised force, (n, n); at a passive joint, the torque required there."""
         return np.linalg.inv(self.inputs + np.diag(1 - self.actuated))
 
 

@@ -82,7 +82,7 @@ def joint_masks(
         outputs: names of the joints that each output depends on.
         width: units of a hidden layer.
         depth: number of hidden layers.
-        min_units: least units for outputs that depend on the same joints.
+        min_units: smallest number of units for outputs that depend on the same joints.
     """
     number = {joint.name: index for index, joint in enumerate(joints)}
     numbers = [tuple(number[name] for name in names) for names in outputs]
@@ -104,7 +104,7 @@ class MaskedNetwork(nn.Module):
         scales: a row (n,) of factors for each input per joint: cos q or the scaled q, sin q, and others.
         outputs: names of the joints that each output depends on; no unit has a path to another joint.
         width, depth: units of a hidden layer, and number of hidden layers.
-        min_units: least units of a hidden layer for outputs that depend on the same joints.
+        min_units: smallest number of units of a hidden layer for outputs that depend on the same joints.
     """
 
     points = 0  # grid points of the function on an edge; 0: a weight per edge

@@ -169,7 +169,7 @@ class ResidualTerms(nn.Module):
         return ResidualConfiguration(q, encoded, torque, friction, mass, slope, intermediates, parameters)
 
     def energy(self, cache: ResidualConfiguration) -> Tensor:
-        """Return the residual of V, (...) [J]; each spline is zero in its middle."""
+        """Return the residual of V, (...) [J]; the energy of each spline is zero in its middle."""
         distance = self._distances(cache.q)
         size = distance.abs()
         # integral of the B-spline from its middle
