@@ -7,10 +7,9 @@ from pathlib import Path
 
 from spelgen.certificate.verification import Verification
 from spelgen.certificate.verify import verify
-from spelgen.emission.module_file import parse_spec, read_source
 from spelgen.emission.plan import derive_spec
 from spelgen.emission.specify import arm_of_spec, find_urdf
-from spelgen.emission.text import module_text
+from spelgen.emission.text import module_text, parse_spec, read_source
 from spelgen.structure.structure import derive
 
 
