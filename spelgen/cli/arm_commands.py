@@ -10,21 +10,7 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, deliver, note, refuse_warnings
-from spelgen.cli.options import (
-    Accept,
-    AngleTolerance,
-    Assumption,
-    Data,
-    Entry,
-    Filter,
-    Joints,
-    MappingFile,
-    MoreData,
-    Output,
-    Robot,
-    Strict,
-    Tip,
-)
+from spelgen.cli.options import flag, option
 
 if TYPE_CHECKING:
     from spelgen.certificate.formulas import Formulas
@@ -37,20 +23,20 @@ EFFECTS = ("stribeck", "polynomial", "memory")
 
 
 def inspect(
-    robot: Robot,
-    joints: Joints = None,
-    tip: Tip = None,
-    assume: Assumption = "kinematics",
-    angle_tolerance: AngleTolerance = 2e-3,
+    robot: options.Robot,
+    joints: options.Joints = None,
+    tip: options.Tip = None,
+    assume: options.Assumption = "kinematics",
+    angle_tolerance: options.AngleTolerance = 2e-3,
     formulas: Annotated[
-        bool, typer.Option("--formulas", help="Write M and V as expressions in q and base parameters.")
+        bool, flag("--formulas", "Write M and V as expressions in q and base parameters.")
     ] = False,
-    entry: Entry = None,
+    entry: options.Entry = None,
     format: Annotated[InspectionFormat | None, options.result_format()] = None,
-    output: Output = None,
-    strict: Strict = False,
+    output: options.Output = None,
+    strict: options.Strict = False,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Verify the structure by Pinocchio, SymPy and numeric samples.")
+        bool, flag("--verify", "Verify the structure by Pinocchio, SymPy and numeric samples.")
     ] = False,
 ) -> None:
     """Show the exact structure of an arm's dynamics."""
@@ -126,29 +112,29 @@ def _formula_file(format: str, closed: Formulas, proof: Verification | None) -> 
 
 
 def identify(
-    robot: Robot,
-    extra_logs: MoreData = None,
-    data: Data = None,
-    mapping: MappingFile = None,
-    joints: Joints = None,
-    tip: Tip = None,
-    angle_tolerance: AngleTolerance = 2e-3,
-    filter: Filter = None,
+    robot: options.Robot,
+    extra_logs: options.MoreData = None,
+    data: options.Data = None,
+    mapping: options.MappingFile = None,
+    joints: options.Joints = None,
+    tip: options.Tip = None,
+    angle_tolerance: options.AngleTolerance = 2e-3,
+    filter: options.Filter = None,
     weights: Annotated[
         Literal["equal", "range", "noise"],
-        typer.Option(help="Weights of the joints: equal, by torque range, or by torque noise."),
+        option("", "Weights of the joints: equal, by torque range, or by torque noise."),
     ] = "noise",
     friction: Annotated[
         str | None,
-        typer.Option(
-            metavar="stribeck,polynomial,memory",
-            help="Friction terms in addition to viscous and Coulomb friction: Stribeck effect; qd |qd| and qd^3; "
+        option(
+            "stribeck,polynomial,memory",
+            "Friction terms in addition to viscous and Coulomb friction: Stribeck effect; qd |qd| and qd^3; "
             "bristles (hysteresis).",
         ),
     ] = None,
-    accept: Accept = None,
+    accept: options.Accept = None,
     format: Annotated[IdentificationFormat | None, options.result_format()] = None,
-    output: Output = None,
+    output: options.Output = None,
 ) -> None:
     """Identify base parameters and friction by least squares."""
     paths = options.logs(data, extra_logs)

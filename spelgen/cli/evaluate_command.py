@@ -1,4 +1,4 @@
-"""Commands about trained runs: `evaluate` on test logs, and `report`, a page about the results."""
+"""Commands about trained runs: `evaluate` and `estimate` along logs, and `report`, a page about the results."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import note, progress_bar, say
-from spelgen.cli.options import Data, Filter, MappingFile, MoreData, Output, Run
+from spelgen.cli.console import answer, note, progress_bar, say
+from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.errors import RunError
 from spelgen.evaluation.tables import LIMITS, csv_text, figures, summary
 from spelgen.files import read_json
@@ -20,25 +20,24 @@ LIMIT_EXCEEDED = 3  # exit code; usage errors have 2
 
 
 def evaluate(
-    run: Run,
-    extra_logs: MoreData = None,
-    data: Data = None,
-    mapping: MappingFile = None,
-    filter: Filter = None,
+    run: options.Run,
+    extra_logs: options.MoreData = None,
+    data: options.Data = None,
+    mapping: options.MappingFile = None,
+    filter: options.Filter = None,
     format: Annotated[Format | None, options.result_format()] = None,
-    output: Output = None,
+    output: options.Output = None,
     limit: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="FIGURE=MAX",
-            help=f"Exit with {LIMIT_EXCEEDED} if a figure is larger: {', '.join(LIMITS)}; once for each.",
+        option(
+            "FIGURE=MAX",
+            f"Exit with {LIMIT_EXCEEDED} if a figure is larger: {', '.join(LIMITS)}; once for each.",
         ),
     ] = None,
     truth: Annotated[
-        Path | None,
-        typer.Option(metavar="URDF", help="The true arm of simulated logs: state the error of M(q)."),
+        Path | None, option("URDF", "The true arm of simulated logs: state the error of M(q).")
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Torque errors only, without rollouts.")] = False,
+    quick: Annotated[bool, flag("--quick", "Torque errors only, without rollouts.")] = False,
 ) -> None:
     """Evaluate a trained run and its baselines on test logs.
 
@@ -100,20 +99,65 @@ def _limit(text: str) -> tuple[str, float]:
     )
 
 
+def estimate(
+    run: options.Run,
+    extra_logs: options.MoreData = None,
+    data: options.Data = None,
+    mapping: options.MappingFile = None,
+    accept: options.Accept = None,
+    alarms: Annotated[
+        float | None, option("RATE", "False alarms of contact per minute; default: 1.", min=1e-6)
+    ] = None,
+    output: Annotated[
+        Path | None, output_option("FILE", "HTML page; default: estimate.html in the run folder.")
+    ] = None,
+    format: options.TextOrJson = "text",
+) -> None:
+    """Run the estimator along logs: payload, contacts, friction drift.
+
+    It prints mass and centre of mass with 95 % intervals, contacts with times and torques, and the friction of each
+    joint relative to the model, and writes a page with their curves.
+    """
+    paths = options.logs(data, extra_logs)
+    from spelgen.fitting.fitted import load_run
+    from spelgen.live.cross_validation import noise_levels
+    from spelgen.live.estimator import torque_model
+    from spelgen.live.replay import replay
+    from spelgen.logs.read import read_logs
+    from spelgen.render.estimate_page import write_estimate
+
+    fit = load_run(run)
+    # reported before logs are read
+    torque_model(fit)
+    levels = noise_levels(fit)
+    joints = list(fit.model.joint_names)
+    logs = read_logs(
+        paths, joints, mapping=options.log_mapping(joints, mapping or fit.record.mapping, accept)
+    )
+    results = replay(fit, logs, alarms)
+    page = write_estimate(fit, levels, results, output or Path(run) / "estimate.html")
+    rate = f"{levels.supported_alarms:.2g} false alarms per minute"
+    record = {
+        "run": str(run),
+        "page": str(page),
+        "supported_alarms_per_minute": levels.supported_alarms,
+        "logs": [result.to_dict() for result in results],
+    }
+    lines = [result.text() for result in results]
+    answer(format, record, *lines, f"thresholds of contact are supported down to {rate}", f"wrote {page}")
+
+
 def report(
-    runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN", help="Run folders; several are compared on one page.")
-    ],
+    runs: Annotated[list[Path], argument("RUN", "Run folders; several are compared on one page.")],
     output: Annotated[
         Path | None,
-        options.output_option(
+        output_option(
             "FILE",
             "HTML file, or .json for the data. Default: report.html in the run folder, runs.html for several.",
         ),
     ] = None,
     robot: Annotated[
-        Path | None,
-        typer.Option(metavar="ROBOT.urdf", help="URDF with its meshes, for the picture of the arm."),
+        Path | None, option("ROBOT.urdf", "URDF with its meshes, for the picture of the arm.")
     ] = None,
 ) -> None:
     """Write an HTML page about one run or several."""

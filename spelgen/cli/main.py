@@ -19,7 +19,6 @@ from typer.core import TyperArgument, TyperCommand, TyperGroup
 from spelgen.cli import (
     arm_commands,
     compare_command,
-    estimate_command,
     evaluate_command,
     log_commands,
     model_commands,
@@ -107,7 +106,7 @@ for command in (
     log_commands.logs,
     train_command.train,
     evaluate_command.evaluate,
-    estimate_command.estimate,
+    evaluate_command.estimate,
     evaluate_command.report,
     model_commands.export,
     compare_command.compare,

@@ -13,7 +13,7 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
-from spelgen.cli.options import Accept, Data, Force, MappingFile, MoreData, RobotOption, TextOrJson
+from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.cli.train_settings import TIME_LIMIT, Request, UsageError, new_run, read_assignments, resumed_run
 from spelgen.errors import LogError, ModuleError, OptionError
 from spelgen.labels import counted
@@ -26,46 +26,35 @@ if TYPE_CHECKING:
 
 
 TrainModule = Annotated[
-    Path | None,
-    typer.Argument(
-        metavar="MODULE.py",
-        help="Module of `spelgen build`; with --resume, a run folder.",
-        show_default=False,
-    ),
+    Path | None, argument("MODULE.py", "Module of `spelgen build`; with --resume, a run folder.")
 ]
-NewRun = Annotated[Path | None, options.output_option("RUN", "Run folder; default: runs/<module>.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Resume the run in the run folder.")]
-Source = Annotated[
-    Path | None, typer.Option("--from", metavar="RUN", help="Adapt the model of this run; replaces MODULE.")
-]
+NewRun = Annotated[Path | None, output_option("RUN", "Run folder; default: runs/<module>.")]
+Resume = Annotated[bool, flag("--resume", "Resume the run in the run folder.")]
+Source = Annotated[Path | None, option("RUN", "Adapt the model of this run; replaces MODULE.", "--from")]
 ObjectiveName = Annotated[
     Objective | None,
-    typer.Option(help="Default: torque for rigid bodies; rollout, after momentum steps, for networks alone."),
+    option("", "Default: torque for rigid bodies; rollout, after momentum steps, for networks alone."),
 ]
 Assignments = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Set an option of the fit, e.g. epochs=50; repeat it for more options.",
-    ),
+    option("KEY=VALUE", "Set an option of the fit, e.g. epochs=50; repeat it for more options.", "--set"),
 ]
 
 
 def train(
     module: TrainModule = None,
-    extra_logs: MoreData = None,
-    data: Data = None,
+    extra_logs: options.MoreData = None,
+    data: options.Data = None,
     output: NewRun = None,
-    robot: RobotOption = None,
-    mapping: MappingFile = None,
+    robot: options.RobotOption = None,
+    mapping: options.MappingFile = None,
     resume: Resume = False,
-    force: Force = False,
+    force: options.Force = False,
     source: Source = None,
     objective: ObjectiveName = None,
     assignments: Assignments = None,
-    accept: Accept = None,
-    format: TextOrJson = "text",
+    accept: options.Accept = None,
+    format: options.TextOrJson = "text",
 ) -> None:
     """Fit a module to logs.
 
