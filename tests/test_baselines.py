@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 import spelgen
 from spelgen.arm.configured_arm import load_arm
-from spelgen.baselines.baseline import EvaluatedArm
-from spelgen.baselines.names import URDF, URDF_WITH_DRIVES
+from spelgen.baselines.registry import EvaluatedArm
+from spelgen.labels import URDF, URDF_WITH_DRIVES
 from spelgen.baselines.predictor import accurate_solver, roll_out_stiff
 from spelgen.baselines.registry import UrdfValues
 from spelgen.cli.main import app

@@ -13,7 +13,7 @@ from planar_model import JOINTS, write_module
 from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
-from spelgen.baselines.names import observed
+from spelgen.labels import observed
 from spelgen.baselines.registry import hold_velocity
 from spelgen.cli import evaluate_command
 from spelgen.dynamics.bristles import bristle_reach

@@ -5,7 +5,7 @@ import pytest
 import torch
 from planar_model import Model
 
-from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
+from spelgen.labels import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.baselines.predictor import Solver
 from spelgen.dynamics.protocol import VelocityState
 from spelgen.evaluation import horizons

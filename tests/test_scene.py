@@ -12,7 +12,7 @@ from spelgen.dynamics.tip import tip_kinematics
 from spelgen.render.arm_section import arm_section, matrix
 from spelgen.render.page import json_data
 from spelgen.render.scene import scene
-from spelgen.render.shapes import joined, tube
+from spelgen.render.scene import joined, tube
 from spelgen.structure.structure import derive
 
 

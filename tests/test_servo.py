@@ -15,7 +15,7 @@ from servo_arm import COM, GRAVITY, MASS, STRIBECK_VELOCITY, Servos, servo_logs,
 from typer.testing import CliRunner
 
 import spelgen
-from spelgen.baselines.names import DELAYED_COMMAND, LINEAR_SERVOS
+from spelgen.labels import DELAYED_COMMAND, LINEAR_SERVOS
 from spelgen.cli.main import app
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import LogError, OptionError, SettingsError

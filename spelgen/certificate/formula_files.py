@@ -14,8 +14,8 @@ from collections.abc import Mapping
 from sympy import Expr, Symbol
 
 from spelgen.certificate import printing
+from spelgen.certificate.expressions import python
 from spelgen.certificate.formulas import WRITABLE, Formula, Formulas
-from spelgen.certificate.printing import python
 from spelgen.labels import printable, short_name
 
 _LATEX_WIDTH = 140

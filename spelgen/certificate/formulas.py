@@ -15,8 +15,14 @@ from flint import fmpq_mpoly
 from sympy import Expr, Integer, Matrix, Rational, Symbol
 
 from spelgen.arm.arm import Chain
-from spelgen.certificate.expressions import PolynomialWriter, coordinate, grouped, parameter, weighted_sum
-from spelgen.certificate.printing import latex
+from spelgen.certificate.expressions import (
+    PolynomialWriter,
+    coordinate,
+    grouped,
+    latex,
+    parameter,
+    weighted_sum,
+)
 from spelgen.certificate.tuning import TUNING
 from spelgen.errors import SpelgenError
 from spelgen.labels import entry_name, parameter_name

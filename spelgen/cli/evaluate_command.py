@@ -175,6 +175,6 @@ def report(
                 say(listing.text() + "\n")
         say(f"wrote {path}: the report, for any browser")
     else:
-        from spelgen.render.runs_page import write_runs
+        from spelgen.render.report_page import write_runs
 
         say(f"wrote {write_runs(runs, output or Path('runs.html'))}")

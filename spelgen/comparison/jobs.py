@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING, cast
 import torch
 from pydantic import TypeAdapter, ValidationError
 
-from spelgen.baselines.names import MODEL, observed
-from spelgen.comparison.arms import ablation_designs
+from spelgen.comparison.arms import ArmInputs, ablation_designs
 from spelgen.comparison.figures import SimulatedFigures, simulated_figures
-from spelgen.comparison.inputs import ArmInputs
 from spelgen.design import Design, load_design
 from spelgen.emission.build import build
 from spelgen.errors import RunError
@@ -25,7 +23,7 @@ from spelgen.fitting.fit import RunOptions, fit
 from spelgen.fitting.objectives import FitOptions
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.tuning import TUNING as WINDOWS
-from spelgen.labels import thousandths
+from spelgen.labels import MODEL, observed, thousandths
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import Rollout, fit_config

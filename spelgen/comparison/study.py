@@ -11,17 +11,14 @@ from pathlib import Path
 
 import torch
 
-from spelgen.baselines.names import MODEL
-from spelgen.comparison.arms import Comparison, ablation_designs
-from spelgen.comparison.figures import step_seconds
-from spelgen.comparison.inputs import ArmInputs, Progress, arm_inputs
+from spelgen.comparison.arms import ArmInputs, Comparison, Progress, ablation_designs, arm_inputs
+from spelgen.comparison.figures import ComparisonTuning, step_seconds
 from spelgen.comparison.jobs import Job, RunResult, run_job
-from spelgen.comparison.tuning import ComparisonTuning
 from spelgen.design import load_design
 from spelgen.errors import RunError, SpelgenError, in_one_line
 from spelgen.evaluation.plain import record
 from spelgen.files import write_json
-from spelgen.labels import counted
+from spelgen.labels import MODEL, counted
 from spelgen.listing import number
 from spelgen.settings.settings import load_settings
 from spelgen.tasks import RunTasks

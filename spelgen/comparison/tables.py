@@ -7,12 +7,11 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from spelgen.baselines.names import MODEL
 from spelgen.comparison.figures import SimulatedFigures
 from spelgen.comparison.jobs import RunResult
 from spelgen.comparison.study import Study
 from spelgen.evaluation.tables import Row, Table, table
-from spelgen.labels import counted, listed
+from spelgen.labels import MODEL, counted, listed
 from spelgen.listing import number
 from spelgen.settings.training import PublishedFigures
 

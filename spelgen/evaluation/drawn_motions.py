@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from scipy.integrate import cumulative_trapezoid
 
-from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import States
 from spelgen.dynamics.bristles import bristles_along
 from spelgen.dynamics.protocol import RigidDynamics
@@ -19,6 +18,7 @@ from spelgen.evaluation.horizons import EvaluatedLogs
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.torque import friction_past, mean_nmse, predicted_torques
 from spelgen.evaluation.tuning import TUNING
+from spelgen.labels import MODEL
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory

@@ -9,10 +9,8 @@ from pathlib import Path
 import torch
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.baseline import EvaluatedArm
-from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import Predictor, accurate_solver, of_dynamics
-from spelgen.baselines.registry import command_followers, torque_predictors
+from spelgen.baselines.registry import EvaluatedArm, command_followers, torque_predictors
 from spelgen.dynamics.parameters import used_parameter_count, without_idle_residuals
 from spelgen.dynamics.protocol import RigidDynamics, input_of
 from spelgen.dynamics.tip import tip_kinematics
@@ -28,12 +26,13 @@ from spelgen.evaluation.horizons import (
 )
 from spelgen.evaluation.replay import replays
 from spelgen.evaluation.results import Results
+from spelgen.evaluation.rollout import mass_errors
 from spelgen.evaluation.subject import Subject, subject
 from spelgen.evaluation.torque import TorqueErrors, coarse_torques, torque_errors
 from spelgen.evaluation.traces import Traces, motion_traces, replay_traces
-from spelgen.evaluation.truth import mass_errors
 from spelgen.evaluation.tuning import TUNING
 from spelgen.fitting.fitted import Fit
+from spelgen.labels import MODEL
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import SHORTEST, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing

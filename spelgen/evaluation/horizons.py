@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from spelgen.baselines.names import observed
 from spelgen.baselines.predictor import Predictor, Solver, States
 from spelgen.dynamics.bristles import BristleReach
 from spelgen.dynamics.protocol import integrable, known_past, memory_along
@@ -17,6 +16,7 @@ from spelgen.errors import Diagnostic
 from spelgen.evaluation.plain import finite
 from spelgen.evaluation.tuning import TUNING
 from spelgen.fitting.rollout import position_difference
+from spelgen.labels import observed
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory

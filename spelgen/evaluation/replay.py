@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from spelgen.baselines.names import MODEL
 from spelgen.baselines.predictor import CommandFollower
 from spelgen.dynamics.parameters import without_idle_residuals
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.tuning import TUNING
+from spelgen.labels import MODEL
 from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 from spelgen.logs.filtering import velocities
 from spelgen.logs.trajectory import Trajectory, split_at_gaps

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.baseline import LinearServoRecord, arm_of_model
+from spelgen.baselines.registry import LinearServoRecord, arm_of_model
 from spelgen.dynamics.bristles import BristleReach, bristle_reach, reach_of
 from spelgen.emission.assemble import ArmModel, spec_of
 from spelgen.evaluation.results import Results

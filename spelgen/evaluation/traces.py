@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spelgen.baselines.names import MODEL, is_drawn
 from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.evaluation.drawn_motions import (
     DrawnMotion,
@@ -30,6 +29,7 @@ from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.replay import PositionErrors
 from spelgen.evaluation.tuning import TUNING
 from spelgen.fitting.rollout import AT_REST, loss_scales, position_difference
+from spelgen.labels import MODEL, is_drawn
 from spelgen.logs.trajectory import Trajectory, coverage, joined_column
 
 

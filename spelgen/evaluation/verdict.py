@@ -6,18 +6,19 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.errors import shortened
 from spelgen.evaluation.horizons import StateErrors
-from spelgen.evaluation.measurements import Measurements, Verdict
 from spelgen.evaluation.tuning import TUNING
-from spelgen.labels import listed, share, thousandths
+from spelgen.labels import CONSTANT_VELOCITY, MODEL, listed, observed, share, thousandths
 from spelgen.listing import number
 from spelgen.logs.checks import ELASTIC
+
+if TYPE_CHECKING:
+    from spelgen.evaluation.results import Results
 
 SEEN = "tested-on-training-data"
 STANDSTILL = " near standstill"
@@ -32,6 +33,14 @@ Limits = Sequence[tuple[float, float] | None]
 """Lower and upper position of each joint [rad, m]; None without limits."""
 
 
+@dataclass(frozen=True)
+class Verdict:
+    """An assessment. sentence: uses, failures, motions to record. because: the figures behind it."""
+
+    sentence: str
+    because: str
+
+
 @dataclass
 class _Uses:
     """The uses that a model is good enough for, the uses that it is not, and the figures that prove both."""
@@ -42,7 +51,7 @@ class _Uses:
 
 
 def verdict(
-    results: Measurements,
+    results: Results,
     identified: Mapping[str, Any] | None = None,
     limits: Limits = (),
     independent: Collection[str] = (),
@@ -85,7 +94,7 @@ def verdict(
     return Verdict(f"{sentence}.", " ".join(filter(None, because)))
 
 
-def _assess_torques(results: Measurements, uses: _Uses) -> None:
+def _assess_torques(results: Results, uses: _Uses) -> None:
     """Assess the torques by the worst joint, since a mean would hide it."""
     torque = results.torque.get(MODEL)
     if torque is None or torque.mean_nmse is None:
@@ -105,7 +114,7 @@ def _assess_torques(results: Measurements, uses: _Uses) -> None:
     uses.proofs.append(proof)
 
 
-def _worst_torque(results: Measurements) -> tuple[str, float]:
+def _worst_torque(results: Results) -> tuple[str, float]:
     """Return the joint of the largest nMSE of the model, and this nMSE; joints logged in coarse steps are omitted."""
     worst = ("", -math.inf)
     if MODEL in results.torque:
@@ -115,7 +124,7 @@ def _worst_torque(results: Measurements) -> tuple[str, float]:
     return worst
 
 
-def _assess_motion(results: Measurements, uses: _Uses) -> None:
+def _assess_motion(results: Results, uses: _Uses) -> None:
     # a long horizon may diverge while a shorter one does not
     finite = [x for x in results.horizons if x.errors[MODEL].mean_relative_rms is not None]
     if results.horizons and not finite:
@@ -138,7 +147,7 @@ def _assess_motion(results: Measurements, uses: _Uses) -> None:
         uses.proofs.append(proof)
 
 
-def _assess_replays(results: Measurements, uses: _Uses) -> None:
+def _assess_replays(results: Results, uses: _Uses) -> None:
     # the first replay is of whole logs: over windows, drift is not visible
     for replay in results.replays[:1]:
         error = replay.errors[MODEL].mean
@@ -157,7 +166,7 @@ def _relative(errors: StateErrors | None) -> float:
     return errors.mean_relative_rms
 
 
-def _better_baselines(results: Measurements) -> list[str]:
+def _better_baselines(results: Results) -> list[str]:
     """Return sentences about the horizons at which a constant velocity, or another baseline, beats the model."""
     times: list[str] = []
     better: dict[str, list[str]] = {}
@@ -184,7 +193,7 @@ def _better_baselines(results: Measurements) -> list[str]:
     return statements
 
 
-def _worst_joint(results: Measurements) -> tuple[str, str, str]:
+def _worst_joint(results: Results) -> tuple[str, str, str]:
     """Return the joint of the largest torque error, or of the largest motion error if only motion fails.
 
     Also returns the speed at which the torque error is larger, and a sentence about the joint.
@@ -202,7 +211,7 @@ def _worst_joint(results: Measurements) -> tuple[str, str, str]:
     return joint, speed, f"At {joint} the torque residual is {amount}."
 
 
-def _worst_motion(results: Measurements) -> tuple[str, float]:
+def _worst_motion(results: Results) -> tuple[str, float]:
     """Return the joint of the largest error in the longest rollouts, divided by its motion, and this error."""
     for last in results.horizons[-1:]:
         errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # None becomes NaN
@@ -211,7 +220,7 @@ def _worst_motion(results: Measurements) -> tuple[str, float]:
     return "", math.inf
 
 
-def _slow_or_fast(results: Measurements, k: int) -> str:
+def _slow_or_fast(results: Results, k: int) -> str:
     """Return the speed of joint k at which its torque residual is larger; "" without a clear difference."""
     if not results.traces.torques:
         return ""
@@ -231,7 +240,7 @@ def _slow_or_fast(results: Measurements, k: int) -> str:
 
 
 def _recommendations(
-    results: Measurements,
+    results: Results,
     identified: Mapping[str, Any],
     limits: Limits,
     independent: Collection[str],

@@ -11,17 +11,16 @@ import numpy as np
 from markupsafe import Markup
 
 from spelgen.arm.arm import Chain
-from spelgen.baselines.names import MODEL
+from spelgen.certificate.expressions import text
 from spelgen.certificate.facts import facts
 from spelgen.certificate.formulas import formulas
 from spelgen.certificate.inspection import LETTERS
-from spelgen.certificate.printing import text
 from spelgen.evaluation.plain import Curve, record
 from spelgen.evaluation.traces import Traces
-from spelgen.labels import entry_name, joint_ranges, joints_in_ranges
+from spelgen.labels import MODEL, entry_name, joint_ranges, joints_in_ranges
+from spelgen.render.charts import TUNING
 from spelgen.render.page import json_data
 from spelgen.render.scene import scene
-from spelgen.render.tuning import TUNING
 from spelgen.structure.nominal import working_range
 from spelgen.structure.structure import Structure
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.render.tuning import TUNING
 from spelgen.templates import render
 
 Values = Sequence[float] | np.ndarray
@@ -285,3 +284,31 @@ def _steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
     step = fine[fine >= rough * (1 - 1e-9)][0]
     values = step * np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
     return values, [f"{value:.6g}" for value in values]
+
+
+@dataclass(frozen=True)
+class RenderTuning:
+    """Limits of the charts and the 3D view of a page."""
+
+    # [1] Points of a line: at 400 pixels more are not visible and only make the page larger.
+    points: int = 300
+    # [1] Decades of a logarithmic axis, counted from the largest value.
+    decades: float = 8.0
+    # [1] Baselines with an error beyond this multiple of the model's error are cut off, so that the others are
+    # distinguishable.
+    outlier: float = 100.0
+    # [1] Root mean square relative to the median from which on few starts dominate it; 1.5 for a normal distribution.
+    dominated: float = 2.0
+    # [1] Quantile of the measured friction that sets the axis: outliers are cut off.
+    bulk: float = 0.995
+    # [1] An entry of M below this fraction of the largest entry is 0 with rounding.
+    zero: float = 1e-9
+    # [1] Faces of all links together, so that a page stays below 1 MB.
+    faces: int = 4000
+    # [1] Radius of the tube that represents a link without a mesh, relative to the extent of the arm.
+    tube_radius: float = 0.028
+    # [1] Relative error that has the last colour of the scale.
+    worst_error: float = 0.5
+
+
+TUNING = RenderTuning()

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from spelgen.comparison.arms import ArmInputs
 from spelgen.comparison.figures import SimulatedFigures
-from spelgen.comparison.inputs import ArmInputs
 from spelgen.comparison.study import Study
 from spelgen.comparison.tables import ArmResults, comparison_sentence
 from spelgen.evaluation.plain import array
-from spelgen.evaluation.truth import true_mass
+from spelgen.evaluation.rollout import true_mass
 from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.labels import counted, named_joints

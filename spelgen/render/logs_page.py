@@ -9,9 +9,9 @@ from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.labels import named_joints
 from spelgen.log_checks.report import LogReport
 from spelgen.logs.trajectory import Trajectory, joined_column, split_at_gaps
+from spelgen.render.charts import TUNING
 from spelgen.render.page import render_page
 from spelgen.render.plots import JointRow, Panel, stacks
-from spelgen.render.tuning import TUNING
 
 
 def page(report: LogReport, arm: Chain, inputs: np.ndarray) -> str:

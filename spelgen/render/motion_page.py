@@ -6,9 +6,9 @@ from spelgen.arm.configured_arm import Arm
 from spelgen.excitation.excitation import ADVICE, Excitation
 from spelgen.labels import named_joints
 from spelgen.render.arm_section import AnimatedMotion, arm_section
+from spelgen.render.charts import TUNING
 from spelgen.render.page import render_page
 from spelgen.render.plots import JointRow, stacks
-from spelgen.render.tuning import TUNING
 
 NAME = "motion"
 

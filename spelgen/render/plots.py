@@ -8,20 +8,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.baselines.names import (
+from spelgen.evaluation.drawn_motions import PredictedMotion
+from spelgen.evaluation.traces import Growth, Quantiles
+from spelgen.labels import (
     CONSTANT_VELOCITY,
     LEAST_SQUARES,
     LEAST_SQUARES_WITH_MEMORY,
     MODEL,
+    UNITS,
     URDF,
     URDF_WITH_DRIVES,
+    NamedJoint,
+    entry_name,
     observed,
 )
-from spelgen.evaluation.drawn_motions import PredictedMotion
-from spelgen.evaluation.traces import Growth, Quantiles
-from spelgen.labels import UNITS, NamedJoint, entry_name
-from spelgen.render.charts import MARGINS, Band, Chart, Line, Mark, Values, line_chart
-from spelgen.render.tuning import TUNING
+from spelgen.render.charts import MARGINS, TUNING, Band, Chart, Line, Mark, Values, line_chart
 
 STYLES = defaultdict(
     lambda: "c6",

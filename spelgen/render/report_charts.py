@@ -6,15 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from spelgen.baselines.names import LEAST_SQUARES, MODEL
 from spelgen.evaluation.drawn_motions import TorqueTrace
 from spelgen.evaluation.plain import array
 from spelgen.evaluation.traces import FrictionTrace, Traces
 from spelgen.evaluation.verdict import Limits
 from spelgen.fitting.run_record import Content
-from spelgen.labels import NamedJoint, named_joints, thousandths
+from spelgen.labels import LEAST_SQUARES, MODEL, NamedJoint, named_joints, thousandths
 from spelgen.listing import number
-from spelgen.render.charts import Band, Chart, Dots, Line, Mark, line_chart
+from spelgen.render.charts import TUNING, Band, Chart, Dots, Line, Mark, line_chart
 from spelgen.render.plots import (
     STYLES,
     JointRow,
@@ -24,7 +23,6 @@ from spelgen.render.plots import (
     stacks,
     trajectory_panels,
 )
-from spelgen.render.tuning import TUNING
 from spelgen.spec import ModelSpec
 
 

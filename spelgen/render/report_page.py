@@ -1,7 +1,8 @@
-"""The page of a run. Files that the run folder does not have are named on the page."""
+"""The pages of a run and of several runs. Files that a run folder does not have are named on the page."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,20 +14,20 @@ from spelgen.arm.configured_arm import Arm
 from spelgen.emission.specify import arm_of_spec
 from spelgen.emission.text import description
 from spelgen.errors import RunError, SpelgenError, in_one_line
-from spelgen.evaluation.measurements import Verdict
 from spelgen.evaluation.results import Results
-from spelgen.evaluation.tables import result_tables
+from spelgen.evaluation.tables import figures, joined, result_tables
 from spelgen.evaluation.traces import Traces
-from spelgen.evaluation.verdict import Limits
+from spelgen.evaluation.verdict import Limits, Verdict
 from spelgen.files import write_json, write_text
 from spelgen.fitting.posterior import Posterior, posterior_of
 from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.servo.report import servo_summary
-from spelgen.labels import UNITS, named_joints
+from spelgen.labels import MODEL, UNITS, listed, named_joints
 from spelgen.render.arm_section import arm_section, evaluated_motions, matrix
 from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, parameter_tables
+from spelgen.render.plots import growth_panels
 from spelgen.render.report_charts import coverage_panels, evaluation_charts, loss_chart
 from spelgen.render.run_facts import (
     best_epoch,
@@ -42,6 +43,7 @@ from spelgen.structure.structure import derive
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
+
 
 SCHEMA = 1
 """Version of the JSON form of a report."""
@@ -205,3 +207,61 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         parameters=parameter_tables(model, run.arm, run.baselines, _posterior(run, model)),
         commands=commands(run.folder, spec, run.config),
     )
+
+
+STYLES = ("model", "train", "gravity", "coriolis", "friction", "hold")
+
+
+def write_runs(folders: Sequence[Path], output: Path) -> Path:
+    """Write the page; return its path. Raises RunError for a folder that is not a run, or a run without evaluation."""
+    return write_text(output, render_runs(folders))
+
+
+def render_runs(folders: Sequence[Path]) -> str:
+    """Return the page as HTML."""
+    runs: dict[str, Run] = {}
+    results: dict[str, Results] = {}
+    for name, folder in zip(_names(folders), folders, strict=True):
+        RunFolder(folder).read_record()  # raises an error if there is no run
+        run = open_run(folder)
+        if run.results is None:
+            raise RunError("a run that is not evaluated", file=folder, do="spelgen evaluate")
+        runs[name], results[name] = run, run.results
+    growths = {name: (x.traces.growth, MODEL) for name, x in results.items() if x.traces.growth}
+    return render_page(
+        "runs.html.jinja",
+        runs=runs,
+        verdict=_verdict(results),
+        robots=sorted({run.spec.robot for run in runs.values()}),
+        tables=joined(results),
+        # more runs than styles repeat the styles
+        growth=growth_panels(growths, dict(zip(runs, STYLES * len(runs), strict=False)), runs),
+    )
+
+
+def _names(folders: Sequence[Path]) -> list[str]:
+    """Return the shortest distinct ends of the folders' paths; complete paths would disclose home folders."""
+    paths = list(map(Path.resolve, folders))
+    names: list[str] = []
+    for count in range(1, max(len(path.parts) for path in paths) + 1):
+        names = ["/".join(path.parts[-count:]) for path in paths]
+        if len(set(names)) == len(names):
+            break
+    return names
+
+
+def _verdict(runs: Mapping[str, Results]) -> str:
+    """Return a sentence that states, for each figure that all runs have, the run with the smallest error."""
+    errors: dict[str, list[tuple[float, str, str]]] = {}
+    for run, results in runs.items():
+        for figure in figures(results):
+            errors.setdefault(figure.label, []).append((figure.value, run, figure.text()))
+    smallest: dict[str, list[str]] = {}
+    for label, of_runs in errors.items():
+        if len(of_runs) == len(runs):
+            _, name, text = min(of_runs)
+            smallest.setdefault(name, []).append(f"{label} ({text})")
+    if not smallest:
+        return "These runs have no common horizons or logs."
+    sentences = [f"{name} has the smallest {listed(labels)}." for name, labels in smallest.items()]
+    return " ".join(sentences)

@@ -8,7 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from spelgen.baselines.names import MODEL
 from spelgen.dynamics.parameters import used_parameter_count
 from spelgen.errors import shortened
 from spelgen.evaluation.results import Results
@@ -17,10 +16,10 @@ from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.torque.report import terms_in_use
-from spelgen.labels import counted, share
+from spelgen.labels import MODEL, counted, share
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.render.tuning import TUNING
+from spelgen.render.charts import TUNING
 from spelgen.runtime.residual_dynamics import ResidualDynamics
 from spelgen.settings.fits import CONFIGS
 from spelgen.settings.training import TrainingSettings
