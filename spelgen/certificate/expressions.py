@@ -21,7 +21,6 @@ from sympy.printing.str import StrPrinter
 
 from spelgen.arm.arm import Chain
 from spelgen.certificate.axes import Axes, is_plain
-from spelgen.certificate.tuning import TUNING
 from spelgen.structure.recursion import base_denominators
 
 Terms = dict[Expr, fmpq]
@@ -54,13 +53,11 @@ class PolynomialWriter:
 
     def __init__(self, arm: Chain, context: fmpq_mpoly_ctx):
         generators = context.gens()
-        self._circles = []
-        for sine, cosine in zip(generators[::3], generators[1::3], strict=True):
-            self._circles.append(sine**2 + cosine**2 - 1)
-        self._angles: list[Expr] = []
-        for joint, denominator in enumerate(base_denominators(arm)):
-            # Angles of mimic joints are multiples of a fraction of the coordinate.
-            self._angles.append(coordinate(joint) / denominator)
+        waves = zip(generators[::3], generators[1::3], strict=True)
+        self._circles = [sine**2 + cosine**2 - 1 for sine, cosine in waves]
+        # angles of mimic joints are multiples of a fraction of the coordinate
+        fractions = enumerate(base_denominators(arm))
+        self._angles = [coordinate(joint) / denominator for joint, denominator in fractions]
         self._runs = parallel_runs(arm)
 
     def reduced(self, polynomial: fmpq_mpoly) -> fmpq_mpoly:
@@ -126,9 +123,7 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
             waves = products
     result: Terms = {}
     for (total, quarters), value in waves.items():
-        function = cos(total)
-        if quarters % 2:
-            function = sin(total)
+        function = sin(total) if quarters % 2 else cos(total)
         # SymPy simplifies cos(-a) to cos(a) and sin(-a) to -sin(a).
         sign, function = function.as_coeff_Mul()
         if quarters > 1:
@@ -147,10 +142,8 @@ def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
         groups.setdefault(unit, {})[symbol] = leading
     total = []
     for unit, parameters in groups.items():
-        factor = fmpq(1)
         # The function of a single parameter retains its coefficients, which are dimensions of the arm.
-        if len(parameters) == 1:
-            factor = abs(next(iter(parameters.values())))
+        factor = abs(next(iter(parameters.values()))) if len(parameters) == 1 else fmpq(1)
         symbols = weighted_sum({symbol: value / factor for symbol, value in parameters.items()})
         total.append(symbols * weighted_sum({function: value * factor for function, value in unit}))
     return Add(*total)
@@ -162,7 +155,7 @@ _FIXED = "\N{NO-BREAK SPACE}"  # textwrap does not break lines at it
 
 def text(expression: Expr) -> str:
     """Return an expression as plain text, with decimals of at most twelve digits."""
-    result: str = StrPrinter({"full_prec": False}).doprint(_rounded(expression, 1, TUNING.digits))
+    result: str = StrPrinter({"full_prec": False}).doprint(_rounded(expression, 1, 12))
     return result
 
 
@@ -170,7 +163,7 @@ def latex(expression: Expr) -> str:
     r"""Return an expression in LaTeX, with \bigl( in place of \left(, which cannot span lines."""
     names = {symbol: _latex_name(symbol.name) for symbol in expression.free_symbols}
     printer = LatexPrinter({"full_prec": False, "mul_symbol": r" \, ", "symbol_names": names})
-    formula: str = printer.doprint(_rounded(expression, 1, TUNING.digits))
+    formula: str = printer.doprint(_rounded(expression, 1, 12))
     return formula.replace(r"\left(", r"\bigl(").replace(r"\right)", r"\bigr)")
 
 
@@ -201,7 +194,7 @@ def lines(formula: str, start: str, width: int, end: str = "") -> list[str]:
 class _PythonPrinter(StrPrinter):  # type: ignore[misc]  # SymPy has no types
     def _print_Add(self, expression: Add, order: str | None = None) -> str:
         """Print a long sum as one call, because Python cannot nest thousands of additions."""
-        if len(expression.args) <= TUNING.nested_terms:
+        if len(expression.args) <= 20:
             result: str = super()._print_Add(expression, order)
             return result
         return f"Add({', '.join(map(self._print, expression.args))})"

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from spelgen.arm.arm import Chain
-from spelgen.certificate import reasons
 from spelgen.certificate.axes import Axes, is_plain
 from spelgen.labels import axes_in_words, entry_name, joints_in_words, listed
 from spelgen.structure.structure import MassEntry, Structure
@@ -35,23 +34,19 @@ class Fact:
     reason: Reason
 
     def __str__(self) -> str:
-        if self.reason:
-            return f"{self.statement}: {self.reason}. {self.means}."
-        return f"{self.statement}. {self.means}."
+        reason = f": {self.reason}" if self.reason else ""
+        return f"{self.statement}{reason}. {self.means}."
 
 
 def facts(arm: Chain, structure: Structure) -> tuple[Fact, ...]:
     """Return the properties of M and V at all configurations, with simple geometric reasons if there are any."""
     # A mimic joint moves several bodies, for which the reasons about pairs of axes are not valid.
-    axes = None
-    if is_plain(arm):
-        axes = Axes(arm)
-    words = _Sentences(structure, axes)
+    words = _Sentences(structure, Axes(arm) if is_plain(arm) else None)
     zero = ("always zero", "Nothing is learned for it", "Nothing is learned for them")
     constant = ("constant", "It needs one parameter and no network", "They need parameters and no networks")
     return (
-        *words.entries("zero", reasons.zero_reason, *zero),
-        *words.entries("constant", reasons.constant_reason, *constant),
+        *words.entries("zero", zero_reason, *zero),
+        *words.entries("constant", constant_reason, *constant),
         *words.equalities(),
         *words.idle_joints(),
         *words.potential(),
@@ -66,9 +61,7 @@ class _Sentences:
     axes: Axes | None
 
     def _reason(self, why: Callable[..., Reason], *subject: object) -> Reason:
-        if self.axes is None:
-            return None
-        return why(self.axes, self.structure, *subject)
+        return None if self.axes is None else why(self.axes, self.structure, *subject)
 
     def entries(
         self, kind: str, why: EntryReason, statement: str, means_one: str, means_several: str
@@ -86,10 +79,8 @@ class _Sentences:
                 joints = sorted({entry.row if prismatic[entry.column] else entry.column for entry in group})
                 reason = reason.format(axes=axes_in_words(joints), joints=joints_in_words(joints))
             names = listed([entry_name(entry.row, entry.column) for entry in group])
-            if len(group) == 1:
-                yield Fact(f"{names} is {statement}", means_one, reason)
-            else:
-                yield Fact(f"{names} are {statement}", means_several, reason)
+            verb, means = ("is", means_one) if len(group) == 1 else ("are", means_several)
+            yield Fact(f"{names} {verb} {statement}", means, reason)
 
     def equalities(self) -> Iterator[Fact]:
         """Yield entries that are equal or opposite at every configuration: they have the same terms."""
@@ -108,31 +99,27 @@ class _Sentences:
             if len(signs) > 1:
                 entries = list(signs)
                 names = ["-" * (signs[x] != signs[entries[0]]) + entry_name(*x) for x in entries]
-                reason = self._reason(reasons.equality_reason, entries)
+                reason = self._reason(equality_reason, entries)
                 yield Fact(f"{' = '.join(names)} always", "One of them is learned", reason)
 
     def idle_joints(self) -> Iterator[Fact]:
         """Yield joints that no entry of M depends on."""
-        inputs: set[int] = set()
-        for entry in self.structure.entries:
-            inputs.update(entry.joints)
+        inputs = {joint for entry in self.structure.entries for joint in entry.joints}
         if not inputs:
             return  # M is constant, which other facts state
         for joint in sorted(set(range(len(self.structure.joints))) - inputs):
-            reason = self._reason(reasons.idle_reason, joint)
-            yield Fact(
-                f"M does not depend on joint {joint + 1}", "It is not an input of the networks of M", reason
-            )
+            means = "It is not an input of the networks of M"
+            yield Fact(f"M does not depend on joint {joint + 1}", means, self._reason(idle_reason, joint))
 
     def potential(self) -> Iterator[Fact]:
         if not self.structure.potential:
-            yield Fact("V is zero", "It needs no network", self._reason(reasons.potential_reason))
+            yield Fact("V is zero", "It needs no network", self._reason(potential_reason))
             return
         # joints with the same reason share a sentence
         groups: dict[Reason, list[int]] = {}
         for joint in range(len(self.structure.joints)):
             if joint not in self.structure.potential:
-                groups.setdefault(self._reason(reasons.weightless_reason, joint), []).append(joint)
+                groups.setdefault(self._reason(weightless_reason, joint), []).append(joint)
         for reason, group in groups.items():
             inputs = "It is not an input" if len(group) == 1 else "They are not inputs"
             means = f"{inputs} of the network of V"

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from spelgen.certificate.verification import Verification
-from spelgen.certificate.verify import verify
+from spelgen.certificate.verify import Verification, verify
 from spelgen.emission.module_file import parse_spec, read_source
 from spelgen.emission.plan import derive_spec
 from spelgen.emission.specify import arm_of_spec, find_urdf

@@ -47,10 +47,7 @@ def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: 
     mass = np.zeros((1 + n, count, n, n))
     gravity = np.zeros((count, n))
     for sample in range(count):
-        drawn = arm
-        if random_inertials:
-            drawn = with_random_inertias(arm, rng)
-        dynamics = arm_dynamics(drawn, Settings())
+        dynamics = arm_dynamics(with_random_inertias(arm, rng) if random_inertials else arm, Settings())
         # Every further row differs from the base in one coordinate: a difference of M is an effect of this
         # coordinate.
         base, moved = _positions(arm, rng), _positions(arm, rng)

@@ -7,7 +7,7 @@ Pinocchio does not round angles: a chain with rounded angles is also made from t
 from __future__ import annotations
 
 import hashlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -15,8 +15,6 @@ import pinocchio as pin
 from lxml import etree
 
 from spelgen.arm.arm import Chain, make_arm
-from spelgen.certificate.tuning import TUNING
-from spelgen.certificate.verification import FactCheck, Verdict, size_text
 from spelgen.dynamics.constraint import mimic_constraint
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
@@ -27,14 +25,21 @@ from spelgen.urdf.robot import Robot
 TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
-def urdf_cross_check(robot: Robot, arm: Chain, seed: int) -> tuple[FactCheck, ...]:
-    """Compare ``arm`` with Pinocchio's reading of the same bytes at random configurations."""
-    try:
-        dynamics = _pinocchio_dynamics(robot, arm)
-    except Exception as problem:  # a failure of Pinocchio is no evidence about the chain
-        text = " ".join(str(problem).split())[:120]
-        result = f"Pinocchio cannot read it ({type(problem).__name__}: {text})"
-        return (FactCheck("reading of the file", "the moving bodies", result, "undecided"),)
+@dataclass(frozen=True)
+class ReadingDifference:
+    """Largest differences of a quantity, relative to its size: from Pinocchio's reading, and by rounded angles."""
+
+    quantity: str
+    difference: float
+    rounding: float
+
+
+def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingDifference]:
+    """Compare ``arm`` with Pinocchio's reading of the same bytes at random configurations.
+
+    Raises any exception of Pinocchio, and ValueError if the file has changed.
+    """
+    dynamics = _pinocchio_dynamics(robot, arm)
     q = np.random.default_rng(seed).uniform(-1.0, 1.0, (6, len(arm.coordinates)))
     gravity = tuple(map(float, arm.gravity))
     as_written = make_arm(robot, joints=arm.joint_names, angle_tolerance=0.0, gravity=gravity)
@@ -42,22 +47,13 @@ def urdf_cross_check(robot: Robot, arm: Chain, seed: int) -> tuple[FactCheck, ..
     written, ours = (_reading(_arm_dynamics(variant), arm, q) for variant in (as_written, arm))
     if all(body.inertia is None for body in arm.bodies):
         del written["masses and inertias"]
-    is_rounded = any(remark.code.startswith("snapped-") for remark in arm.diagnostics)
-    allowed = TUNING.frame_rounding * len(robot.joints)
-    checks = []
+    differences = []
     for quantity, values in written.items():
         # Relative to the magnitude of each number, so that light bodies count; bounded below against rounding errors.
         scale = np.abs(values).max(axis=0) + (1e-3 * np.abs(values).max() or 1.0)
-        difference = float((np.abs(theirs[quantity] - values) / scale).max())
-        rounding = float((np.abs(ours[quantity] - values) / scale).max())
-        verdict: Verdict = "agrees"
-        if difference > allowed or (rounding > allowed and not is_rounded):
-            verdict = "differs"
-        result = f"at most {size_text(difference)} of their size apart"
-        if is_rounded:
-            result += f"; the reported roundings move them by {size_text(rounding)}"
-        checks.append(FactCheck(f"{quantity} in the file", "as Pinocchio reads them", result, verdict))
-    return tuple(checks)
+        pair = (np.abs(other[quantity] - values) / scale for other in (theirs, ours))
+        differences.append(ReadingDifference(quantity, *(float(apart.max()) for apart in pair)))
+    return differences
 
 
 def _pinocchio_dynamics(robot: Robot, arm: Chain) -> PinocchioDynamics:

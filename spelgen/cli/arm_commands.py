@@ -15,7 +15,7 @@ from spelgen.cli.options import flag, option
 if TYPE_CHECKING:
     from spelgen.certificate.formulas import Formulas
     from spelgen.certificate.inspection import Inspection
-    from spelgen.certificate.verification import Verification
+    from spelgen.certificate.verify import Verification
 
 InspectionFormat = Literal["text", "json", "html", "latex", "sympy"]
 IdentificationFormat = Literal["text", "json", "html"]

@@ -1,4 +1,4 @@
-"""Forward simulation of a model, and two tests against the physics: its invariants, and the error of M if the truth is known."""
+"""Forward simulation of a model, its invariants, and the error of M of simulated arms whose truth is known."""
 
 from __future__ import annotations
 

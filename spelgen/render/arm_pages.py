@@ -15,7 +15,7 @@ from spelgen.structure.structure import derive
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
     from spelgen.certificate.formulas import Formulas
-    from spelgen.certificate.verification import Verification
+    from spelgen.certificate.verify import Verification
     from spelgen.identification.identification import Identification
 
 

@@ -14,10 +14,10 @@ from spelgen.arm.arm import Chain
 from spelgen.certificate.expressions import text
 from spelgen.certificate.facts import facts
 from spelgen.certificate.formulas import formulas
-from spelgen.certificate.inspection import LETTERS
+from spelgen.certificate.inspection import cell_text
 from spelgen.evaluation.plain import Curve, record
 from spelgen.evaluation.traces import Traces
-from spelgen.labels import MODEL, entry_name, joint_ranges, joints_in_ranges
+from spelgen.labels import MODEL, entry_name, joints_in_ranges
 from spelgen.render.charts import TUNING
 from spelgen.render.page import json_data
 from spelgen.render.scene import scene
@@ -69,9 +69,8 @@ def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
     explanations = _explanations(arm, structure)
     cells = {}
     for entry in structure.entries:
-        text = LETTERS.get(entry.kind, joint_ranges(entry.joints))
-        name = entry_name(entry.row, entry.column)
-        cell = Cell(entry.kind, text, tuple(entry.joints), explanations[name])
+        explanation = explanations[entry_name(entry.row, entry.column)]
+        cell = Cell(entry.kind, cell_text(entry), tuple(entry.joints), explanation)
         cells[entry.row, entry.column] = cells[entry.column, entry.row] = cell
     joints = range(len(structure.joints))
     return [[cells[row, column] for column in joints] for row in joints]
