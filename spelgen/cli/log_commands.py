@@ -92,9 +92,9 @@ def excite(
         written.append(str(write_text(trajectory, motion.joint_trajectory())))
     if html is not None:
         # imported here: pages need packages that take long to import
-        from spelgen.render.motion_page import page
+        from spelgen.render.arm_pages import motion_page
 
-        written.append(str(write_text(html, page(motion, arm))))
+        written.append(str(write_text(html, motion_page(motion, arm))))
     lines = [f"wrote {path}" for path in written]
     answer(format, {"files": written} | motion.to_dict(), motion.text(), *lines)
 
@@ -171,7 +171,6 @@ def logs(
     """
     from spelgen.log_checks.check_logs import check_logs
     from spelgen.logs.read import read_bounded_logs
-    from spelgen.render.logs_page import page
 
     # a mapping must name the joints of the URDF
     arm = options.load(robot, joints, tip, angle_tolerance)
@@ -188,7 +187,10 @@ def logs(
         say(json.dumps(result.to_dict(), indent=2))
     # also for logs with errors, whose charts may show the cause
     if html is not None:
-        note(f"wrote {write_text(html, page(result, arm.chain, arm.actuation.matrix()))}")
+        from spelgen.render.arm_pages import logs_page
+
+        text = logs_page(result, arm.chain, arm.actuation.matrix())
+        note(f"wrote {write_text(html, text)}")
     if result.errors:
         note(SpelgenErrors(result.errors))
     # errors before warnings

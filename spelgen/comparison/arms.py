@@ -15,7 +15,6 @@ from lxml import etree
 from pydantic import Field, StringConstraints
 
 from spelgen.arm.configured_arm import load_arm
-from spelgen.comparison.figures import ComparisonTuning
 from spelgen.design import PRESET_NAMES, Design, load_design
 from spelgen.errors import LogError, RunError, SettingsError, collect, suggestion
 from spelgen.files import read_json, remove, write_bytes, write_json, write_text
@@ -54,8 +53,7 @@ class ComparedArm(Group):
     def files(self) -> Iterator[tuple[str, Path]]:
         """Yield each path with its key."""
         yield "urdf", self.urdf
-        for path in self.data:
-            yield "data", path
+        yield from (("data", path) for path in self.data)
         if self.mapping is not None:
             yield "mapping", self.mapping
 
@@ -137,7 +135,6 @@ def _error(document: YamlDocument, place: Location, got: str, do: str) -> Settin
     return SettingsError(got, file=document.path, line=document.line(place), element=dotted(place), do=do)
 
 
-TUNING = ComparisonTuning()
 Progress = Callable[[int, int], None]
 
 
@@ -174,7 +171,8 @@ class ArmInputs(ComparedArm):
             return train, test
         logs = [*train, *test]
         if splits == 1:
-            held_out = split_validation(logs, TUNING.held_out, 0)
+            # a quarter for testing, as the logs have no test.* files
+            held_out = split_validation(logs, 0.25, 0)
             return list(held_out.training), list(held_out.validation)
         if len(logs) < splits:
             expected = f"{splits} or more, for as many splits"
@@ -214,9 +212,8 @@ def _simulate(inputs: ArmInputs, loaded: Arm, folder: Path, progress: Progress |
 
     Models know only a copy of the URDF without inertials, drives and friction, so that no model starts from the truth.
     """
-    from spelgen.simulation.simulate import (
-        simulate,  # Pinocchio is an extra, not needed for the user's own logs
-    )
+    # Pinocchio is an extra, not needed for the user's own logs
+    from spelgen.simulation.simulate import simulate
 
     if loaded.settings.input == "position":
         raise SettingsError(
@@ -247,5 +244,4 @@ def _kinematics(urdf: Path) -> bytes:
     tree = etree.ElementTree(etree.fromstring(urdf.read_bytes(), parser))
     for element in list(tree.iter("dynamics", "visual", "collision", "inertial")):
         element.getparent().remove(element)
-    text: bytes = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
-    return text
+    return bytes(etree.tostring(tree, xml_declaration=True, encoding="utf-8"))

@@ -41,8 +41,6 @@ class ComparisonTuning:
     timed_steps: int = 5
     # Time over which motions are predicted [s], as in Wang et al., Sci Rep 15:33179 (2025).
     horizon: float = 1.0
-    # Fraction of the trajectories that is held out for testing if the logs have no test.* files.
-    held_out: float = 0.25
     # The other constants are used only to estimate the time of a comparison; measured with robots/two_link.urdf.
     # Time of the measurements of a run after training [s].
     measuring: float = 10.0

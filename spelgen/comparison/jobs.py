@@ -204,9 +204,9 @@ def _errors(results: Results) -> Errors:
         measure = f"position RMS, {replay.name} [{thousandths(results.joint_types)}]"
         errors[measure] = {name: 1000 * error.mean for name, error in replay.errors.items()}
     for horizon in reversed(results.horizons):
-        open_loop = {name: error for name, error in horizon.errors.items() if not name.endswith(observed(""))}
-        measure = f"relative RMS, {horizon.name}"
-        errors[measure] = {name: error.mean_relative_rms for name, error in open_loop.items()}
+        open_loop = [name for name in horizon.errors if not name.endswith(observed(""))]
+        relative = {name: horizon.errors[name].mean_relative_rms for name in open_loop}
+        errors[f"relative RMS, {horizon.name}"] = relative
     if results.torque:
         errors["torque nMSE"] = {name: error.mean_nmse for name, error in results.torque.items()}
     return errors

@@ -77,21 +77,17 @@ def typical_and_worst(motions: Sequence[Drawn]) -> tuple[Drawn, ...]:
     """Return the motion of median error, and the motion of largest error if there are several."""
     # a sort keeps the order of equal errors: the same logs give the same page
     ordered = sorted(motions, key=lambda motion: math.inf if motion.error is None else motion.error)
-    chosen = {}
-    if ordered:
-        chosen["typical"] = ordered[(len(ordered) - 1) // 2]
+    chosen = [replace(motion, which="typical") for motion in ordered[(len(ordered) - 1) // 2 :][:1]]
     if len(ordered) > 1:
-        chosen["worst"] = ordered[-1]
-    return tuple(replace(motion, which=which) for which, motion in chosen.items())
+        chosen.append(replace(ordered[-1], which="worst"))
+    return tuple(chosen)
 
 
 def thinned(motion: PredictedMotion, max_samples: int) -> PredictedMotion:
     """Return the motion at about `max_samples` samples at most."""
     stride = -(-len(motion.t) // max_samples)
-    curves: dict[str, Any] = {}
-    for name, values in vars(motion).items():
-        if isinstance(values, np.ndarray):
-            curves[name] = values[::stride]
+    arrays = {name: values for name, values in vars(motion).items() if isinstance(values, np.ndarray)}
+    curves: dict[str, Any] = {name: values[::stride] for name, values in arrays.items()}
     return replace(motion, **curves)
 
 
@@ -134,17 +130,10 @@ def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
 def _steps(piece: Trajectory, logs: EvaluatedLogs) -> DynamicsSamples:
     """Return the sample intervals of a log too slow for a filter: mean motion, acceleration and torque in each."""
     steps = cut_windows([piece], 2, measured=logs.used.filtered)
-    q = steps.q.mean(dim=1).numpy()
     qdd = steps.qd.diff(dim=1)[:, 0] / steps.dt
-    return DynamicsSamples(
-        piece.name,
-        q,
-        steps.qd.mean(dim=1).numpy(),
-        qdd.numpy(),
-        steps.tau[:, 0].numpy(),
-        bristles_along(q, logs.reach),
-        rate=piece.sample_rate,
-    )
+    q, qd, tau = steps.q.mean(dim=1).numpy(), steps.qd.mean(dim=1).numpy(), steps.tau[:, 0].numpy()
+    z = bristles_along(q, logs.reach)
+    return DynamicsSamples(piece.name, q, qd, qdd.numpy(), tau, z, rate=piece.sample_rate)
 
 
 def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples) -> TorqueTrace:
@@ -162,9 +151,8 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
             "gravity": gravity.numpy(),
             "friction": model.friction_torque(q, qd, *friction_past(model, samples)).numpy(),
         }
-    predicted = {}
-    for name, predictor in dynamics.items():
-        predicted[name] = _at_joints(inputs, predicted_torques(predictor, samples))
+    torques = {name: predicted_torques(predictor, samples) for name, predictor in dynamics.items()}
+    predicted = {name: _at_joints(inputs, torque) for name, torque in torques.items()}
     measured = _at_joints(inputs, samples.tau)
     t = np.arange(len(samples.q)) / samples.rate
     # friction includes an offset of the torque
@@ -175,9 +163,8 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
         "friction": predicted[MODEL] - stored,
         "not explained": measured - predicted[MODEL],
     }
-    energy = {}
-    for name, torque in works.items():
-        energy[name] = cumulative_trapezoid((torque * samples.qd).sum(axis=-1), t, initial=0)
+    power = {name: (torque * samples.qd).sum(axis=-1) for name, torque in works.items()}
+    energy = {name: cumulative_trapezoid(values, t, initial=0) for name, values in power.items()}
     return TorqueTrace(
         trajectory=samples.name,
         error=mean_nmse(predicted[MODEL] - measured, measured),

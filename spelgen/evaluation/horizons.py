@@ -16,7 +16,7 @@ from spelgen.errors import Diagnostic
 from spelgen.evaluation.plain import finite
 from spelgen.evaluation.tuning import TUNING
 from spelgen.fitting.rollout import position_difference
-from spelgen.labels import observed
+from spelgen.labels import counted, observed
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
@@ -74,9 +74,8 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
 
 def without_past(windows: Windows, past: int) -> Windows:
     """Return the windows without their first `past` steps; z remains the state at the first sample."""
-    return Windows(
-        windows.dt[:, past:], windows.q[:, past:], windows.qd[:, past:], windows.tau[:, past:], windows.z
-    )
+    later = (column[:, past:] for column in (windows.dt, windows.q, windows.qd, windows.tau))
+    return Windows(*later, windows.z)
 
 
 TipPosition = Callable[[Tensor], Tensor]
@@ -146,10 +145,7 @@ class EvaluatedLogs:
     def starts(self, span: int, window_count: int) -> list[tuple[Trajectory, int]]:
         """Return the piece and the first sample of each of these windows."""
         stride = self.stride(span, window_count)
-        starts: list[tuple[Trajectory, int]] = []
-        for piece in self.pieces:
-            starts += [(piece, first) for first in range(0, len(piece) - span, stride)]
-        return starts
+        return [(piece, k) for piece in self.pieces for k in range(0, len(piece) - span, stride)]
 
     def windows(self, span: int, window_count: int) -> Windows:
         """Return these windows; they are shorter than `span` if all pieces are."""
@@ -171,11 +167,8 @@ def horizon_lengths(
     logs: EvaluatedLogs, steps: Sequence[int], seconds: Sequence[float], notes: list[Diagnostic]
 ) -> dict[str, int]:
     """Return the number of samples of each horizon by name; longer ones than every trajectory are noted instead."""
-    lengths = {}
-    for k in steps:
-        lengths["1 step" if k == 1 else f"{k} steps"] = k
-    for duration in seconds:
-        lengths[f"{duration:g} s"] = round(duration * logs.rate)
+    lengths = {counted(k, "step"): k for k in steps}
+    lengths |= {f"{duration:g} s": round(duration * logs.rate) for duration in seconds}
     possible = {}
     for name, k in lengths.items():
         if 0 < k <= logs.longest:
@@ -240,9 +233,8 @@ def end_errors(
     if tip is not None:
         distance = _rms((tip(q) - tip(measured_q)).norm(dim=-1, keepdim=True))
         (tip_mm,) = finite(1000 * distance)
-    return StateErrors(
-        finite(q_error), finite(qd_error), finite(q_relative), finite(qd_relative), finite(mean)[0], tip_mm
-    )
+    per_joint = map(finite, (q_error, qd_error, q_relative, qd_relative))
+    return StateErrors(*per_joint, finite(mean)[0], tip_mm)
 
 
 def _rms(values: Tensor) -> Tensor:

@@ -78,9 +78,7 @@ def replays(
 
     Returns both, and the position errors of the model over whole logs. The baselines are described in `notes`.
     """
-    pieces: list[Trajectory] = []
-    for log in logs:
-        pieces += split_at_gaps(log, shortest=3)
+    pieces = [piece for log in logs for piece in split_at_gaps(log, shortest=3)]
     windows: list[LogRows] = []
     first_qd: list[np.ndarray] = []
     for piece in pieces:
@@ -107,19 +105,21 @@ def _replay(
 ) -> tuple[Replay, list[np.ndarray]]:
     """Return the errors of each predictor from initial velocities qd (parts, n), and the errors of the model (K, n)."""
     q = np.stack([log.q[rows.start] for log, rows in parts])
-    errors: dict[str, list[np.ndarray]] = {}
+    measured = [log.q[rows][1:] for log, rows in parts]
+    errors = {}
     for predictor, follower in predictors.items():
-        errors[predictor] = []
-        for (log, rows), predicted in zip(parts, follower.positions(parts, q, qd), strict=True):
-            errors[predictor].append(predicted - log.q[rows][1:])
-    summaries = {}
-    for predictor, missed in errors.items():
-        # a log with gaps is several pieces of one name
-        by_name: dict[str, list[np.ndarray]] = {}
-        for (log, _), error in zip(parts, missed, strict=True):
-            by_name.setdefault(log.name, []).append(np.square(error))
-        trajectories = {log: float(np.sqrt(np.concatenate(x).mean())) for log, x in by_name.items()}
-        joints = np.sqrt(np.square(np.concatenate(missed)).mean(axis=0))
-        mean = float(np.mean(list(trajectories.values())))
-        summaries[predictor] = ReplayErrors(trajectories, mean, tuple(joints.tolist()))
+        errors[predictor] = list(map(np.subtract, follower.positions(parts, q, qd), measured))
+    names = [log.name for log, _ in parts]
+    summaries = {predictor: _summary(names, missed) for predictor, missed in errors.items()}
     return Replay(name, summaries), errors[MODEL]
+
+
+def _summary(names: Sequence[str], errors: Sequence[np.ndarray]) -> ReplayErrors:
+    """Return the errors (K, n) [rad, m] of parts of logs, pooled by the names of the logs."""
+    by_name: dict[str, list[np.ndarray]] = {}
+    # a log with gaps is several pieces of one name
+    for name, error in zip(names, errors, strict=True):
+        by_name.setdefault(name, []).append(np.square(error))
+    trajectories = {name: float(np.sqrt(np.concatenate(x).mean())) for name, x in by_name.items()}
+    joints = np.sqrt(np.square(np.concatenate(errors)).mean(axis=0))
+    return ReplayErrors(trajectories, float(np.mean(list(trajectories.values()))), tuple(joints.tolist()))

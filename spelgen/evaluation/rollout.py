@@ -141,8 +141,6 @@ def mass_errors(
     """
     q = q[:: max(1, len(q) // TUNING.mass_positions)]
     true = true_mass(truth, q, joints)
-    errors = {}
-    for name, predictor in dynamics.items():
-        with torch.no_grad():
-            errors[name] = mass_error(torch.as_tensor(predictor.mass_matrix(q)), true)
-    return errors
+    with torch.no_grad():
+        learned = {name: torch.as_tensor(x.mass_matrix(q)) for name, x in dynamics.items()}
+    return {name: mass_error(mass, true) for name, mass in learned.items()}

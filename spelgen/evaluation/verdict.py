@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -77,11 +76,8 @@ def verdict(
         sentence += f", not for {listed(uses.bad)}"
     joint, speed, proof = _worst_joint(results)
     recommendations = _recommendations(results, identified or {}, limits, independent, joint, speed)
-    details = []
-    if joint:
-        details.append(f"worst at {joint}{speed}")
-    if recommendations:
-        details.append(f"next, record {next(iter(recommendations))}")
+    details = [f"worst at {joint}{speed}"] if joint else []
+    details += [f"next, record {motion}" for motion in list(recommendations)[:1]]
     because = [] if elastic is None else [f"{elastic.where}: {elastic.message}."]
     for detail in details:
         # longer details follow the first sentence
@@ -102,11 +98,10 @@ def _assess_torques(results: Results, uses: _Uses) -> None:
     joint, unexplained = _worst_torque(results)
     if not joint:
         unexplained = torque.mean_nmse
-    for threshold, good, bad in TORQUE_USES:
-        if 1 - unexplained >= threshold:  # coefficient of determination
-            uses.good += good
-            uses.bad += bad
-            break
+    # 1 - nMSE is the coefficient of determination
+    _, good, bad = next(row for row in TORQUE_USES if 1 - unexplained >= row[0])
+    uses.good += good
+    uses.bad += bad
     mean, worst = (share(max(0.0, 1 - nmse)) for nmse in (torque.mean_nmse, unexplained))
     proof = f"explains {mean} of the variance of the torques"
     if worst != mean:
@@ -116,11 +111,12 @@ def _assess_torques(results: Results, uses: _Uses) -> None:
 
 def _worst_torque(results: Results) -> tuple[str, float]:
     """Return the joint of the largest nMSE of the model, and this nMSE; joints logged in coarse steps are omitted."""
+    torque = results.torque.get(MODEL)
+    pairs = [] if torque is None else zip(results.joints, torque.joint_nmse, strict=False)
     worst = ("", -math.inf)
-    if MODEL in results.torque:
-        for joint, error in zip(results.joints, results.torque[MODEL].joint_nmse, strict=False):
-            if error is not None and joint not in results.torque_steps:
-                worst = max(worst, (joint, error), key=itemgetter(1))
+    for joint, error in pairs:
+        if error is not None and error > worst[1] and joint not in results.torque_steps:
+            worst = joint, error
     return worst
 
 
@@ -132,14 +128,13 @@ def _assess_motion(results: Results, uses: _Uses) -> None:
         uses.proofs.append("predicts no finite motion")
     for last in finite[-1:]:
         error = _relative(last.errors[MODEL])
-        if error <= TUNING.close_prediction:
-            uses.good.append(f"simulation {last.name} ahead")
-        elif error <= TUNING.rough_prediction:
-            uses.good.append(f"rough simulation {last.name} ahead")
-        else:
-            uses.bad.append(f"simulation {last.name} ahead")
+        simulation = f"simulation {last.name} ahead"
+        if error > TUNING.rough_prediction:
+            uses.bad.append(simulation)
             if _relative(last.errors.get(observed(MODEL))) <= TUNING.rough_prediction:
                 uses.good.append(f"prediction {last.name} ahead with a momentum observer")
+        else:
+            uses.good.append(simulation if error <= TUNING.close_prediction else f"rough {simulation}")
         proof = f"is off by {share(error, 'the motion')} after {last.name}"
         tip = last.errors[MODEL].tip_mm
         if tip is not None:
@@ -151,19 +146,16 @@ def _assess_replays(results: Results, uses: _Uses) -> None:
     # the first replay is of whole logs: over windows, drift is not visible
     for replay in results.replays[:1]:
         error = replay.errors[MODEL].mean
-        if error == min(errors.mean for errors in replay.errors.values()):
-            uses.good.append("simulation from commands")
-        else:
-            uses.bad.append("simulation from commands")
+        is_best = error == min(errors.mean for errors in replay.errors.values())
+        (uses.good if is_best else uses.bad).append("simulation from commands")
         distance = f"{1000 * error:.3g} {thousandths(results.joint_types)}"
         uses.proofs.append(f"misses {distance} of the positions that follow commands, {replay.name}")
 
 
 def _relative(errors: StateErrors | None) -> float:
     """Return the mean error divided by the motion; infinite if it is unknown."""
-    if errors is None or errors.mean_relative_rms is None:
-        return math.inf
-    return errors.mean_relative_rms
+    error = None if errors is None else errors.mean_relative_rms
+    return math.inf if error is None else error
 
 
 def _better_baselines(results: Results) -> list[str]:
@@ -187,10 +179,8 @@ def _better_baselines(results: Results) -> list[str]:
     if times:
         ahead = f"A constant velocity predicts better {listed(times)} ahead"
         statements.append(f"{ahead}: there, use the model for torques only.")
-    if better:
-        reasons = [f"{name} is better {listed(occasions)}" for name, occasions in better.items()]
-        statements.append(f"But {listed(reasons)}.")
-    return statements
+    reasons = [f"{name} is better {listed(occasions)}" for name, occasions in better.items()]
+    return [*statements, f"But {listed(reasons)}."] if reasons else statements
 
 
 def _worst_joint(results: Results) -> tuple[str, str, str]:

@@ -67,8 +67,7 @@ def parameter_tables(
 
 def body_parameters(model: RigidBodyDynamics) -> np.ndarray:
     """Return the inertial parameters in the order of ``Body.inertia``, (bodies, 10) [kg, kg m, kg m^2]."""
-    values: np.ndarray = model.inertial_parameters.detach().numpy()
-    return values
+    return np.asarray(model.inertial_parameters.detach())
 
 
 def base_table(
@@ -79,11 +78,7 @@ def base_table(
     friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
     base = base_parameters(arm.chain, friction, arm.actuation.drives().speeds)
     parameters = identified["base_parameters"]
-    names, determined, formulas = [], [], []
-    for parameter in parameters:
-        names.append(parameter["name"])
-        determined.append(parameter["determined"])
-        formulas.append("" if parameter["formula"] == parameter["name"] else parameter["formula"])
+    names, determined = ([parameter[key] for parameter in parameters] for key in ("name", "determined"))
     nominal = base.combination[:, : 10 * len(arm.chain.bodies)] @ urdf_parameters(arm.chain)
     # no URDF has friction and drives in this form, and some have no inertials
     nominal[base.bodies :] = np.nan
@@ -109,22 +104,15 @@ def base_table(
                 learned[k] = np.nan
         columns["model"] = list(map(_number, learned))
     columns["least squares, 95 %"] = list(map(_interval, parameters))
-    columns["determined"], columns["made of"] = determined, formulas
-    sure: list[tuple[str, ...]] = []
-    unsure: list[tuple[str, ...]] = []
-    for row in zip(*columns.values(), strict=True):
-        if row[-2] in DETERMINED:
-            sure.append(row)
-        else:
-            unsure.append(row)
-    return ParameterTable(
-        "Base parameters: identifiable combinations",
-        tuple(columns),
-        tuple(sure),
-        f"{note}.",
-        folded=tuple(unsure),
-        folded_title=f"{len(unsure)} more, not significantly different from zero",
-    )
+    columns["determined"] = determined
+    # a parameter of one body is its own formula
+    columns["made of"] = [x["formula"] if x["formula"] != x["name"] else "" for x in parameters]
+    rows = list(zip(*columns.values(), strict=True))
+    sure = tuple(row for row in rows if row[-2] in DETERMINED)
+    unsure = tuple(row for row in rows if row[-2] not in DETERMINED)
+    title, more = "Base parameters: identifiable combinations", "not significantly different from zero"
+    more = f"{len(unsure)} more, {more}"
+    return ParameterTable(title, tuple(columns), sure, f"{note}.", folded=unsure, folded_title=more)
 
 
 def _number(value: float) -> str:

@@ -125,16 +125,9 @@ def growth_panels(
                 marks.append(Band(f"{name}, 10 to 90 %", growth.seconds, error.low, error.high, styles[name]))
         if marks:
             chart = line_chart(
-                marks,
-                f"{title}: error by horizon",
-                "horizon [s]",
-                label,
-                log=True,
-                log_x=True,
-                limits=_error_limits(errors),
-                width=520,
-                height=260,
-            )
+                marks, f"{title}: error by horizon", "horizon [s]", label, log=True, log_x=True,
+                limits=_error_limits(errors), width=520, height=260,
+            )  # fmt: skip
             panels.append(Panel(title, (chart,)))
     return panels
 
@@ -171,10 +164,8 @@ def trajectory_panels(
     positions = {name: x.predicted_q for name, x in predictions.items()}
     velocities = {name: x.predicted_qd for name, x in predictions.items() if x.predicted_qd is not None}
     rows = []
-    for quantity, values, predicted in (
-        ("position", measured.q, positions),
-        ("velocity", measured.qd, velocities),
-    ):
+    quantities = ("position", measured.q, positions), ("velocity", measured.qd, velocities)
+    for quantity, values, predicted in quantities:
         if values is None:
             continue
         lines, errors = [("measured", values, "truth")], []
@@ -208,13 +199,11 @@ def mass_panels(
     # rounding errors of entries that are always zero are below this bound
     zero = TUNING.zero * max(np.nanmax(np.abs(mass)) for mass in masses.values())
     for number, (i, j) in enumerate(np.argwhere(np.tri(len(joint_types))).tolist()):
-        entries = {label: mass[number] for label, mass in masses.items()}
-        if np.nanmax(np.abs(list(entries.values()))) > zero:
-            lines = [Line(label, t, entry, styles[label]) for label, entry in entries.items()]
+        lines = [Line(label, t, mass[number], styles[label]) for label, mass in masses.items()]
+        if np.nanmax(np.abs([line.y for line in lines])) > zero:
             name = entry_name(i, j)
-            unit = "kg m"
-            if joint_types[i] == joint_types[j]:
-                unit = UNITS[joint_types[i]].inertia
+            # an entry of a revolute and a prismatic joint is a first moment
+            unit = UNITS[joint_types[i]].inertia if joint_types[i] == joint_types[j] else "kg m"
             chart = line_chart(lines, name, "t [s]", f"{name} [{unit}]", width=width)
             panels.append(Panel(name, (chart,)))
     return panels

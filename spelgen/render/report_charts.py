@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from spelgen.evaluation.drawn_motions import TorqueTrace
+from spelgen.evaluation.drawn_motions import PredictedMotion, TorqueTrace
 from spelgen.evaluation.plain import array
 from spelgen.evaluation.traces import FrictionTrace, Traces
 from spelgen.evaluation.verdict import Limits
@@ -42,22 +42,25 @@ def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
         drawn["friction"] = friction_panels(traces.friction, traces.torques, joints)
     if traces.torques:  # one trajectory shows the shares of the energy
         drawn["energy"] = energy_chart(traces.torques[0])
-    torques = {}
+    torques, trajectories = {}, {}
     for trace in traces.torques:
         torques[f"{trace.which.capitalize()} trajectory: {trace.trajectory}"] = torque_panels(trace, joints)
-    trajectories = {}
     for example in traces.trajectories:
-        which = example.which.capitalize()
-        if example.start is None:
-            distance = None if example.error is None else 1000 * example.error
-            off = f"{number(distance)} {thousandths(spec.joint_types)} off"
-            title = f"{which} log replayed: {example.trajectory}, {off}"
-        else:
-            title = f"{which} prediction: {example.trajectory}, {example.start:.3g} s into it, "
-            title += f"relative error {number(example.error)}"
         motion, lines = f"prediction {example.which}", {"predicted": example}
-        trajectories[title] = trajectory_panels(lines, {"predicted": "predicted"}, joints, motion)
+        panels = trajectory_panels(lines, {"predicted": "predicted"}, joints, motion)
+        trajectories[_motion_title(example, spec)] = panels
     return drawn | {"torques": torques, "trajectories": trajectories}
+
+
+def _motion_title(example: PredictedMotion, spec: ModelSpec) -> str:
+    """Return the title of a predicted motion, or of a replayed log, with its error."""
+    which = example.which.capitalize()
+    if example.start is None:
+        distance = None if example.error is None else 1000 * example.error
+        off = f"{number(distance)} {thousandths(spec.joint_types)} off"
+        return f"{which} log replayed: {example.trajectory}, {off}"
+    start = f"{example.trajectory}, {example.start:.3g} s into it"
+    return f"{which} prediction: {start}, relative error {number(example.error)}"
 
 
 def loss_chart(metrics: Sequence[Content], best_epoch: int) -> Chart:
@@ -111,14 +114,9 @@ def friction_panels(
                 marks.append(Line("model, over time", qd, modelled, "loop model"))
         for name, curves in friction.by.items():
             marks.append(Line(name, friction.qd[k], curves[k], STYLES[name]))
-        chart = line_chart(
-            marks,
-            f"Friction of {joint.name}",
-            joint.axis("velocity"),
-            f"friction [{joint.units.torque}]",
-            limits=_friction_limits(np.concatenate(values), curve),
-            height=220,
-        )
+        limits, axis = _friction_limits(np.concatenate(values), curve), joint.axis("torque", "friction")
+        title = f"Friction of {joint.name}"
+        chart = line_chart(marks, title, joint.axis("velocity"), axis, limits=limits, height=220)
         panels.append(Panel(joint.name, (chart,)))
     return panels
 
@@ -138,10 +136,8 @@ def coverage_panels(
     traces: Traces, identified: Content | None, joints: Sequence[NamedJoint], limits: Limits
 ) -> list[Panel]:
     """Return per joint the histograms of position and velocity in training and test logs, with the position limits."""
-    logs: dict[str, Content | None] = {
-        "training": (identified or {}).get("coverage"),
-        "test": traces.coverage,
-    }
+    logs: dict[str, Content | None] = {"training": (identified or {}).get("coverage")}
+    logs["test"] = traces.coverage
     panels = []
     for k, joint in enumerate(joints):
         charts = []
@@ -154,9 +150,8 @@ def coverage_panels(
             if key == "q":
                 for bound in limits[k] or ():
                     marks.append(Line("joint limits", (bound, bound), (0.0, top), "hold"))
-            title, height = f"{quantity} of {joint.name}", 130
-            label = "fraction of samples"
-            charts.append(line_chart(marks, title, joint.axis(quantity), label, width=300, height=height))
+            title, labels = f"{quantity} of {joint.name}", (joint.axis(quantity), "fraction of samples")
+            charts.append(line_chart(marks, title, *labels, width=300, height=130))
         panels.append(Panel(joint.name, tuple(charts)))
     return panels
 
@@ -174,8 +169,7 @@ def _histogram(name: str, histogram: Content) -> Band:
 def energy_chart(trace: TorqueTrace) -> Chart:
     """Return the terms of the energy balance along a trajectory."""
     styles = ("truth", "urdf", "friction", "model")
-    lines = []
-    for (name, energy), color in zip(trace.energy.items(), styles, strict=True):
-        lines.append(Line(name, trace.t, energy, color))
+    terms = zip(trace.energy.items(), styles, strict=True)
+    lines = [Line(name, trace.t, energy, style) for (name, energy), style in terms]
     motion = f"torque {trace.which}"
     return line_chart(lines, "Energy", "t [s]", "energy [J]", motion=motion, width=560, height=250)

@@ -80,24 +80,14 @@ class Run:
 def open_run(path: Path | str) -> Run:
     """Return the content of a run folder. Raises RunError or ModuleError."""
     folder = RunFolder(path)
-    evaluation = _record(folder, folder.evaluation)
-    arm = None
-    spec = folder.read_spec()
+    spec, arm, results = folder.read_spec(), None, None
+    if folder.evaluation.is_file():
+        results = Results.from_dict(folder.read_json(folder.evaluation))
     if folder.urdf.exists():
         with suppress(SpelgenError):
             arm = arm_of_spec(spec, folder.urdf)
-    return Run(
-        folder,
-        spec,
-        folder.read_record() if folder.config.is_file() else None,
-        None if evaluation is None else Results.from_dict(evaluation),
-        folder.read_baselines(),
-        arm,
-    )
-
-
-def _record(folder: RunFolder, path: Path) -> Content | None:
-    return folder.read_json(path) if path.is_file() else None
+    record = folder.read_record() if folder.config.is_file() else None
+    return Run(folder, spec, record, results, folder.read_baselines(), arm)
 
 
 def write_report(
@@ -131,7 +121,7 @@ def report_data(folder: Path | str) -> Content:
         "bodies": body_parameters(model).tolist() if isinstance(model, RigidBodyDynamics) else None,
         "tables": list(map(asdict, parameter_tables(model, run.arm, run.baselines, posterior))),
         "posterior": None if posterior is None else posterior.to_dict(),
-        "evaluation": _record(run.folder, run.folder.evaluation),
+        "evaluation": None if run.results is None else run.folder.read_json(run.folder.evaluation),
         "least_squares": run.baselines or None,
     }
 
@@ -155,18 +145,14 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
     """Return the page about a run as HTML, deterministically. robot: see ``write_report``."""
     folder = Path(folder)
     if not RunFolder(folder).path.is_dir():
-        raise RunError(
-            "no run", file=folder, expected="a folder with spec.json", do="make one with `spelgen train`"
-        )
+        expected = "a folder with spec.json"
+        raise RunError("no run", file=folder, expected=expected, do="make one with `spelgen train`")
     # the files of a run folder are untrusted: each of them may have any content
     try:
         return _rendered(open_run(folder), robot)
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, TemplateError) as error:
-        raise RunError(
-            f"files without the data of a report ({in_one_line(error)})",
-            file=folder,
-            do="run `spelgen evaluate` again",
-        ) from error
+        got = f"files without the data of a report ({in_one_line(error)})"
+        raise RunError(got, file=folder, do="run `spelgen evaluate` again") from error
 
 
 def _rendered(run: Run, robot: Path | str | None) -> str:
@@ -178,9 +164,8 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
     sections = dict.fromkeys(("arm", "cells", "training", "settings", "losses"))
     sections |= evaluation_charts(traces, spec)
     if run.arm is not None:
-        sections["arm"] = arm_section(
-            run.arm.chain, Path(robot or run.arm.robot.path), evaluated_motions(traces)
-        )
+        urdf = Path(robot or run.arm.robot.path)
+        sections["arm"] = arm_section(run.arm.chain, urdf, evaluated_motions(traces))
         sections["cells"] = matrix(run.arm.chain, derive(run.arm.chain, spec.options.assume))
     if record is not None:
         sections["training"] = training_facts(record, metrics, run.baselines, model)
@@ -252,15 +237,17 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 def _verdict(runs: Mapping[str, Results]) -> str:
     """Return a sentence that states, for each figure that all runs have, the run with the smallest error."""
+    # the first element decides which run is the smallest
     errors: dict[str, list[tuple[float, str, str]]] = {}
     for run, results in runs.items():
         for figure in figures(results):
-            errors.setdefault(figure.label, []).append((figure.value, run, figure.text()))
+            text = f"{figure.label} ({figure.text()})"
+            errors.setdefault(figure.label, []).append((figure.value, run, text))
     smallest: dict[str, list[str]] = {}
-    for label, of_runs in errors.items():
+    for of_runs in errors.values():
         if len(of_runs) == len(runs):
             _, name, text = min(of_runs)
-            smallest.setdefault(name, []).append(f"{label} ({text})")
+            smallest.setdefault(name, []).append(text)
     if not smallest:
         return "These runs have no common horizons or logs."
     sentences = [f"{name} has the smallest {listed(labels)}." for name, labels in smallest.items()]

@@ -63,10 +63,8 @@ def outlier_note(results: Results) -> str:
     rms = last.errors[MODEL].mean_relative_rms
     if rms is None or not rms > TUNING.dominated * median:
         return ""
-    return (
-        f"After {last.name} the median error is {share(median, 'the motion')}, and the root mean square "
-        f"{share(rms, 'the motion')}: few starts dominate it."
-    )
+    text = f"After {last.name} the median error is {share(median, 'the motion')}, and the root mean square "
+    return f"{text}{share(rms, 'the motion')}: few starts dominate it."
 
 
 def best_epoch(metrics: Sequence[Content]) -> int:
@@ -96,17 +94,14 @@ def training_facts(
     # fits to torques have no epochs
     if metrics:
         last, best = metrics[-1], best_epoch(metrics)
-        origin = f"epoch {best}"
-        if not best:
-            origin = "the start: no epoch was better"
+        origin = f"epoch {best}" if best else "the start: no epoch was better"
         facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {_duration(last['seconds'])}"
         facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"
         if record.options.get("solver", "rk4") == "rk4":
             facts["integrator"] = f"rk4, {counted(last['substeps'], 'step')} between samples"
-    if record.warnings:
-        facts["warnings"] = "; ".join(record.warnings)
-    if record.notes:
-        facts["notes"] = "; ".join(record.notes)
+    for label, remarks in (("warnings", record.warnings), ("notes", record.notes)):
+        if remarks:
+            facts[label] = "; ".join(remarks)
     if record.options.get("momentum_steps"):
         facts["start"] = f"{record.options['momentum_steps']:,} steps on the momentum along the logs"
     return facts
@@ -119,9 +114,8 @@ def settings(record: Record) -> dict[str, str]:
 
 
 def _names(trajectories: Sequence[str]) -> str:
-    if not trajectories:
-        return "none"
-    return f"{counted(len(trajectories), 'trajectory')}: {shortened(trajectories, 5)}"
+    count = counted(len(trajectories), "trajectory")
+    return f"{count}: {shortened(trajectories, 5)}" if trajectories else "none"
 
 
 def _duration(seconds: float) -> str:
@@ -139,8 +133,7 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str
     # without its folder, which may be one of another machine
     robot, option = shlex.quote(Path(spec.urdf).name), ""
     if run.urdf.exists():
-        robot = f"RUN/{run.urdf.name}"
-        option = f" --robot {robot}"
+        robot, option = f"RUN/{run.urdf.name}", f" --robot RUN/{run.urdf.name}"
     build = f"spelgen build {robot}"
     for key, value in _changed(options, asdict(Options())).items():
         words = ",".join(value) if isinstance(value, (list, tuple)) else str(value)

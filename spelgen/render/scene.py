@@ -144,14 +144,12 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
 def _axis(joint: UrdfJoint) -> np.ndarray:
     """Return the unit vector of the axis, (3,)."""
     axis = np.array(joint.axis, dtype=float)
-    unit: np.ndarray = axis / (np.linalg.norm(axis) or 1.0)
-    return unit
+    return np.asarray(axis / (np.linalg.norm(axis) or 1.0))
 
 
 def _rotation(joint: UrdfJoint) -> np.ndarray:
     """Return the rotation matrix (3, 3) of roll, pitch and yaw about fixed axes."""
-    matrix: np.ndarray = Rotation.from_euler("xyz", joint.rpy).as_matrix()
-    return matrix
+    return np.asarray(Rotation.from_euler("xyz", joint.rpy).as_matrix())
 
 
 @dataclass(frozen=True, eq=False)
