@@ -90,23 +90,24 @@ def validate(values: Mapping[str, object], document: YamlDocument | None = None)
     """
     file = None if document is None else document.path
 
-    def line(name: str) -> int | None:
-        return None if document is None else document.line((name,))
-
+    lines = {name: None if document is None else document.line((name,)) for name in {*values, *CHOICES}}
     errors = []
     for name in values:
         if name not in CHOICES:
             do = suggestion(str(name), CHOICES)
-            errors.append(SettingsError(f"unknown key {name!r}", file=file, line=line(name), do=do))
+            errors.append(SettingsError(f"unknown key {name!r}", file=file, line=lines[name], do=do))
     for name, choices in CHOICES.items():
-        got = repr(values[name]) if name in values else "nothing"
         if values.get(name) not in choices:
-            expected = f"one of {', '.join(choices)}"
-            errors.append(SettingsError(got, file=file, line=line(name), element=name, expected=expected))
+            got, expected = (
+                repr(values[name]) if name in values else "nothing",
+                f"one of {', '.join(choices)}",
+            )
+            errors.append(SettingsError(got, file=file, line=lines[name], element=name, expected=expected))
+    # wrong values first: whether a wrong value conflicts with another one is unknown
     collect(errors)
     for first, second, do in _conflicts(values):
         got = f"{first}: {values[first]} with {second}: {values[second]}"
-        errors.append(SettingsError(got, file=file, line=line(first), do=do))
+        errors.append(SettingsError(got, file=file, line=lines[first], do=do))
     collect(errors)
 
 

@@ -102,17 +102,13 @@ def _once(errors: Sequence[SpelgenError]) -> str:
     """Return the first of errors that differ only in their files, and the files of the others."""
     first = errors[0]
     files = dict.fromkeys(error.file for error in errors if error.file and error.file != first.file)
-    if not files:
-        return str(first)
-    return f"{first}\n  the same: {shortened(list(files), 5)}"
+    return f"{first}\n  the same: {shortened(list(files), 5)}" if files else str(first)
 
 
 def _in_short(text: str) -> str:
     """Return a text, or start and end of a long one: a name in a file may have a million characters."""
-    if len(text) <= MAX_TEXT:
-        return text
-    half = MAX_TEXT // 3
-    return f"{text[:half]}... ({len(text)} characters) ...{text[-half:]}"
+    third = MAX_TEXT // 3
+    return text if len(text) <= MAX_TEXT else f"{text[:third]}... ({len(text)} characters) ...{text[-third:]}"
 
 
 def in_one_line(error: BaseException) -> str:
@@ -134,10 +130,8 @@ def suggestion(name: str, names: Iterable[str]) -> str:
     nearest = get_close_matches(name, names, n=1)
     if nearest:
         return f"did you mean {nearest[0]!r}?"
-    hint = f"known are {', '.join(map(repr, names[:10]))}"
-    if len(names) > 10:
-        hint += f" and {len(names) - 10} more"
-    return hint
+    more = f" and {len(names) - 10} more" if len(names) > 10 else ""
+    return f"known are {', '.join(map(repr, names[:10]))}{more}"
 
 
 def shortened(names: Sequence[str], limit: int) -> str:

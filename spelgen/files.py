@@ -54,8 +54,7 @@ def read_bytes(
     except FileNotFoundError:
         raise error("no such file", file=path) from None
     except (OSError, ValueError) as problem:  # ValueError: a null character in the name
-        reason = problem.strerror if isinstance(problem, OSError) else None
-        reason = reason or str(problem)
+        reason = (isinstance(problem, OSError) and problem.strerror) or problem
         raise error(f"cannot be read ({reason})", file=path) from None
     raise error(f"a file of {size} bytes", file=path, expected=f"at most {largest}", do=do)
 
@@ -87,8 +86,7 @@ def limited_memory(size: int) -> Iterator[None]:
         return
     previous, largest = resource.getrlimit(resource.RLIMIT_AS)
     allowed = pages * resource.getpagesize() + size
-    if largest != resource.RLIM_INFINITY:
-        allowed = min(allowed, largest)
+    allowed = allowed if largest == resource.RLIM_INFINITY else min(allowed, largest)
     resource.setrlimit(resource.RLIMIT_AS, (allowed, largest))
     try:
         yield

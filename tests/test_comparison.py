@@ -23,9 +23,8 @@ from spelgen.baselines.predictor import Predictor
 from spelgen.baselines.registry import hold_velocity
 from spelgen.cli.main import app
 from spelgen.comparison import jobs
-from spelgen.comparison.arms import ComparedArm, Comparison, ablation_designs, load_comparison
+from spelgen.comparison.arms import ComparedArm, Comparison, ablation_designs, arm_inputs, load_comparison
 from spelgen.comparison.figures import PredictionLoss, predict_example, spread_windows
-from spelgen.comparison.arms import arm_inputs
 from spelgen.comparison.study import duration, prepare_study, run_study
 from spelgen.comparison.tables import arm_sections, arm_sentence, arm_tables, comparison_sentence
 from spelgen.design import load_design

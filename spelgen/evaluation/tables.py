@@ -22,6 +22,7 @@ OBSERVER = (
 Numbers = Mapping[str, float | None]
 """Numbers per column; None: unknown."""
 MASS_TITLE = "Error of the mass matrix, relative to the true one (at positions of the test logs)"
+CSV_HEAD = ("table", "row", "predictor", "value")
 LIMITS = ("torque.nmse", "joint.nmse", "rollout.rms")
 """The figures that `spelgen evaluate --limit` takes."""
 
@@ -119,7 +120,7 @@ def csv_text(results: Results) -> str:
     """Return the numbers of all tables as CSV, a line for each; unknown values are empty."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(("table", "row", "predictor", "value"))
+    writer.writerow(CSV_HEAD)
     for one_table in result_tables(results):
         for row in one_table.rows:
             writer.writerows((one_table.title, row.label, *value) for value in row.values.items())

@@ -13,6 +13,9 @@ from spelgen.templates import read, render
 from spelgen.version import __version__
 
 
+SCRIPTS = ("page.js", "arm.js")
+
+
 def render_page(template: str, **context: object) -> str:
     """Return one self-contained HTML page from a template.
 
@@ -40,7 +43,7 @@ def json_data(data: object) -> Markup:
 
 @cache
 def _assets() -> tuple[Markup, ...]:
-    return tuple(Markup(read(name).strip()) for name in ("page.css", "page.js", "arm.js"))
+    return tuple(Markup(read(name).strip()) for name in ("page.css", *SCRIPTS))
 
 
 def _digest(text: str) -> str:
