@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 InspectionFormat = Literal["text", "json", "html", "latex", "sympy"]
 IdentificationFormat = Literal["text", "json", "html"]
 EFFECTS = ("stribeck", "polynomial", "memory")
+FRICTION_HELP = (
+    "Friction terms in addition to viscous and Coulomb friction: Stribeck effect; qd |qd| and qd^3; bristles "
+    "(hysteresis)."
+)
 
 
 def inspect(
@@ -86,15 +90,12 @@ def _text(
         if proof:
             data["verification"] = proof.to_dict()
         return json.dumps(data, indent=2) + "\n"
+    paragraphs = [] if proof is None else [proof.text()]
     if closed is None:
-        result = inspection.text()
-    else:
-        from spelgen.certificate import formula_files
+        return "\n\n".join([inspection.text(), *paragraphs]) + "\n"
+    from spelgen.certificate import formula_files
 
-        result = formula_files.text(closed)
-    if proof:
-        result += f"\n\n{proof.text()}"
-    return result + "\n"
+    return "\n\n".join([formula_files.text(closed), *paragraphs]) + "\n"
 
 
 def _formula_file(format: str, closed: Formulas, proof: Verification | None) -> str:
@@ -106,9 +107,7 @@ def _formula_file(format: str, closed: Formulas, proof: Verification | None) -> 
         note(f"too long to be written: {', '.join(names)}")
     if proof:
         note(proof.text())
-    if format == "latex":
-        return formula_files.latex(closed)
-    return formula_files.sympy_source(closed)
+    return formula_files.latex(closed) if format == "latex" else formula_files.sympy_source(closed)
 
 
 def identify(
@@ -124,14 +123,7 @@ def identify(
         Literal["equal", "range", "noise"],
         option("", "Weights of the joints: equal, by torque range, or by torque noise."),
     ] = "noise",
-    friction: Annotated[
-        str | None,
-        option(
-            "stribeck,polynomial,memory",
-            "Friction terms in addition to viscous and Coulomb friction: Stribeck effect; qd |qd| and qd^3; "
-            "bristles (hysteresis).",
-        ),
-    ] = None,
+    friction: Annotated[str | None, option(",".join(EFFECTS), FRICTION_HELP)] = None,
     accept: options.Accept = None,
     format: Annotated[IdentificationFormat | None, options.result_format()] = None,
     output: options.Output = None,

@@ -27,15 +27,8 @@ INTERRUPTED = 130  # 128 + SIGINT, as shells count
 BROKEN_PIPE = 141  # 128 + SIGPIPE
 
 # top-level module -> the extra that installs it
-EXTRAS = {
-    "pinocchio": "simulate",
-    "casadi": "deploy",
-    "mujoco": "deploy",
-    "onnxruntime": "deploy",
-    "onnxscript": "deploy",
-    "safetensors": "deploy",
-    "ray": "parallel",
-}
+EXTRAS = {"pinocchio": "simulate", "ray": "parallel"}
+EXTRAS |= dict.fromkeys(("casadi", "mujoco", "onnxruntime", "onnxscript", "safetensors"), "deploy")
 
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 
@@ -70,9 +63,7 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
 
 def _name_values(annotation: object, *metadata: object) -> None:
     """Set the name of an option's values in the help: N, X, FILE, or the choices."""
-    value_type = annotation
-    if NoneType in get_args(annotation):
-        value_type = get_args(annotation)[0]
+    value_type = get_args(annotation)[0] if NoneType in get_args(annotation) else annotation
     for info in metadata:
         if isinstance(info, OptionInfo) and info.metavar is None and value_type is not bool:
             info.metavar = METAVARS.get(value_type) or "|".join(map(str, get_args(value_type)))
@@ -82,9 +73,7 @@ def _local(value: object) -> object:
     """Return the local copies of paths that are addresses; other values are unchanged."""
     if isinstance(value, list):
         return [_local(element) for element in value]
-    if isinstance(value, Path):
-        return local(value)
-    return value
+    return local(value) if isinstance(value, Path) else value
 
 
 def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
@@ -105,17 +94,14 @@ def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
 def _message(error: BaseException, debug: bool) -> str:
     if isinstance(error, SpelgenError):
         return str(error)
-    if isinstance(error, ModuleNotFoundError):
-        extra = EXTRAS.get((error.name or "").split(".")[0])
-        if extra is not None:
-            return (
-                f"this needs the package {error.name}, which is not installed; pip install 'spelgen[{extra}]'"
-            )
+    package = (error.name or "") if isinstance(error, ModuleNotFoundError) else ""
+    extra = EXTRAS.get(package.split(".")[0])
+    if extra is not None:
+        return f"this needs the package {package}, which is not installed; pip install 'spelgen[{extra}]'"
     # a full disk or a missing permission is not a defect of spelgen
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{os.fsdecode(error.filename)}: {(error.strerror or type(error).__name__).lower()}"
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror.lower()
+    if isinstance(error, OSError) and (error.filename is not None or error.strerror):
+        file = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+        return f"{file}{(error.strerror or type(error).__name__).lower()}"
     hint = "" if debug else "; --debug shows where"
     return f"spelgen: unexpected {in_one_line(error)}{hint}"
 

@@ -11,12 +11,11 @@ import typer
 from spelgen.cli import options
 from spelgen.cli.console import answer, note, progress_bar, say
 from spelgen.cli.options import argument, flag, option, output_option
-from spelgen.errors import RunError
 from spelgen.evaluation.tables import LIMITS, csv_text, figures, summary
-from spelgen.files import read_json
 
 Format = Literal["text", "json", "csv"]
 LIMIT_EXCEEDED = 3  # exit code; usage errors have 2
+LIMIT_HELP = f"Exit with {LIMIT_EXCEEDED} if a figure is larger: {', '.join(LIMITS)}; once for each."
 
 
 def evaluate(
@@ -27,13 +26,7 @@ def evaluate(
     filter: options.Filter = None,
     format: Annotated[Format | None, options.result_format()] = None,
     output: options.Output = None,
-    limit: Annotated[
-        list[str] | None,
-        option(
-            "FIGURE=MAX",
-            f"Exit with {LIMIT_EXCEEDED} if a figure is larger: {', '.join(LIMITS)}; once for each.",
-        ),
-    ] = None,
+    limit: Annotated[list[str] | None, option("FIGURE=MAX", LIMIT_HELP)] = None,
     truth: Annotated[
         Path | None, option("URDF", "The true arm of simulated logs: state the error of M(q).")
     ] = None,
@@ -94,9 +87,8 @@ def _limit(text: str) -> tuple[str, float]:
             return name, float(value)
     except ValueError:
         pass
-    raise typer.BadParameter(
-        f"{text!r} is not FIGURE=MAX with one of {', '.join(LIMITS)}", param_hint="'--limit'"
-    )
+    message = f"{text!r} is not FIGURE=MAX with one of {', '.join(LIMITS)}"
+    raise typer.BadParameter(message, param_hint="'--limit'")
 
 
 def estimate(
@@ -131,20 +123,14 @@ def estimate(
     torque_model(fit)
     levels = noise_levels(fit)
     joints = list(fit.model.joint_names)
-    logs = read_logs(
-        paths, joints, mapping=options.log_mapping(joints, mapping or fit.record.mapping, accept)
-    )
-    results = replay(fit, logs, alarms)
+    log_mapping = options.log_mapping(joints, mapping or fit.record.mapping, accept)
+    results = replay(fit, read_logs(paths, joints, mapping=log_mapping), alarms)
     page = write_estimate(fit, levels, results, output or Path(run) / "estimate.html")
-    rate = f"{levels.supported_alarms:.2g} false alarms per minute"
-    record = {
-        "run": str(run),
-        "page": str(page),
-        "supported_alarms_per_minute": levels.supported_alarms,
-        "logs": [result.to_dict() for result in results],
-    }
-    lines = [result.text() for result in results]
-    answer(format, record, *lines, f"thresholds of contact are supported down to {rate}", f"wrote {page}")
+    record: dict[str, object] = {"run": str(run), "page": str(page)}
+    record["supported_alarms_per_minute"] = rate = levels.supported_alarms
+    record["logs"] = [result.to_dict() for result in results]
+    supported = f"thresholds of contact are supported down to {rate:.2g} false alarms per minute"
+    answer(format, record, *(result.text() for result in results), supported, f"wrote {page}")
 
 
 def report(
@@ -163,18 +149,17 @@ def report(
     """Write an HTML page about one run or several."""
     if robot is not None and len(runs) > 1:
         raise typer.BadParameter("belongs to the page of one run", param_hint="'--robot'")
-    if len(runs) == 1:
-        from spelgen.evaluation.results import Results
-        from spelgen.fitting.run_folder import RunFolder
-        from spelgen.render.report_page import write_report
+    from spelgen.evaluation.results import Results
+    from spelgen.fitting.run_folder import RunFolder
+    from spelgen.render.report_page import write_report, write_runs
 
-        path, evaluation = write_report(runs[0], output, robot), RunFolder(runs[0]).evaluation
-        if evaluation.exists():
-            listing = summary(Results.from_dict(read_json(evaluation, RunError)))
-            if listing is not None:
-                say(listing.text() + "\n")
-        say(f"wrote {path}: the report, for any browser")
-    else:
-        from spelgen.render.report_page import write_runs
-
+    if len(runs) > 1:
         say(f"wrote {write_runs(runs, output or Path('runs.html'))}")
+        return
+    path, folder = write_report(runs[0], output, robot), RunFolder(runs[0])
+    listing = None
+    if folder.evaluation.exists():
+        listing = summary(Results.from_dict(folder.read_json(folder.evaluation)))
+    if listing is not None:
+        say(listing.text() + "\n")
+    say(f"wrote {path}: the report, for any browser")

@@ -16,15 +16,13 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
-from spelgen.cli import (
-    arm_commands,
-    compare_command,
-    evaluate_command,
-    log_commands,
-    model_commands,
-    train_command,
-)
+from spelgen.cli.arm_commands import identify, inspect
+from spelgen.cli.compare_command import compare
 from spelgen.cli.console import handle_errors, say
+from spelgen.cli.evaluate_command import estimate, evaluate, report
+from spelgen.cli.log_commands import excite, logs, simulate
+from spelgen.cli.model_commands import build, check, export, init
+from spelgen.cli.train_command import train
 from spelgen.version import __version__
 
 BaseUsageError: type[Exception] = typer.BadParameter.__mro__[1]
@@ -96,22 +94,9 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-for command in (
-    arm_commands.inspect,
-    model_commands.init,
-    model_commands.build,
-    log_commands.simulate,
-    arm_commands.identify,
-    log_commands.excite,
-    log_commands.logs,
-    train_command.train,
-    evaluate_command.evaluate,
-    evaluate_command.estimate,
-    evaluate_command.report,
-    model_commands.export,
-    compare_command.compare,
-    model_commands.check,
-):
+# in the order of a first project, which is the order of `spelgen --help`
+COMMANDS = [inspect, init, build, simulate, identify, excite, logs, train, evaluate, estimate, report]
+for command in [*COMMANDS, export, compare, check]:
     app.command(cls=Command, context_settings=CONTEXT)(handle_errors(command))
 
 

@@ -168,6 +168,5 @@ def load(robot: Path, joints: str | None, tip: str | None, angle_tolerance: floa
 def require_free(path: Path, *, force: bool) -> None:
     """Raise SpelgenError if an output exists already, unless `force` allows to replace it."""
     if path.exists() and not force:
-        raise SpelgenError(
-            "this output exists already", file=path, do="--force replaces it, -o names another"
-        )
+        do = "--force replaces it, -o names another"
+        raise SpelgenError("this output exists already", file=path, do=do)

@@ -147,26 +147,21 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
     if TIME_LIMIT in request.values and TIME_LIMIT not in type(fit.config).model_fields:
         objective = fit.config.objective
         note(f"info: {TIME_LIMIT} limits fits to windows; these logs are fitted by {objective}")
-    record = {
-        "run": str(folder),
-        "status": fit.status,
-        "objective": fit.config.objective,
-        "steps": fit.steps,
-        "epochs": fit.epochs,
-        "seconds": fit.seconds,
-        # JSON has no infinity, the loss of a rollout that diverged
-        "validation_loss": fit.best_validation if math.isfinite(fit.best_validation) else None,
-        "torque_nmse": fit.torque_nmse,
-        "posterior": fit.posterior.to_dict() if fit.checkpoint.posterior else None,
-        "findings": [finding.to_dict() for finding in fit.diagnostics],
-    }
+    posterior = fit.posterior if fit.checkpoint.posterior else None
+    record = {"run": str(folder), "status": fit.status, "objective": fit.config.objective}
+    record |= {"steps": fit.steps, "epochs": fit.epochs, "seconds": fit.seconds}
+    # JSON has no infinity, the loss of a rollout that diverged
+    record["validation_loss"] = fit.best_validation if math.isfinite(fit.best_validation) else None
+    record["torque_nmse"] = fit.torque_nmse
+    record["posterior"] = None if posterior is None else posterior.to_dict()
+    record["findings"] = [finding.to_dict() for finding in fit.diagnostics]
     outcome: list[str] = [*_outcome(fit)]
     if payload is not None:
         from spelgen.live.replay import payload_content, payload_sentence
 
         record["payload"] = payload_content(payload)
         outcome.append(textwrap.fill(f"in these logs: {payload_sentence(payload)}", 80))
-    outcome += [table.text() for table in fit.posterior.listings] if fit.checkpoint.posterior else []
+    outcome += [] if posterior is None else [table.text() for table in posterior.listings]
     answer(format, record, *outcome, f"run folder: {folder}")
     if fit.status == "interrupted":
         note("the best model so far is in the run folder; resume it by --resume")
@@ -210,9 +205,8 @@ def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -
     """Return the run folder: with --resume the argument may be the folder itself."""
     if resume and module is not None and module.is_dir():
         return module
-    if module is not None:
-        return Path("runs") / module.stem
-    return Path("runs") / f"{(source or Path()).resolve().name}_adapted"
+    name = f"{(source or Path()).resolve().name}_adapted" if module is None else module.stem
+    return Path("runs") / name
 
 
 def _specification(module: Path | None, source: Path | None, resumed: Path | None) -> ModelSpec:

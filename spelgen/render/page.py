@@ -12,7 +12,6 @@ from markupsafe import Markup
 from spelgen.templates import read, render
 from spelgen.version import __version__
 
-
 SCRIPTS = ("page.js", "arm.js")
 
 
