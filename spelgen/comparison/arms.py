@@ -27,7 +27,7 @@ from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.messages import dotted, validated
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Count, Group
-from spelgen.settings.yaml_document import Location, YamlDocument, read_document
+from spelgen.settings.yaml_document import Location, read_document
 
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
@@ -105,7 +105,11 @@ def load_comparison(path: Path) -> Comparison:
     """
     document = read_document(path)
     comparison = validated(Comparison, document.value(), document)
-    collect([*_unknown_presets(comparison, document), *_missing_files(comparison, document)])
+    errors = []
+    for place, got, do in _contradictions(comparison, path.parent):
+        element, line = dotted(place), document.line(place)
+        errors.append(SettingsError(got, file=path, line=line, element=element, do=do))
+    collect(errors)
     arms = {name: arm.in_folder(path.parent) for name, arm in comparison.arms.items()}
     presets = comparison.presets
     if presets is not None:
@@ -117,22 +121,15 @@ def _is_file(preset: str) -> bool:
     return Path(preset).suffix in YAML
 
 
-def _unknown_presets(comparison: Comparison, document: YamlDocument) -> Iterator[SettingsError]:
+def _contradictions(comparison: Comparison, folder: Path) -> Iterator[tuple[Location, str, str]]:
+    """Yield location, error and advice for each unknown preset and for each file that the folder does not have."""
     for number, preset in enumerate(comparison.presets or ()):
         if preset not in (*PRESET_NAMES, *ablation_designs()) and not _is_file(preset):
-            hint = suggestion(preset, PRESET_NAMES)
-            yield _error(document, ("presets", number), f"unknown preset {preset!r}", hint)
-
-
-def _missing_files(comparison: Comparison, document: YamlDocument) -> Iterator[SettingsError]:
+            yield ("presets", number), f"unknown preset {preset!r}", suggestion(preset, PRESET_NAMES)
     for name, arm in comparison.arms.items():
         for key, file in arm.files():
-            if not (document.path.parent / file).exists():
-                yield _error(document, ("arms", name, key), f"no such file: {file}", "check the path")
-
-
-def _error(document: YamlDocument, place: Location, got: str, do: str) -> SettingsError:
-    return SettingsError(got, file=document.path, line=document.line(place), element=dotted(place), do=do)
+            if not (folder / file).exists():
+                yield ("arms", name, key), f"no such file: {file}", "check the path"
 
 
 Progress = Callable[[int, int], None]

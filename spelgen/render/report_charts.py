@@ -13,16 +13,9 @@ from spelgen.evaluation.verdict import Limits
 from spelgen.fitting.run_record import Content
 from spelgen.labels import LEAST_SQUARES, MODEL, NamedJoint, named_joints, thousandths
 from spelgen.listing import number
+from spelgen.render import plots
 from spelgen.render.charts import TUNING, Band, Chart, Dots, Line, Mark, line_chart
-from spelgen.render.plots import (
-    STYLES,
-    JointRow,
-    Panel,
-    growth_panels,
-    mass_panels,
-    stacks,
-    trajectory_panels,
-)
+from spelgen.render.plots import JointRow, Panel
 from spelgen.spec import ModelSpec
 
 
@@ -34,10 +27,10 @@ def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
     if growth is not None:
         growths = {name: (growth, name) for name in growth.relative}
         # the bands of all predictors would overlap
-        drawn["growth"] = growth_panels(growths, STYLES, (MODEL, LEAST_SQUARES))
+        drawn["growth"] = plots.growth_panels(growths, plots.STYLES, (MODEL, LEAST_SQUARES))
     if mass is not None and mass.by:
         entries = {name: curves.entries for name, curves in mass.by.items()}
-        drawn["mass"] = mass_panels(mass.t, entries, STYLES, spec.joint_types)
+        drawn["mass"] = plots.mass_panels(mass.t, entries, plots.STYLES, spec.joint_types)
     if traces.friction is not None:
         drawn["friction"] = friction_panels(traces.friction, traces.torques, joints)
     if traces.torques:  # one trajectory shows the shares of the energy
@@ -47,7 +40,7 @@ def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
         torques[f"{trace.which.capitalize()} trajectory: {trace.trajectory}"] = torque_panels(trace, joints)
     for example in traces.trajectories:
         motion, lines = f"prediction {example.which}", {"predicted": example}
-        panels = trajectory_panels(lines, {"predicted": "predicted"}, joints, motion)
+        panels = plots.trajectory_panels(lines, {"predicted": "predicted"}, joints, motion)
         trajectories[_motion_title(example, spec)] = panels
     return drawn | {"torques": torques, "trajectories": trajectories}
 
@@ -86,7 +79,7 @@ def torque_panels(trace: TorqueTrace, joints: Sequence[NamedJoint]) -> list[Pane
         JointRow("Residual", "residual", "torque", [("residual", measured - predicted, "model")], 100),
         JointRow("Components of the torque", "components", "torque", components, 162),
     ]
-    return stacks(trace.t, rows, joints, f"torque {trace.which}")
+    return plots.stacks(trace.t, rows, joints, f"torque {trace.which}")
 
 
 def friction_panels(
@@ -113,7 +106,7 @@ def friction_panels(
                 marks.append(Line("measured, over time", qd, measured, "loop"))
                 marks.append(Line("model, over time", qd, modelled, "loop model"))
         for name, curves in friction.by.items():
-            marks.append(Line(name, friction.qd[k], curves[k], STYLES[name]))
+            marks.append(Line(name, friction.qd[k], curves[k], plots.STYLES[name]))
         limits, axis = _friction_limits(np.concatenate(values), curve), joint.axis("torque", "friction")
         title = f"Friction of {joint.name}"
         chart = line_chart(marks, title, joint.axis("velocity"), axis, limits=limits, height=220)

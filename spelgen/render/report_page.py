@@ -24,19 +24,12 @@ from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import Content, Record
 from spelgen.fitting.servo.report import servo_summary
 from spelgen.labels import MODEL, UNITS, listed, named_joints
+from spelgen.render import run_facts
 from spelgen.render.arm_section import arm_section, evaluated_motions, matrix
 from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, parameter_tables
 from spelgen.render.plots import growth_panels
 from spelgen.render.report_charts import coverage_panels, evaluation_charts, loss_chart
-from spelgen.render.run_facts import (
-    best_epoch,
-    commands,
-    head_numbers,
-    outlier_note,
-    settings,
-    training_facts,
-)
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.spec import ModelSpec
 from spelgen.structure.structure import derive
@@ -168,10 +161,10 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         sections["arm"] = arm_section(run.arm.chain, urdf, evaluated_motions(traces))
         sections["cells"] = matrix(run.arm.chain, derive(run.arm.chain, spec.options.assume))
     if record is not None:
-        sections["training"] = training_facts(record, metrics, run.baselines, model)
-        sections["settings"] = settings(record)
+        sections["training"] = run_facts.training_facts(record, metrics, run.baselines, model)
+        sections["settings"] = run_facts.settings(record)
     if metrics:
-        sections["losses"] = loss_chart(metrics, best_epoch(metrics))
+        sections["losses"] = loss_chart(metrics, run_facts.best_epoch(metrics))
     joints = named_joints(spec.joint_names, spec.joint_types)
     return render_page(
         "report.html.jinja",
@@ -179,9 +172,9 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         spec=spec,
         about=description(spec),
         units=UNITS,
-        numbers=head_numbers(model, record, metrics, run.results),
+        numbers=run_facts.head_numbers(model, record, metrics, run.results),
         verdict=run.verdict,
-        outliers=None if run.results is None else outlier_note(run.results),
+        outliers=None if run.results is None else run_facts.outlier_note(run.results),
         config=record,
         evaluation=run.results,
         tables=tables,
@@ -190,7 +183,7 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         under_servos=record is not None and record.mapping.input == "position",
         summary=None if record is None else servo_summary(record.servo),
         parameters=parameter_tables(model, run.arm, run.baselines, _posterior(run, model)),
-        commands=commands(run.folder, spec, run.config),
+        commands=run_facts.commands(run.folder, spec, run.config),
     )
 
 
