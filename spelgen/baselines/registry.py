@@ -113,6 +113,7 @@ class UrdfValues(Baseline):
 
             plain = urdf_dynamics(arm.urdf, arm.joints)
             predictors = [of_dynamics(URDF, plain, arm.probe)]
+            # without drives in the URDF both predictors would be equal
             if drives_known(arm.urdf, arm.joints):
                 driven = urdf_dynamics(arm.urdf, arm.joints, drives=True)
                 predictors.append(of_dynamics(URDF_WITH_DRIVES, driven, arm.probe))
@@ -143,6 +144,7 @@ class IdentifiedArm(Baseline):
         try:
             require_torques(logs)
             identified = identify_by(arm, logs, methods, preprocessing)
+        # a baseline that cannot be fitted must not stop the fit of the model
         except (LogError, np.linalg.LinAlgError):
             return {}
         fits = {key: fit for (key, _), fit in zip(FRICTION.values(), identified, strict=True)}
@@ -185,6 +187,7 @@ def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preproces
 
     preprocessing: resolved by the fit of the model.
     """
+    # the coverage of the training logs is needed for the assessment of test logs
     fitted: FittedBaselines = {"coverage": coverage(logs)}
     for baseline in BASELINES:
         fitted |= baseline.fit(arm, logs, preprocessing)

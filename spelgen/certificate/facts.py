@@ -67,6 +67,7 @@ class _Sentences:
         self, kind: str, why: EntryReason, statement: str, means_one: str, means_several: str
     ) -> Iterator[Fact]:
         """Yield the facts about entries of this kind; entries with the same reason share a sentence."""
+        # a table of facts would repeat one reason for every entry of a wrist
         groups: dict[Reason, list[MassEntry]] = {}
         for entry in self.structure.entries:
             if entry.kind == kind:

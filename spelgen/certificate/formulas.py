@@ -159,6 +159,7 @@ def formulas(
     entries: list[Entry] = [*((row + 1, column + 1) for row, column in triangle(n)), "V"]
     if entry is not None:
         lower: Entry = entry if entry == "V" else (max(entry), min(entry))
+        # M is symmetric: 1,2 is written as 2,1
         if lower not in entries:
             expected = f"a row and a column from 1 to {n}, or V"
             raise SpelgenError(f"the entry {entry[0]},{entry[1]} of M", expected=expected)
@@ -193,6 +194,7 @@ class _Writer:
             polynomials = self._polynomials(entry, budget)
         except TooLarge:
             return Formula(entry, None, None)
+        # counted first: an entry that is too long is not converted to expressions
         terms = sum(map(len, polynomials.values()))
         if terms > longest:
             return Formula(entry, terms, None)
@@ -211,6 +213,7 @@ class _Writer:
         for base in self.base:
             # The coefficient of a base parameter is the coefficient of its first inertial parameter.
             polynomial = self._writer.reduced(self._expansion.polynomial(element, base.index, budget))
+            # V has an arbitrary constant: without it the formula is shorter
             if entry == "V":
                 polynomial -= polynomial[(0,) * self._expansion.context.nvars()]
             polynomials[base.name] = polynomial

@@ -116,6 +116,7 @@ class Inspection:
             entries.append({"row": row + 1, "col": column + 1, "kind": kind, "value": value})
         if self.input == "torque":
             return {"entries": entries}
+        # logs of torques have a scale; under servos only ratios are determined, and JSON states which
         rank = servo_rank(self.arm)
         undetermined = [f"{name} of {self.structure.joints[joint]}" for name, joint in rank.open]
         ratios = list(map(self._names, rank.groups))
@@ -176,6 +177,7 @@ class Inspection:
         """Return the lower triangle of M as aligned text: the joints that each entry depends on."""
         cells, n = self._cells(), len(self.structure.joints)
         lines = ["Mass matrix: joints each entry depends on; C constant, 0 always zero"]
+        # each column as narrow as possible: seven joints must fit into 80 characters
         widths = [max(len(cells[row, column]) for row in range(column, n)) for column in range(n)]
         for row in range(n):
             line = f"  {row + 1:>2}"
@@ -192,6 +194,7 @@ class Inspection:
         outputs, constants = len(structure.outputs), len(structure.constants)
         mass = f"{counted(outputs, 'output')} and {counted(constants, 'constant')}"
         mass += f" make all {len(structure.entries)} entries"
+        # an arm whose M is constant needs no networks
         if counts:
             groups = [f"{count} of {joints_in_ranges(joints)}" for joints, count in counts.items()]
             mass += f": {'; '.join(groups)}"
@@ -259,6 +262,7 @@ def inspect(
 
     Raises the errors of ``load_arm``, and ArmError for ``inertials`` if the URDF has none.
     """
+    # an arm that is loaded keeps its own options
     if not isinstance(arm, Arm):
         arm = load_arm(arm, joints, tip, angle_tolerance)
     structure = derive(arm.chain, assume)

@@ -130,6 +130,7 @@ def verify(robot: Robot, arm: Chain, structure: Structure, *, seed: int = 0) -> 
     count = len(structure.entries) + 6
     rng = np.random.default_rng(seed)
     is_random = structure.assume == "kinematics"
+    # one set of samples for all facts: a fact that needed samples of its own could pass by chance
     samples = draw(arm, count, rng, random_inertials=is_random)
     facts = [
         *_entries(structure, samples),
@@ -198,6 +199,7 @@ def _smallest_form(structure: Structure, samples: NumericSamples) -> _DerivedFac
         remainder = remainder - values[..., None] * row_of(term.basis, n) / samples.scale
         # relative to the sum of the absolute values of the terms
         changes = np.abs(values[1:] - values[0]).max(axis=1) / (np.abs(functional) @ samples.scale)
+        # its own joints may change it
         changes[list(term.joints)] = 0.0
         name = f"an output of {joints_in_ranges(term.joints)} with others" if term.joints else "a constant"
         magnitudes.append((f"change of {name}", float(changes.max()), False))
@@ -241,6 +243,7 @@ def _rank(fact: str, rows: np.ndarray, rank: int) -> _DerivedFact:
         # The triangular factor has the same singular values and fewer rows.
         rows = np.asarray(np.linalg.qr(rows, mode="r"))
     values = np.linalg.svd(rows, compute_uv=False)
+    # relative, as the rows have no common unit
     values = values / (values.max(initial=0.0) or 1.0)
     values = np.pad(values, (0, max(0, rank - len(values))))
     magnitudes = []

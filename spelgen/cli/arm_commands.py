@@ -60,6 +60,7 @@ def inspect(
     if formulas or chosen_entry is not None or chosen in ("latex", "sympy"):
         from spelgen.certificate.formulas import WRITABLE
 
+        # a program reads formulas of any length, a person does not
         longest = WRITABLE if chosen in ("json", "sympy") else None
         closed = inspection.closed_forms(chosen_entry, longest=longest)
     # the result comes first; --strict and a failed proof only decide the exit code
@@ -137,6 +138,7 @@ def identify(
     from spelgen.logs.preprocessing import Preprocessing
     from spelgen.logs.read import read_logs
 
+    # an option of names and not one flag per effect: new effects need no new option
     effects = options.names(friction) or []
     for name in effects:
         if name not in EFFECTS:

@@ -48,6 +48,7 @@ def evaluate(
     from spelgen.logs.preprocessing import Preprocessing
 
     logs = read_test_logs(run, paths, mapping)
+    # after the logs, whose errors are more frequent and reported sooner
     model = load_run(run)
     with progress_bar("evaluating") as progress:
         results = evaluate_model(
@@ -62,6 +63,7 @@ def evaluate(
     record = results.to_dict()
     # before anything is printed: a closed pipe must not lose the result
     write_json(RunFolder(run).evaluation, record)
+    # on stderr: stdout has the result only, which scripts read
     for diagnostic in results.diagnostics:
         note(diagnostic)
     forms = {"text": results.text, "csv": lambda: csv_text(results).removesuffix("\n")}

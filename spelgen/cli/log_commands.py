@@ -88,6 +88,7 @@ def excite(
             progress=progress,
         )
     written = [str(write_text(output, motion.csv()))]
+    # the CSV remains the main output: `simulate` and logs use it
     if trajectory is not None:
         written.append(str(write_text(trajectory, motion.joint_trajectory())))
     if html is not None:
@@ -130,6 +131,7 @@ def simulate(
     from spelgen.simulation.simulate import simulate as simulate_arm
 
     arm = options.load(robot, joints, tip, angle_tolerance)
+    # the URDF's names, so that the logs need no mapping
     names = arm.chain.joint_names
     motions = [read_motion(file, names) for file in motion or ()]
     truth = output / "as_built.urdf"
@@ -206,6 +208,7 @@ def _suggested(paths: list[Path], arm: Arm, file: Path) -> Path:
     from spelgen.logs.formats import log_files
     from spelgen.logs.suggest import suggest_mapping
 
+    # the first log only: a mapping applies to all, which have the same columns
     logs, errors = log_files(paths)
     collect(errors)
     suggestion = suggest_mapping(logs[0], arm.chain.joint_names, commands=arm.settings.input == "position")

@@ -34,6 +34,7 @@ def init(
     options.require_free(path, force=force)
     # the settings file is not read: this command writes it
     arm = make_arm(read_urdf(robot), joints=options.names(joints), tip=tip)
+    # damping and friction of the URDF become the first values, which a user then edits
     drives = [StarterJoint(x.name, x.joint_type, x.damping, x.friction) for x in arm.coordinates]
     say(f"wrote {write_text(path, starter(robot.name, drives, arm.bodies[-1].link))}")
 
@@ -125,6 +126,7 @@ def export(
     from spelgen.exporting.exported import format_by_extension, require_fitting
     from spelgen.fitting.fitted import load_run
 
+    # a format is seldom written: the name of the output states it
     if to is None:
         to = format_by_extension(output)
     # names and free places are checked before the model is loaded, which takes seconds

@@ -95,6 +95,7 @@ def result_format() -> OptionInfo:
 
 def choose_format(format: str | None, output: Path | None, formats: Container[str]) -> str:
     """Return the format, by default the format of the output's suffix if the command has it, else text."""
+    # a suffix that the command has no format for is the user's choice of a name
     by_suffix = SUFFIXES.get(output.suffix.lower(), "text") if output else "text"
     return format or (by_suffix if by_suffix in formats else "text")
 
@@ -127,6 +128,7 @@ def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
         return None
     if text == "V":
         return "V"
+    # at most four digits: Python refuses to convert thousands of them, and no arm has as many joints
     match = re.fullmatch(r"\s*(\d{1,4})\s*,\s*(\d{1,4})\s*", text, re.ASCII)
     if match is None:
         raise typer.BadParameter("name it as ROW,COLUMN or V", param_hint="'--entry'")
@@ -135,6 +137,7 @@ def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
 
 def logs(data: list[Path] | None, extra_logs: list[Path] | None) -> list[Path]:
     """Return the paths of all options --data. Raises a usage error if there are none."""
+    # an option and not an argument, so that a forgotten --data is not taken for the name of a module
     if not data:
         raise typer.BadParameter("name at least one file or folder", param_hint="'--data'")
     return [*data, *(extra_logs or [])]

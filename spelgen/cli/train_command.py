@@ -135,6 +135,7 @@ def _payload(fit: Fit, source: Path | None) -> Payload | None:
 
     original = load_run(source)
     levels = stored_levels(original)
+    # a run of an earlier version, or one whose logs were too short for the noise levels
     if levels is None:
         return None
     keep_levels(fit, levels)

@@ -111,6 +111,7 @@ def load_comparison(path: Path) -> Comparison:
         errors.append(SettingsError(got, file=path, line=line, element=element, do=do))
     collect(errors)
     arms = {name: arm.in_folder(path.parent) for name, arm in comparison.arms.items()}
+    # names of presets are no paths
     presets = comparison.presets
     if presets is not None:
         presets = tuple(str(path.parent / name) if _is_file(name) else name for name in presets)
@@ -159,6 +160,7 @@ class ArmInputs(ComparedArm):
         The test trajectories are test.* of the logs or a quarter of all; of several splits, one fold of a k-fold
         cross-validation. They are chosen by a fixed seed, so all models have the same.
         """
+        # loaded again in each worker: paths are sent to it instead of arms
         arm = self.load()
         train = read_logs(self.data, arm, self.mapping, "train")
         test = []
@@ -174,6 +176,7 @@ class ArmInputs(ComparedArm):
         if len(logs) < splits:
             expected = f"{splits} or more, for as many splits"
             raise LogError(f"{len(logs)} trajectories", element="data", expected=expected)
+        # whole trajectories: samples of one trajectory are correlated, and a split within it would leak
         folds = np.array_split(np.random.default_rng(0).permutation(len(logs)), splits)
         return set_aside(logs, folds[number])
 
@@ -193,6 +196,7 @@ def arm_inputs(
     apart: dict[str, bool | set[str]] = {"about": True, "comparison": {"seeds", "published"}}
     settings = [loaded.settings.model_dump_json(exclude_unset=True, exclude=apart)]
     settings.append(mapping.model_dump_json(exclude_unset=True))
+    # size and time in place of the content: logs may have gigabytes
     versions = [(file, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     sources = json.dumps((loaded.robot.digest, arm.joints, arm.tip, settings, versions), default=str)
     inputs = ArmInputs(**dict(arm), digest=hashlib.sha256(sources.encode()).hexdigest()[:16])
@@ -200,6 +204,7 @@ def arm_inputs(
         changes = {"urdf": folder / "known.urdf", "truth": arm.urdf, "data": (folder,)}
         inputs = inputs.model_copy(update=changes | {"joints": loaded.joints, "tip": loaded.tip})
         _simulate(inputs, loaded, folder, progress)
+    # too few logs are an error now and not after hours of training
     inputs.split(0, splits)
     return inputs
 

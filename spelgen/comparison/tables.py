@@ -95,6 +95,7 @@ def arm_sentence(results: Sequence[RunResult]) -> str:
     models = [name for name in errors if name in runs]
     if not models:
         return f"No model has a finite {measure}."
+    # medians are sorted, the smallest first
     best = errors[models[0]]
     # equal to three digits: in effect the same model, as closed-form and hybrid without residual terms
     equal = [name for name in models if number(errors[name]) == number(best)]
@@ -103,6 +104,7 @@ def arm_sentence(results: Sequence[RunResult]) -> str:
     for name, error in errors.items():
         if name not in equal and error < best:
             smaller.append(f"{name} ({number(error)})")
+        # a factor to an error of zero is not defined
         elif name not in equal and best:
             larger.append(f"{number(error / best)} times smaller than with {name}")
     if larger:
@@ -167,9 +169,11 @@ def _losses(
         medians = _summary(figures, figure, statistics.median)
         rows.append(Row(label, medians))
         baseline = medians.get(BASELINE)
+        # the ratio is what the paper states: absolute losses depend on its units and sampling
         if baseline is not None and label in RATIO:
             ratios = {name: baseline / median if median else None for name, median in medians.items()}
             rows.append(Row(f"{BASELINE}'s {RATIO[label]} / this", ratios, ranked=False))
+    # only presets that a paper has figures of
     records = {name: published[name].model_dump(exclude_none=True) for name in figures if name in published}
     for field in PublishedFigures.model_fields:
         values = {name: record[field] for name, record in records.items() if field in record}

@@ -85,6 +85,7 @@ def typical_and_worst(motions: Sequence[Drawn]) -> tuple[Drawn, ...]:
 
 def thinned(motion: PredictedMotion, max_samples: int) -> PredictedMotion:
     """Return the motion at about `max_samples` samples at most."""
+    # every sample at the same distance: filtered curves would hide spikes that the errors contain
     stride = -(-len(motion.t) // max_samples)
     arrays = {name: values for name, values in vars(motion).items() if isinstance(values, np.ndarray)}
     curves: dict[str, Any] = {name: values[::stride] for name, values in arrays.items()}
@@ -112,6 +113,7 @@ def replayed_motion(log: Trajectory, error: np.ndarray) -> PredictedMotion:
         t=log.t - log.t[0],
         q=log.q,
         u=log.u,
+        # the first position is given, not predicted
         predicted_q=np.concatenate([log.q[:1], log.q[1:] + error]),
     )
 
@@ -119,6 +121,7 @@ def replayed_motion(log: Trajectory, error: np.ndarray) -> PredictedMotion:
 def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
     """Return ten seconds from the middle of each log, as logs begin and end at rest, at the samples of a chart."""
     motions = []
+    # logs too slow for accelerations by a filter still show their torques
     slow = [piece for piece in logs.pieces if not shows_accelerations(piece.sample_rate)]
     for samples in [*logs.samples, *(_steps(piece, logs) for piece in slow)]:
         count = min(len(samples.q), round(TUNING.torque_seconds * samples.rate) + 1)
@@ -153,7 +156,9 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
         }
     torques = {name: predicted_torques(predictor, samples) for name, predictor in dynamics.items()}
     predicted = {name: _at_joints(inputs, torque) for name, torque in torques.items()}
+    # at the joints, where the terms of the model act; logs have the torques of the motors
     measured = _at_joints(inputs, samples.tau)
+    # the samples are evenly spaced after the filter
     t = np.arange(len(samples.q)) / samples.rate
     # friction includes an offset of the torque
     stored = parts["inertia"] + parts["Coriolis"] + parts["gravity"]

@@ -85,8 +85,10 @@ def evaluate(
 
     Raises LogError.
     """
+    # checks come before rollouts, which take minutes
     tested = subject(model, arm)
     logs = [logs] if isinstance(logs, Trajectory) else logs
+    # columns are matched by name: another order of the joints is no error, a missing joint is
     for trajectory in logs:
         require_joints(trajectory, tested.joints)
     notes = check(logs, tested.joints, tested.model.joint_types)
@@ -96,6 +98,7 @@ def evaluate(
             f"names also used in training: {', '.join(seen)}; errors on training data are not test errors"
         )
         notes.append(Diagnostic("warning", SEEN, "logs", None, message))
+    # an arm under servos has no torques, so inverse dynamics and rollouts under torques are undefined for it
     if input_of(tested.model) == "position":
         if baselines:
             expected = "none: the model is one of position servos"
@@ -139,9 +142,11 @@ def _evaluate_torques(
     pieces = used.pieces(logs, shortest=2)
     tests = EvaluatedLogs(pieces, samples, used, tested.reach, tested.model.joint_types)
     lengths = horizon_lengths(tests, *ahead, notes)
+    # windows as long as in training: on longer ones errors of the dynamics would hide those of the integrator
     probe = tests.windows(tested.window - 1, TUNING.probed_model_windows)
     # residual terms that were not selected only cost time
     model = without_idle_residuals(tested.model)
+    # chosen per predictor: stiff friction needs more steps, and its error must not count as an error of the dynamics
     solver = accurate_solver(model, probe)
     known = EvaluatedArm(tested.joints, tested.urdf, tested.baselines, tested.fitted_arm, probe, notes)
     predictors = [Predictor(MODEL, solver, model), *torque_predictors(known)]
@@ -167,6 +172,7 @@ def _evaluate_torques(
             expected=f"motion at {SLOWEST:g} Hz or more, {SHORTEST:g} s without a gap",
             do="omit --quick",
         )
+    # after the errors, which include these joints: only the assessment omits them
     steps = coarse_torques(logs, tested.joints, notes) if torque else {}
     masses = {}
     if truth is not None:

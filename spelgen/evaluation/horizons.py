@@ -189,6 +189,7 @@ def predict(
 ) -> tuple[Horizon, Predictions]:
     """Evaluate rollouts of `steps` samples: open loop, and with the disturbance observed before they start."""
     past = past_steps(logs.rate)
+    # without room for the past, the open-loop prediction is still evaluated
     if past + steps > logs.longest:
         message = f"no observer over {name}: the longest trajectory has {logs.longest} steps"
         notes.append(Diagnostic("info", "no-observer", "logs", None, message))
@@ -224,8 +225,10 @@ def end_errors(
     q, qd = (predicted[:, -1] for predicted in states)  # (W, n)
     measured_q, measured_qd = windows.q[:, -1], windows.qd[:, -1]
     # angles of revolute joints are compared modulo a revolution
+    # root mean square and not the mean: large errors decide whether a simulation can be used
     q_error = _rms(position_difference(q, measured_q, joint_types))
     qd_error = _rms(qd - measured_qd)
+    # relative to the motion, so that joints and horizons can be compared
     q_relative = q_error / _rms(position_difference(measured_q, windows.q[:, 0], joint_types))
     qd_relative = qd_error / _rms(measured_qd - windows.qd[:, 0])
     mean = torch.cat([q_relative, qd_relative]).mean(dim=0, keepdim=True)

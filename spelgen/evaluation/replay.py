@@ -54,6 +54,7 @@ class ServoModel:
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the positions per part, (K, n). All parts run in one batch, in which shorter ones are padded."""
+        # one number for all parts, as they are one batch; more steps than needed only cost time
         steps = max(steps_between(log) for log, _ in parts)
         lengths = [rows.stop - rows.start - 1 for _, rows in parts]
         commands, intervals = [], []
@@ -88,12 +89,14 @@ def replays(
             first_qd.append(qd[start])
     for name, baseline in baselines.items():
         notes.append(Diagnostic("info", "baseline", "logs", None, f"{name}: {baseline.about}"))
+    # the model is one of the predictors: all are measured by the same code
     predictors = {MODEL: ServoModel(model), **baselines}
     # a log begins at rest; a window begins in motion
     logs_from_rest: list[LogRows] = [(piece, slice(0, len(piece))) for piece in pieces]
     at_rest = np.zeros((len(pieces), pieces[0].q.shape[1]))
     replay, missed = _replay("whole log", predictors, logs_from_rest, at_rest)
     results = [replay]
+    # logs shorter than a window have no second table
     if windows:
         name = f"windows of {TUNING.replay_window:g} s"
         results.append(_replay(name, predictors, windows, np.stack(first_qd))[0])

@@ -77,6 +77,7 @@ def invariants(model: ArmModel, windows: Windows, low: Tensor, high: Tensor) -> 
 
 def _least_eigenvalue(model: ArmModel, low: Tensor, high: Tensor) -> float:
     """Return the smallest eigenvalue of M over random q in [low, high] (n,), divided by the mean eigenvalue."""
+    # a fixed seed: the same model has the same figure
     generator = torch.Generator().manual_seed(0)
     count = TUNING.sampled_positions
     q = low + (high - low) * torch.rand(count, len(low), dtype=low.dtype, generator=generator)
@@ -90,6 +91,7 @@ def _energy_rise(model: ArmModel, windows: Windows) -> float | None:
     q, qd = windows.q[: TUNING.started_states, 0], windows.qd[: TUNING.started_states, 0]
     no_input = q.new_zeros(len(q), TUNING.free_steps, model.n)
     q, qd = rollout(model, q, qd, no_input, 1e-3)
+    # the initial state is measured and may have any energy; later states are the model's own
     q, qd = q[:, 1:], qd[:, 1:]
     energy = model.hamiltonian(q, model.momentum(q, qd))
     kinetic = (energy - model.potential_energy(q)).max().item()
@@ -122,6 +124,7 @@ def mass_error(learned: Tensor, true: Tensor) -> float:
         learned: M (T, n, n) of a model.
         true: M (T, n, n) of the arm.
     """
+    # the mean of the true M: with the M of each position, an error near a singular M would dominate
     factor = torch.linalg.cholesky(true.mean(dim=0))
     half = torch.linalg.solve_triangular(factor, learned - true, upper=False)
     relative = torch.linalg.solve_triangular(factor, half.mT, upper=False)
@@ -139,6 +142,7 @@ def mass_errors(
         joints: Names of the n joints.
         q: Positions (T, n) [rad; m] of the test logs.
     """
+    # M changes slowly along a trajectory: more positions give the same error
     q = q[:: max(1, len(q) // TUNING.mass_positions)]
     true = true_mass(truth, q, joints)
     with torch.no_grad():

@@ -78,6 +78,7 @@ class Subject:
         if self.spec is not None:
             depends = {*self.spec.potential, *(k for entry in self.spec.entries for k in entry[3])}
             for k, joint in enumerate(self.spec.joints):
+                # one limit alone states no range
                 bound = None if joint.lower is None or joint.upper is None else (joint.lower, joint.upper)
                 limits.append(bound)
                 if k not in depends:
@@ -112,6 +113,7 @@ def read_test_logs(
     """Return the test logs of a run's arm (of a folder test.*, if there are any); mapping: None: as in training."""
     run = RunFolder(folder)
     record, spec = run.read_record(), run.read_spec()
+    # test logs usually come from the same logger as the training logs
     if mapping is None:
         mapping = record.mapping
     elif isinstance(mapping, str | Path) and run.urdf.exists():  # it may contain all joints of the URDF

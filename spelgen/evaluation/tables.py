@@ -110,6 +110,7 @@ def joined(runs: Mapping[str, Results]) -> list[Table]:
                 rows.setdefault(row.label, {})[run] = row.values[MODEL]
     common = []
     for title, rows in tables.items():
+        # a number that one run does not have cannot be compared
         of_all = {label: values for label, values in rows.items() if len(values) == len(runs)}
         if of_all:
             common.append(table(title, of_all))
@@ -133,6 +134,7 @@ def summary(results: Results) -> Listing | None:
         return None
     errors = {name: x.mean_nmse for name, x in results.torque.items()}
     rows: dict[str, Numbers] = {"torque that is unexplained": errors, "error of M(q)": results.mass_errors}
+    # from the least to the most information: the reader sees the gain of each step
     names = [name for name in (URDF, LEAST_SQUARES, MODEL) if name in errors]
     lines = []
     for label, values in rows.items():
@@ -154,6 +156,7 @@ def _horizon_tables(results: Results) -> list[Table]:
             head = f"{head} ({horizon.seconds:.3g} s)"
         relative[head] = {name: errors.mean_relative_rms for name, errors in horizon.errors.items()}
         tips[head] = {name: errors.tip_mm for name, errors in horizon.errors.items()}
+        # short logs have no observer, and need no explanation of it
         if observed(MODEL) in horizon.errors:
             note = OBSERVER
     q = {name: errors.q for name, errors in horizon.errors.items()}
@@ -192,6 +195,7 @@ def _replay_tables(results: Results) -> list[Table]:
         rows: dict[str, Numbers] = {}
         for log in replay.errors[MODEL].trajectories:
             rows[log] = {name: 1000 * errors.trajectories[log] for name, errors in replay.errors.items()}
+        # last, as a sum below its terms
         rows["mean of all"] = {name: 1000 * errors.mean for name, errors in replay.errors.items()}
         joints = {name: [1000 * rms for rms in errors.joints] for name, errors in replay.errors.items()}
         title = f"Commands replayed, {replay.name}: RMS"
@@ -206,6 +210,7 @@ def _by_joint(
 ) -> Table:
     """Return a table with a row for each joint; the unit is in the title if all joints have the same."""
     units = [asdict(UNITS[joint_type])[quantity] for joint_type in results.joint_types]
+    # a unit per row only if needed: it makes the first column wide
     labels, common = results.joints, f" [{units[0]}]"
     if len(set(units)) > 1:
         pairs = zip(results.joints, units, strict=True)

@@ -50,6 +50,7 @@ def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueEr
         by_trajectory[sample.name] = mean_nmse(residual[rows], sample.tau[rows])
         parts.append((residual, sample.tau, rows))
     residual, torque, rows = map(np.concatenate, zip(*parts, strict=True))
+    # pooled over samples: a mean over logs would give a log of one second the weight of one of an hour
     by_joint = _nmse(residual[rows], torque[rows])
     return TorqueErrors(
         nmse=by_trajectory,

@@ -60,10 +60,12 @@ def verdict(
     identified: content of least_squares.json, for the coverage of the training logs. limits: of the joints.
     independent: names of joints on whose position the dynamics do not depend, as of a vertical first axis.
     """
+    # each assessment adds its uses: a sentence about the model is made of what the logs show
     uses = _Uses()
     _assess_torques(results, uses)
     _assess_motion(results, uses)
     _assess_replays(results, uses)
+    # such as an evaluation with --quick on logs without accelerations
     if not uses.proofs:
         return Verdict("No verdict: no horizon and no torque was evaluated.", "")
     sentence = f"Good enough for {listed(uses.good)}" if uses.good else "Not accurate enough yet"
@@ -172,6 +174,7 @@ def _better_baselines(results: Results) -> list[str]:
         if errors[best] < model_error:
             better.setdefault(best, []).append(f"after {horizon.name}")
     torque = {name: x.mean_nmse for name, x in results.torque.items() if x.mean_nmse is not None}
+    # torques are compared without the observer, which does not estimate them
     best = min(torque, key=torque.__getitem__, default=MODEL)
     if MODEL in torque and best != MODEL:
         better.setdefault(best, []).append("in torque")
@@ -241,6 +244,7 @@ def _recommendations(
     recommendations = {}
     trained = identified.get("coverage") or {}
     unseen = identified.get("unseen_directions")
+    # first: parameters that no log determines cannot be improved by any further fit
     if unseen:
         reason = f"The training logs do not excite {unseen} directions of the base parameters."
         recommendations["a richer motion (as spelgen excite proposes)"] = reason
@@ -257,6 +261,7 @@ def _recommendations(
             fractions[joint] = (covered["high"] - covered["low"]) / min(bound[1] - bound[0], 2 * math.pi)
     if fractions:
         joint = min(fractions, key=fractions.__getitem__)
+        # only the narrowest joint: one recommendation is followed, a list is not
         if fractions[joint] < TUNING.narrow_range:
             reason = f"{joint} has moved over {share(fractions[joint], 'its range')}."
             recommendations[f"wider motion of {joint}"] = reason
@@ -273,6 +278,7 @@ def _outside(
         for name, inner, outer in ranges:
             if quantity == "q" and name in independent:
                 continue
+            # a tenth: models extrapolate a little without harm
             room = 0.1 * (inner["high"] - inner["low"])
             if outer["low"] < inner["low"] - room or outer["high"] > inner["high"] + room:
                 exceeded.append(f"{word} of {name}")

@@ -62,6 +62,7 @@ def inspection_page(
 def identification_page(identification: Identification, arm: Arm) -> str:
     """Return the page: base parameters with confidence intervals, the arm, and the torque residual."""
     record: Content = identification.to_dict()
+    # from the JSON form, which is the contract that the page shows
     words = [parameter["determined"] for parameter in record["base_parameters"]]
     never = [name for name, visibility in record["identifiability"].items() if visibility == "never"]
     return render_page(
@@ -83,6 +84,7 @@ def identification_page(identification: Identification, arm: Arm) -> str:
 def motion_page(excitation: Excitation, arm: Arm) -> str:
     """Return the page about a motion of `arm`, approach included."""
     motion = excitation.approach.then(excitation.motion)
+    # twice the points of a chart: the animation uses the same arrays
     step = -(-len(motion.t) // (2 * TUNING.points))  # ceil
     t, q, qd = (x[::step] for x in (motion.t, motion.q, motion.qd))
     drawn = AnimatedMotion("motion", "approach and motion", t.round(3), q.round(4))
@@ -123,6 +125,7 @@ def log_charts(log: Trajectory, arm: Chain, inputs: np.ndarray) -> list[Panel]:
     t, q = joined_column(segments, "t"), joined_column(segments, "q")
     position = [("logged", q, "truth")]
     rows = [JointRow("position", "position", "position", position)]
+    # position servos have no torques to compare with the URDF
     if log.u is not None:
         position.append(("commanded", joined_column(segments, "u"), "predicted"))
     else:
@@ -130,6 +133,7 @@ def log_charts(log: Trajectory, arm: Chain, inputs: np.ndarray) -> list[Panel]:
         velocity = [("logged", joined_column(segments, "qd"), "truth"), ("dq/dt", derivative, "predicted")]
         torque = [("logged", joined_column(segments, "tau") @ inputs.T, "truth")]
         if any(body.inertia for body in arm.bodies):
+            # gravity only: acceleration and friction of the URDF would hide a wrong sign or unit of the torque
             still = np.zeros_like(q)
             gravity = regressor(arm, q, still, still) @ urdf_parameters(arm)  # (T, n)
             torque.append(("gravity of the URDF", gravity, "predicted"))

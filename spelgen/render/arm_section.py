@@ -72,6 +72,7 @@ def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
 
 def _explanations(arm: Chain, structure: Structure) -> dict[str, str]:
     """Return, by entry name, the dependence of the entry, the facts that mention it, and its formula."""
+    # the facts of `spelgen inspect`: a page and a terminal must not explain an entry differently
     every_fact = facts(arm, structure)
     closed = {formula.name: formula for formula in formulas(arm, structure).rows}
     explanations = {}
@@ -86,6 +87,7 @@ def _explanations(arm: Chain, structure: Structure) -> dict[str, str]:
             if of_all or name in re.findall(r"M\d+(?:,\d+)?", fact.statement):
                 lines.append(str(fact))
         formula = closed[name]
+        # long formulas would cover the page; the command writes them
         if formula.expression is not None:
             lines.append(f"{name} = {text(formula.expression)}")
         elif entry.kind != "zero":

@@ -76,6 +76,7 @@ def base_table(
     """Return the base parameters by least squares, from the URDF and of a rigid-body model, with 95 % intervals."""
     effects = identified["method"]["effects"]
     friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
+    # derived again instead of stored: the combinations belong to the URDF and the friction model, not to the logs
     base = base_parameters(arm.chain, friction, arm.actuation.drives().speeds)
     parameters = identified["base_parameters"]
     names, determined = ([parameter[key] for parameter in parameters] for key in ("name", "determined"))
@@ -97,6 +98,7 @@ def base_table(
             "squares has no column for"
         )
     elif isinstance(model, RigidBodyDynamics):
+        # the first columns of every friction model are bodies and armatures, which the model has as well
         common = np.concatenate([body_parameters(model).ravel(), model.armature.detach().numpy()])
         learned = base.combination[:, : len(common)] @ common
         for k in range(base.bodies, len(names)):
@@ -156,6 +158,7 @@ def _body_table(values: np.ndarray, arm: Arm | None, posterior: Posterior | None
 
 def _about_center(body: np.ndarray) -> tuple[str, str, str]:
     """Return mass, centre of mass and principal moments about it, as text; body: inertial parameters, (10,)."""
+    # without mass there is no centre of mass; the URDF may have such bodies
     if body[0] <= 0:
         return f"{body[0]:.4g}", "", ""
     mass, center, tensor = about_center(body)
@@ -174,6 +177,7 @@ def _joint_table(model: ArmModel, arm: Arm | None, posterior: Posterior | None) 
     columns = {"joint": list(model.joint_names)}
     note = "Viscous and Coulomb friction are fitted to the model's friction law."
     if posterior is not None:
+        # numbers with their intervals: they replace the nearest friction, which has none
         columns |= posterior.drive_columns
         note += " Intervals are of 95 %."
     else:
@@ -201,6 +205,7 @@ def _constant_table(mass: DerivedMass | ConstantMass, joint_types: Sequence[str]
     count = len(mass.raw_constants)
     # dM / d constant, (constants, n, n): M is linear in its functions and constants
     functions = len(mass.function_mean) if isinstance(mass, DerivedMass) else 0
+    # unit vectors of the constants give the basis of each one, whatever entries it occurs in
     zeros = torch.zeros(functions, count, dtype=torch.float64)
     units = torch.eye(count, dtype=torch.float64)
     rows = []

@@ -95,6 +95,7 @@ def stacks(
     """
     panels = []
     for k, joint in enumerate(joints):
+        # one time axis per column: its charts are read together
         charts = [row.chart(t, joint, k, motion=motion) for row in rows[:-1]]
         charts.append(rows[-1].chart(t, joint, k, "t [s]", motion))
         panels.append(Panel(joint.name, tuple(charts)))
@@ -161,6 +162,7 @@ def trajectory_panels(
         motion: See `line_chart`.
     """
     measured = next(iter(predictions.values()))
+    # a replayed log of position servos has no velocities
     positions = {name: x.predicted_q for name, x in predictions.items()}
     velocities = {name: x.predicted_qd for name, x in predictions.items() if x.predicted_qd is not None}
     rows = []
@@ -169,12 +171,14 @@ def trajectory_panels(
         if values is None:
             continue
         lines, errors = [("measured", values, "truth")], []
+        # first, so that the measured curve is drawn above it
         if measured.u is not None:
             lines.insert(0, ("commanded", measured.u, "hold"))
         for name, curve in predicted.items():
             lines.append((name, curve, styles[name]))
             errors.append((name, curve - values, styles[name]))
         rows.append(JointRow(quantity, quantity, quantity, lines))
+        # a chart of its own: next to the motion the error would be a flat line
         rows.append(JointRow(f"Error of the {quantity}", "error", quantity, errors, 100))
     return stacks(measured.t, rows, joints, motion)
 

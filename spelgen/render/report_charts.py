@@ -22,6 +22,7 @@ from spelgen.spec import ModelSpec
 def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
     """Return the charts of each section of the report; None, or no charts, for a section without traces."""
     joints = named_joints(spec.joint_names, spec.joint_types)
+    # the template tests for None, and an undefined name would be an error in it
     drawn: dict[str, object] = dict.fromkeys(("growth", "mass", "friction", "energy"))
     growth, mass = traces.growth, traces.mass
     if growth is not None:
@@ -60,6 +61,7 @@ def loss_chart(metrics: Sequence[Content], best_epoch: int) -> Chart:
     """Return training and validation loss over the epochs, with the epoch of the best model."""
     columns = [(record["epoch"], record["loss"], record["validation"]) for record in metrics]
     epochs, *losses = array(columns).T
+    # a vertical line over the whole range; the axis is logarithmic, so it cannot start at 0
     ends = (np.nanmin(losses), np.nanmax(losses))
     lines = [
         Line("training loss", epochs, losses[0], "train"),
@@ -76,6 +78,7 @@ def torque_panels(trace: TorqueTrace, joints: Sequence[NamedJoint]) -> list[Pane
     components = [(name, torque, name.lower()) for name, torque in trace.parts.items()]
     rows = [
         JointRow("Torque", "torque", "torque", curves, 160),
+        # residual and components have their own scales: the residual is small if the model is good
         JointRow("Residual", "residual", "torque", [("residual", measured - predicted, "model")], 100),
         JointRow("Components of the torque", "components", "torque", components, 162),
     ]

@@ -77,6 +77,7 @@ def open_run(path: Path | str) -> Run:
     if folder.evaluation.is_file():
         results = Results.from_dict(folder.read_json(folder.evaluation))
     if folder.urdf.exists():
+        # a page without the picture of the arm is better than none: the results do not depend on the URDF
         with suppress(SpelgenError):
             arm = arm_of_spec(spec, folder.urdf)
     record = folder.read_record() if folder.config.is_file() else None
@@ -98,6 +99,7 @@ def write_report(
     """
     folder = Path(folder)
     path = Path(output or folder / "report.html")
+    # the suffix decides, so that a script needs no further option
     if path.suffix == ".json":
         return write_json(path, report_data(folder))
     return write_text(path, render_report(folder, robot))
@@ -131,6 +133,7 @@ def _posterior(run: Run, model: ArmModel | None) -> Posterior | None:
     content = run.folder.load_checkpoint().posterior
     if content is None:
         return None
+    # the delay is a parameter of the posterior: it shifts the torques of the fit
     return posterior_of(model, content, run.config.preprocessing.torque_delay or 0.0, run.folder.checkpoint)
 
 
@@ -151,6 +154,7 @@ def render_report(folder: Path | str, robot: Path | str | None = None) -> str:
 def _rendered(run: Run, robot: Path | str | None) -> str:
     spec, record, metrics = run.spec, run.config, run.folder.read_metrics()
     model = _trained(run)
+    # the page of a run that is not evaluated has the same sections, and states what is missing
     traces, tables = Traces({}), []
     if run.results is not None:
         traces, tables = run.results.traces, result_tables(run.results)
@@ -197,6 +201,7 @@ def write_runs(folders: Sequence[Path], output: Path) -> Path:
 
 def render_runs(folders: Sequence[Path]) -> str:
     """Return the page as HTML."""
+    # all runs are read before anything is written: an error names the run
     runs: dict[str, Run] = {}
     results: dict[str, Results] = {}
     for name, folder in zip(_names(folders), folders, strict=True):
@@ -219,6 +224,7 @@ def render_runs(folders: Sequence[Path]) -> str:
 
 def _names(folders: Sequence[Path]) -> list[str]:
     """Return the shortest distinct ends of the folders' paths; complete paths would disclose home folders."""
+    # resolved: `.` has no name, and two links to one folder are the same run
     paths = list(map(Path.resolve, folders))
     names: list[str] = []
     for count in range(1, max(len(path.parts) for path in paths) + 1):
@@ -241,6 +247,7 @@ def _verdict(runs: Mapping[str, Results]) -> str:
         if len(of_runs) == len(runs):
             _, name, text = min(of_runs)
             smallest.setdefault(name, []).append(text)
+    # runs with other horizons or logs cannot be ranked
     if not smallest:
         return "These runs have no common horizons or logs."
     sentences = [f"{name} has the smallest {listed(labels)}." for name, labels in smallest.items()]

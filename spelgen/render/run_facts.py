@@ -46,6 +46,7 @@ def head_numbers(
     summary = None if record is None else servo_summary(record.servo)
     if summary is not None:
         numbers.append(summary.headline)
+    # parameters that the fit switched off are not counted: the number states the size of the model in use
     elif model is not None:
         numbers.append((f"{used_parameter_count(model):,}", "trained parameters"))
     if metrics:
@@ -86,6 +87,7 @@ def training_facts(
         "windows": f"{record.training_windows:,} for training, {record.validation_windows:,} for validation",
         "filter": f"{preprocessing.cutoff:g} Hz, zero phase" if preprocessing.filtered else "none",
     }
+    # least squares needs accelerations, and so fewer samples than the model
     if "samples" in baselines:
         count = f"{baselines['samples']:,}"
         facts["dense samples"] = f"{count} that move, from which least squares is fitted as well"
@@ -119,6 +121,7 @@ def _names(trajectories: Sequence[str]) -> str:
 
 
 def _duration(seconds: float) -> str:
+    # three digits at most: times of training vary by more
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = seconds / 60
@@ -127,6 +130,7 @@ def _duration(seconds: float) -> str:
 
 def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str]:
     """Return the commands that reproduce a run, with LOGS in place of the logs, whose paths are not recorded."""
+    # only options that differ from their defaults: the command remains short enough to be read
     options = asdict(spec.options)
     if spec.options.design is not None:  # the run folder has no copy of the YAML file
         options["preset"] += ".yaml"
@@ -148,6 +152,7 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str
         options |= record.options | asdict(record.preprocessing)
         for key, value in _changed(options, defaults).items():
             train += f" --set {shlex.quote(f'{key}={value}')}"
+        # the mapping on the command line replaces the settings of the robot
         if run.mapping.exists():
             train += f" --mapping RUN/{run.mapping.name}"
         lines.append(train)

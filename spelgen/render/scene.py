@@ -60,12 +60,14 @@ def scene(urdf: Path, joints: Sequence[str]) -> Scene:
     """Return the scene of the arm with these moving joints. Raises the errors of ``read_urdf``."""
     robot = read_urdf(urdf)
     constraint = mimic_constraint(robot, joints)
+    # other branches of the robot (a second arm, a base with wheels) are not drawn
     names = _links(robot, joints)
     visual = link_shapes(urdf, "visual", names, TUNING.faces)
     tubes = f" Drawn as tubes, since meshes were not read: {visual.unread_text}." if visual.unread else ""
     if not visual.shapes:
         tubes = " No meshes were read; links are drawn as tubes."
     lengths = [np.linalg.norm(joint.xyz) for name, joint in robot.joint_above.items() if name in names]
+    # a sum and not the largest distance: it does not depend on the configuration
     extent = max(float(sum(lengths)), 1e-3)  # positive even if all joints lie in one point
     links = []
     for name in names:
@@ -131,6 +133,7 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
         if carried.type == "prismatic":  # a thin tube along its travel
             travel = max(abs(carried.lower or 0.0), abs(carried.upper or 0.0))
             meshes += tube(end, end + travel * _rotation(carried) @ _axis(carried), 0.4 * radius)
+    # a last link without children would not be visible otherwise
     if not below and inertial is not None:
         meshes += tube(np.zeros(3), np.array(inertial.com, dtype=float), 0.7 * radius)
     if joint is not None and joint.moves:
@@ -181,6 +184,7 @@ def tube(start: np.ndarray, end: np.ndarray, radius: float, sides: int = 10) -> 
     """
     import trimesh
 
+    # axes that nearly intersect would give discs in place of tubes
     if np.linalg.norm(end - start) <= radius / 2:
         return []
     return [trimesh.creation.cylinder(radius, segment=[start, end], sections=sides)]
@@ -190,6 +194,7 @@ def triangles(shape: LinkShape) -> Trimesh:
     """Return the triangles of a shape in the frame of its link."""
     from trimesh import Trimesh, creation
 
+    # 12 sides and 8 x 10 faces: coarse, since pages must remain small and edges are not visible at this size
     if shape.mesh is not None:
         mesh = Trimesh(*shape.mesh, process=False)
     elif shape.kind == "box":
