@@ -107,8 +107,10 @@ def _once(errors: Sequence[SpelgenError]) -> str:
 
 def _in_short(text: str) -> str:
     """Return a text, or start and end of a long one: a name in a file may have a million characters."""
+    if len(text) <= MAX_TEXT:
+        return text
     third = MAX_TEXT // 3
-    return text if len(text) <= MAX_TEXT else f"{text[:third]}... ({len(text)} characters) ...{text[-third:]}"
+    return f"{text[:third]}... ({len(text)} characters) ...{text[-third:]}"
 
 
 def in_one_line(error: BaseException) -> str:

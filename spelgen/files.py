@@ -54,8 +54,8 @@ def read_bytes(
     except FileNotFoundError:
         raise error("no such file", file=path) from None
     except (OSError, ValueError) as problem:  # ValueError: a null character in the name
-        reason = (isinstance(problem, OSError) and problem.strerror) or problem
-        raise error(f"cannot be read ({reason})", file=path) from None
+        reason = problem.strerror if isinstance(problem, OSError) else None
+        raise error(f"cannot be read ({reason or problem})", file=path) from None
     raise error(f"a file of {size} bytes", file=path, expected=f"at most {largest}", do=do)
 
 
@@ -86,7 +86,8 @@ def limited_memory(size: int) -> Iterator[None]:
         return
     previous, largest = resource.getrlimit(resource.RLIMIT_AS)
     allowed = pages * resource.getpagesize() + size
-    allowed = allowed if largest == resource.RLIM_INFINITY else min(allowed, largest)
+    if largest != resource.RLIM_INFINITY:
+        allowed = min(allowed, largest)
     resource.setrlimit(resource.RLIMIT_AS, (allowed, largest))
     try:
         yield

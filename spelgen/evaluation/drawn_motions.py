@@ -77,7 +77,9 @@ def typical_and_worst(motions: Sequence[Drawn]) -> tuple[Drawn, ...]:
     """Return the motion of median error, and the motion of largest error if there are several."""
     # a sort keeps the order of equal errors: the same logs give the same page
     ordered = sorted(motions, key=lambda motion: math.inf if motion.error is None else motion.error)
-    chosen = [replace(motion, which="typical") for motion in ordered[(len(ordered) - 1) // 2 :][:1]]
+    if not ordered:
+        return ()
+    chosen = [replace(ordered[(len(ordered) - 1) // 2], which="typical")]
     if len(ordered) > 1:
         chosen.append(replace(ordered[-1], which="worst"))
     return tuple(chosen)
