@@ -105,10 +105,11 @@ def share(fraction: float, reference: str = "") -> str:
 
 def printable(text: str, allowed: str = "") -> str:
     """Return text from a file with escaped control characters, except the characters ``allowed``."""
-    escaped = {
-        x: x.encode("unicode_escape").decode() for x in set(text) if not x.isprintable() and x not in allowed
-    }
-    return text.translate(str.maketrans(escaped))
+    unsafe = [x for x in dict.fromkeys(text) if not x.isprintable() and x not in allowed]
+    # escapes contain no unsafe characters: one replacement cannot change another one
+    for character in unsafe:
+        text = text.replace(character, character.encode("unicode_escape").decode())
+    return text
 
 
 def short_name(name: str) -> str:

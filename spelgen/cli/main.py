@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import Annotated, Any
@@ -95,7 +95,19 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 # in the order of a first project, which is the order of `spelgen --help`
-COMMANDS = [inspect, init, build, simulate, identify, excite, logs, train, evaluate, estimate, report]
+COMMANDS: list[Callable[..., None]] = [
+    inspect,
+    init,
+    build,
+    simulate,
+    identify,
+    excite,
+    logs,
+    train,
+    evaluate,
+    estimate,
+    report,
+]
 for command in [*COMMANDS, export, compare, check]:
     app.command(cls=Command, context_settings=CONTEXT)(handle_errors(command))
 

@@ -149,7 +149,7 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
         objective = fit.config.objective
         note(f"info: {TIME_LIMIT} limits fits to windows; these logs are fitted by {objective}")
     posterior = fit.posterior if fit.checkpoint.posterior else None
-    record = {"run": str(folder), "status": fit.status, "objective": fit.config.objective}
+    record: dict[str, object] = {"run": str(folder), "status": fit.status, "objective": fit.config.objective}
     record |= {"steps": fit.steps, "epochs": fit.epochs, "seconds": fit.seconds}
     # JSON has no infinity, the loss of a rollout that diverged
     record["validation_loss"] = fit.best_validation if math.isfinite(fit.best_validation) else None

@@ -74,8 +74,8 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
 
 def without_past(windows: Windows, past: int) -> Windows:
     """Return the windows without their first `past` steps; z remains the state at the first sample."""
-    later = (column[:, past:] for column in (windows.dt, windows.q, windows.qd, windows.tau))
-    return Windows(*later, windows.z)
+    dt, q, qd, tau = (column[:, past:] for column in (windows.dt, windows.q, windows.qd, windows.tau))
+    return Windows(dt, q, qd, tau, windows.z)
 
 
 TipPosition = Callable[[Tensor], Tensor]
@@ -236,8 +236,8 @@ def end_errors(
     if tip is not None:
         distance = _rms((tip(q) - tip(measured_q)).norm(dim=-1, keepdim=True))
         (tip_mm,) = finite(1000 * distance)
-    per_joint = map(finite, (q_error, qd_error, q_relative, qd_relative))
-    return StateErrors(*per_joint, finite(mean)[0], tip_mm)
+    of_q, of_qd, relative_q, relative_qd = map(finite, (q_error, qd_error, q_relative, qd_relative))
+    return StateErrors(of_q, of_qd, relative_q, relative_qd, finite(mean)[0], tip_mm)
 
 
 def _rms(values: Tensor) -> Tensor:

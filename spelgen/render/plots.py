@@ -204,7 +204,7 @@ def mass_panels(
     zero = TUNING.zero * max(np.nanmax(np.abs(mass)) for mass in masses.values())
     for number, (i, j) in enumerate(np.argwhere(np.tri(len(joint_types))).tolist()):
         lines = [Line(label, t, mass[number], styles[label]) for label, mass in masses.items()]
-        if np.nanmax(np.abs([line.y for line in lines])) > zero:
+        if np.nanmax(np.abs([line.heights for line in lines])) > zero:
             name = entry_name(i, j)
             # an entry of a revolute and a prismatic joint is a first moment
             unit = UNITS[joint_types[i]].inertia if joint_types[i] == joint_types[j] else "kg m"
