@@ -105,11 +105,8 @@ def share(fraction: float, reference: str = "") -> str:
 
 def printable(text: str, allowed: str = "") -> str:
     """Return text from a file with escaped control characters, except the characters ``allowed``."""
-    unsafe = [x for x in dict.fromkeys(text) if not x.isprintable() and x not in allowed]
-    # escapes contain no unsafe characters: one replacement cannot change another one
-    for character in unsafe:
-        text = text.replace(character, character.encode("unicode_escape").decode())
-    return text
+    safe = (x if x.isprintable() or x in allowed else x.encode("unicode_escape").decode() for x in text)
+    return "".join(safe)
 
 
 def short_name(name: str) -> str:

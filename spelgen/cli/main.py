@@ -95,20 +95,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 # in the order of a first project, which is the order of `spelgen --help`
-COMMANDS: list[Callable[..., None]] = [
-    inspect,
-    init,
-    build,
-    simulate,
-    identify,
-    excite,
-    logs,
-    train,
-    evaluate,
-    estimate,
-    report,
-]
-for command in [*COMMANDS, export, compare, check]:
+COMMANDS: list[Callable[..., None]] = [inspect, init, build, simulate, identify, excite, logs]
+COMMANDS += [train, evaluate, estimate, report, export, compare, check]
+for command in COMMANDS:
     app.command(cls=Command, context_settings=CONTEXT)(handle_errors(command))
 
 
