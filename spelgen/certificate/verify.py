@@ -2,7 +2,7 @@
 
 With ``kinematics`` every sample has its own random inertial parameters; with ``inertials`` all samples have the
 parameters of the URDF. The verification shares only the chain with the derivation; the chain is compared with the
-reading of the file by Pinocchio (``urdf_cross_check``).
+reading of the file by Pinocchio (``numeric_samples``).
 """
 
 from __future__ import annotations
@@ -15,8 +15,13 @@ from typing import Literal
 import numpy as np
 
 from spelgen.arm.arm import Chain
-from spelgen.certificate.numeric_samples import ENGINE, NumericSamples, draw, regressor
-from spelgen.certificate.urdf_cross_check import differences_of_reading
+from spelgen.certificate.numeric_samples import (
+    ENGINE,
+    NumericSamples,
+    differences_of_reading,
+    draw,
+    regressor,
+)
 from spelgen.errors import shortened
 from spelgen.labels import entry_name, joints_in_ranges
 from spelgen.listing import WIDTH, Listing

@@ -18,10 +18,10 @@ from spelgen.log_checks.report import LogReport
 from spelgen.logs.trajectory import Trajectory, joined_column, split_at_gaps
 from spelgen.render.arm_section import AnimatedMotion, arm_section, matrix
 from spelgen.render.charts import TUNING
-from spelgen.render.page import render_page
 from spelgen.render.parameters import DETERMINED, base_table
 from spelgen.render.plots import JointRow, Panel, stacks
 from spelgen.structure.structure import derive
+from spelgen.templates import render_page
 
 if TYPE_CHECKING:
     from spelgen.certificate.formulas import Formulas

@@ -18,10 +18,10 @@ from spelgen.certificate.inspection import cell_text
 from spelgen.evaluation.plain import Curve, record
 from spelgen.evaluation.traces import Traces
 from spelgen.labels import MODEL, entry_name, joints_in_ranges
-from spelgen.render.page import json_data
 from spelgen.render.scene import scene
 from spelgen.structure.nominal import working_range
 from spelgen.structure.structure import Structure
+from spelgen.templates import json_data
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from spelgen.files import write_text
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.labels import counted, named_joints
 from spelgen.render.charts import Chart, Line, line_chart
-from spelgen.render.page import render_page
 from spelgen.render.plots import Panel, mass_panels, trajectory_panels
+from spelgen.templates import render_page
 
 STYLES = ("c1", "c2", "c3", "gravity", "c4", "c5", "c6")
 

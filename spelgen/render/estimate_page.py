@@ -13,8 +13,8 @@ from spelgen.labels import named_joints
 from spelgen.live.noise import NoiseLevels
 from spelgen.live.replay import LogEstimate, payload_sentence
 from spelgen.render.charts import Band, Chart, Line, Mark, line_chart
-from spelgen.render.page import render_page
 from spelgen.render.plots import JointRow, Panel, stacks
+from spelgen.templates import render_page
 
 
 def write_estimate(fit: Fit, levels: NoiseLevels, results: Sequence[LogEstimate], path: Path) -> Path:

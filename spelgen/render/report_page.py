@@ -26,13 +26,13 @@ from spelgen.fitting.servo.report import servo_summary
 from spelgen.labels import MODEL, UNITS, listed, named_joints
 from spelgen.render import run_facts
 from spelgen.render.arm_section import arm_section, evaluated_motions, matrix
-from spelgen.render.page import render_page
 from spelgen.render.parameters import body_parameters, parameter_tables
 from spelgen.render.plots import growth_panels
 from spelgen.render.report_charts import coverage_panels, evaluation_charts, loss_chart
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.spec import ModelSpec
 from spelgen.structure.structure import derive
+from spelgen.templates import render_page
 
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
