@@ -9,7 +9,7 @@ from itertools import groupby
 
 @dataclass(frozen=True)
 class Units:
-    """Units of the quantities of a joint; torque: or force; inertia: of the diagonal entry of M."""
+    """Units of the quantities of a joint. torque: of its torque or force. inertia: of the diagonal entry of M."""
 
     position: str
     velocity: str

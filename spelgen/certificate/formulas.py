@@ -32,7 +32,7 @@ from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure
 
 WRITABLE = 3000
-"""Terms of an entry that a program reads, or that is requested by itself."""
+"""Largest number of terms of an entry in a file for programs, or of a single requested entry."""
 
 Entry = tuple[int, int] | Literal["V"]
 """An entry of M, (row, column) from 1, or V."""
