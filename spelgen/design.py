@@ -64,6 +64,7 @@ def load_design(preset: str | Path | Design) -> Design:
     """Return the design of a preset of spelgen, or of a YAML file. Raises SettingsError."""
     if isinstance(preset, Design):
         return preset
+    # names first: a file without suffix cannot hide a preset
     if str(preset) in PRESET_NAMES:
         return _read(PRESETS / f"{preset}.yaml")
     if Path(preset).suffix in (".yaml", ".yml"):
@@ -78,6 +79,7 @@ def _read(path: Path) -> Design:
     content = document.value()
     if not isinstance(content, dict):
         raise SettingsError("no keys with values", file=path, expected=f"the keys {', '.join(CHOICES)}")
+    # the description is for readers of the file
     values = {key: value for key, value in content.items() if key != "about"}
     validate(values, document)
     return Design(**values)
@@ -113,6 +115,7 @@ def validate(values: Mapping[str, object], document: YamlDocument | None = None)
 
 def _conflicts(values: Mapping[str, object]) -> Iterator[tuple[str, str, str]]:
     """Yield pairs of keys with contradicting values, and advice."""
+    # rules in the order in which a reader of the file meets the keys
     rigid = values["mass"] == "closed-form"
     if rigid != (values["potential"] == "closed-form"):
         yield "mass", "potential", "rigid bodies give both: name closed-form for both or for neither"

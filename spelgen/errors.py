@@ -41,6 +41,7 @@ class SpelgenError(Exception):
         statement = _in_short(self.got)
         if self.expected is not None:
             statement = f"got {statement}, expected {_in_short(self.expected)}"
+        # the form of compilers, from which editors jump to the line
         location = ":".join(str(x) for x in (self.file, self.line) if x is not None)
         message = ": ".join(x for x in (_in_short(location), _in_short(self.element or ""), statement) if x)
         if self.do is not None:
@@ -88,6 +89,7 @@ class SpelgenErrors(SpelgenError):
         self.errors = tuple(errors)
 
     def __str__(self) -> str:
+        # a folder of logs from one logger has the same error in every file
         groups: dict[tuple[object, ...], list[SpelgenError]] = {}
         for error in self.errors:
             key = (error.line, error.element, error.got, error.expected, error.do)
@@ -129,6 +131,7 @@ def collect(errors: Sequence[SpelgenError]) -> None:
 def suggestion(name: str, names: Iterable[str]) -> str:
     """Return a hint for an unknown ``name``: the closest of the known ``names``, or the first ten."""
     names = list(names)
+    # one name: a list of similar names would have to be read
     nearest = get_close_matches(name, names, n=1)
     if nearest:
         return f"did you mean {nearest[0]!r}?"
@@ -139,6 +142,7 @@ def suggestion(name: str, names: Iterable[str]) -> str:
 def shortened(names: Sequence[str], limit: int) -> str:
     """Return the names, or the first ``limit`` of them and the number of the others."""
     omitted = len(names) - limit
+    # `and 1 more` is longer than most names
     if omitted <= 1:
         return ", ".join(names)
     return ", ".join([*names[:limit], f"and {omitted} more"])

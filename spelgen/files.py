@@ -49,6 +49,7 @@ def read_bytes(
         # The size is read first: a sparse file of many gigabytes takes no space.
         size = path.stat().st_size
         require_regular_file(path, error, kind)
+        # a parser of JSON cannot be interrupted, so its input is limited
         if size <= largest:
             return path.read_bytes()
     except FileNotFoundError:
@@ -65,6 +66,7 @@ def read_json(path: Path, error: type[SpelgenError]) -> dict[str, Any]:
         content = json.loads(read_bytes(path, error))
     except (ValueError, RecursionError) as problem:
         raise error(f"broken JSON ({problem})", file=path) from problem
+    # all files of spelgen are objects, which can get further keys
     if not isinstance(content, dict):
         raise error(f"{type(content).__name__} in JSON", file=path, expected="an object")
     return content
@@ -104,6 +106,7 @@ def replacing(path: Path | str) -> Iterator[Path]:
     """
     path = Path(path)
     with naming(path):
+        # a new run folder is no reason for a command to fail after minutes of work
         path.parent.mkdir(parents=True, exist_ok=True)
         # In the same folder: a file is renamed atomically only within a file system.
         unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -164,6 +167,7 @@ def local(path: Path | str) -> Path:
     Files written to the copy are sent to the address (see `sent`). Raises SpelgenError if the address cannot be
     reached, or has keys outside itself.
     """
+    # a local file whose name looks like an address takes precedence
     match = ADDRESS.match(str(path))
     if match is None or Path(path).exists():
         return Path(path)

@@ -67,6 +67,7 @@ def joints_in_ranges(joints: tuple[int, ...]) -> str:
 
 def entry_name(row: int, column: int) -> str:
     """Return the name of an entry of M with indices from 0: M21, or M12,1 from the tenth joint."""
+    # M111 could be row 1 and column 11, or row 11 and column 1
     comma = "," * (max(row, column) >= 9)
     return f"M{row + 1}{comma}{column + 1}"
 
@@ -95,6 +96,7 @@ def counted(count: int, noun: str) -> str:
 
 def share(fraction: float, reference: str = "") -> str:
     """Return ``5 % of the motion``, or ``13.6 times the motion`` for a fraction above 1."""
+    # 250 % of the motion is harder to imagine than 2.5 times the motion
     if fraction > 1:
         return f"{fraction:.3g} times {reference}".rstrip()
     # four digits close to 100 %
@@ -111,6 +113,7 @@ def printable(text: str, allowed: str = "") -> str:
 
 def short_name(name: str) -> str:
     """Return a name from a file for a line of a table: shortened, without control characters."""
+    # line ends and tabs of a name would break the table
     line = " ".join(printable(name).split())
     # a table of 80 columns has room for 36 characters beside its numbers
     return f"{line[:33]}..." if len(line) > 36 else line or '""'

@@ -36,6 +36,7 @@ class Listing:
         """Return the table for a terminal or a file, without a line end."""
         columns = list(map(list, zip(self.head, *self.rows, strict=True)))
         tables = "\n\n".join(self._layout(columns, group) for group in _groups(_fitted(columns)))
+        # indented as the rows, so that the next title is found at a glance
         note = textwrap.wrap(self.note, WIDTH - 2, initial_indent="  ", subsequent_indent="  ")
         return "\n".join([*textwrap.wrap(self.title, WIDTH), tables, *note])
 
@@ -87,6 +88,7 @@ def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
     room = WIDTH - 2 - max(MIN_NAME, _width(words))
     groups: list[list[int]] = [[]]
     used = 0
+    # greedy: columns keep their order, and only the last table may be narrow
     for column in range(1, len(columns)):
         width = 2 + _width(columns[column])
         if used and used + width > room:
@@ -121,6 +123,7 @@ def number(value: float | None) -> str:
     """
     if value is None or not math.isfinite(value):
         return "-"
+    # a count is exact: rounding would hide a lost sample
     if isinstance(value, int):
         return f"{value:,}"
     # Plain decimals in the range in which three digits need no exponent.

@@ -178,6 +178,7 @@ class ModelSpec:
         joints += [index for basis in bases for row in basis for index in row[:2]]
         joints += [index for x in self.inputs for index in (x.joint, x.motor)]
         joints += [index for row, column, _, depends in self.entries for index in (row, column, *depends)]
+        # logs and exports find joints and links by name
         names = [joint.name for joint in self.joints], [link.name for link in links]
         consistent = (
             n > 0
@@ -230,6 +231,7 @@ def spec_from_json(text: str, file: Path | None = None) -> ModelSpec:
         # Written again it must be the same: pydantic converts numbers and ignores keys.
         if json.loads(spec.to_json()) == {"format": version, **content}:
             return spec
+        # not ignored: a specification that was edited by hand would be another model than its text states
         reason = "keys or values of other types"
     except (ValidationError, ValueError, RecursionError, SettingsError) as problem:
         reason = " ".join(str(problem).split())[:200]

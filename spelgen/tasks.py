@@ -39,6 +39,7 @@ def run_here(
     work: Callable[[Task], Result], tasks: Sequence[Task]
 ) -> Iterator[tuple[Task, Result | Exception]]:
     """Run one task after the other in this process."""
+    # the exception is yielded, not raised: one failed run must not stop the others
     for task in tasks:
         try:
             outcome: Result | Exception = work(task)
@@ -95,6 +96,7 @@ def _run_on_ray(
     remote: Any = ray.remote(num_cpus=1, max_retries=RETRIES)(_work_or_die)
     waiting = {remote.remote(work, task): task for task in tasks}
     try:
+        # in the order in which tasks end: a result is stored at once, whatever happens later
         while waiting:
             (reference,), _ = ray.wait(list(waiting), num_returns=1)
             yield waiting.pop(reference), _outcome(reference)

@@ -25,6 +25,7 @@ _FOLDER = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[1] / "te
 def _environment(autoescape: bool) -> Environment:
     return Environment(
         loader=FileSystemLoader(_FOLDER),
+        # a misspelt name would otherwise leave a gap in a page or in generated code
         undefined=StrictUndefined,
         autoescape=autoescape,
         trim_blocks=True,
@@ -55,6 +56,7 @@ def render_page(template: str, **context: object) -> str:
     The Content-Security-Policy of the page admits its own style sheet and scripts by their digests and nothing else:
     the page loads no file or address, and text from a user's file cannot run as a script.
     """
+    # inline, not linked: a page is one file, which can be sent by mail
     style, *scripts = _assets()
     return render(
         template,

@@ -69,6 +69,7 @@ def compare(
         "presets": tuple(ablation_designs()) if ablation else names and tuple(names),
         "seeds": seeds, "splits": splits, "steps": steps,
     }  # fmt: skip
+    # options of the command line take precedence over the file
     changes = {name: value for name, value in values.items() if value is not None}
     comparison = _comparison(target, data, mapping).model_copy(update=changes)
     name = target.stem + ("-logs" if data else "") + ("-ablation" if ablation else "")
@@ -85,6 +86,7 @@ def compare(
         with workers(parallel, address) as run_tasks:
             study = run_study(study, run_tasks, note)
         sections = arm_sections(study)
+        # the tables are printed as well, since a page cannot be read in a terminal
         for section in sections:
             say(f"{section.name}: {section.sentence}\n")
             for table in section.tables:

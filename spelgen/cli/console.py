@@ -84,6 +84,7 @@ def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
         raise typer.Exit(BROKEN_PIPE)
     if debug:
         traceback.print_exception(error)
+    # no traceback: the user knows the reason
     if isinstance(error, KeyboardInterrupt):
         note("interrupted")
         raise typer.Exit(INTERRUPTED)
@@ -115,6 +116,7 @@ def progress_bar(title: str) -> Iterator[Callable[..., None]]:
     from rich.console import Console
     from rich.progress import Progress
 
+    # on stderr: stdout has the result only
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as bar:
         task = bar.add_task(title, total=None)
         yield lambda done, total, now=title: bar.update(task, completed=done, total=total, description=now)
@@ -132,6 +134,7 @@ def note(text: object) -> None:
 
 def answer(form: str, record: Mapping[str, object], *lines: str) -> None:
     """Print the result of a command: its lines as text, or its record as one line of JSON."""
+    # one line: logs of a pipeline have one record per line
     if form == "json":
         print(json.dumps(record, default=str))
         return

@@ -176,6 +176,7 @@ def logs(
 
     # a mapping must name the joints of the URDF
     arm = options.load(robot, joints, tip, angle_tolerance)
+    # before the logs are read: they may be readable only with the suggested mapping
     if suggest is not None:
         options.require_free(suggest, force=force)
         mapping = _suggested(paths, arm, suggest)

@@ -35,6 +35,7 @@ class Command(TyperCommand):
 
     def get_help(self, ctx: Any) -> str:
         """Return the help."""
+        # the help of typer has `PATH` beside each name, which is no more than the name states
         for parameter in self.params:
             if isinstance(parameter, TyperArgument):
                 vars(parameter)["display_type"] = lambda ctx: ""
@@ -115,6 +116,7 @@ def common(
     ] = False,
 ) -> None:
     """Derive, train and export dynamics models of robot arms from URDF files and logs."""
+    # help and exit code 0, as git and cargo do; typer would exit with an error
     if ctx.invoked_subcommand is None:
         say(ctx.get_help())
 

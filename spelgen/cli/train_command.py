@@ -81,6 +81,7 @@ def train(
     # with --resume, the argument may be the run folder
     folder = output or _default_folder(module, source, resume=resume)
     spec = _specification(module, source, folder if resume else None)
+    # a resumed run keeps the settings of its record, not those of a file that may have changed since
     urdf = None if resume else robot or (None if module is None else _unchanged_urdf(module, spec))
     start = resumed_run(folder, request) if resume else new_run(urdf, request)
     from spelgen.emission.specify import arm_of_spec
@@ -111,6 +112,7 @@ def train(
             require=lambda logs: [] if arm is None else require_sound_logs(logs, arm, log_mapping),
             options=run_options,
         )
+    # the option that does not apply is known only after the logs chose the objective
     except OptionError as error:
         option = "--objective" if error.option == "objective" else f"--set {error.option}"
         raise UsageError(f"{option}: {error.got}") from error
@@ -164,6 +166,7 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
         outcome.append(textwrap.fill(f"in these logs: {payload_sentence(payload)}", 80))
     outcome += [] if posterior is None else [table.text() for table in posterior.listings]
     answer(format, record, *outcome, f"run folder: {folder}")
+    # as a shell does: a script must not take an interrupted fit for a finished one
     if fit.status == "interrupted":
         note("the best model so far is in the run folder; resume it by --resume")
         raise typer.Exit(INTERRUPTED)

@@ -84,6 +84,7 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         name, _, field = key.strip().replace("-", "_").partition(".")
+        # checked before the keys: the user may have written a blank in place of `=`
         if not equals:
             raise UsageError(f"--set: got {assignment!r}, expected KEY=VALUE")
         if name not in keys:

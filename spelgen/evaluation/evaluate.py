@@ -87,7 +87,7 @@ def evaluate(
     """
     # checks come before rollouts, which take minutes
     tested = subject(model, arm)
-    logs = [logs] if isinstance(logs, Trajectory) else logs
+    logs = [logs] if isinstance(logs, Trajectory) else list(logs)
     # columns are matched by name: another order of the joints is no error, a missing joint is
     for trajectory in logs:
         require_joints(trajectory, tested.joints)
