@@ -3,16 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from math import atan2, cos, lcm, pi, sin, tan
 
 import numpy as np
 
-from spelgen.arm.tuning import TUNING
-
 Vector = tuple[Fraction, Fraction, Fraction]
 Matrix = tuple[Vector, Vector, Vector]
 
+
+@dataclass(frozen=True)
+class GeometryTuning:
+    """Tolerances for the exact values that rounded numbers of a URDF represent."""
+
+    # [rad] Distance to a multiple of pi/12, pi/8 or pi/5 within which an angle is rounded to it. It is small because
+    # 0.26, 0.39 and 0.63 also occur as exact values.
+    fine_tolerance: float = 2e-5
+    # [1] Divisors of pi for these multiples: the special angles on the CAD drawings of 189 arms.
+    fine_divisors: tuple[int, ...] = (12, 8, 5)
+    # [m] An offset below this bound is 0: composed rotations have rounding errors of this size.
+    offset_noise: float = 1e-9
+    # [1] A component of a unit axis below this bound is 0: CAD exporters print three digits.
+    axis_noise: float = 1e-3
+    # [rad, 1] A change of an angle or of an axis below this bound is not reported.
+    notable: float = 1e-9
+    # [1] An element of a rotation, or a moment divided by the largest moment, below this bound is rounding and means
+    # 0.
+    zero_noise: float = 1e-12
+    # [rad] Largest error of a rational rotation: thousands of times below the accuracy of any calibration.
+    rotation_error: float = 1e-11
+    # [1] Bounds of denominators, tried in turn so that the shortest fractions are found first.
+    denominators: tuple[int, ...] = (10**7, 10**10, 10**13)
+    # [rad] Start of the sectors of a quarter turn into which angles are sorted, just below pi/4: no common angle lies
+    # at an edge.
+    eighth: float = 0.7
+    # [1] Largest number of bits of a denominator: exact arithmetic on longer ones takes hours (untrusted input).
+    max_bits: int = 4096
+    # [rad] Largest angle between two axes that are meant to be parallel, rounding included.
+    parallel: float = 1e-2
+
+
+TUNING = GeometryTuning()
 
 IDENTITY: np.ndarray = np.eye(3, dtype=object) * Fraction(1)
 ZERO = np.array([Fraction(0)] * 3)
@@ -41,13 +73,11 @@ def rounded_angle(angle: float, tolerance: float) -> float:
     """
     if tolerance == 0.0:
         return angle
-    nearest = round(angle / (pi / 2)) * (pi / 2)
-    if abs(nearest - angle) <= tolerance:
-        return nearest
-    for divisor in TUNING.fine_divisors:
+    limits = {2: tolerance} | dict.fromkeys(TUNING.fine_divisors, TUNING.fine_tolerance)
+    for divisor, limit in limits.items():
         step = pi / divisor
         nearest = round(angle / step) * step
-        if abs(nearest - angle) <= TUNING.fine_tolerance:
+        if abs(nearest - angle) <= limit:
             return nearest
     return angle
 
@@ -85,20 +115,14 @@ def alignment(axis: np.ndarray) -> np.ndarray:
     cross = np.cross(closest, axis)
     skew = np.cross(np.eye(3), cross)
     smallest = np.eye(3) + skew + skew @ skew / (1.0 + float(closest @ axis))
-    turned: np.ndarray = smallest @ _coordinate_alignment(index, sign)
-    return turned
-
-
-def _coordinate_alignment(index: int, sign: float) -> np.ndarray:
-    """Return a signed permutation (3, 3) that maps +z to the coordinate axis ``index``, or to its opposite."""
-    following, last = np.eye(3)[(index + 1) % 3], np.eye(3)[(index + 2) % 3]
-    axis = sign * np.eye(3)[index]
-    if sign > 0:
-        return np.stack([following, last, axis], axis=1)
-    if index == 2:
+    # a signed permutation that maps +z to the closest coordinate axis, or to its opposite
+    first, second = np.eye(3)[(index + 1) % 3], np.eye(3)[(index + 2) % 3]
+    columns = [first, second, closest] if sign > 0 else [second, first, closest]
+    if sign < 0 and index == 2:
         # Rotation by pi about x. Parameters of existing modules depend on this convention for -z axes.
-        return np.stack([following, -last, axis], axis=1)
-    return np.stack([last, following, axis], axis=1)
+        columns = [first, -second, closest]
+    turned: np.ndarray = smallest @ np.stack(columns, axis=1)
+    return turned
 
 
 def exact_rotation(rotation: np.ndarray) -> np.ndarray:

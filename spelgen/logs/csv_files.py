@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import takewhile
 from pathlib import Path
 
 import pyarrow as pa
@@ -57,13 +58,8 @@ def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
 
     Raises LogError for any other file that begins with numbers.
     """
-    columns = [*STAMP]
-    names: list[str] = []
-    for cell in cells[len(STAMP) :]:
-        if is_number(cell):
-            break
-        names.append(cell)
-        columns.append(f"name_{cell}")
+    names = list(takewhile(lambda cell: not is_number(cell), cells[len(STAMP) :]))
+    columns = [*STAMP, *(f"name_{name}" for name in names)]
     labels = len(columns)
     for quantity in FIELDS:
         if len(columns) < len(cells):

@@ -10,9 +10,8 @@ import numpy as np
 from spelgen.dynamics.bristles import BristleReach, bristles_along, direction_along
 from spelgen.logs.filtering import interpolated, low_passed, regular_times, require_cutoff, resampled
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
-from spelgen.logs.tuning import SAMPLES, TUNING
+from spelgen.logs.tuning import SAMPLES, TUNING, shows_accelerations
 
 FREQUENCY = SAMPLES.sample_rate
 SHORTEST = SAMPLES.shortest_piece

@@ -7,9 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import Trajectory
-from spelgen.logs.tuning import TUNING
+from spelgen.logs.tuning import TUNING, is_dense
 
 # SciPy is imported where it is called: that takes the better part of a second, which most commands can do without
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from math import pi
 
@@ -25,23 +24,25 @@ def make_trajectory(data: np.ndarray, layout: Layout, name: str, repairs: tuple[
     Wrapped angles and overflowed registers are unwrapped, and rows that are written several times are read once,
     before anything is differentiated; with 'dropouts: dropped' lost rows and outliers are removed, too.
     """
-    mapping, remarks = layout.mapping, layout.remarks
-    data, wraps = _without_wraps(data, mapping.signals(layout.joints), mapping)
+    mapping = layout.mapping
+    signals = mapping.signals(layout.joints)
+    data, wraps = _without_wraps(data, signals, mapping)
     data, dropped = _without_repeats(data, len(layout.joints), mapping)
     repairs += dropped
     if mapping.dropouts == "dropped":
-        data, dropped = _without_outliers(data, mapping.signals(layout.joints))
+        data, dropped = _without_outliers(data, signals)
         repairs += dropped
-    t, columns = data[:, 0], np.split(data[:, 1:], len(mapping.quantities), axis=1)
-    signals = dict(zip(mapping.quantities, columns, strict=True))
-    q, tau = signals["q"], signals.get("tau", np.zeros((len(t), 0)))
-    qd = signals.get("qd", np.zeros_like(q))
-    if "qd" not in signals:
+    t, *columns = np.split(data, [1 + len(layout.joints) * k for k in range(len(mapping.quantities))], axis=1)
+    t, logged = t[:, 0], dict(zip(mapping.quantities, columns, strict=True))
+    q = logged["q"]
+    qd = logged.get("qd", np.zeros_like(q))
+    if "qd" not in logged:
         for rows in _pieces(t):
             qd[rows] = np.gradient(q[rows], t[rows], axis=0)  # central differences
-    tau = earlier(t, tau, mapping.torque_delay)
-    trajectory = Trajectory(t, q, qd, tau, name, layout.file, layout.accepted, signals.get("u"), repairs)
-    return replace(trajectory, remarks=remarks + wraps, mapping=mapping)
+    tau = earlier(t, logged.get("tau", np.zeros((len(t), 0))), mapping.torque_delay)
+    return Trajectory(
+        t, q, qd, tau, name, layout.file, layout.accepted, logged.get("u"), repairs, layout.remarks + wraps, mapping
+    )  # fmt: skip
 
 
 def _without_wraps(
@@ -49,13 +50,16 @@ def _without_wraps(
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return rows (T, C) in which signals with a period do not jump by it, and remarks on them."""
     remarks: list[str] = []
+    if not any(mapping.word("period", *signal) for signal in signals):
+        return data, ()
+    data = data.copy()
     values = dict(zip(signals, data[:, 1:].T, strict=True))
-    for (quantity, joint), logged in values.items():
+    for (quantity, joint), column in values.items():
         period = abs(mapping.scale(quantity, joint)) * (mapping.word("period", quantity, joint) or 0.0)
         if not period:
             continue
-        count = jump_count(logged, period)
-        result = unwrapped(logged, period)
+        count = jump_count(column, period)
+        result = unwrapped(column, period)
         if quantity == "u":
             # a command is close to the position, although the two registers may count from different revolutions
             result = result - period * np.round(np.median(result - values["q", joint]) / period)
@@ -65,11 +69,8 @@ def _without_wraps(
             result = centred(result - offset, period) + offset
         if count:
             remarks.append(f"{quantity} of {joint!r} wraps at {period:.4g}: {counted(count, 'jump')} removed")
-        if result is not logged:
-            values[quantity, joint] = result
-    if all(column is logged for column, logged in zip(values.values(), data[:, 1:].T, strict=True)):
-        return data, ()
-    return np.column_stack([data[:, 0], *values.values()]), tuple(remarks)
+        column[:] = result
+    return data, tuple(remarks)
 
 
 def _without_repeats(
@@ -84,11 +85,13 @@ def _without_repeats(
     if count <= TUNING.repeats * len(data):
         return data, ()
     rate = (len(data) - 1 - count) / (data[-1, 0] - data[0, 0])
-    message = f"every row is written {copies} times"
-    if copies == 1:
-        message = f"{count} rows repeat the row before in motion"
-        if mapping.dropouts == "kept":
-            return data, (f"{message}: 'dropouts: dropped' under 'logs' removes them, {rate:.3g} Hz remain",)
+    if copies > 1:
+        return data[~repeats], (
+            f"every row is written {copies} times: repeats were left out, {rate:.3g} Hz remain",
+        )
+    message = f"{count} rows repeat the row before in motion"
+    if mapping.dropouts == "kept":
+        return data, (f"{message}: 'dropouts: dropped' under 'logs' removes them, {rate:.3g} Hz remain",)
     return data[~repeats], (f"{message}: repeats were left out, {rate:.3g} Hz remain",)
 
 
@@ -99,11 +102,11 @@ def _without_outliers(
     outliers = np.zeros(len(data), bool)
     found = []
     for (quantity, joint), values in zip(signals, data[:, 1:].T, strict=True):
-        if quantity != "u":
-            rows = outlier_rows(quantity, values)
+        rows = outlier_rows(quantity, values)
+        # commands may jump
+        if quantity != "u" and rows.any():
             outliers |= rows
-            if rows.any():
-                found.append(f"{quantity} of {joint!r} at t = {listed_times(data[rows, 0])}")
+            found.append(f"{quantity} of {joint!r} at t = {listed_times(data[rows, 0])}")
     if not found:
         return data, ()
     message = f"{counted(int(outliers.sum()), 'row')} left out as dropouts: {'; '.join(found)}"
@@ -145,7 +148,7 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[n
         positions = slice(1, 1 + len(layout.joints))
         # two recordings in one file would be interleaved by sorting
         if _roughness(ordered[:, positions]) > _roughness(data[:, positions]):
-            require_increasing_times(t, rows, layout)
+            raise _backward_times(t, rows, layout)
         data = ordered
         repairs += (f"{late} times before that of the row above: the rows were sorted",)
     is_repeat = np.diff(data[:, 0], prepend=-np.inf) == 0
@@ -196,21 +199,18 @@ def _roughness(positions: np.ndarray) -> float:
     return float((length / np.where(ranges > 0, ranges, 1.0)).sum())
 
 
-def require_increasing_times(t: np.ndarray, rows: Sequence[int] | np.ndarray, layout: Layout) -> None:
-    """Raise LogError unless times (T,), of these rows of the file, increase."""
+def _backward_times(t: np.ndarray, rows: np.ndarray, layout: Layout) -> LogError:
+    """Return the error of times (T,), of these rows of the file, that do not increase."""
     backward = np.flatnonzero(np.diff(t) < TUNING.shortest_step)
-    if backward.size:
-        k = backward[0]
-        got = f"t = {t[k + 1]:g} s after {t[k]:g} s ({backward.size} such steps, this is the first)"
-        do = "sort the rows, drop repeats, or split recordings by a column 'trajectory'"
-        raise layout.row_error(got, rows[k + 1], layout.columns[0], "increasing times", do)
+    k = backward[0]
+    got = f"t = {t[k + 1]:g} s after {t[k]:g} s ({backward.size} such steps, this is the first)"
+    do = "sort the rows, drop repeats, or split recordings by a column 'trajectory'"
+    return layout.row_error(got, rows[k + 1], layout.columns[0], "increasing times", do)
 
 
 def _pieces(t: np.ndarray) -> Iterator[slice]:
     """Yield the gap-free pieces of two samples or more of times (T,); of a lone sample no window is cut."""
-    for start, stop in pairwise(gap_ends(t)):
-        if stop - start > 1:
-            yield slice(start, stop)
+    yield from (slice(start, stop) for start, stop in pairwise(gap_ends(t)) if stop - start > 1)
 
 
 def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:

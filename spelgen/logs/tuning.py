@@ -1,4 +1,4 @@
-"""Constants of reading, checking and preparing logs."""
+"""Constants of reading, checking and preparing logs, and the limits of their sample rates."""
 
 from __future__ import annotations
 
@@ -120,14 +120,6 @@ class SampleTuning:
 
 
 @dataclass(frozen=True)
-class ServoRolloutTuning:
-    """Integration of motion under position servos."""
-
-    # [s] Largest step; longer ones bias armatures by a few per cent (measured).
-    step: float = 3.4e-3
-
-
-@dataclass(frozen=True)
 class ResonanceTuning:
     """Detection of elastic joints. Recorded arms: see benchmarks; none of them shows a resonance."""
 
@@ -156,5 +148,17 @@ class ResonanceTuning:
     valid: float = 0.1
 
 
-TUNING, SIGNALS, SAMPLES = LogTuning(), SignalCheckTuning(), SampleTuning()
-SERVO_ROLLOUT, RESONANCE = ServoRolloutTuning(), ResonanceTuning()
+TUNING, SIGNALS, SAMPLES, RESONANCE = LogTuning(), SignalCheckTuning(), SampleTuning(), ResonanceTuning()
+
+SLOWEST = TUNING.samples_per_period * TUNING.automatic_cutoff  # [Hz] of logs that show accelerations at all
+FAST = 1 + TUNING.clock_error  # no logger's clock is exact, so every bound of a rate has a tolerance
+
+
+def shows_accelerations(rate: float) -> bool:
+    """Whether torques can be fitted to logs of this rate [Hz]: the filter's cutoff must lie below Nyquist's bound."""
+    return rate * FAST >= SLOWEST
+
+
+def is_dense(rate: float) -> bool:
+    """Whether motion between samples is almost linear at this rate [Hz]: differences from a line are noise."""
+    return rate * FAST >= TUNING.dense_rate

@@ -252,8 +252,12 @@ class LogMapping(Group):
     def column(self, quantity: str, joint: str) -> str:
         """Return the column of "q", "qd", "tau" or "u" of a joint."""
         name: str | None = getattr(self.joint(joint).columns, quantity)
-        pattern: str = getattr(self.columns, quantity)
-        return name or pattern.replace("{joint}", self.log_name(joint))
+        return name or self.pattern(quantity).replace("{joint}", self.log_name(joint))
+
+    def pattern(self, quantity: str) -> str:
+        """Return the name of the columns of a quantity, with `{joint}`."""
+        name: str = getattr(self.columns, quantity)
+        return name
 
     def of_trajectory(self, text: str) -> LogMapping:
         """Return the mapping for one recording of a file: `{trajectory}` in the columns' names is its text."""

@@ -10,6 +10,7 @@ import io
 import json
 import sys
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -17,10 +18,26 @@ import numpy as np
 
 from spelgen.errors import SpelgenError
 from spelgen.files import read_bytes
-from spelgen.urdf.tuning import TUNING
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
+
+
+@dataclass(frozen=True)
+class MeshTuning:
+    """Limits of the process that reads meshes."""
+
+    # [bytes] Memory of the process that reads meshes.
+    mesh_memory: int = 2**30
+    # [s] Processor time of this process: imports and the simplification of fine meshes take most of it.
+    mesh_seconds: int = 30
+    # [bytes] Largest file with a mesh.
+    max_mesh_bytes: int = 50_000_000
+    # [1] Largest number of faces of a mesh: archives may expand without end.
+    max_mesh_faces: int = 2_000_000
+
+
+TUNING = MeshTuning()
 
 
 class MeshFolder:
