@@ -9,7 +9,7 @@ from emitted import import_source
 from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.body_regressor import regressor_of
 from spelgen.emission.specify import generate
-from spelgen.structure.pseudo_inertia import pseudo_inertia
+from spelgen.structure.nominal import pseudo_inertia
 from spelgen.structure.sampling import float_energies
 
 ROBOTS = ("two_link", "rpr", "six_dof", "ur10e", "panda")

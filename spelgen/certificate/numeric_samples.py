@@ -15,7 +15,7 @@ import pinocchio as pin
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.settings.settings import Settings
-from spelgen.structure.pseudo_inertia import parameters_of
+from spelgen.structure.nominal import parameters_of
 
 ENGINE = f"Pinocchio {pin.__version__}"
 

@@ -11,10 +11,9 @@ from pydantic import Field, StringConstraints
 
 from spelgen.design import PRESET_NAMES, Design, load_design
 from spelgen.errors import SettingsError, collect, suggestion
-from spelgen.settings.messages import dotted, validated
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Count, Group
-from spelgen.settings.yaml_document import Location, YamlDocument, read_document
+from spelgen.settings.yaml_document import Location, YamlDocument, dotted, read_document, validated
 
 YAML = (".yaml", ".yml")
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,60}$")]

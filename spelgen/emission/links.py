@@ -11,7 +11,7 @@ from spelgen.arm.arm import Chain
 from spelgen.arm.rational import Vector
 from spelgen.emission.tuning import TUNING
 from spelgen.spec import LinkSpec, Triple
-from spelgen.structure.pseudo_inertia import parameters_of, pseudo_inertia, reference_factor
+from spelgen.structure.nominal import parameters_of, pseudo_inertia, reference_factor
 
 
 def link_specs(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[LinkSpec, ...]:

@@ -16,7 +16,7 @@ from spelgen.emission.entry_sums import mean_mass
 from spelgen.emission.links import link_specs
 from spelgen.emission.tuning import TUNING
 from spelgen.errors import SettingsError
-from spelgen.settings.joint import JointSettings
+from spelgen.settings.settings import JointSettings
 from spelgen.spec import (
     ConstantSpec,
     Entries,

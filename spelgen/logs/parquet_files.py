@@ -16,8 +16,7 @@ from spelgen.errors import LogError, collect
 from spelgen.files import read_json, require_regular_file
 from spelgen.logs.tables import LogFormat, LogTable, reading, stored_columns, table_layout
 from spelgen.settings.log_mapping import LogMapping, MotorCalibration
-from spelgen.settings.messages import validated
-from spelgen.settings.yaml_document import YamlDocument
+from spelgen.settings.yaml_document import YamlDocument, validated
 
 INFO = "meta/info.json"  # of a data set of LeRobot
 STATE, ACTION, TIMESTAMP = "observation.state", "action", "timestamp"

@@ -14,7 +14,6 @@ import numpy as np
 from spelgen.arm.arm import Chain
 from spelgen.structure.recursion import triangle
 from spelgen.structure.sampling import float_energies
-from spelgen.structure.tuning import TUNING
 
 PARAMETERS = ("kp", "kd", "armature", "dry")
 
@@ -55,16 +54,18 @@ def servo_rank(arm: Chain) -> ServoRank:
     _, null = _row_and_null_space(system / norms)
     changes = (null / norms[:, None])[: n * len(PARAMETERS)].reshape(n, len(PARAMETERS), -1)
     changes = changes / np.abs(changes).max()
+    # smaller differences are rounding: the errors of null vectors are a thousand times the errors of the matrix
+    equal = 1e-6
     groups: list[list[int]] = []
     undetermined = []
     for joint in range(n):
         for group in groups:
-            if np.abs(changes[group[0], 0] - changes[joint, 0]).max() < TUNING.equal_components:
+            if np.abs(changes[group[0], 0] - changes[joint, 0]).max() < equal:
                 group.append(joint)
                 break
         else:
             groups.append([joint])
-        differs = np.abs(changes[joint] - changes[joint, 0]).max(axis=-1) > TUNING.equal_components
+        differs = np.abs(changes[joint] - changes[joint, 0]).max(axis=-1) > equal
         undetermined += [(PARAMETERS[k], joint) for k in np.flatnonzero(differs)]
     undetermined.sort(key=lambda entry: PARAMETERS.index(entry[0]))
     return ServoRank(tuple(map(tuple, groups)), tuple(undetermined))
@@ -103,5 +104,6 @@ def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> n
 def _row_and_null_space(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return orthonormal bases of row space and null space, (k, rank) and (k, k - rank), of a matrix (m, k), m >= k."""
     _, singular_values, directions = np.linalg.svd(matrix, full_matrices=False)
-    rank = int((singular_values > TUNING.zero_singular_value * singular_values[0]).sum())
+    # a smaller singular value is a rounding error
+    rank = int((singular_values > 1e-9 * singular_values[0]).sum())
     return directions[:rank].T, directions[rank:].T
