@@ -12,7 +12,6 @@ import numpy as np
 from spelgen.arm.chain import ChainChoice, Leader, choose_chain, leaders
 from spelgen.arm.placement import AngleRounding, Frame, Placement, TenVector
 from spelgen.arm.rational import (
-    TUNING,
     Matrix,
     Vector,
     as_matrix,
@@ -314,7 +313,7 @@ def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], joint: UrdfJoin
     for body in (moving.body for moving in moved):
         # a body rotates about the z axis of its frame
         beside = np.array(body.rotation, dtype=float)[:, 2]
-        is_parallel = np.linalg.norm(np.cross(axis, beside)) < TUNING.parallel
+        is_parallel = np.linalg.norm(np.cross(axis, beside)) < 1e-2  # [rad] rounding included
         if body.parent == frame.body >= 0 and body.joint_type != "prismatic" and is_parallel:
             parallel.append(body.name)
     return parallel

@@ -83,7 +83,7 @@ class AngleRounding:
         unit: np.ndarray = np.array(joint.axis) / np.linalg.norm(joint.axis)
         if self.tolerance == 0.0:
             return unit
-        rounded = np.where(np.abs(unit) < TUNING.axis_noise, 0.0, unit)
+        rounded = np.where(np.abs(unit) < 1e-3, 0.0, unit)  # CAD exporters print three digits
         # A unit vector again, as components below the noise were removed.
         rounded /= np.linalg.norm(rounded)
         if np.abs(rounded - unit).max() > TUNING.notable:
@@ -93,7 +93,7 @@ class AngleRounding:
 
     def position(self, vector: np.ndarray) -> np.ndarray:
         """Return a composed position (3,) [m] without the noise of rounded rotations."""
-        noise = TUNING.offset_noise if self.tolerance else 0.0
+        noise = 1e-9 if self.tolerance else 0.0  # [m] rounding errors of composed rotations
         return np.array([bounded(value) if abs(value) >= noise else Fraction(0) for value in vector])
 
     def _note(self, code: str, where: str, line: int, message: str) -> None:

@@ -17,15 +17,6 @@ Matrix = tuple[Vector, Vector, Vector]
 class GeometryTuning:
     """Tolerances for the exact values that rounded numbers of a URDF represent."""
 
-    # [rad] Distance to a multiple of pi/12, pi/8 or pi/5 within which an angle is rounded to it. It is small because
-    # 0.26, 0.39 and 0.63 also occur as exact values.
-    fine_tolerance: float = 2e-5
-    # [1] Divisors of pi for these multiples: the special angles on the CAD drawings of 189 arms.
-    fine_divisors: tuple[int, ...] = (12, 8, 5)
-    # [m] An offset below this bound is 0: composed rotations have rounding errors of this size.
-    offset_noise: float = 1e-9
-    # [1] A component of a unit axis below this bound is 0: CAD exporters print three digits.
-    axis_noise: float = 1e-3
     # [rad, 1] A change of an angle or of an axis below this bound is not reported.
     notable: float = 1e-9
     # [1] An element of a rotation, or a moment divided by the largest moment, below this bound is rounding and means
@@ -35,13 +26,6 @@ class GeometryTuning:
     rotation_error: float = 1e-11
     # [1] Bounds of denominators, tried in turn so that the shortest fractions are found first.
     denominators: tuple[int, ...] = (10**7, 10**10, 10**13)
-    # [rad] Start of the sectors of a quarter turn into which angles are sorted, just below pi/4: no common angle lies
-    # at an edge.
-    eighth: float = 0.7
-    # [1] Largest number of bits of a denominator: exact arithmetic on longer ones takes hours (untrusted input).
-    max_bits: int = 4096
-    # [rad] Largest angle between two axes that are meant to be parallel, rounding included.
-    parallel: float = 1e-2
 
 
 TUNING = GeometryTuning()
@@ -61,9 +45,7 @@ def bounded(value: Fraction) -> Fraction:
     Such a number results from dozens of consecutive approximated rotations, and is not exact. Arithmetic with it could
     take hours for a file from an untrusted source.
     """
-    if value.denominator.bit_length() <= TUNING.max_bits:
-        return value
-    return Fraction(float(value))
+    return value if value.denominator.bit_length() <= 4096 else Fraction(float(value))
 
 
 def rounded_angle(angle: float, tolerance: float) -> float:
@@ -73,7 +55,9 @@ def rounded_angle(angle: float, tolerance: float) -> float:
     """
     if tolerance == 0.0:
         return angle
-    limits = {2: tolerance} | dict.fromkeys(TUNING.fine_divisors, TUNING.fine_tolerance)
+    # The special angles on the CAD drawings of 189 arms. The tolerance of multiples of pi/12, pi/8 and pi/5 is small
+    # because 0.26, 0.39 and 0.63 also occur as exact values.
+    limits = {2: tolerance, 12: 2e-5, 8: 2e-5, 5: 2e-5}
     for divisor, limit in limits.items():
         step = pi / divisor
         nearest = round(angle / step) * step
@@ -185,8 +169,9 @@ def _turn(axis: int, cosine: float, sine: float) -> np.ndarray:
     """Return the rational rotation (3, 3) about a coordinate axis by the angle with this cosine and sine."""
     # Reduction to a quarter turn, so that the approximations of 45 and 135 degrees differ by exactly a right angle.
     # Common angles are inside the interval of the reduced angles, not at its ends.
-    quarter, angle = divmod(atan2(sine, cosine) + TUNING.eighth, pi / 2)
-    tangent = tan((angle - TUNING.eighth) / 2)
+    eighth = 0.7  # [rad] just below pi/4
+    quarter, angle = divmod(atan2(sine, cosine) + eighth, pi / 2)
+    tangent = tan((angle - eighth) / 2)
     t = Fraction(0)
     if abs(tangent) >= TUNING.zero_noise:
         for bound in TUNING.denominators:

@@ -85,8 +85,8 @@ def velocity_products(trajectory: Trajectory) -> np.ndarray:
 
     products = np.zeros((2 * trajectory.q.shape[1],) * 2)
     for piece in split_at_gaps(trajectory, shortest=2):
-        # over several steps: from one sample to the next quantisation of q is larger than its change
-        span = min(SIGNALS.increments, len(piece) - 1)
+        # over ten steps: from one sample to the next quantisation of q is larger than its change
+        span = min(10, len(piece) - 1)
         integral = cumulative_trapezoid(piece.qd, piece.t, axis=0, initial=0)
         positions = np.concatenate([integral, piece.q], axis=1)
         increments = positions[span:] - positions[:-span]
@@ -125,12 +125,12 @@ def find_frozen(signals: JointSignals) -> str | None:
     """Find a position or a velocity that never changes while the other one does."""
     from scipy.integrate import cumulative_trapezoid
 
-    q, qd = signals.q, signals.qd
-    if np.ptp(qd) == 0 and np.ptp(q) > SIGNALS.drift:
+    q, qd, motion = signals.q, signals.qd, 0.05  # [rad, m]
+    if np.ptp(qd) == 0 and np.ptp(q) > motion:
         return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
     # the trapezoidal rule: a constant q with a noisy qd around zero stays where it is
     drift = np.abs(cumulative_trapezoid(qd, signals.trajectory.t)).max(initial=0.0)
-    if np.ptp(q) == 0 and drift > SIGNALS.drift:
+    if np.ptp(q) == 0 and drift > motion:
         return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
     return None
 

@@ -14,7 +14,6 @@ import pyarrow.csv
 from spelgen.errors import LogError
 from spelgen.logs.bags import FIELDS
 from spelgen.logs.tables import LogFormat, LogTable, table_layout
-from spelgen.logs.tuning import TUNING
 from spelgen.logs.values import is_number
 from spelgen.settings.log_mapping import PLAIN, LogMapping
 
@@ -75,12 +74,13 @@ def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
 
 def _decoded_head(file: Path) -> tuple[str, str]:
     """Return the encoding and the first characters of a file."""
+    size = 2**16
     with file.open("rb") as source:
-        head = source.read(TUNING.csv_head)
+        head = source.read(size)
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16", head.decode("utf-16", "ignore")
     # a head cut off in the middle of a character is still UTF-8
-    errors = "strict" if len(head) < TUNING.csv_head else "ignore"
+    errors = "strict" if len(head) < size else "ignore"
     try:
         return "utf-8", head.decode("utf-8", errors)
     except UnicodeDecodeError:

@@ -17,7 +17,7 @@ from spelgen.labels import counted
 from spelgen.logs.jumps import held_samples, is_lost, is_outlier, jumps, read_as_words
 from spelgen.logs.recording import listed_times, outlier_rows
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
-from spelgen.logs.tuning import RESONANCE, SIGNALS, shows_accelerations
+from spelgen.logs.tuning import SIGNALS, shows_accelerations
 
 
 class Advice(NamedTuple):
@@ -82,7 +82,7 @@ class JointSignals(NamedTuple):
 
 def is_factor(value: float, unit: float) -> bool:
     """Return True if a factor is the factor of a unit, within a tolerance."""
-    return 1 / SIGNALS.unit_factor < value / unit < SIGNALS.unit_factor
+    return 0.8 < value / unit < 1.25
 
 
 def find_dropouts(signals: JointSignals) -> str | None:
@@ -125,10 +125,10 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
     word = read_as_words((values - offset) / scale, turn)
     if word is None:
         return None
-    # commands may jump: they are words only if decoding brings them to the positions
+    # commands may jump: they are words only if decoding brings them to a third of their distance from the positions
     if name == "u":
         q = signals.q[~is_lost(signals.signal("u"))]
-        if np.std(word.values * scale + offset - q) > SIGNALS.near_position * np.std(values - q):
+        if np.std(word.values * scale + offset - q) > 0.3 * np.std(values - q):
             return None
     unit = mapping.unit(name, joint) or ("as logged" if turn is None else "rad")
     size, count = float(f"{word.value:.9g}"), counted(word.jumps, "time")
@@ -160,16 +160,16 @@ def find_too_rare(signals: JointSignals) -> str | None:
 
 def find_unsigned_velocity(signals: JointSignals) -> str | None:
     """Find velocities that are the magnitude of dq/dt."""
-    trajectory, qd = signals.trajectory, signals.qd
+    trajectory, qd, share = signals.trajectory, signals.qd, 0.05
     lowest, highest = sorted((abs(qd.min()), abs(qd.max())))
     # noise of a joint at rest has both signs
-    if trajectory.mapping.velocity == "differentiated" or lowest > SIGNALS.unsigned * highest or len(qd) < 3:
+    if trajectory.mapping.velocity == "differentiated" or lowest > share * highest or len(qd) < 3:
         return None
     speed = np.gradient(signals.q, trajectory.t)
     backward, forward = sorted((-np.quantile(speed, 0.02), np.quantile(speed, 0.98)))
-    if backward < SIGNALS.unsigned * forward or abs(qd).std() == 0:
+    if backward < share * forward or abs(qd).std() == 0:
         return None
-    if not np.corrcoef(np.abs(speed), np.abs(qd))[0, 1] > SIGNALS.unsigned_agreement:
+    if not np.corrcoef(np.abs(speed), np.abs(qd))[0, 1] > 0.9:
         return None
     return f"qd that is the magnitude of dq/dt: from {qd.min():.3g} to {qd.max():.3g} while q goes both ways"
 
@@ -178,28 +178,29 @@ def find_elastic(signals: JointSignals) -> str | None:
     """Find a joint whose torque shows the resonance of an elastic gear or belt."""
     piece = max(split_at_gaps(signals.trajectory), key=len)
     rate, k = piece.sample_rate, signals.number
-    length = round(RESONANCE.segment * rate)
-    is_long = shows_accelerations(rate) and len(piece) >= RESONANCE.segments * length
+    # a segment of 2 s: its inverse is the resolution in frequency
+    length = round(2.0 * rate)
+    is_long = shows_accelerations(rate) and len(piece) >= 4 * length
     if not (is_long and piece.tau.size and np.ptp(piece.tau[:, k])):
         return None
     frequency, inertia = _apparent_inertia(piece.qd[:, k], piece.tau[:, k], rate, length)
-    if len(frequency) < RESONANCE.fewest_bands:
+    if len(frequency) < 5:
         return None
     ones = np.ones_like(frequency)
     rigid, _ = _relative_error([ones, frequency**-2.0], inertia)
     candidates = []
-    for resonance in np.geomspace(frequency[0], RESONANCE.beyond * frequency[-1], RESONANCE.candidates):
+    for resonance in np.geomspace(frequency[0], 1.5 * frequency[-1], 120):
         # multiplied by the denominator: a band next to the resonance must not decide by itself
         factor = 1 - (frequency / resonance) ** 2
         error, (motor, link) = _relative_error([factor, ones], factor * inertia)
-        if motor > 0 and link > RESONANCE.smallest_link * motor:
+        if motor > 0 and link > 0.1 * motor:
             candidates.append((error, resonance, motor, link))
-    largest_error = min(RESONANCE.elastic_error, rigid / 2)
-    if rigid < RESONANCE.rigid_error or not candidates or min(candidates)[0] > largest_error:
+    # relative errors of the rigid and of the elastic apparent inertia: no recorded rigid arm shows a resonance
+    if rigid < 0.1 or not candidates or min(candidates)[0] > min(0.06, rigid / 2):
         return None
     _, resonance, motor, link = min(candidates)
-    # up to there the apparent inertia is within `valid` of its value at rest
-    share = RESONANCE.valid * (motor + link) / link
+    # up to there the apparent inertia is within 10 % of its value at rest
+    share = 0.1 * (motor + link) / link
     valid = resonance * float(np.sqrt(share / (1 + share)))
     unit = "kg" if signals.kind == "prismatic" else "kg m^2"
     return (
@@ -219,8 +220,10 @@ def _apparent_inertia(
         rate: sample rate [Hz].
         length: samples of a segment; segments overlap by half.
     """
+    # [Hz] below, gravity and friction prevail; links of arms resonate between 3 and 30 Hz
+    lowest, highest = 0.9, 30.0
     frequency = np.fft.rfftfreq(length, 1 / rate)
-    kept = (frequency >= RESONANCE.lowest) & (frequency <= min(RESONANCE.highest, rate / 3))
+    kept = (frequency >= lowest) & (frequency <= min(highest, rate / 3))
     frequency = frequency[kept]
     segments = sliding_window_view(np.stack([qd, tau]), length, axis=1)[:, :: length // 2]
     segments = (segments - segments.mean(axis=2, keepdims=True)) * np.hanning(length)
@@ -228,13 +231,13 @@ def _apparent_inertia(
     acceleration = velocity * (2j * np.pi * frequency)
     power = np.stack([np.abs(acceleration) ** 2, np.abs(torque) ** 2]).sum(axis=1)
     cross = (acceleration.conj() * torque).sum(axis=0).real
-    edges = np.geomspace(RESONANCE.lowest, frequency[-1], RESONANCE.bands)
+    edges = np.geomspace(lowest, frequency[-1], 25)
     firsts = np.unique(np.searchsorted(frequency, edges))
     (moved, driven), together = np.add.reduceat(power, firsts, axis=1), np.add.reduceat(cross, firsts)
     means = np.add.reduceat(frequency, firsts) / np.diff(np.append(firsts, len(frequency)))
     # torque in phase with the acceleration, in bands that the motion excites
-    coherent = together**2 > RESONANCE.coherence * moved * driven
-    coherent &= moved > RESONANCE.excited * moved.max(initial=0.0)
+    coherent = together**2 > 0.85 * moved * driven
+    coherent &= moved > 1e-3 * moved.max(initial=0.0)
     return means[coherent], together[coherent] / moved[coherent]
 
 

@@ -64,7 +64,7 @@ def _without_wraps(
             # a command is close to the position, although the two registers may count from different revolutions
             result = result - period * np.round(np.median(result - values["q", joint]) / period)
         # without a jump, an angle beyond half a turn is as good as one within it
-        elif count or abs(period - 2 * pi) > TUNING.limit_of_turn:
+        elif count or abs(period - 2 * pi) > 1e-6:
             offset = mapping.offset(quantity, joint)
             result = centred(result - offset, period) + offset
         if count:
@@ -82,7 +82,8 @@ def _without_repeats(
         return data, ()
     repeats, copies = repeated_rows(data[:, 1:], positions)
     count = int(np.count_nonzero(repeats))
-    if count <= TUNING.repeats * len(data):
+    # so few have no effect on a fit
+    if count <= 0.02 * len(data):
         return data, ()
     rate = (len(data) - 1 - count) / (data[-1, 0] - data[0, 0])
     if copies > 1:
@@ -153,8 +154,8 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[n
         repairs += (f"{late} times before that of the row above: the rows were sorted",)
     is_repeat = np.diff(data[:, 0], prepend=-np.inf) == 0
     differs = is_repeat & np.append(False, (np.diff(data[:, 1:], axis=0) != 0).any(axis=1))
-    # different states of one time: the clock is too coarse for the rows
-    if np.count_nonzero(differs) > max(TUNING.few_repeats, TUNING.coarse_clock * len(data)):
+    # different states of one time: the clock is too coarse for the rows; ten rows are an accident of a logger
+    if np.count_nonzero(differs) > max(10, 0.02 * len(data)):
         t, message = _reconstructed(data[:, 0], layout)
         return np.column_stack([t, data[:, 1:]]), (*repairs, message)
     repeats = np.count_nonzero(is_repeat)

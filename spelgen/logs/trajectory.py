@@ -208,7 +208,7 @@ def coverage(logs: Sequence[Trajectory]) -> dict[str, object]:
     for name in ("q", "qd"):
         joints = []
         for column in joined_column(logs, name).T:
-            counts = np.histogram(column, TUNING.bins)[0].tolist()
+            counts = np.histogram(column, 24)[0].tolist()
             joints.append({"low": _rounded(column.min()), "high": _rounded(column.max()), "counts": counts})
         result[name] = joints
     return result

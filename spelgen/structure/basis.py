@@ -194,8 +194,7 @@ def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     width = matrix.shape[1]
     # The triangular factor of [A, B] has the same normal equations and far fewer rows.
     factor = np.asarray(np.linalg.qr(np.concatenate([matrix, right], axis=1), mode="r"))
-    result: np.ndarray = np.linalg.lstsq(factor[:, :width], factor[:, width:], rcond=None)[0]
-    return result
+    return np.asarray(np.linalg.lstsq(factor[:, :width], factor[:, width:], rcond=None)[0])
 
 
 def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:

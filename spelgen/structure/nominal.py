@@ -165,8 +165,7 @@ def _gravity_torque(arm: Chain, q: np.ndarray, inertias: list[list[float]]) -> n
     _, forward = float_energies(arm, q + shifts, inertias)
     _, backward = float_energies(arm, q - shifts, inertias)
     gradient = (forward - backward) / (2 * step)
-    result: np.ndarray = np.sqrt((gradient**2).mean(axis=1))
-    return result
+    return np.asarray(np.sqrt((gradient**2).mean(axis=1)))
 
 
 def _mass_changes(
@@ -185,8 +184,7 @@ def _mass_changes(
     for index in range(q.shape[1]):
         moved[index, :, index] = np.roll(q[:, index], 1)  # the position in another sample
     moved_mass, _ = float_energies(arm, moved, inertias)
-    result: np.ndarray = np.sqrt((((moved_mass - mass) / typical) ** 2).mean(axis=(1, 2)))
-    return result
+    return np.asarray(np.sqrt((((moved_mass - mass) / typical) ** 2).mean(axis=(1, 2))))
 
 
 def _sensitivities(magnitudes: np.ndarray) -> tuple[float, ...]:
@@ -235,8 +233,7 @@ def parameters_of(pseudo: np.ndarray) -> np.ndarray:
 
 def _trace(matrices: np.ndarray) -> np.ndarray:
     """Return traces (..., 1, 1) of (..., 3, 3)."""
-    result: np.ndarray = np.trace(matrices, axis1=-2, axis2=-1)[..., None, None]
-    return result
+    return np.asarray(np.trace(matrices, axis1=-2, axis2=-1)[..., None, None])
 
 
 def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from fractions import Fraction
 from functools import cached_property
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -203,15 +204,18 @@ class Spans:
     @cached_property
     def _nearer_root(self) -> list[np.ndarray]:
         """For each joint, a basis (m, dim U) of the changes of M with the joints before it."""
-        bases = [self._coordinates[0][:0]]
-        for rows in self._coordinates[:-1]:
-            bases.append(field.row_basis(np.concatenate([bases[-1], rows])))
-        return bases
+        return _sums(self._coordinates)
 
     @cached_property
     def _nearer_tip(self) -> list[np.ndarray]:
         """For each joint, a basis (m, dim U) of the changes of M with the joints after it."""
-        bases = [self._coordinates[0][:0]]
-        for rows in reversed(self._coordinates[1:]):
-            bases.insert(0, field.row_basis(np.concatenate([bases[0], rows])))
-        return bases
+        return _sums(self._coordinates[::-1])[::-1]
+
+
+def _sums(bases: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return for each of these bases (m, dim U) an echelon basis of the sum of the spans before it."""
+
+    def with_next(rows: np.ndarray, basis: np.ndarray) -> np.ndarray:
+        return field.row_basis(np.concatenate([rows, basis]))
+
+    return list(accumulate(bases[:-1], with_next, initial=bases[0][:0]))

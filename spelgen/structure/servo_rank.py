@@ -55,20 +55,12 @@ def servo_rank(arm: Chain) -> ServoRank:
     changes = (null / norms[:, None])[: n * len(PARAMETERS)].reshape(n, len(PARAMETERS), -1)
     changes = changes / np.abs(changes).max()
     # smaller differences are rounding: the errors of null vectors are a thousand times the errors of the matrix
-    equal = 1e-6
-    groups: list[list[int]] = []
-    undetermined = []
-    for joint in range(n):
-        for group in groups:
-            if np.abs(changes[group[0], 0] - changes[joint, 0]).max() < equal:
-                group.append(joint)
-                break
-        else:
-            groups.append([joint])
-        differs = np.abs(changes[joint] - changes[joint, 0]).max(axis=-1) > equal
-        undetermined += [(PARAMETERS[k], joint) for k in np.flatnonzero(differs)]
-    undetermined.sort(key=lambda entry: PARAMETERS.index(entry[0]))
-    return ServoRank(tuple(map(tuple, groups)), tuple(undetermined))
+    equal, kp = 1e-6, changes[:, :1]
+    same = np.abs(kp - changes[None, :, 0]).max(axis=-1) < equal  # (n, n)
+    groups = dict.fromkeys(tuple(np.flatnonzero(row).tolist()) for row in same)
+    differs = np.abs(changes - kp).max(axis=-1) > equal  # (n, K)
+    undetermined = [(PARAMETERS[k], joint) for k, joint in np.argwhere(differs.T).tolist()]
+    return ServoRank(tuple(groups), tuple(undetermined))
 
 
 def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
@@ -97,8 +89,7 @@ def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> n
     # The last direction of the derivatives is the velocity, along which qd changes by qdd.
     momentum = np.einsum("spij,sj->sip", mass[:, n], qd + 1j * step * qdd)
     kinetic = np.einsum("skpij,si,sj->skp", mass[:, :n], qd, qd) / 2
-    torque: np.ndarray = (momentum - kinetic + potential[:, :n]).imag / step
-    return torque
+    return np.asarray((momentum - kinetic + potential[:, :n]).imag / step)
 
 
 def _row_and_null_space(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
