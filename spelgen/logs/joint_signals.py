@@ -21,7 +21,7 @@ from spelgen.logs.tuning import SIGNALS, shows_accelerations
 
 
 class Advice(NamedTuple):
-    """Finding of a check with the exact remedy, which the check has tried."""
+    """Finding of a check with a remedy that the check has tested."""
 
     message: str
     do: str
@@ -30,7 +30,8 @@ class Advice(NamedTuple):
 class JointSignals(NamedTuple):
     """Signals of one joint in one trajectory: the subject of the checks without the robot.
 
-    q, qd: (T,). factor: ratio of dq/dt to qd; NaN at rest. correlations: of qd with dq/dt of every joint; NaN at rest.
+    q, qd: (T,). factor: ratio of dq/dt to qd; NaN for a joint at rest. correlations: of qd with dq/dt of each joint;
+    NaN for a joint at rest.
     """
 
     trajectory: Trajectory
@@ -44,19 +45,19 @@ class JointSignals(NamedTuple):
 
     @property
     def turns(self) -> bool:
-        """Whether the joint may turn on and on."""
+        """Whether the joint can turn without limit."""
         return self.kind == "continuous" or bool(self.trajectory.mapping.word("period", "q", self.joint))
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """The quantities that were measured: neither commands nor differences."""
+        """Names of the measured quantities: without commands, and without differentiated velocities."""
         if self.trajectory.u is None and self.trajectory.tau.size:
             return self.trajectory.mapping.quantities
         return ("q",)
 
     @property
     def step(self) -> float:
-        """Median of the times between samples [s], 0 of a single sample."""
+        """Median time between samples [s]; 0 for a single sample."""
         steps = np.diff(self.trajectory.t)
         return float(np.median(steps)) if steps.size else 0.0
 
@@ -72,16 +73,16 @@ class JointSignals(NamedTuple):
 
     @property
     def correlation(self) -> float:
-        """Of qd and dq/dt."""
+        """Correlation of qd and dq/dt."""
         return self.correlations[self.number]
 
     def changes_by(self, unit: float) -> bool:
-        """Return True if dq/dt is this multiple of qd, as with a wrong unit."""
+        """Return True if dq/dt is this multiple of qd, which indicates a wrong unit."""
         return self.correlation > SIGNALS.agreement and is_factor(self.factor, unit)
 
 
 def is_factor(value: float, unit: float) -> bool:
-    """Return True if a factor is the factor of a unit, within a tolerance."""
+    """Return True if a factor equals the factor of a unit within a tolerance."""
     return 0.8 < value / unit < 1.25
 
 
@@ -100,7 +101,7 @@ def find_dropouts(signals: JointSignals) -> str | None:
 
 
 def find_jumps(signals: JointSignals) -> str | Advice | None:
-    """Find signals that jump: words of a register read as plain numbers, wrapped angles, joined recordings."""
+    """Find signals that jump: undecoded register words, wrapped angles, joined recordings."""
     for name in signals.trajectory.quantities:
         found = _find_words(signals, name)
         if found is not None:
@@ -116,11 +117,11 @@ def find_jumps(signals: JointSignals) -> str | Advice | None:
 
 
 def _find_words(signals: JointSignals, name: str) -> Advice | None:
-    """Find words of a register, or wrapped angles, in "q", "qd", "tau" or "u" of the joint."""
+    """Find undecoded register words, or wrapped angles, in "q", "qd", "tau" or "u" of the joint."""
     mapping, values, joint = signals.trajectory.mapping, signals.signal(name), signals.joint
     scale, offset = mapping.scale(name, joint), mapping.offset(name, joint)
     turn = None if signals.kind == "prismatic" or name not in ("q", "u") else 2 * np.pi / abs(scale)
-    # one lost sample or outlier makes two jumps, which no register explains
+    # a lost sample or an outlier has two jumps, unlike a register
     values = values[~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))]
     word = read_as_words((values - offset) / scale, turn)
     if word is None:
@@ -139,7 +140,7 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
 
 
 def find_held(signals: JointSignals) -> str | None:
-    """Find signals that change less often than rows are written."""
+    """Find signals whose values are held over several rows."""
     rate = signals.trajectory.sample_rate
     for name in signals.measured:
         often = held_samples(signals.signal(name))
@@ -162,7 +163,7 @@ def find_unsigned_velocity(signals: JointSignals) -> str | None:
     """Find velocities that are the magnitude of dq/dt."""
     trajectory, qd, share = signals.trajectory, signals.qd, 0.05
     lowest, highest = sorted((abs(qd.min()), abs(qd.max())))
-    # noise of a joint at rest has both signs
+    # the velocity noise of a joint at rest has both signs
     if trajectory.mapping.velocity == "differentiated" or lowest > share * highest or len(qd) < 3:
         return None
     speed = np.gradient(signals.q, trajectory.t)
@@ -175,7 +176,7 @@ def find_unsigned_velocity(signals: JointSignals) -> str | None:
 
 
 def find_elastic(signals: JointSignals) -> str | None:
-    """Find a joint whose torque shows the resonance of an elastic gear or belt."""
+    """Find joints whose torques show the resonance of an elastic gear or belt."""
     piece = max(split_at_gaps(signals.trajectory), key=len)
     rate, k = piece.sample_rate, signals.number
     # a segment of 2 s: its inverse is the resolution in frequency
@@ -190,7 +191,7 @@ def find_elastic(signals: JointSignals) -> str | None:
     rigid, _ = _relative_error([ones, frequency**-2.0], inertia)
     candidates = []
     for resonance in np.geomspace(frequency[0], 1.5 * frequency[-1], 120):
-        # multiplied by the denominator: a band next to the resonance must not decide by itself
+        # multiplied by the denominator, so that one band at the resonance does not dominate
         factor = 1 - (frequency / resonance) ** 2
         error, (motor, link) = _relative_error([factor, ones], factor * inertia)
         if motor > 0 and link > 0.1 * motor:
@@ -212,7 +213,8 @@ def find_elastic(signals: JointSignals) -> str | None:
 def _apparent_inertia(
     qd: np.ndarray, tau: np.ndarray, rate: float, length: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return frequencies (B,) [Hz] and the ratios (B,) of torque to acceleration in phase, where they are coherent.
+    """Return frequencies (B,) [Hz] and apparent inertias (B,), the in-phase ratios of torque to acceleration, of
+    coherent bands.
 
     Args:
         qd: (T,) velocity [rad/s, m/s].
@@ -242,7 +244,7 @@ def _apparent_inertia(
 
 
 def _relative_error(columns: Sequence[np.ndarray], values: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the error of least squares relative to the values (B,), root mean square, and the coefficients (C,)."""
+    """Return the RMS residual of least squares relative to the RMS of the values (B,), and the coefficients (C,)."""
     matrix = np.stack(columns, axis=1)
     x = np.linalg.lstsq(matrix, values, rcond=None)[0]
     return float(np.linalg.norm(matrix @ x - values) / np.linalg.norm(values)), x

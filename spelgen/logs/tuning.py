@@ -33,11 +33,11 @@ class LogTuning:
     # [Hz] Cutoff of the low-pass filter by default: rigid-body motion lies below, ripple and quantisation above
     # (UR10e).
     automatic_cutoff: float = 8.0
-    # [1] Samples of a window per period of the cutoff; two is Nyquist's bound.
+    # [1] Smallest number of samples per period of the cutoff; Nyquist's bound is two.
     samples_per_period: int = 3
     # [Hz] Logs of a lower rate are interpolated by cubics, and their windows are not filtered.
     dense_rate: float = 50.0
-    # [1] Columns that a message lists: enough to see how they are named.
+    # [1] Largest number of columns in a message.
     listed: int = 5
 
 
@@ -45,8 +45,7 @@ class LogTuning:
 class SignalCheckTuning:
     """Thresholds of the checks of logs that several checks use."""
 
-    # [1] Correlation from which on two signals are equal up to a factor; the factor may differ from 1 by the
-    # remainder.
+    # [1] Correlation from which on two signals are proportional; 1 minus it is the tolerance of a factor of 1.
     agreement: float = 0.9
     # [s] Smallest and largest median time between samples: no arm is sampled above 10 kHz or below 2 Hz.
     fastest_step: float = 1e-4
@@ -63,16 +62,16 @@ class SampleTuning:
 
 TUNING, SIGNALS, SAMPLES = LogTuning(), SignalCheckTuning(), SampleTuning()
 
-SLOWEST = TUNING.samples_per_period * TUNING.automatic_cutoff  # [Hz] of logs that show accelerations at all
+SLOWEST = TUNING.samples_per_period * TUNING.automatic_cutoff  # [Hz] lowest rate for accelerations
 # No bound of a rate is exact: nominal 50 Hz are 49.95 Hz with one logger and 50.1 Hz with another.
 FAST = 1.002
 
 
 def shows_accelerations(rate: float) -> bool:
-    """Whether torques can be fitted to logs of this rate [Hz]: the filter's cutoff must lie below Nyquist's bound."""
+    """Return True if logs of this rate [Hz] determine accelerations: the filter's cutoff is below Nyquist's bound."""
     return rate * FAST >= SLOWEST
 
 
 def is_dense(rate: float) -> bool:
-    """Whether motion between samples is almost linear at this rate [Hz]: differences from a line are noise."""
+    """Return True if linear interpolation between samples suffices at this rate [Hz]."""
     return rate * FAST >= TUNING.dense_rate

@@ -193,7 +193,7 @@ class Spans:
 
     @cached_property
     def _pivots(self) -> list[int]:
-        """Entries of M that are the coordinates in the basis of U: these columns of the basis are the identity."""
+        """Pivot entries of M, whose changes are the coordinates in the basis of U."""
         return [self.order[pivot] for pivot in field.pivots(self.varying[:, self.order])]
 
     @cached_property
@@ -203,12 +203,12 @@ class Spans:
 
     @cached_property
     def _nearer_root(self) -> list[np.ndarray]:
-        """For each joint, a basis (m, dim U) of the changes of M with the joints before it."""
+        """For each joint, a basis (m, dim U) of the changes of M with earlier joints, in the basis of U."""
         return _sums(self._coordinates)
 
     @cached_property
     def _nearer_tip(self) -> list[np.ndarray]:
-        """For each joint, a basis (m, dim U) of the changes of M with the joints after it."""
+        """For each joint, a basis (m, dim U) of the changes of M with later joints, in the basis of U."""
         return _sums(self._coordinates[::-1])[::-1]
 
 

@@ -125,7 +125,7 @@ def _read_axis(joint: Element, kind: str | None) -> Vector:
 
 
 def _read_limits(limit: Element, kind: str | None) -> Limits:
-    # exporters write 0 for an effort or a velocity that nobody stated
+    # exporters write 0 for an unknown effort or velocity
     effort, velocity = limit.limit("effort") or None, limit.limit("velocity") or None
     if kind == "continuous":
         # lower and upper of a continuous joint have no meaning

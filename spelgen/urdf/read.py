@@ -60,7 +60,7 @@ def read_urdf(path: Path) -> Robot:
         root="",
         diagnostics=(),
     )
-    # only if all joints could be read, because links of unread joints appear as roots
+    # only if all joints could be read, because the child links of unread joints would count as roots
     if not notes.errors:
         robot = _rooted(notes, root, robot)
     collect(sorted(notes.errors, key=lambda error: error.line or 0))
