@@ -85,7 +85,7 @@ def velocity_products(trajectory: Trajectory) -> np.ndarray:
 
     products = np.zeros((2 * trajectory.q.shape[1],) * 2)
     for piece in split_at_gaps(trajectory, shortest=2):
-        # over ten steps: from one sample to the next quantisation of q is larger than its change
+        # over ten samples: between neighbouring samples the quantisation of q may be larger than its change
         span = min(10, len(piece) - 1)
         integral = cumulative_trapezoid(piece.qd, piece.t, axis=0, initial=0)
         positions = np.concatenate([integral, piece.q], axis=1)
@@ -115,7 +115,7 @@ def find_degrees(signals: JointSignals) -> str | None:
         return f"q that changes {signals.factor:.3g} times as fast as qd says (180/pi is 57.3)"
     if signals.changes_by(1 / DEGREES):
         return f"qd that is {1 / signals.factor:.3g} times as large as q changes (180/pi is 57.3)"
-    # a joint with limits turns less: larger positions are in degrees
+    # joints with limits have smaller positions: larger ones are in degrees
     if np.ptp(signals.q) > 4 * np.pi and not signals.turns:
         return f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
     return None
@@ -125,7 +125,8 @@ def find_frozen(signals: JointSignals) -> str | None:
     """Find a position or a velocity that never changes while the other one does."""
     from scipy.integrate import cumulative_trapezoid
 
-    q, qd, motion = signals.q, signals.qd, 0.05  # [rad, m]
+    # [rad, m] above this integral of qd a constant q is frozen, and the reverse
+    q, qd, motion = signals.q, signals.qd, 0.05
     if np.ptp(qd) == 0 and np.ptp(q) > motion:
         return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
     # by the trapezoidal rule, so that noise of qd about zero has a small integral

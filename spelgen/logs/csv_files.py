@@ -74,6 +74,7 @@ def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
 
 def _decoded_head(file: Path) -> tuple[str, str]:
     """Return the encoding and the first characters of a file."""
+    # of the head, from which encoding, delimiter and decimal point are detected
     size = 2**16
     with file.open("rb") as source:
         head = source.read(size)

@@ -99,7 +99,8 @@ def _columns(
         require_cutoff(piece, rate if is_denser else FREQUENCY, cutoff)
     q, qd, tau = sampled(piece.q), sampled(piece.qd), sampled(piece.tau)
     selected = is_moving(qd)
-    # a filter that begins or ends within a motion has a transient, whose error is 20 times the noise for this long
+    # a filter that begins or ends within a motion has a transient, whose error is 20 times the noise for this long, in
+    # periods of the cutoff
     if cutoff is not None:
         unsettled = round(0.75 * FREQUENCY / cutoff)
         selected[:unsettled] = selected[len(selected) - unsettled :] = False

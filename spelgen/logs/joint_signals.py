@@ -1,8 +1,9 @@
-"""Signals of one joint in one trajectory, and their checks: jumps, held values, lost signs, elastic joints.
+"""Signals of one joint in one trajectory, and checks of them: outliers, register words, held values, elastic joints.
 
-An elastic joint shows in the inertia that a motor's torque moves: of a motor with inertia J_m that carries a link with
-inertia J_l by a spring, torque and acceleration in phase have the ratio H(f) = J_m + J_l / (1 - (f / f_0)^2), with f_0
-the resonance of the link with a locked motor; a rigid joint has H = J + c / f^2, with c of gravity.
+The apparent inertia of an elastic joint at the motor increases with frequency up to a resonance. For a motor with
+inertia J_m that drives a link with inertia J_l by a spring, the ratio of the torque in phase with the acceleration to
+the acceleration is H(f) = J_m + J_l / (1 - (f / f_0)^2), with the resonance f_0 of the link at a locked motor. A rigid
+joint has H = J + c / f^2, with a constant c due to gravity.
 """
 
 from __future__ import annotations
@@ -83,6 +84,7 @@ class JointSignals(NamedTuple):
 
 def is_factor(value: float, unit: float) -> bool:
     """Return True if a factor equals the factor of a unit within a tolerance."""
+    # within this ratio a measured factor is that of a unit
     return 0.8 < value / unit < 1.25
 
 
@@ -126,7 +128,7 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
     word = read_as_words((values - offset) / scale, turn)
     if word is None:
         return None
-    # commands may jump: they are words only if decoding brings them to a third of their distance from the positions
+    # commands may jump: they count as words only if decoded commands are close to the positions
     if name == "u":
         q = signals.q[~is_lost(signals.signal("u"))]
         if np.std(word.values * scale + offset - q) > 0.3 * np.std(values - q):
@@ -161,6 +163,7 @@ def find_too_rare(signals: JointSignals) -> str | None:
 
 def find_unsigned_velocity(signals: JointSignals) -> str | None:
     """Find velocities that are the magnitude of dq/dt."""
+    # largest velocity of the rarer sign, relative to the largest velocity, of a signal without sign
     trajectory, qd, share = signals.trajectory, signals.qd, 0.05
     lowest, highest = sorted((abs(qd.min()), abs(qd.max())))
     # the velocity noise of a joint at rest has both signs
@@ -185,22 +188,26 @@ def find_elastic(signals: JointSignals) -> str | None:
     if not (is_long and piece.tau.size and np.ptp(piece.tau[:, k])):
         return None
     frequency, inertia = _apparent_inertia(piece.qd[:, k], piece.tau[:, k], rate, length)
+    # two constants and a resonance cannot be told from noise by fewer bands
     if len(frequency) < 5:
         return None
     ones = np.ones_like(frequency)
     rigid, _ = _relative_error([ones, frequency**-2.0], inertia)
     candidates = []
+    # a resonance somewhat above the excited frequencies shows already
     for resonance in np.geomspace(frequency[0], 1.5 * frequency[-1], 120):
         # multiplied by the denominator, so that one band at the resonance does not dominate
         factor = 1 - (frequency / resonance) ** 2
         error, (motor, link) = _relative_error([factor, ones], factor * inertia)
+        # a smaller link has no visible resonance
         if motor > 0 and link > 0.1 * motor:
             candidates.append((error, resonance, motor, link))
-    # relative errors of the rigid and of the elastic apparent inertia: no recorded rigid arm shows a resonance
+    # smallest relative error of the rigid model, and largest one of the elastic model, of the apparent inertia: with
+    # these no recorded arm shows a resonance
     if rigid < 0.1 or not candidates or min(candidates)[0] > min(0.06, rigid / 2):
         return None
     _, resonance, motor, link = min(candidates)
-    # up to there the apparent inertia is within 10 % of its value at rest
+    # up to this frequency the apparent inertia differs from its value at rest by less than 10 %
     share = 0.1 * (motor + link) / link
     valid = resonance * float(np.sqrt(share / (1 + share)))
     unit = "kg" if signals.kind == "prismatic" else "kg m^2"
@@ -222,7 +229,7 @@ def _apparent_inertia(
         rate: sample rate [Hz].
         length: samples of a segment; segments overlap by half.
     """
-    # [Hz] below, gravity and friction prevail; links of arms resonate between 3 and 30 Hz
+    # [Hz] below, gravity and friction dominate; links of arms have resonances between 3 and 30 Hz
     lowest, highest = 0.9, 30.0
     frequency = np.fft.rfftfreq(length, 1 / rate)
     kept = (frequency >= lowest) & (frequency <= min(highest, rate / 3))

@@ -64,18 +64,17 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     steps = np.diff(values)
     sizes = np.abs(steps)
     is_jump = sizes > TUNING.jump * _usual(sizes)
-    # a signal of which one in twenty steps is large has no outliers, but noise
+    # a signal with more large steps is noisy
     if not is_jump.any() or is_jump.mean() > 0.05:
         return outliers
     for first, second in pairwise(np.flatnonzero(is_jump)):
         out, back = steps[first], steps[second]
-        # a signal that returns after more than five samples has jumped
+        # an outlier has at most five samples: a signal that returns later has jumped
         is_excursion = out * back < 0 and 0.5 < abs(out / back) < 2 and second - first <= 5
         if not is_excursion:
             continue
         low, high = max(0, first - TUNING.jump_window), second + 1 + TUNING.jump_window
-        # four times the steps of the neighbours, since a fast motion has large steps on both sides; the largest two may
-        # be another outlier's
+        # a fast motion has large steps on both sides; the two largest steps may belong to another outlier
         around = np.sort(np.concatenate([sizes[low:first], sizes[second + 1 : high]]))[:-2]
         if min(abs(out), abs(back)) > 4.0 * around.max(initial=0.0):
             outliers[first + 1 : second + 1] = True
@@ -97,7 +96,7 @@ def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
     sizes, dt = np.abs(np.diff(q)), np.diff(t)
     median = float(np.median(dt))
     is_jump = (sizes > TUNING.jump * _usual(sizes)) & (dt <= TUNING.gap * median)
-    # no arm is faster than 40 rad/s, m/s; stamps may come in bursts: a step is at least as long as most
+    # no arm is faster than 40 rad/s, m/s; time stamps may come in bursts: a step lasts at least the median time
     return np.flatnonzero(is_jump & (sizes > 40.0 * np.maximum(dt, median)))
 
 
@@ -164,7 +163,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     steps = np.diff(values)
     limit = 0.4 * float(np.ptp(values))
     rows = np.flatnonzero(np.abs(steps) > limit)
-    # a signal around 0, and so the sign bit of its words, changes its sign at half of the steps at most
+    # a signal about 0, and with it the sign bit of its words, changes its sign at half of the steps at most
     if not len(rows) or len(rows) > 0.5 * len(values):
         return None
     jump, usual = float(np.median(np.abs(steps[rows]))), _usual(np.abs(steps))
@@ -176,7 +175,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
     best, best_score = None, (len(rows) / 2, np.inf)
     for size in sizes:
-        # words of a register lie within its period but for noise, words with a sign bit on both sides of the bit
+        # overflowing words are within one period but for noise; words with a sign bit are on both sides of it
         readings = []
         if np.ptp(values) < 1.01 * size:
             readings.append(Word("period", size, len(rows), centred(unwrapped(values, size), size)))

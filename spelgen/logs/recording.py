@@ -154,7 +154,7 @@ def in_time_order(data: np.ndarray, rows: np.ndarray, layout: Layout) -> tuple[n
         repairs += (f"{late} times before that of the row above: the rows were sorted",)
     is_repeat = np.diff(data[:, 0], prepend=-np.inf) == 0
     differs = is_repeat & np.append(False, (np.diff(data[:, 1:], axis=0) != 0).any(axis=1))
-    # different states of one time: the clock is too coarse for the rows; ten rows are an accident of a logger
+    # many rows with equal times and different values: the clock is coarse; up to ten are accidental
     if np.count_nonzero(differs) > max(10, 0.02 * len(data)):
         t, message = _reconstructed(data[:, 0], layout)
         return np.column_stack([t, data[:, 1:]]), (*repairs, message)
@@ -201,7 +201,7 @@ def _roughness(positions: np.ndarray) -> float:
 
 
 def _backward_times(t: np.ndarray, rows: np.ndarray, layout: Layout) -> LogError:
-    """Return the error of times (T,), of these rows of the file, that do not increase."""
+    """Return the error of times (T,) that do not increase; rows: their numbers in the file."""
     backward = np.flatnonzero(np.diff(t) < TUNING.shortest_step)
     k = backward[0]
     got = f"t = {t[k + 1]:g} s after {t[k]:g} s ({backward.size} such steps, this is the first)"

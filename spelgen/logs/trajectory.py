@@ -237,15 +237,18 @@ def delayed_commands(trajectory: Trajectory, rows: slice, delay: float, steps: i
     """Return the means (K, steps, n) of the delayed commands over the steps between the samples of ``rows``; delay
     [s].
 
-    Each command is held until the next. Means, not values: motions are then smooth in the delay.
+    Each command is held until the next. Means are differentiable with respect to the delay; values at single times are
+    not.
     """
     samples = trajectory.t[rows]
     earliest, latest = np.searchsorted(trajectory.t, samples[[0, -1]] - delay)
-    # from the command that was held then
+    # from the command that was held at that time
     held_rows = slice(max(0, earliest - 1), latest + 1)
     t, u = trajectory.t[held_rows], require_commands(trajectory)[held_rows]
-    held = np.concatenate([u[:1], u[:-1]])  # until each sample
-    corners = np.concatenate([t[:1] - 1e3, t])  # [s] the first command was held before the recording
+    held = np.concatenate([u[:1], u[:-1]])  # the command held until each sample
+    corners = np.concatenate(
+        [t[:1] - 1e3, t]
+    )  # [s] the first command is assumed to hold before the recording
     integral = np.zeros((len(t) + 1, u.shape[1]))
     integral[1:] = np.cumsum(np.diff(corners)[:, None] * held, axis=0)
     edges = samples[:-1, None] + np.diff(samples)[:, None] * np.arange(steps) / steps

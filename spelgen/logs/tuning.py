@@ -19,9 +19,9 @@ class LogTuning:
     npz_bytes: int = 2**30
     # [rad, rad/s, Nm; m, m/s, N] Largest magnitude of a signal; larger ones have a wrong unit.
     largest_value: float = 1e9
-    # [s] Largest time: its fourth power is a floating-point number.
+    # [s] Largest time, so that its fourth power does not overflow.
     latest: float = 1e24
-    # [s] Shortest time between samples, for the same reason.
+    # [s] Shortest time between samples, so that its fourth power does not underflow.
     shortest_step: float = 1e-15
     # [1] A step that exceeds this multiple of the typical step is a jump, and a 0 between samples whose magnitudes
     # exceed it is a missing value: continuous signals approach 0 gradually.

@@ -75,7 +75,8 @@ def clock_start(table: pa.Table, layout: Layout) -> pa.Scalar | None:
     is_stamp = pa.types.is_temporal(_column(first_row, layout.columns[0]).type)
     if not (pa.types.is_integer(times.type) or pa.types.is_floating(times.type)):
         return None
-    # floating-point seconds since 1970 have too few digits; a clock that starts with the recording stays below 1e8
+    # seconds since 1970 as floating-point numbers have too few digits; a clock that starts with the recording stays
+    # below 1e8 in any unit
     first = times[0].as_py()
     is_date = first is not None and (is_stamp or 1e8 < abs(first) < np.inf)
     return times[0] if is_date else None

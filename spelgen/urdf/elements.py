@@ -86,7 +86,8 @@ def read_joint(notes: Notes, xml: etree._Element) -> UrdfJoint | None:
     parent = _read_end(joint, "parent")
     child = _read_end(joint, "child")
     xyz, rpy = _read_origin(joint)
-    optional = Notes(notes.path)  # a fixed joint needs none of it
+    # motion attributes of a fixed joint have no meaning: their errors are warnings
+    optional = Notes(notes.path)
     motion = joint if kind in MOVING else Element(optional, xml, joint.where)
     axis = _read_axis(motion, kind)
     limits = _read_limits(motion.child("limit"), kind)

@@ -51,7 +51,7 @@ def main(faces: int, meshes: list[tuple[str, list[float]]], output: IO[bytes]) -
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (2**30,) * 2)
-        # [s] imports and the simplification of fine meshes take most of it
+        # [s] imports and the simplification of fine meshes take most of the time
         resource.setrlimit(resource.RLIMIT_CPU, (30,) * 2)
     arrays: dict[str, np.ndarray] = {}
     for index, (path, scale) in enumerate(meshes):
