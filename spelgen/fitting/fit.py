@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.baseline import FittedBaselines, arm_of_model
-from spelgen.baselines.registry import fit_baselines
+from spelgen.baselines.registry import FittedBaselines, arm_of_model, fit_baselines
 from spelgen.dynamics.protocol import input_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, OptionError, RunError, SettingsError, SpelgenError
@@ -32,8 +31,8 @@ from spelgen.fitting.servo.objective import ServoObjective
 from spelgen.fitting.torque.objective import TorqueObjective
 from spelgen.logs.dynamics_samples import SHORTEST
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.tuning import shows_accelerations
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import FitConfig, fit_config
 
