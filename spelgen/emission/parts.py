@@ -28,15 +28,9 @@ class ModelParts:
     rows: dict[str, tuple[Call, ...]]
     model: Call
 
-    @property
-    def uses_networks(self) -> bool:
-        """Whether the model has networks with random initial weights."""
-        return _names(self.model, GENERATOR)
-
-    @property
-    def uses_mass_entries(self) -> bool:
-        """Whether M is a linear combination of functions and constants."""
-        return _names(self.model, MASS_ENTRIES)
+    def uses(self, name: Code) -> bool:
+        """Return True if the call refers to a name, for example to ``generator`` if the model has networks."""
+        return _names(self.model, name)
 
 
 def model_parts(spec: ModelSpec) -> ModelParts:

@@ -74,6 +74,7 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
     friction = projection.friction
     for index, coordinate in enumerate(arm.coordinates):
         element = joints[coordinate.name]
+        # the file has one <dynamics> per joint: readers use the first or the last
         _remove(element, "dynamics")
         values = {"damping": _number(friction.viscous[index]), "friction": _number(friction.coulomb[index])}
         etree.SubElement(element, "dynamics", values)
@@ -84,6 +85,7 @@ def _settings_text(projection: RigidBodyProjection) -> str:
     """Return the settings of the arm with the armature and friction of a projection."""
     path = projection.arm.robot.path.with_suffix(".yaml")
     content: dict[str, dict[str, dict[str, object]]] = {}
+    # other settings of the user are kept
     if path.exists():
         content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     joints = content.setdefault("joints", {})
@@ -130,6 +132,7 @@ def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[st
     model = trained.model
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}
     factor = array(friction_factor(model, sampled_positions(projection.arm.chain)))
+    # a factor of one at all positions says nothing
     if (factor != 1).any():
         constants["position_factor"] = np.stack([factor.min(axis=0), factor.max(axis=0)], axis=-1)
     return constants
