@@ -122,6 +122,7 @@ def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
 
 
 def _joint(coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings) -> JointSpec:
+    # networks see the range in which the joint works, also if the file has no limits
     low, high = working_range(coordinate)
     lower, upper, speed = coordinate.lower, coordinate.upper, coordinate.velocity
     if coordinate.continuous:
@@ -151,6 +152,7 @@ def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
     effort = coordinate.effort
     if not effort or effort > TUNING.largest_effort:
         effort = None
+    # a known gain is constant, a guessed one is trained
     kp = drive.kp or rounded((effort or TUNING.servo_effort) / TUNING.full_effort_at, 3)
     return ServoSpec(kp, drive.kp is not None, rounded(TUNING.servo_lag * kp, 3), effort)
 

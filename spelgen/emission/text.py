@@ -273,6 +273,7 @@ def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
 def require_unedited(text: str, file: Path | None = None) -> ModelSpec:
     """Return the specification in the text of a module. Raises ModuleError if the text differs from its module."""
     spec = parse_spec(text, file)
+    # the whole text is compared: an edit anywhere would be lost without a word
     if text in (module_text(spec, standalone=is_standalone) for is_standalone in (False, True)):
         return spec
     raise ModuleError(

@@ -74,9 +74,8 @@ def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> 
     """
     dynamics, friction = arm_dynamics(arm, settings), make_friction(arm, settings)
     limit = np.array([coordinate.effort or TUNING.servo_effort for coordinate in arm.coordinates])
-    kp = 2 * limit
-    for joint, coordinate in enumerate(arm.coordinates):
-        kp[joint] = settings.joint(coordinate.name).kp or kp[joint]
+    known = [settings.joint(coordinate.name).kp for coordinate in arm.coordinates]
+    kp = np.array([gain or 2 * effort for gain, effort in zip(known, limit, strict=True)])
     kd = TUNING.servo_lag * kp
     interval = t[1] - t[0]
     steps = int(np.ceil(interval / TUNING.servo_step))
