@@ -13,7 +13,6 @@ from planar_model import JOINTS, write_module
 from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
-from spelgen.baselines.names import observed
 from spelgen.baselines.registry import hold_velocity
 from spelgen.cli import evaluate_command
 from spelgen.dynamics.bristles import bristle_reach
@@ -30,6 +29,7 @@ from spelgen.evaluation.tables import table
 from spelgen.evaluation.torque import coarse_torques, torque_errors
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.train import train
+from spelgen.labels import observed
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import Trajectory, read_logs, write_logs

@@ -14,8 +14,8 @@ import spelgen
 from spelgen import design
 from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines import registry
-from spelgen.baselines.baseline import Baseline
 from spelgen.baselines.predictor import Predictor
+from spelgen.baselines.registry import Baseline
 from spelgen.emission import specify
 from spelgen.emission.assemble import load_module
 from spelgen.errors import RunError

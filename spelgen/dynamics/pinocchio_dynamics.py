@@ -24,7 +24,7 @@ from spelgen.urdf.read import read_urdf
 
 
 def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
-    """Return the method for states (..., n) that are arrays or tensors; their batches are broadcast."""
+    """Decorate a method of arrays so that states (..., n) may be tensors, and their batches are broadcast."""
 
     @wraps(method)
     def on_arrays(self: PinocchioDynamics, *states: Any) -> object:

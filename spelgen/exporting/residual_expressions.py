@@ -35,7 +35,7 @@ def residual_symbols(model: TrainedModel) -> Symbols:
     has_potential = residuals.potential is not None
     sizes = {
         "mass": (entries, entries, 1),
-        # directional derivatives: a program computes them in one sweep, without all n columns of first
+        # directional derivatives: a program computes them in one sweep, without the n columns of the symbol `first`
         "rate": (entries, entries, 1),
         "kinetic": (entries, n, 1),
         # for derivatives of forces

@@ -151,7 +151,7 @@ def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     result = energies(model.arm, positions, model.inertias.tolist(), float)
     mass = ca.SX(model.n, model.n)
     for (row, column), entry in result.mass.items():
-        # one expression for both triangles
+        # the same expression in both triangles: CasADi computes it once
         mass[row, column] = mass[column, row] = entry
     return mass, ca.SX(result.potential)
 
