@@ -254,20 +254,21 @@ def read_spec(path: Path | str) -> ModelSpec:
 
 def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
     """Return the specification in the text of a module, which may be edited. Raises ModuleError."""
+    values = {}
     try:
         for node in ast.parse(text).body:
             if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant):
-                names = [target.id for target in node.targets if isinstance(target, ast.Name)]
-                if names == ["FACTS"]:
-                    raise ModuleError(
-                        "a module of an earlier version of spelgen", file=file, expected=_EXPECTED,
-                        do="build it again with `spelgen build`, and train it again",
-                    )  # fmt: skip
-                if names == ["SPEC"]:
-                    return spec_from_json(str(node.value.value), file)
+                values[ast.unparse(node.targets[0])] = node.value.value
     except (SyntaxError, ValueError, RecursionError, MemoryError) as problem:
         raise _no_module(problem, file) from None
-    raise _no_module(None, file)
+    if "FACTS" in values:
+        raise ModuleError(
+            "a module of an earlier version of spelgen", file=file, expected=_EXPECTED,
+            do="build it again with `spelgen build`, and train it again",
+        )  # fmt: skip
+    if "SPEC" not in values:
+        raise _no_module(None, file)
+    return spec_from_json(str(values["SPEC"]), file)
 
 
 def require_unedited(text: str, file: Path | None = None) -> ModelSpec:
