@@ -21,11 +21,7 @@ from spelgen.simulation.tuning import TUNING
 
 
 def servo_motions(
-    arm: Chain,
-    settings: Settings,
-    drives: Drives | None = None,
-    *,
-    progress: Progress = silent,
+    arm: Chain, settings: Settings, drives: Drives | None = None, *, progress: Progress = silent
 ) -> SimulatedLogs:
     """Return trajectories under random commands; the same settings give the same logs.
 
