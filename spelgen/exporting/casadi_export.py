@@ -119,6 +119,7 @@ def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[st
         values["energy"] = _network(residuals.potential, encoded)
         # reverse mode: takes about the time of the network
         values["gravity"] = ca.gradient(values["energy"], q)
+    # its derivative is the torque: both stay consistent
     if residuals.has_torque:
         values["torque_energy"] = _torque_energy(residuals, q)
         values["torque"] = ca.gradient(values["torque_energy"], q)

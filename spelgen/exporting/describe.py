@@ -108,9 +108,9 @@ def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
             do="--to torch, onnx, mjcf and urdf take every preset",
         )
     weights = exact.prepare()
-    # armature and constant residual terms are one matrix
     constant_mass = array(weights.armature)
     residuals = Residuals((), None, None, {}, (), {})
+    # a constant residual of M needs no evaluation: it is added to the armature
     if residual_terms(exact) is not None:
         constant_mass += array(weights.residual.constant).reshape(exact.n, exact.n)
         residuals = _residuals(exact)

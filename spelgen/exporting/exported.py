@@ -14,6 +14,7 @@ from spelgen.labels import printable
 if TYPE_CHECKING:
     from spelgen.exporting.describe import Trained
 
+# of all formats: an export has no other units than the model
 UNITS = "Units: rad and Nm for revolute joints, m and N for prismatic ones"
 
 

@@ -15,6 +15,7 @@ from lxml import etree
 from spelgen.arm.arm import Chain, Coordinate, make_arm
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.body_regressor import about_center, quaternion
+from spelgen.dynamics.pinocchio_arm import body_constraint
 from spelgen.dynamics.tip_frame import link_poses, tip_frame
 from spelgen.emission.build import build
 from spelgen.exporting.describe import Trained
@@ -122,12 +123,10 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
     model.dof_damping[:] = 0.0
     model.dof_frictionloss[:] = 0.0
     # positions and velocities of all joints, mimic joints included, from the coordinates
-    jacobian = np.zeros((model.nv, len(arm.coordinates)))
-    offset = np.zeros(model.nv)
-    for body in arm.bodies:
-        (dof,) = model.joint(body.name).dofadr
-        jacobian[dof, body.coordinate] = float(body.multiplier)
-        offset[dof] = body.offset
+    constraint = body_constraint(arm)
+    # MuJoCo orders joints by the tree of bodies
+    order = np.argsort([model.joint(name).dofadr[0] for name in constraint.names])
+    jacobian, offset = constraint.jacobian[order], constraint.offset[order]
     driven = [arm.joint_names.index(model.actuator(k).name) for k in range(model.nu)]
     data = mujoco.MjData(model)
     # MuJoCo stores a sparse M: it is expanded into this array

@@ -86,6 +86,7 @@ class RigidBodyProjection:
 
 def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
     """Return the projection of a trained model of ``arm``."""
+    # a copy in double precision: the model of the user is not changed
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     q = sampled_positions(arm.chain)
     # rigid bodies of the model need no search; residual terms are left out and stated

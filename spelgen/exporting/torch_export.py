@@ -107,6 +107,7 @@ def _saved(program: torch.export.ExportedProgram) -> bytes:
 
 def _called_by_torch(files: dict[str, bytes], model: PreparedModel) -> Called:
     """Return a function that calls the programs of files."""
+    # the saved content is checked, not the program in memory
     programs = {name: torch.export.load(io.BytesIO(content)).module() for name, content in files.items()}
 
     def called(name: str, inputs: Values) -> Values:

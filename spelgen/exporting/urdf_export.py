@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 import yaml
 from lxml import etree
 
@@ -94,9 +95,9 @@ def _settings_text(projection: RigidBodyProjection) -> str:
         # settings have the inertia at the rotor, the model has the inertia at the joint
         gear = projection.arm.settings.joint(coordinate.name).gear
         joint = joints.setdefault(coordinate.name, {})
-        joint["rotor_inertia"] = _rounded(projection.armature[index] / gear**2)
-        joint["viscous"] = _rounded(friction.viscous[index])
-        joint["coulomb"] = [_rounded(friction.forward[index]), _rounded(friction.backward[index])]
+        joint["rotor_inertia"] = _plain(projection.armature[index] / gear**2)
+        joint["viscous"] = _plain(friction.viscous[index])
+        joint["coulomb"] = _plain([friction.forward[index], friction.backward[index]])
     return str(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
 
 
@@ -115,7 +116,7 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
         sections["law"] = _law_constants(trained, projection)
     servos = projection.servos
     if servos is not None:
-        content |= {"servo": _SERVO, "delay": _rounded(servos.delay)}
+        content |= {"servo": _SERVO, "delay": _plain(servos.delay)}
         gains = {"kp": servos.kp, "kd": servos.kd, "limit": servos.limit, "dead_zone": servos.dead_zone}
         sections["servo"] = gains
     joints: dict[str, dict[str, object]] = {}
@@ -138,16 +139,10 @@ def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[st
     return constants
 
 
-def _plain(value: np.ndarray) -> float | list[float]:
-    """Return the numbers of an array () or (K,) for YAML."""
-    if value.ndim == 0:
-        return _rounded(float(value))
-    return list(map(_rounded, value.tolist()))
-
-
-def _rounded(value: float) -> float:
-    """Return a number rounded to twelve digits: readable, and more precise than any fit."""
-    return float(_number(value))
+def _plain(value: npt.ArrayLike) -> object:
+    """Return a number, or the numbers of (K,), for YAML: readable with twelve digits, more precise than any fit."""
+    rounded = np.vectorize(lambda x: float(_number(x)), otypes=[float])
+    return rounded(value).tolist()
 
 
 def _set_inertial(link: etree._Element, inertia: np.ndarray, rotation: np.ndarray) -> None:
