@@ -18,8 +18,8 @@ from spelgen.cli import evaluate_command
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.pinocchio_dynamics import urdf_dynamics
 from spelgen.dynamics.tip import tip_kinematics
+from spelgen.emission.assemble import load_module
 from spelgen.emission.build import build
-from spelgen.emission.loading import load_module
 from spelgen.emission.specify import generate
 from spelgen.errors import Diagnostic, LogError, RunError
 from spelgen.evaluation.evaluate import evaluate

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from spelgen.dynamics.equations import MotionEquations, equations_of
 from spelgen.dynamics.protocol import RigidDynamics, is_stateful, memory_after, sliding_memory
-from spelgen.logs.commands import LogRows
+from spelgen.logs.trajectory import LogRows
 from spelgen.logs.windows import Windows, thinned
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
@@ -166,7 +166,7 @@ class Solver:
 
 
 def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
-    """Return the solver with the fewest steps per sample interval for which doubling the steps changes nothing."""
+    """Return the solver with the fewest steps per sample interval that suffice: twice as many change little."""
     windows = thinned(probe, TUNING.probed_windows)
     motion = (windows.qd - windows.qd[:, :1]).square().mean().sqrt().clamp(min=1e-9)
     solver = Solver(dynamics, 1)

@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from spelgen.certificate.verify import Verification, verify
-from spelgen.emission.module_file import parse_spec, read_source
 from spelgen.emission.plan import derive_spec
 from spelgen.emission.specify import arm_of_spec, find_urdf
-from spelgen.emission.text import module_text
+from spelgen.emission.text import module_text, parse_spec, read_source
 from spelgen.structure.structure import derive
 
 

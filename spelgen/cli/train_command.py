@@ -215,7 +215,7 @@ def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -
 
 def _specification(module: Path | None, source: Path | None, resumed: Path | None) -> ModelSpec:
     """Return the specification of the model: of a run that is resumed or adapted, or of a module."""
-    from spelgen.emission.module_file import read_spec
+    from spelgen.emission.text import read_spec
     from spelgen.fitting.run_folder import RunFolder
 
     folder = resumed or source

@@ -15,9 +15,8 @@ from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.tuning import TUNING
 from spelgen.labels import MODEL
-from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 from spelgen.logs.filtering import velocities
-from spelgen.logs.trajectory import Trajectory, split_at_gaps
+from spelgen.logs.trajectory import LogRows, Trajectory, delayed_commands, split_at_gaps, steps_between
 
 
 @dataclass(frozen=True)
@@ -106,7 +105,10 @@ def replays(
 def _replay(
     name: str, predictors: Mapping[str, CommandFollower], parts: Sequence[LogRows], qd: np.ndarray
 ) -> tuple[Replay, list[np.ndarray]]:
-    """Return the errors of each predictor from initial velocities qd (parts, n), and the errors of the model (K, n)."""
+    """Return the errors per predictor, and the position errors (K, n) of the model on each part.
+
+    qd: (parts, n) initial velocities [rad/s, m/s].
+    """
     q = np.stack([log.q[rows.start] for log, rows in parts])
     measured = [log.q[rows][1:] for log, rows in parts]
     errors = {}

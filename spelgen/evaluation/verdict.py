@@ -214,7 +214,7 @@ def _worst_motion(results: Results) -> tuple[str, float]:
 
 
 def _slow_or_fast(results: Results, k: int) -> str:
-    """Return the speed of joint k at which its torque residual is larger; "" without a clear difference."""
+    """Return the words for slow or for fast motion of joint k, whichever has the larger torque residual, or ""."""
     if not results.traces.torques:
         return ""
     residuals, speeds = [], []

@@ -84,7 +84,7 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
         others = [log for j, other in enumerate(folds) if j != k for log in other]
         tested.append((fitted_to(fit, others), fold))
     levels = find_levels(tested, *limits(arm, fit.model.n))
-    # the digits that a run folder keeps
+    # rounded to the digits that a run folder contains
     return NoiseLevels.model_validate(levels.model_dump(mode="json"))
 
 

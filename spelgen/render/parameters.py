@@ -21,8 +21,7 @@ from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.intervals import Interval
 from spelgen.labels import UNITS, entry_name
 from spelgen.listing import Listing
-from spelgen.runtime.constant_mass import ConstantMass
-from spelgen.runtime.derived_mass import DerivedMass
+from spelgen.runtime.derived_mass import ConstantMass, DerivedMass
 from spelgen.runtime.network_dynamics import NetworkDynamics
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
@@ -118,7 +117,7 @@ def base_table(
 
 
 def _number(value: float) -> str:
-    """Return four digits; "" for NaN."""
+    """Return the text of a number with four digits; "" for NaN."""
     return f"{value:.4g}".replace("nan", "")
 
 

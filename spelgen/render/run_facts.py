@@ -20,7 +20,7 @@ from spelgen.labels import MODEL, counted, share
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.render.charts import TUNING
-from spelgen.runtime.residual_dynamics import ResidualDynamics
+from spelgen.runtime.residual_terms import ResidualDynamics
 from spelgen.settings.fits import CONFIGS
 from spelgen.settings.training import TrainingSettings
 from spelgen.spec import ModelSpec, Options
