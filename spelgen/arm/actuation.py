@@ -4,8 +4,6 @@ Logs contain joint torques, or motor torques if the settings specify ``torque: m
 the couplings of wrists.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple

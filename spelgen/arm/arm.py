@@ -1,11 +1,10 @@
 """Robot -> Chain: the serial chain with exact geometry; links on fixed and locked joints are lumped into bodies."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from math import pi
+from typing import NamedTuple
 
 import numpy as np
 
@@ -101,8 +100,7 @@ class Chain:
         return all(body.inertia is not None and body.inertia[0] > 0 for body in self.bodies)
 
 
-@dataclass(frozen=True)
-class MovingJoint:
+class MovingJoint(NamedTuple):
     """A moving joint, the ``links`` with an inertial that move rigidly with it, and their body."""
 
     joint: UrdfJoint
@@ -110,8 +108,7 @@ class MovingJoint:
     body: Body
 
 
-@dataclass(frozen=True)
-class LumpedLinks:
+class LumpedLinks(NamedTuple):
     """Moving joints (the chain first), locked joints (fixed ones included), and the frames of all links by name."""
 
     moved: tuple[MovingJoint, ...]

@@ -1,7 +1,5 @@
 """Exact rotations and vectors as arrays of fractions, and rational approximation of angles and rotations."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction

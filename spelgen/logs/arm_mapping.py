@@ -1,7 +1,5 @@
 """The joints of logs and the mapping of their columns, from an arm, a model, or names of joints."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable

@@ -4,8 +4,6 @@ MCAP files without an end are read here: a recorder that was killed writes no su
 one another: an operation code (1 byte), a length (8 bytes) and a body. https://mcap.dev/spec
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace

@@ -3,8 +3,6 @@
 A new format is a file like `csv_files.py`, and its name in FORMATS.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path

@@ -4,8 +4,6 @@ Every function takes one signal (T,) or the columns of a log (T, C), of any form
 difference between neighbouring samples, the typical step the median of the steps that are not 0.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import NamedTuple
 

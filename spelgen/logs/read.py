@@ -1,7 +1,5 @@
 """Reading and writing of log files, in SI units and with the URDF's signs; without filter and resampling."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path

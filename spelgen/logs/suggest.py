@@ -3,8 +3,6 @@
 Units that neither names nor times specify remain SI: the checks of logs detect degrees, and state the lines to write.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 import re

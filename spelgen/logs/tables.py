@@ -1,7 +1,5 @@
 """Result of all readers of logs: a table, and its columns for the quantities of an arm."""
 
-from __future__ import annotations
-
 import difflib
 import re
 import zipfile

@@ -1,7 +1,5 @@
 """Conversion of logged columns to numbers in SI units with the URDF's signs; errors name rows without a number."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import starmap
 from typing import TypeAlias

@@ -3,8 +3,6 @@
 `OWNERS` lists the objectives of each option; an option of another objective is an `OptionError`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Self

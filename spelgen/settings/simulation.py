@@ -1,7 +1,5 @@
 """Settings of `spelgen simulate`: motions, torques and measurement."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator

@@ -1,7 +1,5 @@
 """Read YAML with the line of each value, and check it key by key; unsafe or ambiguous constructs are errors."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Warnings about physically inconsistent values and probable mistakes in a URDF."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

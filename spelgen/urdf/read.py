@@ -1,7 +1,5 @@
 """URDF file -> Robot, with the values of the file: all elements are checked, and no defect is repaired silently."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace

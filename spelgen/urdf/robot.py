@@ -1,7 +1,5 @@
 """A robot with the values of its URDF: links, joints and transmissions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path

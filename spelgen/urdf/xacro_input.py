@@ -6,16 +6,14 @@ a separate process with limited time and memory, but with the permissions of the
 FILE -> stdout, messages -> stderr.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from spelgen.errors import UrdfError
 
@@ -25,8 +23,7 @@ MISSING = 3  # exit code of the process where the package xacro is not installed
 _BY_HAND = "expand it where that works: xacro FILE name:=value ... > ROBOT.urdf"
 
 
-@dataclass(frozen=True)
-class XacroOutput:
+class XacroOutput(NamedTuple):
     """The expanded URDF, and the warnings of xacro."""
 
     data: bytes
