@@ -107,6 +107,7 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
         direct = [InputEntry(k, k, "fixed", 1.0) for k, name in enumerate(joints) if name in driven]
         return Actuation(len(joints), tuple(direct), remarks, couplings)
     coupled = {entry.row for entry in couplings}
+    # G is known for coupled joints, and a gear of their own would count twice
     geared = [
         _geared(robot, settings, name, k)
         for k, name in enumerate(joints)

@@ -235,6 +235,7 @@ def _total(placement: Placement, links: Sequence[UrdfLink]) -> TenVector | None:
     if not tens:
         return None
     total = tens[0]
+    # bounded after each sum: of an untrusted file digits could grow with every link
     for ten in tens[1:]:
         total = tuple(bounded(a + b) for a, b in zip(total, ten, strict=True))
     return total

@@ -83,6 +83,7 @@ def log_source(arm: LoggedArm, mapping: GivenMapping = None) -> LogSource:
 
 def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | None = None) -> LogMapping:
     """Return a mapping as an object; keys that a file or a dict does not have are from the settings, `stated`."""
+    # a complete mapping replaces the one of the settings; keys of a file or a dict complete it
     if isinstance(mapping, LogMapping):
         return mapping
     if isinstance(mapping, str | Path):

@@ -76,6 +76,7 @@ def _logs_at(path: Path, role: str | None) -> list[Path]:
     if not logs:
         packed = next(filter(None, map(_unpacking, sorted(path.iterdir()))), None)
         raise LogError("a folder without logs", file=path, expected=formats, do=packed)
+    # other names state no role: all logs of the folder are then used
     selected = [log for log in logs if log.stem == role]
     if selected or role is None or {"train", "test"}.isdisjoint(log.stem for log in logs):
         return selected or logs

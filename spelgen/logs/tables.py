@@ -129,6 +129,7 @@ def missing_columns(
     patterns = [mapping.pattern(x).replace("{joint}", "<joint>") for x in of_quantity]
     of_joints = dict(zip(joints, zip(*of_quantity.values(), strict=True), strict=True))
     unlogged = [joint for joint, names in of_joints.items() if set(names) <= set(missing)]
+    # a joint without any column was not logged; a wrong name affects one of its columns
     if unlogged and len(unlogged) < len(joints):
         logged = ", ".join(joint for joint in joints if joint not in unlogged)
         do = (

@@ -51,11 +51,13 @@ class JointSettings(Group):
     @property
     def armature(self) -> float:
         """Rotor inertia on the joint side of the gear [kg m^2]."""
+        # a rotor turns gear times as fast, and its torque acts gear times as strongly
         return self.rotor_inertia * self.gear**2
 
     @field_validator("coulomb")
     @classmethod
     def _resists(cls, value: tuple[float, float]) -> tuple[float, float]:
+        # friction of the opposite sense would drive the joint
         if value[0] < 0 or value[1] > 0:
             raise ValueError("the torque for qd > 0 (not negative), then for qd < 0 (not positive)")
         return value
@@ -91,6 +93,7 @@ class Unusable:
         self.errors = tuple(errors)
 
     def __getattr__(self, name: str) -> NoReturn:
+        # names with underscores are asked for by copy and pickle, which must not fail
         if not name.startswith("__"):
             collect(self.errors)
         raise AttributeError(name)
@@ -133,14 +136,17 @@ class Settings(Group):
     @field_validator("joints", mode="before")
     @classmethod
     def _by_name(cls, joints: object) -> object:
+        # a frequent confusion, for which the message of pydantic would not name the other key
         if isinstance(joints, list):
             raise ValueError("settings by the name of a joint; `moving_joints` lists the joints that move")
         return joints
 
     @model_validator(mode="after")
     def _drives(self) -> Settings:
+        # both define the last joint, and could contradict each other
         if self.tip is not None and self.moving_joints is not None:
             raise ValueError("'tip' or 'moving_joints', not both")
+        # a position servo commands a joint, and its logs have no torques
         if self.input == "position" and (self.torque == "motor" or self.couplings):
             raise ValueError("'input: position' or 'torque: motor' and couplings, not both")
         # A joint in two couplings would have two different motor torques.

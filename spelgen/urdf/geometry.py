@@ -74,6 +74,7 @@ def link_shapes(
     for link in root.iterfind("link"):
         name = link.get("name", "")
         for each in link.iterfind(element) if name in links else ():
+            # one invalid shape must not hide the others, which are only drawn
             try:
                 shapes.append(_shape(name, each))
             except ValueError as error:

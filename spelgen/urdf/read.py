@@ -29,6 +29,7 @@ def read_urdf(path: Path) -> Robot:
     """
     document = read_document(path)
     notes = Notes(document.path)
+    # line numbers would be searched for in the wrong file
     if document.path != path:
         message = f"expanded by xacro: lines are those of the document that `xacro {path.name}` prints"
         notes.diagnostics.append(Diagnostic("info", "expanded-xacro", "robot", None, message))
@@ -132,6 +133,7 @@ def _check_mimics(notes: Notes, joints: Sequence[UrdfJoint]) -> None:
         if leader is None:
             got = f"no joint is named {joint.mimic.joint!r}"
             notes.error(joint.line, where, got, do=suggestion(joint.mimic.joint, by_name))
+        # a follower of a fixed joint would be a fixed joint that looks as if it moves
         elif not leader.moves:
             got = f"the {leader.type} joint {leader.name!r}"
             notes.error(joint.line, where, got, "a revolute, continuous or prismatic joint to follow")

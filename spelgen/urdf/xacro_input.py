@@ -54,6 +54,7 @@ def expand(path: Path, max_bytes: int) -> XacroOutput:
             raise UrdfError(f"xacro still running after {MAX_SECONDS} s", file=path, do=_BY_HAND) from None
         lines = run.stderr.decode(errors="replace").splitlines()
         warnings = tuple(line.removeprefix("warning: ") for line in lines if line.startswith("warning: "))
+        # messages before the failure are often its cause: they are all part of the error
         if run.returncode:
             raise _failure(path, run.returncode, [line for line in lines if not line.startswith("warning: ")])
         size = output.seek(0, 2)
