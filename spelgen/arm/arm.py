@@ -23,8 +23,7 @@ from spelgen.errors import ArmError, Diagnostic
 from spelgen.urdf.robot import JointType, Robot, UrdfJoint, UrdfLink
 
 
-@dataclass(frozen=True)
-class Coordinate:
+class Coordinate(NamedTuple):
     """A degree of freedom; limits as in the file (rad or m, N m or N, per second), None if absent."""
 
     name: str

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, starmap
 from pathlib import Path
+from typing import NamedTuple
 
 import pyarrow as pa
 
@@ -54,8 +55,7 @@ class Layout:
 LogTable = tuple[Layout, pa.Table]
 
 
-@dataclass(frozen=True)
-class LogFormat:
+class LogFormat(NamedTuple):
     """A format of logs: its files and its reader.
 
     read: function of a path, the joints and the mapping that returns tables, or raises LogError. suffixes: of its
