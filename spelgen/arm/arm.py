@@ -13,8 +13,6 @@ from spelgen.arm.placement import AngleRounding, Frame, Placement, TenVector
 from spelgen.arm.rational import (
     Matrix,
     Vector,
-    as_matrix,
-    as_vector,
     bounded,
     exact,
     rotation_from_rpy,
@@ -212,8 +210,8 @@ def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> Lump
             coordinate=chain.names.index(followed.leader.name),
             multiplier=followed.multiplier,
             offset=float(followed.offset),
-            rotation=as_matrix(rotation),
-            translation=as_vector(translation),
+            rotation=tuple(map(tuple, rotation)),
+            translation=tuple(translation),
             inertia=_total(placement, links),
         )
         moved.append(MovingJoint(joint, links, body))
