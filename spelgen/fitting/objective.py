@@ -122,9 +122,9 @@ class Objective(ABC):
         self._checkpoint = checkpoint
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Fit until an end is reached, by default at once; call ``save`` to keep a `checkpoint`.
+        """Run the fit until a stopping criterion holds, and return it; call ``save`` to write a `checkpoint`.
 
-        KeyboardInterrupt may end it anywhere.
+        By default nothing is left to do after `begin`. KeyboardInterrupt may be raised at any time.
         """
         return "finished"
 

@@ -102,7 +102,7 @@ class Remedies:
         return keys
 
     def _change(self, code: str, reading: Hypothesis) -> tuple[np.ndarray, str]:
-        """Return a mask (n,) of the joints that a change affects, and a text about the content of the log."""
+        """Return a mask (n,) of the joints that a change affects, and a text that describes the content of the log."""
         unchanged, order = self.unchanged, np.arange(len(reading.offset))
         reversed_motion = reading.motion_scale * unchanged.motion_scale < 0
         factors = reading.torque_scale / unchanged.torque_scale
