@@ -4,8 +4,6 @@ A check is a code, a severity and a function of a subject, registered in CHECKS.
 individually, so that only one need be in memory. Package `log_checks` has the checks that need the robot.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -159,6 +157,7 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
 
 def time_unit(step: float) -> str | None:
     """Return the unit of time in which a step between samples is plausible for a robot's log; None if there is none."""
+    # units differ by a factor of 1000, the range of plausible steps by 5000: the first plausible unit is the largest
     slowest, fastest = SIGNALS.slowest_step, SIGNALS.fastest_step
     return next((unit for unit, size in TIMES.items() if fastest <= step * size <= slowest), None)
 
