@@ -41,7 +41,7 @@ from rivals import deep_lagrangian, network
 import spelgen
 from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import load_arm
-from spelgen.baselines.names import CONSTANT_VELOCITY, MODEL, observed
+from spelgen.labels import CONSTANT_VELOCITY, MODEL, observed
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.pinocchio_dynamics import drives_known, urdf_dynamics

@@ -16,7 +16,7 @@ import spelgen
 from spelgen.cli.main import app
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import LogError, SettingsError, SpelgenError, SpelgenErrors
-from spelgen.evaluation.truth import mass_error, true_mass
+from spelgen.evaluation.rollout import mass_error, true_mass
 from spelgen.excitation.trajectory import Motion
 from spelgen.settings.joint import JointSettings
 from spelgen.settings.settings import Settings

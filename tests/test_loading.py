@@ -10,10 +10,9 @@ import torch
 from emitted import built, printed_without_structure
 from planar_model import write_module
 
+from spelgen.emission.assemble import load_module
 from spelgen.emission.build import build
-from spelgen.emission.loading import load_module
-from spelgen.emission.module_file import read_spec
-from spelgen.emission.text import module_text
+from spelgen.emission.text import module_text, read_spec
 from spelgen.errors import ModuleError
 
 ROBOTS = Path(__file__).parents[1] / "robots"
@@ -154,7 +153,7 @@ def test_a_specification_is_checked_like_any_file(module):
 
 
 def test_loading_needs_no_symbolic_algebra(module):
-    code = "import spelgen.emission.loading as loading\nprint(loading.load_module(sys.argv[1]).n)"
+    code = "import spelgen.emission.assemble as loading\nprint(loading.load_module(sys.argv[1]).n)"
     assert printed_without_structure(code, module) == "2\n"
 
 

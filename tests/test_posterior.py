@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import spelgen
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
-from spelgen.dynamics.base_combinations import base_combinations
+from spelgen.dynamics.body_regressor import base_combinations
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters

@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
+from spelgen.emission.assemble import load_module
 from spelgen.emission.build import build
-from spelgen.emission.loading import load_module
 from spelgen.emission.specify import generate
 from spelgen.errors import LogError
 from spelgen.fitting.fit import fit

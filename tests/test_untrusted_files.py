@@ -20,8 +20,8 @@ from time_bounds import in_time
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.comparison.jobs import RunResult
+from spelgen.emission.assemble import load_module
 from spelgen.emission.build import build
-from spelgen.emission.loading import load_module
 from spelgen.emission.specify import generate
 from spelgen.errors import LogError, RunError, SettingsError, SpelgenError
 from spelgen.exporting.exported import readme

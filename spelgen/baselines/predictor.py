@@ -172,16 +172,13 @@ def accurate_solver(dynamics: RigidDynamics, probe: Windows) -> Solver:
     solver = Solver(dynamics, 1)
     coarse = solver(windows)[1]
     # only dynamics that diverge would need shorter steps, and cannot be predicted with them either
-    while (
-        2 * solver.substeps <= TUNING.most_substeps
-        and windows.dt.mean() / (2 * solver.substeps) >= TUNING.shortest_step
-    ):
+    most = min(TUNING.most_substeps, windows.dt.mean().item() / TUNING.shortest_step)
+    while 2 * solver.substeps <= most:
         finer = replace(solver, substeps=2 * solver.substeps)
         fine = finer(windows)[1]
         error = (fine - windows.qd[:, 1:]).square().mean().sqrt()
-        if (fine - coarse).square().mean().sqrt() < TUNING.tolerance * torch.maximum(
-            TUNING.least_error * motion, error
-        ):
+        allowed = TUNING.tolerance * torch.maximum(TUNING.least_error * motion, error)
+        if (fine - coarse).square().mean().sqrt() < allowed:
             break
         solver, coarse = finer, fine
     return solver

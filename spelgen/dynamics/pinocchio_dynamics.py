@@ -135,10 +135,6 @@ class PinocchioDynamics:
         return result.reshape(*batch, *result.shape[1:])
 
 
-# Width of the tanh in place of the sign of the velocity, for Coulomb friction of a URDF [rad/s, m/s].
-COULOMB_SMOOTHING_VELOCITY = 0.05
-
-
 def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) -> PinocchioDynamics:
     """Return the dynamics of these joints of a URDF and of their mimic joints; all other joints are locked at zero.
 
@@ -160,7 +156,8 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
         if name in by_joint:
             model.armature[model.joints[model.getJointId(name)].idx_v] = by_joint[name].armature
     moving = [robot.joint[name] for name in joints]
-    friction = joint_friction(moving, by_joint, COULOMB_SMOOTHING_VELOCITY, speeds)
+    # width of the tanh in place of the sign of the velocity [rad/s, m/s]
+    friction = joint_friction(moving, by_joint, 0.05, speeds)
     return PinocchioDynamics(model, constraint, friction, motors.inputs)
 
 

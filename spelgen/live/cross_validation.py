@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.baseline import arm_of_model
+from spelgen.baselines.registry import arm_of_model
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.parameters import without_idle_residuals, without_residuals
 from spelgen.dynamics.protocol import residual_terms
