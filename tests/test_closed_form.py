@@ -7,7 +7,7 @@ import torch
 from emitted import closed_forms
 
 from spelgen.dynamics.body_regressor import regressor_of
-from spelgen.structure.pseudo_inertia import pseudo_inertia
+from spelgen.structure.nominal import pseudo_inertia
 from spelgen.structure.sampling import float_energies
 
 ROBOTS = ("two_link", "rpr", "six_dof", "ur10e", "panda")

@@ -28,9 +28,8 @@ from spelgen.fitting.servo.windows import servo_windows
 from spelgen.identification.intervals import jackknife_covariance
 from spelgen.labels import DELAYED_COMMAND, LINEAR_SERVOS
 from spelgen.listing import number
-from spelgen.logs.commands import delayed_commands
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.trajectory import Trajectory, delayed_commands
 from spelgen.render.report_page import render_report
 from spelgen.structure.servo_rank import servo_rank
 

@@ -31,7 +31,7 @@ from spelgen.logs import bags
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.fits import MomentumFit, Rollout
-from spelgen.settings.messages import validated
+from spelgen.settings.yaml_document import validated
 
 JOINTS = ("joint1", "joint2")
 SAMPLES = 60

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
-from spelgen.logs.commands import LogRows, delayed_commands
+from spelgen.logs.trajectory import LogRows, delayed_commands
 
 
 @dataclass(frozen=True)

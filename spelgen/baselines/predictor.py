@@ -12,7 +12,7 @@ from torch import Tensor
 
 from spelgen.dynamics.equations import MotionEquations, equations_of
 from spelgen.dynamics.protocol import RigidDynamics, is_stateful, memory_after, sliding_memory
-from spelgen.logs.commands import LogRows
+from spelgen.logs.trajectory import LogRows
 from spelgen.logs.windows import Windows, thinned
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 

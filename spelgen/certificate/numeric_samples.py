@@ -23,7 +23,7 @@ from spelgen.dynamics.constraint import mimic_constraint
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.settings.settings import Settings
-from spelgen.structure.pseudo_inertia import parameters_of
+from spelgen.structure.nominal import parameters_of
 from spelgen.urdf.document import urdf_bytes
 from spelgen.urdf.robot import Robot
 

@@ -12,9 +12,9 @@ from pydantic import ValidationError
 
 from spelgen.errors import RunError, suggestion
 from spelgen.settings.fits import OWNERS, Adaptation
-from spelgen.settings.messages import explain
 from spelgen.settings.training import PREPROCESSING, TrainingSettings
 from spelgen.settings.values import Count
+from spelgen.settings.yaml_document import explain
 
 if TYPE_CHECKING:
     from spelgen.fitting.objectives import FitOptions

@@ -24,10 +24,9 @@ from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory, set_aside
 from spelgen.logs.windows import split_validation
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.messages import dotted, validated
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.values import Count, Group
-from spelgen.settings.yaml_document import Location, read_document
+from spelgen.settings.yaml_document import Location, dotted, read_document, validated
 
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from spelgen.design import BREAKAWAY
-from spelgen.settings.joint import JointSettings
+from spelgen.settings.settings import JointSettings
 
 
 class DampedJoint(Protocol):

@@ -17,7 +17,7 @@ from spelgen.design import Design, load_design
 from spelgen.emission.parts import mean_mass, rounded
 from spelgen.emission.tuning import TUNING
 from spelgen.errors import SettingsError
-from spelgen.settings.joint import JointSettings
+from spelgen.settings.settings import JointSettings
 from spelgen.spec import (
     ConstantSpec,
     Entries,
@@ -31,8 +31,14 @@ from spelgen.spec import (
     Triple,
 )
 from spelgen.structure.basis import Weights
-from spelgen.structure.nominal import Nominal, exact_inertias, nominal, working_range
-from spelgen.structure.pseudo_inertia import parameters_of, reference_factor
+from spelgen.structure.nominal import (
+    Nominal,
+    exact_inertias,
+    nominal,
+    parameters_of,
+    reference_factor,
+    working_range,
+)
 from spelgen.structure.structure import Structure, derive
 
 

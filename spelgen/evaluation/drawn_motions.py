@@ -20,8 +20,8 @@ from spelgen.evaluation.torque import friction_past, mean_nmse, predicted_torque
 from spelgen.evaluation.tuning import TUNING
 from spelgen.labels import MODEL
 from spelgen.logs.dynamics_samples import DynamicsSamples
-from spelgen.logs.rates import shows_accelerations
 from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.tuning import shows_accelerations
 from spelgen.logs.windows import Windows, cut_windows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 

@@ -37,7 +37,6 @@ from spelgen.labels import MODEL
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import SHORTEST, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.rates import SLOWEST
 from spelgen.logs.trajectory import (
     Trajectory,
     joined_column,
@@ -45,6 +44,7 @@ from spelgen.logs.trajectory import (
     require_joints,
     require_torques,
 )
+from spelgen.logs.tuning import SLOWEST
 
 STEPS: Sequence[int] = (1, 10)
 SECONDS: Sequence[float] = (1.0,)

@@ -15,9 +15,8 @@ from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic
 from spelgen.evaluation.tuning import TUNING
 from spelgen.labels import MODEL
-from spelgen.logs.commands import LogRows, delayed_commands, steps_between
 from spelgen.logs.filtering import velocities
-from spelgen.logs.trajectory import Trajectory, split_at_gaps
+from spelgen.logs.trajectory import LogRows, Trajectory, delayed_commands, split_at_gaps, steps_between
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ import numpy as np
 import yaml
 from lxml import etree
 
+from spelgen.arm.arm import lump_links
 from spelgen.arm.chain import choose_chain
-from spelgen.arm.lump_links import lump_links
 from spelgen.dynamics.body_regressor import about_center
 from spelgen.dynamics.parameters import friction_factor
 from spelgen.exporting.describe import Trained, array

@@ -22,7 +22,7 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import FitConfig
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.messages import validated
+from spelgen.settings.yaml_document import validated
 
 Status = Literal["finished", "stopped early", "out of time", "interrupted"]
 

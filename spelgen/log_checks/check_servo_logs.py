@@ -14,10 +14,9 @@ from spelgen.log_checks.report import JointFollowing, JointReport, percent, sign
 from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
 from spelgen.log_checks.tuning import SERVO_LOGS as TUNING
 from spelgen.logs.checks import DEGREES, Findings, run_checks
-from spelgen.logs.commands import delayed_commands
 from spelgen.logs.filtering import derivative
 from spelgen.logs.joint_signals import is_factor
-from spelgen.logs.trajectory import Trajectory, require_commands, split_at_gaps
+from spelgen.logs.trajectory import Trajectory, delayed_commands, require_commands, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, SIGNALS
 
 if TYPE_CHECKING:

@@ -15,23 +15,14 @@ import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.labels import counted
+from spelgen.logs import joint_signals as signal_checks
 from spelgen.logs.joint_signals import Advice, JointSignals
-from spelgen.logs.jump_checks import (
-    find_dropouts,
-    find_held,
-    find_jumps,
-    find_too_rare,
-    find_unsigned_velocity,
-)
-from spelgen.logs.rates import SLOWEST, is_dense, shows_accelerations
-from spelgen.logs.resonance import find_elastic
 from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
-from spelgen.logs.tuning import SIGNALS
+from spelgen.logs.tuning import SIGNALS, SLOWEST, is_dense, shows_accelerations
 from spelgen.settings.log_mapping import TIMES
 
 DEGREES = 180.0 / np.pi
 ELASTIC = "elastic-joint"
-TURNS = 4 * np.pi  # [rad] Joints with limits have smaller positions: larger ones are in degrees.
 
 Subject = TypeVar("Subject")
 
@@ -63,12 +54,11 @@ class Findings:
 
     def add(self, check: Check[Any], message: str, where: str, file: Path | None = None) -> None:
         """Add the message of a check; the message of an error is extended by the option that accepts it."""
-        if check.severity == "error":
-            do = f"{check.do}; --accept {check.code} if it is right"
-            error = LogError(message, file=file, element=where, expected=check.expected, do=do)
-            self.errors.append(error)
-        else:
+        if check.severity != "error":
             self.notes.append(Diagnostic(check.severity, check.code, where, None, message))
+            return
+        do = f"{check.do}; --accept {check.code} if it is right"
+        self.errors.append(LogError(message, file=file, element=where, expected=check.expected, do=do))
 
 
 def run_checks(
@@ -95,8 +85,8 @@ def velocity_products(trajectory: Trajectory) -> np.ndarray:
 
     products = np.zeros((2 * trajectory.q.shape[1],) * 2)
     for piece in split_at_gaps(trajectory, shortest=2):
-        # over several samples: between neighbouring samples the quantisation of q may be larger than its change
-        span = min(SIGNALS.increments, len(piece) - 1)
+        # over ten samples: between neighbouring samples the quantisation of q may be larger than its change
+        span = min(10, len(piece) - 1)
         integral = cumulative_trapezoid(piece.qd, piece.t, axis=0, initial=0)
         positions = np.concatenate([integral, piece.q], axis=1)
         increments = positions[span:] - positions[:-span]
@@ -125,7 +115,8 @@ def find_degrees(signals: JointSignals) -> str | None:
         return f"q that changes {signals.factor:.3g} times as fast as qd says (180/pi is 57.3)"
     if signals.changes_by(1 / DEGREES):
         return f"qd that is {1 / signals.factor:.3g} times as large as q changes (180/pi is 57.3)"
-    if np.ptp(signals.q) > TURNS and not signals.turns:
+    # joints with limits have smaller positions: larger ones are in degrees
+    if np.ptp(signals.q) > 4 * np.pi and not signals.turns:
         return f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
     return None
 
@@ -134,42 +125,42 @@ def find_frozen(signals: JointSignals) -> str | None:
     """Find a position or a velocity that never changes while the other one does."""
     from scipy.integrate import cumulative_trapezoid
 
-    q, qd = signals.q, signals.qd
-    if np.ptp(qd) == 0 and np.ptp(q) > SIGNALS.drift:
+    # [rad, m] above this integral of qd a constant q is frozen, and the reverse
+    q, qd, motion = signals.q, signals.qd, 0.05
+    if np.ptp(qd) == 0 and np.ptp(q) > motion:
         return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
     # by the trapezoidal rule, so that noise of qd about zero has a small integral
     drift = np.abs(cumulative_trapezoid(qd, signals.trajectory.t)).max(initial=0.0)
-    if np.ptp(q) == 0 and drift > SIGNALS.drift:
+    if np.ptp(q) == 0 and drift > motion:
         return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
     return None
 
 
 def find_time_unit(signals: JointSignals) -> str | Advice | None:
     """Find times that are not in seconds: from a sample rate below 2 Hz, or from the ratio of dq/dt to qd."""
-    step = signals.step
+    step, unit = signals.step, None
     if step > SIGNALS.slowest_step:
         # reported once, and not for each joint
         if signals.number:
             return None
-        unit = time_unit(step)
         message = f"a sample every {step:.3g} s"
-        if unit is None or signals.trajectory.mapping.units.t != "s":
+        if signals.trajectory.mapping.units.t == "s":
+            unit = time_unit(step)
+        if unit is None:
             return message
         message += f", {1 / (step * TIMES[unit]):.4g} Hz if times are in {unit}"
-        return Advice(message, f"write 'units: {{t: {unit}}}' under 'logs' in the robot's YAML")
-    for unit in ("ms", "us", "ns"):
-        if signals.changes_by(TIMES[unit]):
-            message = f"q that changes {signals.factor:.3g} times as fast as qd says: times in {unit}"
-            return Advice(message, f"write 'units: {{t: {unit}}}' under 'logs' in the robot's YAML")
-    return None
+    else:
+        unit = next((x for x in ("ms", "us", "ns") if signals.changes_by(TIMES[x])), None)
+        if unit is None:
+            return None
+        message = f"q that changes {signals.factor:.3g} times as fast as qd says: times in {unit}"
+    return Advice(message, f"write 'units: {{t: {unit}}}' under 'logs' in the robot's YAML")
 
 
 def time_unit(step: float) -> str | None:
     """Return the unit of time in which a step between samples is plausible for a robot's log; None if there is none."""
-    for unit, size in TIMES.items():
-        if SIGNALS.fastest_step <= step * size <= SIGNALS.slowest_step:
-            return unit
-    return None
+    slowest, fastest = SIGNALS.slowest_step, SIGNALS.fastest_step
+    return next((unit for unit, size in TIMES.items() if fastest <= step * size <= slowest), None)
 
 
 def find_no_torques(signals: JointSignals) -> str | None:
@@ -193,19 +184,21 @@ def find_wrong_velocity(signals: JointSignals) -> str | None:
     if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
         # the velocity is correct except for its sign, so q is correct, and its derivative can replace qd
         advice = "; its sense is opposite: write 'velocity: differentiated' under 'logs' in the robot's YAML"
-    for joint, fit in zip(signals.joints, signals.correlations, strict=True):
-        if fit > max(SIGNALS.agreement, correlation):
-            advice = f"; it is the derivative of q of joint {joint!r}: check the names of the columns"
-            break
+    required = max(SIGNALS.agreement, correlation)
+    others = [
+        joint for joint, fit in zip(signals.joints, signals.correlations, strict=True) if fit > required
+    ]
+    if others:
+        advice = f"; it is the derivative of q of joint {others[0]!r}: check the names of the columns"
     return f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}{advice}"
 
 
 def find_constant_torque(signals: JointSignals) -> str | None:
     """Find torques that never change; logs of commands have none."""
-    tau = signals.trajectory.tau
-    if not tau.size or np.ptp(tau[:, signals.number]) > 0:
+    tau = signals.signal("tau")
+    if not tau.size or np.ptp(tau) > 0:
         return None
-    return f"tau is always {tau[0, signals.number]:g}: right for a joint without a motor only"
+    return f"tau is always {tau[0]:g}: right for a joint without a motor only"
 
 
 def find_rest(signals: JointSignals) -> str | None:
@@ -237,25 +230,22 @@ def find_low_rate(trajectory: Trajectory) -> str | None:
     )
 
 
-CLOCK_CHECKS = [
-    Check("gap", "info", find_gaps),
-    Check("low-rate", "warning", find_low_rate),
-]
+CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", find_low_rate)]
 # reported when a log is read, one message per repair
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
     Check(
-        "jumps", "error", find_jumps, expected="signals without jumps",
+        "jumps", "error", signal_checks.find_jumps, expected="signals without jumps",
         do="split recordings that were joined by a column 'trajectory', or check the encoder",
     ),
     Check(
-        "dropouts", "error", find_dropouts,
-        unless=("jumps",), expected="signals without holes and outliers",
+        "dropouts", "error", signal_checks.find_dropouts, ("jumps",),
+        expected="signals without holes and outliers",
         do="write 'dropouts: dropped' under 'logs' in the robot's YAML to drop those rows",
     ),
     Check(
-        "degrees", "error", find_degrees, unless=("jumps",), expected="radians and rad/s",
+        "degrees", "error", find_degrees, ("jumps",), expected="radians and rad/s",
         do="convert degrees, by 'units' under 'logs' in the robot's YAML; if the units are right, declare them there, "
         "or in the Parquet schema's metadata 'units'",
     ),
@@ -264,19 +254,19 @@ CHECKS: list[Check[JointSignals]] = [
         do="check the logger, and the names of the columns",
     ),
     Check(
-        "time-unit", "error", find_time_unit, unless=("degrees", "frozen"), expected="times in seconds",
+        "time-unit", "error", find_time_unit, ("degrees", "frozen"), expected="times in seconds",
         do="write 'units: {t: ms}' (us, ns) under 'logs' in the robot's YAML",
     ),
     Check(
-        "held-samples", "error", find_too_rare, unless=("time-unit",),
+        "held-samples", "error", signal_checks.find_too_rare, ("time-unit",),
         expected=f"values that change {SLOWEST:g} times a second",
         do="log the measurements when they are new, and not the last ones again",
     ),
-    Check("held-values", "warning", find_held, unless=("held-samples", "time-unit")),
+    Check("held-values", "warning", signal_checks.find_held, ("held-samples", "time-unit")),
     Check(
-        "velocity-without-sign", "error", find_unsigned_velocity, unless=("degrees", "time-unit", "frozen"),
-        expected="dq/dt", do="write 'velocity: differentiated' under 'logs' in the robot's YAML: velocities are then "
-        "those of q",
+        "velocity-without-sign", "error", signal_checks.find_unsigned_velocity, ("degrees", "time-unit", "frozen"),
+        expected="dq/dt",
+        do="write 'velocity: differentiated' under 'logs' in the robot's YAML: velocities are then those of q",
     ),
     Check(
         "no-torques", "error", find_no_torques, everywhere=True, expected="the torques that moved it",
@@ -284,11 +274,11 @@ CHECKS: list[Check[JointSignals]] = [
     ),
     Check(
         "velocity-is-no-derivative", "warning", find_wrong_velocity,
-        unless=("degrees", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign"),
+        ("degrees", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign"),
     ),
-    Check(ELASTIC, "warning", find_elastic, unless=("degrees", "time-unit", "frozen", "dropouts", "jumps")),
-    Check("constant-torque", "warning", find_constant_torque, unless=("no-torques",), everywhere=True),
-    Check("joint-at-rest", "info", find_rest, unless=("frozen",), everywhere=True),
+    Check(ELASTIC, "warning", signal_checks.find_elastic, ("degrees", "time-unit", "frozen", "dropouts", "jumps")),
+    Check("constant-torque", "warning", find_constant_torque, ("no-torques",), everywhere=True),
+    Check("joint-at-rest", "info", find_rest, ("frozen",), everywhere=True),
 ]  # fmt: skip
 
 
@@ -300,42 +290,41 @@ class LogChecks:
 
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
         self.products = np.zeros((2 * len(joints),) * 2)
-        self._joints, self._kinds = joints, joint_types
+        self._joints, self._kinds, self._count = joints, joint_types, 0
         self._results: dict[tuple[str, Check[Any]], list[tuple[str, str, Path | None]]] = {}
-        self._count = 0
 
     def add(self, trajectory: Trajectory) -> None:
         """Add a trajectory."""
         self._count += 1
-        where = f"trajectory {trajectory.name}"
-        for clock_check, message in run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted):
-            self._add(message, clock_check, message, where, trajectory)
-        for result, messages in ((REPAIRED, trajectory.repairs), (REMARKED, trajectory.remarks)):
-            for message in messages:
-                self._add(message, result, message, where, trajectory)
+        found: list[tuple[Check[Any], str]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
+        found += [(REPAIRED, message) for message in trajectory.repairs]
+        found += [(REMARKED, message) for message in trajectory.remarks]
+        for check, message in found:
+            self._add(message, check, message, "", trajectory)
         products = velocity_products(trajectory)
         self.products += products
         factors, correlations = map(np.ndarray.tolist, velocity_agreement(products))
         for k, (joint, kind) in enumerate(zip(self._joints, self._kinds, strict=True)):
             columns = trajectory.q[:, k], trajectory.qd[:, k]
             signals = JointSignals(trajectory, k, kind, self._joints, *columns, factors[k], correlations[k])
-            for joint_check, message in run_checks(CHECKS, signals, trajectory.accepted):
-                self._add(joint, joint_check, message, f"{where}, joint {joint!r}", trajectory)
+            for check, message in run_checks(CHECKS, signals, trajectory.accepted):
+                self._add(joint, check, message, f", joint {joint!r}", trajectory)
 
-    def _add(self, group: str, result: Check[Any], message: str, where: str, trajectory: Trajectory) -> None:
-        self._results.setdefault((group, result), []).append((message, where, trajectory.file))
+    def _add(self, group: str, check: Check[Any], message: str, joint: str, trajectory: Trajectory) -> None:
+        occurrence = message, f"trajectory {trajectory.name}{joint}", trajectory.file
+        self._results.setdefault((group, check), []).append(occurrence)
 
     def findings(self) -> Findings:
         """Return the findings: one per joint and check; of checks of clocks, one per message."""
         summary = Findings()
-        for (_, result), occurrences in self._results.items():
+        for (_, check), occurrences in self._results.items():
             # joints at rest are a finding only if they never move
-            if result.everywhere and len(occurrences) < self._count:
+            if check.everywhere and len(occurrences) < self._count:
                 continue
             message, where, file = occurrences[0]
             if len(occurrences) > 1:
                 message += f" (and in {counted(len(occurrences) - 1, 'more trajectory')})"
-            summary.add(result, message, where, file)
+            summary.add(check, message, where, file)
         return summary
 
 

@@ -18,7 +18,7 @@ from spelgen.errors import SpelgenError
 from spelgen.excitation.trajectory import SPEEDS, motion_bounds
 from spelgen.files import write_bytes, write_text
 from spelgen.simulation.tuning import AS_BUILT
-from spelgen.structure.pseudo_inertia import parameters_of, pseudo_inertia
+from spelgen.structure.nominal import parameters_of, pseudo_inertia
 from spelgen.urdf.document import urdf_bytes
 
 ABOUT = "The arm as built, from seed {}: the ground truth of simulated logs. `spelgen simulate` on it makes more logs."

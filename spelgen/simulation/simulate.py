@@ -14,10 +14,9 @@ from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import SettingsError
 from spelgen.excitation.trajectory import Motion
 from spelgen.logs.trajectory import Trajectory, set_aside
-from spelgen.settings.messages import validated
 from spelgen.settings.settings import Settings
 from spelgen.settings.simulation import ControlledSimulation, ServoSimulation, SimulationSettings
-from spelgen.settings.yaml_document import YamlDocument
+from spelgen.settings.yaml_document import YamlDocument, validated
 from spelgen.simulation.integration import rollout
 from spelgen.simulation.prescribed import prescribed
 from spelgen.simulation.protocol import (
