@@ -30,7 +30,7 @@ from truth import Case, Truth, record_log, wrong_urdf
 
 from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm, load_arm
-from spelgen.identification.drive_samples import DriveLog
+from spelgen.identification.drive_hints import DriveLog
 from spelgen.identification.geometry_search import compare_readings
 from spelgen.identification.log_geometry import GeometryProblem, Hypothesis, MotionSamples
 from spelgen.identification.tuning import GEOMETRY

@@ -115,7 +115,7 @@ def test_gain_of_motor_currents(arm):
     def warned(gain, drives=""):
         joints = ", ".join(f"{name}: {{gain: {gain}}}" for name in names)
         settings.write_text(f"logs: {{units: {{tau: A}}, joints: {{{joints}}}}}\n{drives}")
-        return "motor currents with a gain of 1" in message_of(load_arm(arm.robot.path), path)
+        return "currents or parts of a torque with a gain of 1" in message_of(load_arm(arm.robot.path), path)
 
     assert warned(1.0) and not message_of(load_arm(arm.robot.path), path).startswith("joint")
     assert not warned(2.0)

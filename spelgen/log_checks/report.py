@@ -13,14 +13,28 @@ from spelgen.arm.arm import Coordinate
 from spelgen.errors import Diagnostic, SpelgenError
 from spelgen.labels import UNITS, counted
 from spelgen.listing import WIDTH, Listing, number
-from spelgen.log_checks.gravity import GravityFit
 from spelgen.log_checks.statistics import Clock, Statistics
-from spelgen.log_checks.tuning import TUNING
-from spelgen.logs.checks import velocity_agreement
 from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.unit_checks import velocity_agreement
 
-UNFITTED = GravityFit()
 MEASURES = {"q": "position", "qd": "velocity", "tau": "torque", "u": "position"}
+
+
+@dataclass(frozen=True)
+class GravityFit:
+    """Gravity in the torque of one joint.
+
+    explained: part of the torque's variance, in addition to friction and the joint's own acceleration, that some
+    inertial values explain as gravity (0..1); None if gravity never loads the joint, if the torque never changes,
+    or with too few samples. factor: ratio to the URDF's gravity torque by least squares, correlation: with the URDF's
+    gravity torque, both after projection. relative_deviation: standard deviation of the URDF's gravity torque,
+    relative to the torque's.
+    """
+
+    explained: float | None = None
+    factor: float | None = None
+    correlation: float | None = None
+    relative_deviation: float | None = None
 
 
 @dataclass(frozen=True)
@@ -57,7 +71,7 @@ class JointReport:
     steps: dict[str, float | None]
     velocity_factor: float | None
     velocity_correlation: float | None
-    gravity: GravityFit = UNFITTED
+    gravity: GravityFit = GravityFit()
     following: JointFollowing | None = None
 
     def largest(self, quantity: str) -> float:
@@ -128,9 +142,13 @@ class LogReport:
         """Return all tables; of trajectories at most `limit`."""
         return [_clock_table(self.trajectories, limit), *self.tables]
 
+    def _short_listings(self) -> list[Listing]:
+        # a data set of a thousand episodes would fill the terminal
+        return self.listings(20)
+
     def text(self) -> str:
         """Return the report for a terminal, in 80 columns; the errors are not in it."""
-        paragraphs = [self.heading(), *map(Listing.text, self.listings(TUNING.shown))]
+        paragraphs = [self.heading(), *map(Listing.text, self._short_listings())]
         wrapped = partial(textwrap.fill, width=WIDTH, initial_indent="  ", subsequent_indent="    ")
         findings = list(map(wrapped, map(str, self.findings)))
         if findings:
@@ -150,7 +168,7 @@ class LogReport:
         for error in self.errors:
             lines.append(("error", "", str(error)))
         table = Listing(self.heading(), ("", "where", "what"), tuple(lines), left=(0, 1, 2))
-        return "".join(map(Listing.html, (table, *self.listings(TUNING.shown))))
+        return "".join(map(Listing.html, (table, *self._short_listings())))
 
 
 def joint_report(
@@ -192,7 +210,6 @@ def _clock_table(trajectories: Sequence[Clock], limit: int | None) -> Listing:
     """Return when samples were taken; of trajectories at most `limit`."""
     head = ("trajectory", "samples", "duration", "sample rate", "jitter", "gaps", "longest")
     rows = []
-    # a data set of a thousand episodes would fill the terminal
     for clock in trajectories[:limit]:
         longest = f"{clock.longest_gap:.3g} s" if clock.gaps else "-"
         duration, rate = f"{clock.duration:.4g} s", f"{clock.sample_rate:.4g} Hz"

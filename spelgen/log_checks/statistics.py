@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from spelgen.log_checks.tuning import TUNING
 from spelgen.logs.rates import is_dense
 from spelgen.logs.trajectory import Trajectory
 
@@ -85,16 +84,22 @@ def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 def quantisation_step(values: np.ndarray) -> float:
     """Return the step of a quantised signal (T,); NaN where it is not quantised, or never changes."""
     differences = np.diff(np.unique(values))
+    tolerance = 0.05  # of a step, and of the levels, that may be off the grid
     # two or three levels are no grid
     if len(differences) < 3:
         return float("nan")
-    smallest = np.quantile(differences, TUNING.step_tolerance)
+    smallest = np.quantile(differences, tolerance)
     step = float(np.median(differences[differences <= 1.5 * smallest]))
     # over a hundred steps the error of the step adds up to a fraction of a step
     near = differences[differences < 100 * step] / step
-    is_whole = np.abs(near - np.round(near)) < TUNING.step_tolerance
-    is_grid = len(near) > 2 and is_whole.mean() > 1 - TUNING.step_tolerance
+    is_whole = np.abs(near - np.round(near)) < tolerance
+    is_grid = len(near) > 2 and is_whole.mean() > 1 - tolerance
     # a smooth signal passes wide levels one after the other, commands on round numbers jump between them
     changes = np.abs(np.diff(values))
-    is_command = np.ptp(values) < TUNING.levels * step and changes[changes > 0].mean() > 1.5 * step
+    is_command = has_few_levels(step, float(np.ptp(values))) and changes[changes > 0].mean() > 1.5 * step
     return step if is_grid and not is_command else float("nan")
+
+
+def has_few_levels(step: float, width: float) -> bool:
+    """Whether a signal that is quantised to steps has too few of them in its range for a reliable magnitude."""
+    return width < 10.0 * step

@@ -6,8 +6,8 @@ so that logs need not lie in memory together. `log_checks` has the checks that t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
@@ -15,9 +15,10 @@ import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.labels import counted
-from spelgen.logs.joint_signals import Advice, JointSignals
+from spelgen.logs.joint_signals import Advice, JointSignals, is_factor, joint_keys, settings_line
 from spelgen.logs.jump_checks import (
     find_dropouts,
+    find_frozen,
     find_held,
     find_jumps,
     find_too_rare,
@@ -25,13 +26,17 @@ from spelgen.logs.jump_checks import (
 )
 from spelgen.logs.rates import SLOWEST, is_dense, shows_accelerations
 from spelgen.logs.resonance import find_elastic
-from spelgen.logs.trajectory import Trajectory, gap_ends, split_at_gaps
-from spelgen.logs.tuning import SIGNALS
-from spelgen.settings.log_mapping import TIMES
+from spelgen.logs.trajectory import Trajectory, gap_ends
+from spelgen.logs.unit_checks import (
+    find_time_unit,
+    find_units,
+    find_wrong_velocity,
+    velocity_agreement,
+    velocity_products,
+)
+from spelgen.settings.log_mapping import SCALES
 
-DEGREES = 180.0 / np.pi
 ELASTIC = "elastic-joint"
-TURNS = 4 * np.pi  # [rad] A joint with limits turns less: larger positions are in degrees.
 
 Subject = TypeVar("Subject")
 
@@ -61,115 +66,31 @@ class Findings:
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
 
-    def add(self, check: Check[Any], message: str, where: str, file: Path | None = None) -> None:
-        """Add the message of a check; to an error, how to accept it."""
-        if check.severity == "error":
-            do = f"{check.do}; --accept {check.code} if it is right"
-            error = LogError(message, file=file, element=where, expected=check.expected, do=do)
-            self.errors.append(error)
-        else:
+    def add(self, check: Check[Any], found: str | Advice, where: str, file: Path | None = None) -> None:
+        """Add the finding of a check; to an error, how to accept it. A finding with a line is an error."""
+        do, message = check.do, found if isinstance(found, str) else found.message
+        if isinstance(found, Advice):
+            do = f"write '{settings_line(found.keys)}' under 'logs' in the robot's YAML"
+        elif check.severity != "error":
             self.notes.append(Diagnostic(check.severity, check.code, where, None, message))
+            return
+        do = f"{do}; --accept {check.code} if it is right"
+        self.errors.append(LogError(message, file=file, element=where, expected=check.expected, do=do))
 
 
 def run_checks(
     checks: Iterable[Check[Subject]], subject: Subject, accepted: Collection[str] = ()
-) -> list[tuple[Check[Subject], str]]:
-    """Return the checks with a finding, and their messages; accepted: codes that are not checked."""
-    results: dict[str, tuple[Check[Subject], str]] = {}
+) -> list[tuple[Check[Subject], str | Advice]]:
+    """Return the checks with a finding, and their findings; accepted: codes that are not checked."""
+    results: dict[str, tuple[Check[Subject], str | Advice]] = {}
     for check in checks:
         # one cause, one message: degrees are no derivatives either
         if check.code in accepted or not results.keys().isdisjoint(check.unless):
             continue
         found = check.find(subject)
-        if isinstance(found, Advice):
-            results[check.code] = replace(check, do=found.do), found.message
-        elif found is not None:
+        if found is not None:
             results[check.code] = check, found
     return list(results.values())
-
-
-def velocity_products(trajectory: Trajectory) -> np.ndarray:
-    """Return sums of products (2n, 2n) of increments over some steps: of the integrals of qd, then of q."""
-    # loaded where it is called: half a second
-    from scipy.integrate import cumulative_trapezoid
-
-    products = np.zeros((2 * trajectory.q.shape[1],) * 2)
-    for piece in split_at_gaps(trajectory, shortest=2):
-        # over several steps: from one sample to the next quantisation of q is larger than its change
-        span = min(SIGNALS.increments, len(piece) - 1)
-        integral = cumulative_trapezoid(piece.qd, piece.t, axis=0, initial=0)
-        positions = np.concatenate([integral, piece.q], axis=1)
-        increments = positions[span:] - positions[:-span]
-        products += increments.T @ increments
-    return products
-
-
-def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return factors (n,) by which qd must be multiplied to be dq/dt, and correlations (n, n).
-
-    Correlations are 1 if qd of the row's joint is proportional to dq/dt of the column's; NaN if a joint is at rest.
-    products: see `velocity_products`.
-    """
-    n = len(products) // 2
-    qd_squares, q_squares = np.split(products.diagonal(), 2)
-    sizes = np.outer(np.sqrt(qd_squares), np.sqrt(q_squares))
-    correlations = products[:n, n:] / np.where(sizes > 1e-12, sizes, np.nan)
-    return products[:n, n:].diagonal() / np.where(qd_squares > 0, qd_squares, np.nan), correlations
-
-
-def find_degrees(signals: JointSignals) -> str | None:
-    """Find revolute joints that look recorded in degrees."""
-    if signals.kind == "prismatic":
-        return None
-    if signals.changes_by(DEGREES):
-        return f"q that changes {signals.factor:.3g} times as fast as qd says (180/pi is 57.3)"
-    if signals.changes_by(1 / DEGREES):
-        return f"qd that is {1 / signals.factor:.3g} times as large as q changes (180/pi is 57.3)"
-    if np.ptp(signals.q) > TURNS and not signals.turns:
-        return f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
-    return None
-
-
-def find_frozen(signals: JointSignals) -> str | None:
-    """Find a position or a velocity that never changes while the other one does."""
-    from scipy.integrate import cumulative_trapezoid
-
-    q, qd = signals.q, signals.qd
-    if np.ptp(qd) == 0 and np.ptp(q) > SIGNALS.drift:
-        return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
-    # the trapezoidal rule: a constant q with a noisy qd around zero stays where it is
-    drift = np.abs(cumulative_trapezoid(qd, signals.trajectory.t)).max(initial=0.0)
-    if np.ptp(q) == 0 and drift > SIGNALS.drift:
-        return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
-    return None
-
-
-def find_time_unit(signals: JointSignals) -> str | Advice | None:
-    """Find times that are not in seconds: no arm is sampled more slowly than at 2 Hz, and q changes as fast as qd."""
-    step = signals.step
-    if step > SIGNALS.slowest_step:
-        # reported once, and not for each joint
-        if signals.number:
-            return None
-        unit = time_unit(step)
-        message = f"a sample every {step:.3g} s"
-        if unit is None or signals.trajectory.mapping.units.t != "s":
-            return message
-        message += f", {1 / (step * TIMES[unit]):.4g} Hz if times are in {unit}"
-        return Advice(message, f"write 'units: {{t: {unit}}}' under 'logs' in the robot's YAML")
-    for unit in ("ms", "us", "ns"):
-        if signals.changes_by(TIMES[unit]):
-            message = f"q that changes {signals.factor:.3g} times as fast as qd says: times in {unit}"
-            return Advice(message, f"write 'units: {{t: {unit}}}' under 'logs' in the robot's YAML")
-    return None
-
-
-def time_unit(step: float) -> str | None:
-    """Return the unit in which the step between two samples is one of a robot's log; None if it is none."""
-    for unit, size in TIMES.items():
-        if SIGNALS.fastest_step <= step * size <= SIGNALS.slowest_step:
-            return unit
-    return None
 
 
 def find_no_torques(signals: JointSignals) -> str | None:
@@ -179,25 +100,6 @@ def find_no_torques(signals: JointSignals) -> str | None:
     if signals.number or not trajectory.tau.size or trajectory.tau.any() or not np.ptp(trajectory.q):
         return None
     return "torques that are all 0 while the arm moves"
-
-
-def find_wrong_velocity(signals: JointSignals) -> str | None:
-    """Find velocities that are not the derivative of the positions, and a joint or a sign that fits better."""
-    factor, correlation, tolerance = signals.factor, signals.correlation, 1 - SIGNALS.agreement
-    # times in another unit have been found at the first joint
-    if signals.step > SIGNALS.slowest_step:
-        return None
-    if np.isnan(correlation) or (correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance):
-        return None
-    advice = ""
-    if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
-        # the velocity is right up to its sense, so that q differentiated has no more errors than q
-        advice = "; its sense is opposite: write 'velocity: differentiated' under 'logs' in the robot's YAML"
-    for joint, fit in zip(signals.joints, signals.correlations, strict=True):
-        if fit > max(SIGNALS.agreement, correlation):
-            advice = f"; it is the derivative of q of joint {joint!r}: check the names of the columns"
-            break
-    return f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}{advice}"
 
 
 def find_constant_torque(signals: JointSignals) -> str | None:
@@ -246,26 +148,25 @@ REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: No
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
     Check(
-        "jumps", "error", find_jumps, expected="signals without jumps",
-        do="split recordings that were joined by a column 'trajectory', or check the encoder",
-    ),
-    Check(
-        "dropouts", "error", find_dropouts,
-        unless=("jumps",), expected="signals without holes and outliers",
-        do="write 'dropouts: dropped' under 'logs' in the robot's YAML to drop those rows",
-    ),
-    Check(
-        "degrees", "error", find_degrees, unless=("jumps",), expected="radians and rad/s",
-        do="convert degrees, by 'units' under 'logs' in the robot's YAML; if the units are right, declare them there, "
-        "or in the Parquet schema's metadata 'units'",
-    ),
-    Check(
         "frozen", "error", find_frozen, expected="columns that belong together",
         do="check the logger, and the names of the columns",
     ),
     Check(
+        "jumps", "error", find_jumps, unless=("frozen",), expected="signals without jumps",
+        do="split recordings that were joined by a column 'trajectory', or check the encoder",
+    ),
+    Check(
+        "dropouts", "error", find_dropouts,
+        unless=("frozen", "jumps"), expected="signals without holes and outliers",
+        do="write 'dropouts: dropped' under 'logs' in the robot's YAML to drop those rows",
+    ),
+    Check(
+        "degrees", "error", find_units, unless=("jumps",), expected="radians and rad/s",
+        do="write 'units' under 'logs' in the robot's YAML, or declare them in the Parquet schema's metadata",
+    ),
+    Check(
         "time-unit", "error", find_time_unit, unless=("degrees", "frozen"), expected="times in seconds",
-        do="write 'units: {t: ms}' (us, ns) under 'logs' in the robot's YAML",
+        do="state the unit of t as 'units' under 'logs' in the robot's YAML",
     ),
     Check(
         "held-samples", "error", find_too_rare, unless=("time-unit",),
@@ -283,7 +184,7 @@ CHECKS: list[Check[JointSignals]] = [
         do="check the names of the columns and the logger",
     ),
     Check(
-        "velocity-is-no-derivative", "warning", find_wrong_velocity,
+        "velocity-is-no-derivative", "warning", find_wrong_velocity, expected="dq/dt",
         unless=("degrees", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign"),
     ),
     Check(ELASTIC, "warning", find_elastic, unless=("degrees", "time-unit", "frozen", "dropouts", "jumps")),
@@ -301,42 +202,89 @@ class LogChecks:
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
         self.products = np.zeros((2 * len(joints),) * 2)
         self._joints, self._kinds = joints, joint_types
-        self._results: dict[tuple[str, Check[Any]], list[tuple[str, str, Path | None]]] = {}
+        self._results: dict[tuple[str, Check[Any]], list[tuple[str | Advice, str, Path | None]]] = {}
         self._count = 0
 
     def add(self, trajectory: Trajectory) -> None:
         """Take in a trajectory."""
         self._count += 1
-        where = f"trajectory {trajectory.name}"
-        for clock_check, message in run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted):
-            self._add(message, clock_check, message, where, trajectory)
+        for clock_check, found in run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted):
+            self._add(str(found), clock_check, found, trajectory)
         for result, messages in ((REPAIRED, trajectory.repairs), (REMARKED, trajectory.remarks)):
             for message in messages:
-                self._add(message, result, message, where, trajectory)
+                self._add(message, result, message, trajectory)
         products = velocity_products(trajectory)
         self.products += products
         factors, correlations = map(np.ndarray.tolist, velocity_agreement(products))
         for k, (joint, kind) in enumerate(zip(self._joints, self._kinds, strict=True)):
             columns = trajectory.q[:, k], trajectory.qd[:, k]
             signals = JointSignals(trajectory, k, kind, self._joints, *columns, factors[k], correlations[k])
-            for joint_check, message in run_checks(CHECKS, signals, trajectory.accepted):
-                self._add(joint, joint_check, message, f"{where}, joint {joint!r}", trajectory)
+            for joint_check, found in run_checks(CHECKS, signals, trajectory.accepted):
+                self._add(joint, joint_check, found, trajectory)
 
-    def _add(self, group: str, result: Check[Any], message: str, where: str, trajectory: Trajectory) -> None:
-        self._results.setdefault((group, result), []).append((message, where, trajectory.file))
+    def _add(self, group: str, check: Check[Any], found: str | Advice, trajectory: Trajectory) -> None:
+        where = f"trajectory {trajectory.name}"
+        self._results.setdefault((group, check), []).append((found, where, trajectory.file))
 
     def findings(self) -> Findings:
-        """Return the findings: one for each joint and check; for clocks, one for each message."""
+        """Return the findings: an error for each check, of all its joints; a note for each joint or message."""
         summary = Findings()
-        for (_, result), occurrences in self._results.items():
+        joints_of: dict[Check[Any], list[str]] = {}
+        for (group, check), occurrences in self._results.items():
+            found, where, file = occurrences[0]
             # a joint that rests in one motion and moves in another is no oddity
-            if result.everywhere and len(occurrences) < self._count:
+            if check.everywhere and len(occurrences) < self._count:
                 continue
-            message, where, file = occurrences[0]
-            if len(occurrences) > 1:
-                message += f" (and in {counted(len(occurrences) - 1, 'more trajectory')})"
-            summary.add(result, message, where, file)
+            if check.severity == "error" or isinstance(found, Advice):
+                joints_of.setdefault(check, []).append(group)
+                continue
+            place = f"{where}, joint {group!r}" if group in self._joints else where
+            summary.add(check, f"{found}{_more(occurrences)}", place, file)
+        for check, joints in joints_of.items():
+            occurrences = self._results[joints[0], check]
+            found, where, file = occurrences[0]
+            place = f"{where}, joint {', '.join(map(repr, joints))}"
+            if isinstance(found, Advice):
+                found = Advice(f"{found.message}{_more(occurrences)}", self._keys(check, joints))
+            else:
+                found += _more(occurrences)
+            summary.add(check, found, place, file)
         return summary
+
+    def _keys(self, check: Check[Any], joints: Sequence[str]) -> dict[str, Any]:
+        """Return the keys of the group `logs` that remedy the findings of a check about some joints."""
+        keys: dict[str, Any] = {}
+        for joint in joints:
+            for found, _, _ in self._results[joint, check]:
+                if isinstance(found, Advice):
+                    keys = _merged(keys, found.keys)
+        entries = keys.get("joints", {})
+        first: Mapping[str, Any] = entries.get(joints[0], {})
+        if first.keys() != {"units"}:
+            return keys
+        # the unit of a joint that rests, or moves little, is that of the others
+        factors, _ = velocity_agreement(self.products)
+        ratio = SCALES.get(first["units"].get("qd"), 1.0) / SCALES.get(first["units"].get("q"), 1.0)
+        is_linear = self._kinds[self._joints.index(joints[0])] == "prismatic"
+        for joint, kind, factor in zip(self._joints, self._kinds, factors.tolist(), strict=True):
+            if is_linear == (kind == "prismatic") and (np.isnan(factor) or is_factor(factor, ratio)):
+                entries.setdefault(joint, first)
+        return joint_keys(entries, self._joints)
+
+
+def _more(occurrences: Sequence[object]) -> str:
+    """Return how many more trajectories show a finding, in brackets."""
+    count = len(occurrences) - 1
+    return f" (and in {counted(count, 'more trajectory')})" if count else ""
+
+
+def _merged(keys: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested keys with those of others."""
+    result = dict(keys)
+    for key, value in others.items():
+        known = result.get(key)
+        result[key] = _merged(known, value) if isinstance(known, dict) else value
+    return result
 
 
 def check(

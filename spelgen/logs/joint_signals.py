@@ -2,20 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import yaml
 
 from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.tuning import SIGNALS
 
 
 class Advice(NamedTuple):
-    """Finding of a check with the exact remedy, which the check has tried."""
+    """Finding of a check, and the keys of the group `logs` that remedy it, which the check has tried."""
 
     message: str
-    do: str
+    keys: Mapping[str, object]
+
+
+def settings_line(keys: Mapping[str, object]) -> str:
+    """Return keys of the settings as YAML in one line, without the outer braces."""
+    text: str = yaml.safe_dump(dict(keys), default_flow_style=True, sort_keys=False, width=float("inf"))
+    return text.strip()[1:-1]
+
+
+def joint_keys(entries: Mapping[str, Mapping[str, object]], joints: Sequence[str]) -> dict[str, object]:
+    """Return the keys of single joints for the group `logs`; units that all joints of an arm share are its units."""
+    first = next(iter(entries.values()))
+    if first.keys() == {"units"} and all(entries.get(joint) == first for joint in joints):
+        return dict(first)
+    return {"joints": dict(entries)}
+
+
+def plain_number(value: float, digits: int = 5) -> float:
+    """Return a number rounded to some digits; an integer if it is one."""
+    rounded = float(f"{value:.{digits}g}")
+    return int(rounded) if rounded.is_integer() else rounded
 
 
 class JointSignals(NamedTuple):

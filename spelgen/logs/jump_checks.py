@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from spelgen.labels import counted
-from spelgen.logs.joint_signals import Advice, JointSignals
+from spelgen.logs.joint_signals import Advice, JointSignals, plain_number
 from spelgen.logs.jumps import held_samples, is_lost, is_outlier, jumps, read_as_words
 from spelgen.logs.rates import shows_accelerations
-from spelgen.logs.recording import listed_times, outlier_rows
+from spelgen.logs.recording import listed_times, outlier_rows, stale_rows
 from spelgen.logs.tuning import SIGNALS
 
 
@@ -23,6 +23,26 @@ def find_dropouts(signals: JointSignals) -> str | None:
             what = "falls to 0" if values[first] == 0 else f"deviates from its neighbours by {size:.4g}"
             times = listed_times(signals.trajectory.t[rows])
             return f"{name} that {what} for a moment, in {counted(len(rows), 'sample')}, at t = {times}"
+    return None
+
+
+def find_frozen(signals: JointSignals) -> str | Advice | None:
+    """Find a position or a velocity that never changes while the other one does, and values that are old for long."""
+    from scipy.integrate import cumulative_trapezoid
+
+    t, q, qd = signals.trajectory.t, signals.q, signals.qd
+    if np.ptp(qd) == 0 and np.ptp(q) > SIGNALS.drift:
+        return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
+    # the trapezoidal rule: a constant q with a noisy qd around zero stays where it is
+    drift = np.abs(cumulative_trapezoid(qd, t)).max(initial=0.0)
+    if np.ptp(q) == 0 and drift > SIGNALS.drift:
+        return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
+    for name in signals.measured if "qd" in signals.measured else ():
+        rows = np.flatnonzero(stale_rows(name, signals.signal(name), t, q, qd))
+        if rows.size:
+            value, count = signals.signal(name)[rows[0]], counted(len(rows), "sample")
+            message = f"{name} that stays at {value:.4g} while the joint moves, in {count} from t = {t[rows[0]]:.4g} s"
+            return Advice(message, {"dropouts": "dropped"})
     return None
 
 
@@ -46,25 +66,32 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
     """Find words of a register, or wrapped angles, in "q", "qd", "tau" or "u" of the joint."""
     mapping, values = signals.trajectory.mapping, signals.signal(name)
     scale, offset = mapping.scale(name, signals.joint), mapping.offset(name, signals.joint)
-    turn = None if signals.kind == "prismatic" or name not in ("q", "u") else 2 * np.pi / abs(scale)
+    unit = mapping.unit(name, signals.joint)
+    turns: list[float | None] = [None]
+    if signals.kind != "prismatic" and name in ("q", "u"):
+        # angles without a stated unit may be in degrees
+        turns = [2 * np.pi / abs(scale), *([360.0] if unit is None else [])]
     # one lost sample or outlier makes two jumps, which no register explains
     values = values[~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))]
-    word = read_as_words((values - offset) / scale, turn)
-    if word is None:
-        return None
-    # commands may jump: they are words only if decoding brings them to the positions
-    if name == "u":
-        q = signals.q[~is_lost(signals.signal("u"))]
-        if np.std(word.values * scale + offset - q) > SIGNALS.near_position * np.std(values - q):
-            return None
-    unit = mapping.unit(name, signals.joint) or ("as logged" if turn is None else "rad")
-    size, count = float(f"{word.value:.9g}"), counted(word.jumps, "time")
-    what = "words with a sign bit" if word.key == "sign_bit" else "a register or an angle that starts again"
-    line = f"joints: {{{signals.joint}: {{{word.key}: {{{name}: {size:.9g}}}}}}}"
-    return Advice(
-        f"{name} that jumps by {size:.6g} ({unit}), {count}: {what}",
-        f"write '{line}' under 'logs' in the robot's YAML",
-    )
+    for turn in turns:
+        word = read_as_words((values - offset) / scale, turn)
+        if word is None:
+            continue
+        # commands may jump: they are words only if decoding brings them to the positions
+        if name == "u":
+            q = signals.q[~is_lost(signals.signal("u"))]
+            if np.std(word.values * scale + offset - q) > SIGNALS.near_position * np.std(values - q):
+                return None
+        keys: dict[str, object] = {word.key: {name: plain_number(word.value, 9)}}
+        if turn == 360.0 and unit is None:
+            unit, keys = "deg", {"units": {name: "deg"}} | keys
+        unit = unit or ("as logged" if turn is None else "rad")
+        what = (
+            "words with a sign bit" if word.key == "sign_bit" else "a register or an angle that starts again"
+        )
+        message = f"{name} that jumps by {word.value:.6g} ({unit}), {counted(word.jumps, 'time')}: {what}"
+        return Advice(message, {"joints": {signals.joint: keys}})
+    return None
 
 
 def find_held(signals: JointSignals) -> str | None:
@@ -80,13 +107,18 @@ def find_held(signals: JointSignals) -> str | None:
     return None
 
 
-def find_too_rare(signals: JointSignals) -> str | None:
+def find_too_rare(signals: JointSignals) -> str | Advice | None:
     """Find held signals from which no acceleration can be computed; arms under servos need none."""
     rate = signals.trajectory.sample_rate
     if signals.trajectory.u is not None or not shows_accelerations(rate):
         return None
-    held = [held_samples(signals.signal(name)) for name in signals.measured]
-    return None if shows_accelerations(rate / max(held)) else find_held(signals)
+    held = {name: held_samples(signals.signal(name)) for name in signals.measured}
+    message = find_held(signals)
+    if message is None or shows_accelerations(rate / max(held.values())):
+        return None
+    # positions that are new show the velocities
+    is_mended = all(often == 1 for name, often in held.items() if name != "qd")
+    return Advice(message, {"velocity": "differentiated"}) if is_mended else message
 
 
 def find_unsigned_velocity(signals: JointSignals) -> str | None:

@@ -84,6 +84,22 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     return np.asarray(outliers & is_beyond)
 
 
+def is_stale(values: np.ndarray, changes: np.ndarray, least: float) -> np.ndarray:
+    """Return a mask (T,) of samples that repeat an old value for long, in a signal that otherwise changes.
+
+    changes: (T,), a signal that cannot change by more than `least` while the values are constant.
+    """
+    stale = np.zeros(len(values), bool)
+    starts = np.flatnonzero(np.diff(values, prepend=np.nan))
+    lengths = np.diff(np.append(starts, len(values)))
+    fewest = TUNING.stale * max(1.0, float(np.median(lengths)))
+    for start, length in zip(starts[lengths > fewest], lengths[lengths > fewest], strict=True):
+        rows = slice(start + 1, start + length)
+        if length < len(values) and np.ptp(changes[rows]) > least:
+            stale[rows] = True
+    return stale
+
+
 def jumps(t: np.ndarray, q: np.ndarray, limit: float = TUNING.fastest) -> np.ndarray:
     """Return the rows after which a position (T,) jumps: faster than `limit` [rad/s, m/s] and typical steps.
 

@@ -136,7 +136,9 @@ def _matrix_columns(arrays: NpzArrays, matrix: str, joints: Sequence[str]) -> li
         if width != len(joints):
             raise LogError(
                 f"{width} columns", file=arrays.file, element=f"array {matrix}",
-                expected=f"{len(joints)}, one for each joint", do=f"name them by an array {JOINT_NAMES!r}",
+                expected=f"{len(joints)}, one for each joint",
+                do="transpose it: rows are times" if len(arrays[matrix]) == len(joints)
+                else f"name them by an array {JOINT_NAMES!r}",
             )  # fmt: skip
         return list(range(width))
     names = list(map(str, arrays[JOINT_NAMES].ravel()))

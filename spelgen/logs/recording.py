@@ -11,7 +11,7 @@ import numpy as np
 
 from spelgen.errors import LogError
 from spelgen.labels import counted
-from spelgen.logs.jumps import centred, is_outlier, jump_count, repeated_rows, unwrapped
+from spelgen.logs.jumps import centred, is_outlier, is_stale, jump_count, repeated_rows, unwrapped
 from spelgen.logs.tables import Layout
 from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.logs.tuning import TUNING
@@ -98,9 +98,12 @@ def _without_outliers(
     """Return rows (T, C) without lost samples and outliers, and a message that lists them."""
     outliers = np.zeros(len(data), bool)
     found = []
-    for (quantity, joint), values in zip(signals, data[:, 1:].T, strict=True):
+    columns = dict(zip(signals, data[:, 1:].T, strict=True))
+    for (quantity, joint), values in columns.items():
         if quantity != "u":
             rows = outlier_rows(quantity, values)
+            if ("qd", joint) in columns:
+                rows |= stale_rows(quantity, values, data[:, 0], columns["q", joint], columns["qd", joint])
             outliers |= rows
             if rows.any():
                 found.append(f"{quantity} of {joint!r} at t = {listed_times(data[rows, 0])}")
@@ -114,6 +117,19 @@ def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of lost samples and outliers of "q", "qd" or "tau"; a velocity may be 0 for a moment."""
     rows = is_outlier(values, smooth=quantity == "q")
     return np.asarray(rows & (values != 0)) if quantity == "qd" else rows
+
+
+def stale_rows(quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
+    """Return a mask (T,) of samples of "q", "qd" or "tau" of a moving joint that repeat an old value for long.
+
+    A torque at its largest or smallest value is not stale, but clipped.
+    """
+    if quantity == "tau":
+        stale = is_stale(values, qd, TUNING.stale_speed * float(np.ptp(qd)))
+        return np.asarray(stale & (values > values.min()) & (values < values.max()))
+    from scipy.integrate import cumulative_trapezoid  # takes long to import
+
+    return is_stale(values, cumulative_trapezoid(qd, t, initial=0) - q, TUNING.stale_motion)
 
 
 def listed_times(t: np.ndarray) -> str:

@@ -35,6 +35,7 @@ class Layout:
     file: named by errors and trajectories. columns: of t, then of q, qd and tau per joint; without qd if velocities
     are differentiated. labels: the column that splits the log into recordings, None without. accepted: see
     `Trajectory`. recording: its name, if the format separates recordings. remarks: facts about the file.
+    header: lines of a CSV before its values.
     """
 
     file: Path
@@ -45,10 +46,11 @@ class Layout:
     accepted: tuple[str, ...]
     recording: str | None = None
     remarks: tuple[str, ...] = ()
+    header: int = 1
 
     def row_error(self, got: str, row: int, column: str, expected: str, do: str | None = None) -> LogError:
-        """Return an error about a column in a 0-based data row, with the line of a CSV, whose first is its header."""
-        line = int(row) + 2 if self.file.suffix == ".csv" else None
+        """Return an error about a column in a 0-based data row, with the line of a CSV."""
+        line = int(row) + 1 + self.header if self.file.suffix == ".csv" else None
         element = f"row {row + 1}, column {column}"
         return LogError(got, file=self.file, line=line, element=element, expected=expected, do=do)
 

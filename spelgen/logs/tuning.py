@@ -31,6 +31,12 @@ class LogTuning:
     jump_window: int = 8
     # [1] Samples within which a signal that has left returns, if they are outliers; later it has jumped.
     excursion: int = 5
+    # [1] A constant value is stale from this multiple of the typical duration of a value on, if the joint moves
+    # meanwhile: q and the integral of qd differ by `stale_motion` [rad, m], or, for torques, qd changes by this
+    # fraction of its range.
+    stale: float = 20.0
+    stale_motion: float = 0.05
+    stale_speed: float = 0.2
     # [1] Fraction of steps that are jumps; a signal with more is noise.
     most_jumps: float = 0.05
     # [1] Fraction of steps at which a signal around 0, and so the sign bit of its words, changes its sign at most.
@@ -93,6 +99,8 @@ class SignalCheckTuning:
     agreement: float = 0.9
     # [1] A factor within this ratio of the factor of a unit is the factor of the unit.
     unit_factor: float = 1.25
+    # [1] Penalty of a unit other than SI, in the logarithm of such a factor: degrees with rpm are 5 % from turns.
+    rare_unit: float = 0.02
     # [s] Smallest and largest median time between samples: no arm is sampled above 10 kHz or below 2 Hz.
     fastest_step: float = 1e-4
     slowest_step: float = 0.5
