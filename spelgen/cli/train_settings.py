@@ -47,7 +47,10 @@ class Assignments(TrainingSettings):
 
 @dataclass(frozen=True)
 class Request:
-    """The options of the command line. values: of `--set`, by key. warm_start: whether the model was fitted before."""
+    """The options of the command `train`.
+
+    values: the values of `--set` by key. warm_start: whether the model was fitted before.
+    """
 
     objective: str | None
     values: Mapping[str, Any]

@@ -109,7 +109,7 @@ class Job(Group):
 
     @property
     def named_design(self) -> str | Design:
-        """Return the design as `build` takes it."""
+        """Return the design in the form that `build` accepts."""
         return ablation_designs().get(self.design, self.design)
 
     def build(self) -> ArmModel:

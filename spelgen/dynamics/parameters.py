@@ -22,7 +22,8 @@ class ParameterInfo:
     kind: bodies, armature, gains, offset, friction_compensation, sizes (magnitude of friction), effects (friction that
     varies with velocity), velocities, load_dependence, fractions (of bristles), torque_splines, torque_ripple,
     friction_splines, mass_constants, mass_residuals, stiffness, damping,
-    dead_zone, delay, or network. unit: of the quantity that the parameter makes, of revolute and of prismatic joints;
+    dead_zone, delay, or network. unit: of the quantity that the parameter represents, of revolute and of prismatic
+    joints;
     most parameters are logarithms of it, relative to a nominal value.
     """
 
@@ -91,7 +92,7 @@ def without_residuals(model: Model) -> Model:
 
 
 def without_idle_residuals(model: Model) -> Model:
-    """Return a copy of the model without residual terms that are zero, for constant parameters."""
+    """Return a copy of the model without residual terms that are zero; the copy must not be trained."""
     # The caller's model may be trained further.
     reduced = copy.deepcopy(model)
     if isinstance(reduced, ResidualDynamics) and reduced.residuals is not None:

@@ -132,7 +132,8 @@ def digest(trajectories: Iterable[Trajectory]) -> str:
 class Validation:
     """Validation windows, and a probe of the training windows for the integrator's steps.
 
-    substeps: steps of rk4 between samples, None to choose them. batch: a fourth of the windows predicted together.
+    substeps: steps of rk4 between samples; None: chosen for the model. batch: of training; validation predicts four
+    times as many windows together.
     """
 
     def __init__(
@@ -168,9 +169,9 @@ class Validation:
         return total / self.size
 
     def substeps(self, present: int | None = None) -> int:
-        """Return the integration steps per sample interval, given ones or chosen for the model.
+        """Return the number of integration steps per sample interval: as prescribed, or chosen for the model.
 
-        present: smallest number that is returned.
+        present: lower bound of the chosen number.
         """
         if self.solver != "rk4":
             return 1

@@ -69,8 +69,8 @@ def fit(
     Returns:
         The fitted model with its record, and with the baselines of least squares if ``arm`` is known.
 
-    Raises OptionError for an option that does not apply to this model, LogError, and RunError when the folder contains
-    a run or cannot be resumed with this.
+    Raises OptionError for an option that does not apply to this model, LogError, and RunError if the folder contains a
+    run or cannot be resumed with these arguments.
     """
     began = options.began or time.monotonic()
     run = None if folder is None else RunFolder(folder)
@@ -118,7 +118,7 @@ class _Fitting:
         status = self._run()
         model, checkpoint = request.model, Checkpoint.model_validate(objective.checkpoint())
         model.load_state_dict(checkpoint.best_weights)
-        model.requires_grad_(True)  # also of parameters that the fit kept constant
+        model.requires_grad_(True)  # also for parameters that the fit kept constant
         return Fit(
             model=model,
             history=objective.history,

@@ -38,10 +38,10 @@ from spelgen.spec import ModelSpec
 class Fit:
     """A fitted model, the record of its fit, and the baselines that were fitted to the same logs.
 
-    history: lines of metrics.jsonl, one per epoch. status: how the fit ended; None: not known, of a run that was
-    loaded. record: content of config.json. checkpoint: content of checkpoint.pt. baselines: content of
-    least_squares.json, {} without any. urdf: of the robot, None if unknown. folder: of the run, None without one.
-    logs: that it was fitted to, () of a run that was loaded.
+    history: lines of metrics.jsonl, one per epoch. status: how the fit ended; None for a run that was loaded. record:
+    content of config.json. checkpoint: content of checkpoint.pt. baselines: content of least_squares.json, {} without
+    any. urdf: of the robot, None if unknown. folder: of the run, None without one.
+    logs: to which the model was fitted; () for a run that was loaded.
     """
 
     model: ArmModel
@@ -199,7 +199,7 @@ class Fit:
         return run.path
 
     def _torque(self, *motion: np.ndarray | None) -> np.ndarray:
-        """Return torques (T, n) at q, qd, qdd and, where they are known, z and direction (see `DynamicsSamples`)."""
+        """Return torques (T, n) at q, qd, qdd, and at z and direction if they are known (see `DynamicsSamples`)."""
         like = next(self.model.parameters())
         inputs = [torch.as_tensor(np.ascontiguousarray(x)).to(like) for x in motion if x is not None]
         with torch.no_grad():

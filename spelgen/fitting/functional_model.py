@@ -17,7 +17,7 @@ Result = TypeVar("Result")
 
 
 class _Caller(torch.nn.Module):
-    """`functional_call` calls `forward` only: this one calls any function of a model."""
+    """Module whose `forward` applies any function to a model, since `functional_call` calls only `forward`."""
 
     def __init__(self, model: ArmModel) -> None:
         super().__init__()

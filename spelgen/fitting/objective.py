@@ -134,7 +134,7 @@ class Objective(ABC):
 
 
 class TorqueLogObjective(Objective):
-    """An `Objective` on logs with torques, which are cut into windows: to fit them, or to measure the model."""
+    """An `Objective` for logs with torques, which are cut into windows: for the fit, or only for validation."""
 
     def _cut_windows(self, window: int, stride: int) -> TrainingData:
         """Return the training and validation windows of the logs. Raises LogError and RunError."""

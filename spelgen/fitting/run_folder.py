@@ -25,10 +25,10 @@ LARGEST_STATE = 2**29  # bytes of model.pt or checkpoint.pt, unpacked
 class RunFolder:
     """The files of one training run.
 
-    spec: specification of the model. urdf, settings: of its robot, where known. mapping: of logs with names and units
-    of their own, as --mapping takes it. config: how it was trained. metrics: a line per epoch. checkpoint: everything
-    needed to resume. weights: the best state_dict so far. evaluation: results of `evaluate`. baseline:
-    baselines fitted to the training logs, and the coverage of these. estimator: noise levels of the estimator.
+    spec: specification of the model. urdf, settings: of its robot, if known. mapping: names and units of the logs, a
+    file for --mapping. config: record of the fit. metrics: a line per epoch. checkpoint: state from which the fit is
+    resumed. weights: the best state_dict so far. evaluation: results of `evaluate`. baseline: baselines fitted to the
+    training logs, and the coverage of these. estimator: noise levels of the estimator.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -108,7 +108,7 @@ class RunFolder:
         return records
 
     def read_json(self, path: Path) -> Content:
-        """One of the folder's JSON files. Raises RunError when it is absent or broken."""
+        """Return the object in a JSON file of the folder. Raises RunError if the file is absent or broken."""
         if not path.exists():
             raise RunError(
                 "no such run", file=self.path, expected=f"a folder with {path.name}", do="spelgen train"
@@ -130,7 +130,7 @@ class RunFolder:
         return checkpoint
 
     def load_state(self, path: Path) -> Content:
-        """checkpoint.pt or model.pt, on the CPU; nothing but tensors and plain values is ever unpickled."""
+        """Return the content of checkpoint.pt or model.pt, on the CPU; only tensors and plain values are unpickled."""
         if not path.exists():
             raise RunError(f"no {path.name}", file=self.path, expected="a run folder", do="spelgen train")
         require_regular_file(path, RunError)
@@ -176,7 +176,7 @@ def _require_unpacked_size(path: Path) -> None:
 
 
 def _require_finite(weights: Content, path: Path) -> None:
-    """Raise RunError where a weight is no number: all that follows from it would be none."""
+    """Raise RunError if a weight is not finite: all results of the model would be NaN."""
     for name, tensor in weights.items():
         if not isinstance(tensor, torch.Tensor):
             continue
@@ -192,7 +192,7 @@ def _require_finite(weights: Content, path: Path) -> None:
 
 
 def write_state(path: Path, state: Content) -> None:
-    """torch.save, all or nothing."""
+    """Write a state with torch.save, all or nothing."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
     write_bytes(path, buffer.getvalue())

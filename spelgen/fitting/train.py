@@ -36,14 +36,15 @@ def train(
     require: Callable[[Sequence[Trajectory]], list[Diagnostic]] | None = None,
     options: RunOptions = QUIET,
 ) -> Fit:
-    """Fit the module to the logs and write a run folder (see `RunFolder`); see `fit`.
+    """Fit the module to the logs and write a run folder (see `RunFolder`); further arguments: see `fit`.
 
-    urdf: the robot the module was built from, for the regularizer and the baselines; by default the file
-    of that name in the module's folder. source: without a module, a run whose model is adapted. config: may
-    also be options, for an objective that depends on the logs. require: raises for logs that are wrong, before anything
-    is fitted, or returns findings. validation: 0.25 by default, seed: 0. For a resumed run all of these
-    are by default as before, and logs are read as spelgen writes them if ``options`` has no mapping.
-    Raises ModuleError, LogError, and RunError when the folder contains a run or cannot be resumed with this.
+    urdf: the robot that the module was built from, for the regularizer and the baselines; by default the file of this
+    name in the module's folder. source: without a module, a run whose model is adapted. config: a configuration, or
+    options for an objective that depends on the logs. require: function that raises an error for unusable logs before
+    the fit, or returns findings. validation, seed: by default 0.25 and 0. A resumed run uses the recorded values by
+    default, the mapping of its logs included.
+
+    Raises ModuleError, LogError, and RunError if the folder contains a run or cannot be resumed with these arguments.
     """
     run = RunFolder(folder)
     robot = None

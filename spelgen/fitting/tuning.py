@@ -20,9 +20,10 @@ class FittingTuning:
     damping_factor: float = 10.0
     # [1] Dampings tried for one step: from the smallest to 1e6, at which steps are negligible.
     max_trials: int = 15
-    # [1] Predicted reduction of the cost, as a fraction of the cost, below which a step is rounding and is not tried.
+    # [1] Predicted reduction of the cost, as a fraction of the cost, below which a step is not tried: rounding errors.
     min_predicted_decrease: float = 1e-10
-    # [1] Gain ratio (decrease divided by predicted reduction) below which the second way of a step is tried, too.
+    # [1] Gain ratio (decrease divided by predicted reduction) below which the next candidate of a step is evaluated,
+    # too.
     min_gain_ratio: float = 0.5
 
     # Windows on which a fit is validated (`fitting.dataset`).

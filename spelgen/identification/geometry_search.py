@@ -1,4 +1,5 @@
-"""Search for the reading of a log that explains its torques: single changes, orders of joints, combinations."""
+"""Search for the hypothesis about the columns of a log with the best fit to its torques: single changes, orders of
+joints, combinations."""
 
 from __future__ import annotations
 
@@ -27,19 +28,19 @@ class Scaling(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class HypothesisComparison:
-    """Readings of a log that are better than the unchanged log, the best first; they explain it equally well."""
+    """Hypotheses that fit a log about equally well, and significantly better than the unchanged log; best first."""
 
     unchanged: HypothesisFit
     better: tuple[HypothesisFit, ...]
 
     @property
     def codes(self) -> tuple[str, ...]:
-        """Codes of the changes of the best reading."""
+        """Codes of the changes that the best hypothesis makes to the log."""
         return self.better[0].hypothesis.codes
 
 
 def compare_readings(problem: GeometryProblem, scalings: Sequence[Scaling] = ()) -> HypothesisComparison:
-    """Return the readings of a log that are significantly better than the unchanged log.
+    """Return the hypotheses that fit a log significantly better than the unchanged log.
 
     scalings: candidates for other units.
     """
@@ -76,9 +77,9 @@ def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[Hy
 def _rescaled(
     problem: GeometryProblem, unchanged: HypothesisFit, scalings: Sequence[Scaling]
 ) -> tuple[HypothesisFit, ...]:
-    """Return the fit with the best factor of the torques, if it is better at all.
+    """Return the fit with the best factor on the torques, if its cost is lower.
 
-    Gravity has shown already that a factor is needed: light bodies, whose cost is small, explain small torques.
+    A low cost is no evidence for a factor, since light bodies can explain small torques; the evidence is from gravity.
     """
     fits = [problem.fit(x) for x in _scaled(problem.unchanged, scalings) if "torque-unit" in x.codes]
     best = min(fits, key=_rank, default=unchanged)
@@ -86,14 +87,14 @@ def _rescaled(
 
 
 def _rank(fit: HypothesisFit) -> float:
-    """Return the cost, plus a penalty by which changes that are rarer come after others that explain as much."""
+    """Return the cost plus a penalty for rare changes, so that common ones of about the same cost come first."""
     return fit.cost + GEOMETRY.rare * sum(RARE.get(code, 0) for code in fit.hypothesis.codes)
 
 
 def single_changes(
     problem: GeometryProblem, base: HypothesisFit, scalings: Sequence[Scaling]
 ) -> list[HypothesisFit]:
-    """Return fits with one more change than the base has."""
+    """Return the fits with one change in addition to those of the base."""
     reading = base.hypothesis
     changed = [*_senses(reading), *_swapped(reading), *_scaled(reading, scalings)]
     fits = [problem.fit(hypothesis) for hypothesis in changed]
@@ -113,7 +114,7 @@ def _senses(base: Hypothesis) -> Iterator[Hypothesis]:
     for sign in 1.0 - 2.0 * np.eye(len(base.offset)):
         torque = {"torque_scale": sign * base.torque_scale}
         yield _changed(base, "torque-sense", **torque)
-        # the offset of a mapping may have been found in either sense
+        # an offset of the mapping may have been determined in either sense
         offsets = {x.tobytes(): x for x in (base.offset, sign * base.offset + 0.0)}
         for offset in offsets.values():
             motion = {"motion_scale": sign * base.motion_scale, "offset": offset}
@@ -145,7 +146,7 @@ def reordered(problem: GeometryProblem, unchanged: HypothesisFit) -> list[Hypoth
     """
     joints = problem.arm.joint_names
     starts = [np.arange(len(joints)), np.arange(len(joints))[::-1]]
-    # a message in alphabetical order has the n-th name in column n
+    # joints may be logged in the alphabetical order of their names
     starts.append(np.argsort(np.argsort(joints)))
     rng = np.random.default_rng(0)
     starts += [rng.permutation(len(joints)) for _ in range(6)]
@@ -191,7 +192,7 @@ def _refined(
 def _with_offset(
     problem: GeometryProblem, base: HypothesisFit, joint: int, revolute: bool
 ) -> list[HypothesisFit]:
-    """Return the fit with the best zero offset of a joint; none if it is below the errors of calibration."""
+    """Return the fit with the best zero offset of a joint; an empty list for an offset below calibration errors."""
     reading = base.hypothesis
     unit = np.eye(len(reading.offset))[joint]
     smallest = GEOMETRY.min_angle if revolute else GEOMETRY.min_shift
@@ -224,14 +225,14 @@ def _with_offset(
         is_right_angle = bool(right) and exact.cost < best.cost + GEOMETRY.right_angle
         if is_right_angle:
             best, offset = exact, right
-    # if other masses can make up for an offset, the angle would be no better than the masses of the URDF
+    # if other masses have the same effect as the offset, its value is as uncertain as the masses of the URDF
     if abs(offset) < smallest or best.misfit > base.misfit - GEOMETRY.needed / 2:
         return []
     return [best if is_right_angle else problem.fit(shifted(round(offset, 4)))]
 
 
 def _with_gravity(problem: GeometryProblem, base: HypothesisFit) -> list[HypothesisFit]:
-    """Return the fits with the best direction of gravity, and with the part of gravity in compensated torques."""
+    """Return the fits with the best direction of gravity, and with the fraction of gravity in compensated torques."""
     present = np.array(base.hypothesis.gravity)
     size = float(np.linalg.norm(present))
     standard = size or 9.81  # m/s^2
@@ -242,7 +243,7 @@ def _with_gravity(problem: GeometryProblem, base: HypothesisFit) -> list[Hypothe
         new *= standard / max(float(np.linalg.norm(new)), 1e-9)
         return None if np.linalg.norm(new - gravity) < 0.01 * standard else _falling(base, new)
 
-    # upright first: a prismatic vertical joint shows no sense of gravity
+    # upright first: a vertical prismatic joint does not determine the sign of gravity
     starts = [problem.fit(_falling(base, standard * axis)) for axis in (*-np.eye(3)[::-1], *np.eye(3))]
     lowest = min(fit.cost for fit in starts)
     starts = [next(fit for fit in starts if fit.cost < lowest + GEOMETRY.rare), *([base] if size else [])]
@@ -273,7 +274,7 @@ def _gravity_jacobian(problem: GeometryProblem, fit: HypothesisFit) -> np.ndarra
 
 
 def _with_compensation(problem: GeometryProblem, base: HypothesisFit) -> HypothesisFit:
-    """Return the fit with the part of gravity that a compensating controller has not taken out of the torques."""
+    """Return the fit with the fraction of gravity in torques that do not include a controller's compensation."""
     present, code = np.array(base.hypothesis.gravity), "gravity-compensated"
     without = problem.fit(_falling(base, np.zeros(3), code))
     part = problem.step(without, (_gravity_jacobian(problem, without) @ present)[..., None])

@@ -46,9 +46,9 @@ class MotionSamples(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A reading of the columns of n joints, and a gravity.
+    """Hypothesis: an assignment of the columns of a log to n joints, with scales and offsets, and a vector of gravity.
 
-    codes: of the changes, as findings have them; none: the unchanged log. q of joint k is motion_scale[k] times the
+    codes: of the changes, as in findings; empty for the unchanged log. q of joint k is motion_scale[k] times the
     column of joint motion_source[k], plus offset[k] [rad, m]; its torque is torque_scale[k] times the column of joint
     torque_source[k]. gravity: in the frame of the root link [m/s^2].
     """
@@ -75,12 +75,12 @@ class Hypothesis:
         return b"".join(x.tobytes() for x in arrays), self.gravity
 
     def signals(self, samples: MotionSamples) -> MotionSamples:
-        """Return the samples as this hypothesis reads them."""
+        """Return the motion and torques that the logged samples represent under this hypothesis."""
         q, qd, qdd = (x[:, self.motion_source] * self.motion_scale for x in samples[:3])
         return MotionSamples(q + self.offset, qd, qdd, samples.tau[:, self.torque_source] * self.torque_scale)
 
     def logged(self, samples: MotionSamples) -> MotionSamples:
-        """Return the columns of the log that this hypothesis reads as `samples`."""
+        """Return the logged columns that represent `samples` under this hypothesis: the inverse of `signals`."""
         motion, torque = np.argsort(self.motion_source), np.argsort(self.torque_source)
         q = (samples.q - self.offset) / self.motion_scale
         qd, qdd = samples.qd / self.motion_scale, samples.qdd / self.motion_scale
@@ -128,8 +128,8 @@ class GeometryProblem:
         self.arm, self.speeds = arm, speeds
         self.unchanged = unchanged or Hypothesis.unchanged(arm)
         self.samples = self.unchanged.logged(samples)
-        # Residuals of recorded arms stay correlated for about 0.2 s: the likelihood counts one error in that time, and
-        # at most 150 per joint, since the errors of a rigid model do not average out in long logs.
+        # Residuals of recorded arms are correlated for about 0.2 s: samples within it count as one independent error.
+        # At most 150 errors per joint count: errors of a rigid model do not average out in long logs.
         self._count = float(np.clip(seconds / 0.2, 1.0, 150.0))
         mean, precision = inertial_prior(arm)
         self._bodies = len(mean)
@@ -146,7 +146,7 @@ class GeometryProblem:
         return fewer
 
     def on_torques(self, counted: np.ndarray) -> GeometryProblem:
-        """Return the problem in which only some torques count; counted: (S, n), of the unchanged log."""
+        """Return the problem with only some torques. counted: mask (S, n) for the columns of the unchanged log."""
         fewer = copy(self)
         fewer._equations, fewer._counted = {}, counted[..., None]
         return fewer
@@ -233,10 +233,11 @@ class GeometryProblem:
         return np.asarray((inverse(matrix) @ vector)[known:])
 
     def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
-        """Return the cost of rotor inertias below 0 and of friction that drives its joint, on average of the log.
+        """Return the penalty of negative rotor inertias, and of friction whose mean power over the log is positive.
 
-        Each costs the square of its standard score / 2, up to a bound: a drive may compensate friction, and the errors
-        of a friction model may resemble inertia. Recorded arms have one of both (shanghai's joint 6, airbot).
+        Each adds half of its squared standard score, up to a bound: drives may compensate friction, and errors of the
+        friction model may resemble inertia. Recorded arms have friction of positive power (shanghai, joint 6) or
+        negative rotor inertia (airbot), not both.
         """
         drives, n = np.arange(len(normal)), len(normal)
         armature, viscous, coulomb = (self._bodies + n * effect + drives for effect in range(3))
@@ -275,7 +276,7 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
     without an inertial [kg].
     """
     if own[0] <= 0:
-        # wide: an extent of half a metre, 20 times the mass of another body
+        # wide: an extent of half a metre, a standard deviation of 20 times the mass of another body
         extent = max(length, 0.5)
         return 20.0 * typical * np.diag(np.repeat([1.0, extent, extent**2], (1, 3, 6)))
     mass = own[0]
@@ -296,7 +297,7 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
 
 
 def _variance(tau: np.ndarray) -> np.ndarray:
-    """Return the variance (n,) of torques (S, n); infinite of a constant, which does not depend on the dynamics."""
+    """Return the variance (n,) of torques (S, n); infinite for a constant torque, which has no information."""
     return np.asarray(np.where(varying(tau), tau.var(axis=0), np.inf))
 
 

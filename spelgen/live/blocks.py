@@ -1,4 +1,4 @@
-"""The momentum balance over blocks of samples: integrate and dump, without a low-pass filter."""
+"""The momentum balance, averaged over blocks of samples; there is no low-pass filter."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from spelgen.live.tuning import TUNING
 
 @dataclass(eq=False)
 class Block:
-    """The momentum balance over a block.
+    """Means of the terms of the momentum balance over a block of samples.
 
-    duration [s]. y: torque that the model does not explain, (n,) [Nm, N]. load: Phi, (n, 10). friction: mean of the
-    model's friction, (n,). uncertainty: of friction whose state is unknown, (n,). moving: whether a joint moves,
-    (n,).
+    duration [s]. y: torque residual of the model, (n,) [Nm, N]. load: regressor Phi of the payload, (n, 10).
+    friction: of the model, (n,) [Nm, N]. uncertainty: of friction whose state is not known exactly, (n,) [Nm, N].
+    moving: whether each joint moved, (n,).
     """
 
     duration: float
@@ -28,7 +28,7 @@ class Block:
 
 
 class Blocks:
-    """Sums of the momentum balance over the samples of a block."""
+    """Accumulator of samples that returns a `Block` after each period of `TUNING.block` seconds."""
 
     def __init__(self, n: int, rest_speed: np.ndarray) -> None:
         self.n, self.rest_speed = n, rest_speed
@@ -36,7 +36,7 @@ class Blocks:
         self._start()
 
     def restart(self) -> None:
-        """Drop the block: time or motion has a hole."""
+        """Discard the samples of the current block, after a gap."""
         self.last = None
 
     def _start(self) -> None:
@@ -45,7 +45,7 @@ class Blocks:
         self.load = np.zeros((self.n, 10))
 
     def add(self, t: float, qd: np.ndarray, at: Balance) -> Block | None:
-        """Add a sample, terms (n,) and (n, 10); return the block that it ends."""
+        """Add a sample: time [s], velocities (n,) and terms of the balance; return the block if it is complete."""
         if self.last is None:
             self._start()
             self.last, self.first = (t, at), at
@@ -77,7 +77,7 @@ class Blocks:
 
 
 def joined(first: Block, second: Block) -> Block:
-    """Return the block of two blocks in a row."""
+    """Return one block for two consecutive blocks."""
     duration = first.duration + second.duration
     weight = second.duration / duration
 

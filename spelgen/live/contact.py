@@ -13,7 +13,7 @@ from spelgen.live.tuning import TUNING
 
 
 class ContactState(NamedTuple):
-    """External torques and their thresholds, (n,) [Nm, N]; touched: joints above, (n,); force: at the tip, (3,) [N]."""
+    """External torques and thresholds, (n,) [Nm, N]; touched: mask (n,) of torques above; force: at the tip [N]."""
 
     external_torque: np.ndarray
     threshold: np.ndarray
@@ -22,7 +22,7 @@ class ContactState(NamedTuple):
 
 
 class ContactObserver:
-    """Low-passed momentum balance, at the rate of the samples.
+    """First-order low-pass filter of the momentum balance, updated with each sample.
 
     Each low-passed term is a state: the torque, friction and momenta of the arm, (5, n), and the payload's regressor,
     (n, 10).
@@ -33,7 +33,7 @@ class ContactObserver:
         self.restart()
 
     def restart(self) -> None:
-        """Begin with the next sample."""
+        """Discard the filter states; the next sample initialises them."""
         n = len(self.factor)
         self.t: float | None = None
         self.inputs, self.load_inputs = np.zeros((5, n)), np.zeros((n, 10))
@@ -41,7 +41,7 @@ class ContactObserver:
     def step(
         self, t: float, qd: np.ndarray, at: Balance, payload: Payload, scale: np.ndarray
     ) -> ContactState:
-        """Use the terms of a sample; scale: friction scale minus one, (n,)."""
+        """Return the external torques after a sample. at: its terms; scale: friction scale minus one, (n,)."""
         signal, variance = self.residual(t, qd, at, payload, scale)
         threshold = self.factor * np.sqrt(variance)
         touched = np.abs(signal) > threshold
@@ -51,7 +51,7 @@ class ContactObserver:
     def residual(
         self, t: float, qd: np.ndarray, at: Balance, payload: Payload, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the low-passed torque that model, payload and drift do not explain, and its variance, (n,)."""
+        """Return the low-pass filtered torque residual of model, payload and drift, and its variance, (n,) each."""
         rate = TUNING.bandwidth
         inputs = np.stack(
             [
@@ -64,7 +64,7 @@ class ContactObserver:
         )
         load = at.load_torque + rate * at.load_momentum
         if self.t is None:
-            # as after constant inputs
+            # the steady state for constant inputs
             self.low, self.load = inputs.copy(), load.copy()
         else:
             step = t - self.t
@@ -73,7 +73,7 @@ class ContactObserver:
             self.low += gains[:, None] * (0.5 * (inputs + self.inputs) - self.low)
             self.load += slow * (0.5 * (load + self.load_inputs) - self.load)
         self.t, self.inputs, self.load_inputs = t, inputs, load
-        # the regressor of the payload, Phi, (n, 10), as of a block
+        # regressor Phi of the payload, (n, 10), as in `Block`
         regressor = rate * at.load_momentum - self.load
         signal = self.low[0] - rate * at.momentum - regressor @ payload.parameters - self.low[1] * scale
         jerk = 2 * rate * (at.momentum - self.low[4]) - rate * (at.momentum - self.low[3])
@@ -84,11 +84,11 @@ class ContactObserver:
 
 
 def tip_force(jacobian: np.ndarray, torque: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Return the force at the tip that is nearest to external torques, (3,) [N], in root axes.
+    """Return the weighted least-squares estimate of a force at the tip, (3,) [N], in root axes, from external torques.
 
     Args:
         jacobian: of the tip, (3, n).
-        torque, variance: (n,).
+        torque, variance: external torques [Nm, N] and their variances, (n,).
     """
     weighted = jacobian / variance
     matrix = weighted @ jacobian.T

@@ -1,4 +1,4 @@
-"""Noise levels of a fit: from its run folder, else by cross-validation on its logs."""
+"""Noise levels of a fit: read from its run folder, or else estimated by cross-validation on its logs."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def noise_levels(fit: Fit) -> NoiseLevels:
 
 
 def keep_levels(fit: Fit, levels: NoiseLevels | None = None) -> None:
-    """Write noise levels into the run folder of a fit; None: find them, for a fit to torques."""
+    """Write noise levels into the run folder of a fit; None: estimate them first, if the fit is to torques."""
     if levels is None:
         if (
             not isinstance(fit.config, TorqueFit)
@@ -92,8 +92,8 @@ def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
     """Return the model of a fit, fitted to other logs from its initial parameters. Raises LogError for too little
     motion.
 
-    A part of the samples suffices to find the error on other logs, and so does a model without residual terms if the
-    fit has none.
+    A part of the samples suffices to estimate the error on other logs. Without residual terms in the fit, none are
+    selected.
     """
     model = assemble(required_spec(fit.model)).double()
     if residual_terms(without_idle_residuals(fit.model)) is None:

@@ -16,15 +16,15 @@ from spelgen.live.tuning import TUNING
 
 
 def huber(squared: float, variance: float) -> float:
-    """Return the variance of a residual, larger for an outlier, for its square and its variance by the model."""
+    """Return the variance for a residual: `variance` of the model, increased for an outlier; squared: residual^2."""
     return max(variance, squared / TUNING.outlier**2)
 
 
 class LoadFilter:
     """Filter of theta, a, b and d, in this order.
 
-    x: (10 + 3 n,). P: its covariance. log_likelihood: of the rows since it was set to zero. surprise: sum of the
-    normalised squared residuals of the last block of moving joints. factor: on the standard deviation of the
+    x: (10 + 3 n,). P: its covariance. log_likelihood: of the rows since its last reset. surprise: sum of the
+    normalised squared residuals of moving joints in the last block. factor: multiplies the standard deviation of the
     disturbance.
     """
 
@@ -39,7 +39,7 @@ class LoadFilter:
         self.log_likelihood = self.surprise = 0.0
 
     def forget_load(self) -> None:
-        """Make the payload unknown."""
+        """Reset the payload to its prior distribution."""
         self.x[:10] = 0.0
         self.P[:10] = self.P[:, :10] = 0.0
         self.P[range(10), range(10)] = np.square(LOAD_PRIOR)
@@ -58,7 +58,7 @@ class LoadFilter:
         self.surprise = 0.0
 
     def update(self, block: Block, joint: int) -> None:
-        """Use the row of a joint; of a joint at rest for its disturbance only."""
+        """Update the state with the row of a joint; a joint at rest updates only its disturbance."""
         n = self.n
         columns = np.array([*range(10), 10 + joint, 10 + n + joint, 10 + 2 * n + joint])
         row = np.array([*block.load[joint], block.friction[joint], 1.0, 1.0])
@@ -81,7 +81,7 @@ class LoadFilter:
 
 
 class DriftFilter:
-    """Filters of a and d of each joint, under the reported payload; all joints at a time.
+    """Independent filters of a and d of each joint, for the reported payload.
 
     a, d: (n,). P: covariance of (a, d): aa, ad, dd, (3, n).
     """
@@ -93,7 +93,7 @@ class DriftFilter:
         self.P = np.stack([np.full_like(self.a, TUNING.friction**2), np.zeros_like(self.a), self.disturbance])
 
     def update(self, block: Block, theta: np.ndarray) -> None:
-        """Advance the state by a block, and use it for a payload theta, (10,)."""
+        """Predict the state over a block, and update it with the block; theta: payload, (10,)."""
         decay = np.exp(-block.duration / self.noise.time_constant)
         aa = self.P[0] + TUNING.friction_walk * block.duration
         ad = self.P[1] * decay
@@ -114,7 +114,7 @@ class DriftFilter:
         ])  # fmt: skip
 
     def ahead(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return friction scale minus one and disturbance, (n,), in some time [s]."""
+        """Return friction scale minus one and the disturbance, (n,) each, predicted for a time from now [s]."""
         if seconds > TUNING.disturbance_ahead:
             return self.a, np.zeros_like(self.d)
         return self.a, self.d * np.exp(-seconds / self.noise.time_constant)

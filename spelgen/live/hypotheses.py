@@ -1,4 +1,4 @@
-"""The payload filter with the hypotheses of another load and of a contact, its rows spread over samples."""
+"""The payload filter, and two more filters for the hypotheses of a changed load and of a contact."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from spelgen.live.tuning import TUNING
 
 
 class PayloadEstimate:
-    """The payload filter, and the hypotheses of another load and of a contact.
+    """The payload filter, and two more filters for the hypotheses of a changed load and of a contact.
 
-    Rows of a block are used one per sample, more if samples are rare. moved: motion since the start or the last
-    change [s].
+    The rows of a block (one per joint and filter) are spread over the samples of the next block, to bound the time per
+    sample. moved: time in motion since the start or the last change of load [s].
     """
 
     def __init__(self, levels: NoiseLevels) -> None:
@@ -29,7 +29,7 @@ class PayloadEstimate:
         self.samples = self.per_sample = 0
 
     def start(self, block: Block) -> None:
-        """Begin to use a block; the rows of the block before are used up."""
+        """Process the remaining rows of the former block, and begin with this block."""
         self.advance(len(self.filters) * len(self.levels.effort))
         if block.moving.any():
             self.moved += block.duration
@@ -41,12 +41,12 @@ class PayloadEstimate:
         self.rows = self._rows(block)
 
     def step(self) -> None:
-        """Use the rows of one sample."""
+        """Process the share of rows of one sample."""
         self.samples += 1
         self.advance(self.per_sample)
 
     def advance(self, rows: int) -> None:
-        """Use some rows of the block."""
+        """Process the next `rows` rows of the block."""
         for _ in range(rows):
             next(self.rows, None)
 
@@ -61,7 +61,7 @@ class PayloadEstimate:
                 yield
 
     def _compare(self, moving: int) -> None:
-        """Begin, accept or drop the hypotheses of another load and of a contact."""
+        """Begin, accept or drop the hypotheses of a changed load and of a contact; moving: number of moving joints."""
         main = self.filters[0]
         if len(self.filters) > 1:
             _, candidate, contact = self.filters
@@ -76,7 +76,7 @@ class PayloadEstimate:
             ):
                 self.filters = [main]
         if len(self.filters) == 1:
-            # from the first second of motion on
+            # not before the payload filter has used the first second of motion
             is_surprise = moving and main.surprise > moving + TUNING.surprise * math.sqrt(2 * moving)
             if is_surprise and self.moved >= TUNING.changed_after:
                 main.log_likelihood = self.hypotheses_moved = 0.0

@@ -1,4 +1,4 @@
-"""Noise levels from the training logs of a fit, by cross-validation: the model of each fold has not seen its logs."""
+"""Noise levels from the training logs of a fit, by cross-validation over logs."""
 
 from __future__ import annotations
 
@@ -20,15 +20,17 @@ from spelgen.live.tuning import TUNING
 from spelgen.logs.trajectory import Trajectory, joined_column
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
-_TIME_CONSTANTS = np.geomspace(0.1, 6.4, 7)  # [s] of the disturbance
-_RATIOS = np.array([0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 5])  # of disturbance and white noise
+_TIME_CONSTANTS = np.geomspace(0.1, 6.4, 7)  # [s] time constants of the disturbance
+_RATIOS = np.array(
+    [0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 5]
+)  # [1] standard deviation of the disturbance divided by that of white noise
 
-WINDOWS = (25, 50)  # blocks of a trial of the payload filter, 5 and 10 s
+WINDOWS = (25, 50)  # lengths of the trials of the payload filter, in blocks: 5 and 10 s
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """A log and the momentum balance along it by a model that was not fitted to it."""
+    """A held-out log, its used samples, and the terms of the momentum balance of a model that was not fitted to it."""
 
     log: Trajectory
     used: list[int]
@@ -36,7 +38,7 @@ class HeldOut:
 
 
 def held_out(model: RigidBodyDynamics, log: Trajectory, levels: NoiseLevels) -> HeldOut:
-    """Return the terms of a model along the usable samples of a log."""
+    """Return the terms of the momentum balance of a model at the accepted samples of a log."""
     intake = Intake(levels, bristle_reach(model))
     used: list[int] = []
     low, high = [], []
@@ -52,7 +54,7 @@ def held_out(model: RigidBodyDynamics, log: Trajectory, levels: NoiseLevels) -> 
 def find_levels(
     folds: Sequence[tuple[RigidBodyDynamics, Sequence[Trajectory]]], effort: np.ndarray, point: np.ndarray
 ) -> NoiseLevels:
-    """Return the noise levels of folds of logs.
+    """Return the noise levels of an arm from held-out logs.
 
     Args:
         folds: models, each with the logs that it was not fitted to.
@@ -73,7 +75,7 @@ def find_levels(
         coulomb=np.mean([model.coulomb.numpy() for model, _ in folds], axis=0),
         speed=np.abs(joined_column(logs, "qd")).max(axis=0),
         encoder=np.min([encoder_step(log.q) for log in logs], axis=0),
-        # torques of the logs are within the limits in any case
+        # no limit is below the largest logged torque
         effort=np.maximum(np.where(np.isfinite(effort), effort, 2.5 * largest), 1.2 * largest),
         minutes=sum(log.duration for log in logs) / 60,
         point=point,
@@ -87,10 +89,10 @@ def find_levels(
 
 
 def load_variance(segments: Sequence[Sequence[Block]], levels: NoiseLevels) -> float:
-    """Return the factor on the covariance of payloads: none is carried, and the estimates show the error.
+    """Return the factor on the covariance of estimated payloads, from logs without payload: each estimate is an error.
 
-    Windows of blocks are independent trials. The factor is the mean squared estimate of mass and first moments, (4,),
-    relative to its covariance, for windows of the worse length: errors of the model average out slowly.
+    Windows of blocks are independent trials. The factor is the mean squared normalised estimate of mass and first
+    moments, (4,), the larger one of two lengths of windows: errors of the model average out slowly.
     """
     factors = [TUNING.variance]
     for window in WINDOWS:
@@ -109,7 +111,7 @@ def load_variance(segments: Sequence[Sequence[Block]], levels: NoiseLevels) -> f
 
 
 def blocks_along(tested: HeldOut, levels: NoiseLevels) -> list[Block]:
-    """Return the blocks along a log."""
+    """Return the consecutive blocks of a held-out log."""
     sums, blocks = Blocks(len(levels.speed), levels.rest_speed), []
     before = -np.inf
     for k, row in zip(tested.used, zip(*tested.terms, strict=True), strict=True):
@@ -124,7 +126,7 @@ def blocks_along(tested: HeldOut, levels: NoiseLevels) -> list[Block]:
 
 
 def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
-    """Return the levels of maximum likelihood of blocks in a row of each log, over a grid; all joints at a time.
+    """Return the noise of maximum likelihood over a grid, per joint; segments: consecutive blocks, for each log.
 
     The model is y = f a + b + d + w per joint (see `live.filters`); white noise has its own scale for each point of
     the grid.
@@ -148,7 +150,7 @@ def _likelihood(
     """Return the negative log likelihood and the mean normalised squared residual, (grid, n).
 
     Args:
-        segments: blocks in a row.
+        segments: consecutive blocks, for each log.
         grid: time constants and ratios, (grid, 2).
         scale: standard deviations of white noise, (grid, n).
     """
@@ -175,7 +177,7 @@ def _likelihood(
             residual = block.y - (row * x).sum(axis=-1)
             squared = np.minimum(np.square(residual) / expected, TUNING.outlier**2)
             gain = covariance / np.maximum(expected, np.square(residual) / TUNING.outlier**2)[..., None]
-            # joints at rest determine no noise of motion
+            # the noise of motion is estimated from moving joints only
             gain = gain * block.moving[:, None]
             cost += 0.5 * (np.log(expected) + squared) * block.moving
             squares += squared * block.moving
@@ -186,7 +188,7 @@ def _likelihood(
 
 
 def _with_observer(levels: NoiseLevels, tested: Sequence[HeldOut]) -> NoiseLevels:
-    """Return levels with the noise of the momentum observer and the tails of its peaks."""
+    """Return the levels completed by the noise of the momentum observer and the exponential tail of its peaks."""
     signals: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
     zero = levels.model_copy(update={"observer": np.zeros_like(levels.observer)})
     for each in tested:

@@ -24,7 +24,7 @@ _BLOCK = 2048  # samples that are computed at a time
 
 
 class Balance(NamedTuple):
-    """Terms at samples, (T, n) or (T, n, 10), in SI units.
+    """Terms of the momentum balance at samples, (T, n) or (T, n, 10), in SI units.
 
     momentum: p. torque: G (tau - offset) + friction compensation + dL/dq. friction: at the middle of the bounds of the
     friction state. uncertainty: half the difference of friction at both bounds. load_momentum: P. load_torque: N.
@@ -42,7 +42,7 @@ class Balance(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LoadAxes:
-    """Motion of the joints at the last body, in its frame: twists (T, bodies, 3), angular and linear.
+    """Joint axes as twists of the last body, in its frame: angular and linear parts, (T, bodies, 3).
 
     axes: twist of the last body per rate of each body's displacement. turning: its time derivative. twist: of the last
     body, (T, 1, 3). gravity: (T, 1, 3) [m/s^2]. rotation: to root axes, (T, 3, 3). ratios: displacements per joint
@@ -70,7 +70,7 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 def load_axes(model: RigidBodyDynamics, q: Tensor, qd: Tensor) -> LoadAxes:
-    """Return the motion at the last body of a model at q and qd, (T, n)."""
+    """Return the joint axes as twists of the last body of a model, at q and qd, (T, n)."""
     chain = model.chain
     count = len(chain.parents)
     # with the columns of the frames in place of points
@@ -90,8 +90,8 @@ def load_axes(model: RigidBodyDynamics, q: Tensor, qd: Tensor) -> LoadAxes:
 
 
 def _projected(axes: tuple[Tensor, Tensor], twist: tuple[Tensor, Tensor]) -> Tensor:
-    """Return a . angular momentum + l . linear momentum per parameter, (T, bodies, 10), of a body that moves at a
-    twist.
+    """Return a . angular momentum + l . linear momentum per inertial parameter of a body with this twist, (T, bodies,
+    10).
 
     Linear momentum is m v + w x mc, angular momentum I w + mc x v. axes: (a, l), (T, bodies, 3).
     """
@@ -120,7 +120,7 @@ def load_terms(at: LoadAxes) -> tuple[Tensor, Tensor]:
 
 
 def load_torque(model: RigidBodyDynamics, q: Tensor, qd: Tensor, qdd: Tensor, theta: Tensor) -> Tensor:
-    """Return the torque that moves a payload theta (10,) at the last body, (T, n) [Nm, N]."""
+    """Return the joint torques for a payload theta (10,) at the last body, at accelerations qdd, (T, n) [Nm, N]."""
     at = load_axes(model, q, qd)
     # d/dt (P theta) = P(qdd) theta + the change of axes and of the body's frame: the wrench is
     # I A + V x* I V, with the acceleration A = sum axes qdd + turning qd
@@ -139,7 +139,7 @@ def load_torque(model: RigidBodyDynamics, q: Tensor, qd: Tensor, qdd: Tensor, th
 def balance(
     model: RigidBodyDynamics, point: np.ndarray, samples: Sequence[np.ndarray], bounds: Sequence[np.ndarray]
 ) -> Balance:
-    """Return the terms at samples.
+    """Return the terms of the momentum balance at samples.
 
     Args:
         model: in double precision.

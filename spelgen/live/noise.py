@@ -39,9 +39,10 @@ class BlockNoise(BaseModel):
 
 
 class NoiseLevels(BaseModel):
-    """All that the estimator knows of an arm besides its model; vectors are (n,).
+    """Noise levels and limits of an arm that the estimator uses in addition to its model; vectors are (n,).
 
-    drift, load: noise of blocks of both filters. observer: standard deviation of the momentum observer of a moving
+    drift, load: noise of the blocks of the drift and payload filters. observer: standard deviation of the momentum
+    observer of a moving
     joint [Nm, N]. peak_start, peak_scale: exponential tail of the peaks of the normalised observer, beyond the
     largest fifth. load_variance: factor on the covariance of payloads. coulomb: friction at low speed [Nm, N]. speed:
     largest of the training logs [rad/s, m/s]. encoder: step of positions [rad, m]. effort: torque limit [Nm, N].
@@ -74,7 +75,7 @@ class NoiseLevels(BaseModel):
         return 1 / self.minutes
 
     def thresholds(self, alarms_per_minute: float) -> np.ndarray:
-        """Return the thresholds of the normalised observer, (n,), for a rate of false alarms of all joints."""
+        """Return the thresholds of the normalised observer, (n,), for a total rate of false alarms of all joints."""
         windows = 60 / TUNING.window * TAIL * len(self.observer)
         tail = self.peak_start + self.peak_scale * math.log(windows / alarms_per_minute)
         return math.sqrt(TUNING.variance) * np.maximum(tail, 1.0)

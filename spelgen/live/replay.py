@@ -139,7 +139,7 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
     estimator, begin = Estimator(fit), 0.0
     for log in logs:
         t = log.t - log.t[0] + begin
-        # further apart than the longest gap
+        # the pause between two logs is longer than the longest gap
         begin = float(t[-1]) + 2 * TUNING.gap
         for _ in estimator.steps(t, log.q, log.qd, log.tau):
             pass
@@ -164,7 +164,7 @@ def _along(estimator: Estimator, log: Trajectory, joints: tuple[str, ...]) -> Lo
 
 
 def contact_events(states: Sequence[EstimatorState], joints: Sequence[str]) -> list[ContactEvent]:
-    """Return the contacts of estimates in a row."""
+    """Return the contacts in consecutive estimates."""
     groups: list[list[EstimatorState]] = []
     for state in states:
         if not state.contact.touched.any():

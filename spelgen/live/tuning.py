@@ -31,11 +31,11 @@ class LiveTuning:
     load_inertia: float = 0.8
     # [1] Prior standard deviation of the friction scale.
     friction: float = 0.03
-    # [1/s] Variance per second of its random walk.
+    # [1/s] Variance per second of the random walk of the friction scale.
     friction_walk: float = 1e-5
     # [1] Prior standard deviation of the torque offset, relative to the effort limit.
     offset: float = 0.01
-    # [1] Factor on the variance of the noise: models err more on other days than between training logs.
+    # [1] Factor on the variance of the noise: errors of models are larger on other days than between training logs.
     variance: float = 1.5
     # [1] Residuals beyond this number of standard deviations have a larger noise (Huber, Robust Statistics, 1981).
     outlier: float = 3.0
@@ -45,15 +45,16 @@ class LiveTuning:
 
     # Changed loads (`live.estimator`).
 
-    # [1] Standard deviations of the squared residuals of a block from which on another load is considered.
+    # [1] Number of standard deviations above which the squared residuals of a block start the hypothesis of a changed
+    # load.
     surprise: float = 3.0
     # [1] Factor on the standard deviation of the disturbance under the hypothesis of a contact.
     contact_disturbance: float = 8.0
-    # [1] Log likelihood ratio, and [s] motion, from which on another load is accepted.
+    # [1] Log likelihood ratio, and [s] time in motion, from which on a changed load is accepted.
     changed: float = 30.0
     changed_after: float = 1.0
-    # [s] Motion after which the hypotheses are dropped; earlier, after `changed_after`, if the log likelihood ratio
-    # is below this.
+    # [s] Time in motion after which the hypotheses are dropped; after `changed_after` if the log likelihood ratio is
+    # below `unlikely`.
     unlikely: float = -8.0
     dropped_after: float = 4.0
 
@@ -73,7 +74,7 @@ class LiveTuning:
 
     # Payload (`live.payload`).
 
-    # [s] Motion between two reports.
+    # [s] Time in motion between two reports of the payload.
     report: float = 1.0
     # [m] Radius of gyration and distance along z of the prior mean of a payload.
     radius: float = 0.2

@@ -42,13 +42,13 @@ TUNING = RobotCheckTuning()
 
 def fit_gravity(arm: Chain, motion: MotionSamples) -> list[GravityFit]:
     """Return the fit of the URDF's gravity to the torque of each joint."""
-    # with fewer samples, gravity and friction are confounded
+    # for fewer samples gravity and friction are confounded
     if len(motion.q) < 100:
         return [GravityFit()] * motion.q.shape[1]
     still, qd = np.zeros_like(motion.q), motion.qd
     rows = regressor(arm, motion.q, still, still)  # (S, n, 10 B)
     load = rows @ urdf_parameters(arm)
-    # with friction and the joint's own inertia, which move with gravity in a slow swing
+    # friction and the joint's own inertia are correlated with gravity in a slow swing: they are removed
     friction = np.stack([np.ones_like(qd), qd, np.tanh(qd / SAMPLES.moving), motion.qdd], axis=2)
     fits = []
     for joint in range(qd.shape[1]):
@@ -58,14 +58,14 @@ def fit_gravity(arm: Chain, motion: MotionSamples) -> list[GravityFit]:
 
 
 def _fit_joint(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
-    """Fit a torque with columns of friction. signals: (S, 2 + K), it, the URDF's gravity torque, and its columns."""
+    """Return the fit of a torque. signals: (S, 2 + K), the torque, the URDF's gravity torque, and its K columns."""
     remainders = _without(friction, signals)
     lengths = np.linalg.norm(remainders, axis=0)
-    # the residual of a constant torque is rounding
+    # the residual of a constant torque consists of rounding errors
     is_rounding = lengths <= TUNING.dependent * np.linalg.norm(signals, axis=0)
     largest = max(1.0, float(np.abs(signals[:, 2:]).max(initial=0.0)))
     is_seen = lengths[2:] > TUNING.dependent * largest * np.sqrt(len(signals))
-    # a vertical axis, or a motor that was off
+    # gravity does not act about a vertical axis; a motor that is off has no torque
     if is_rounding[0] or not is_seen.any():
         return GravityFit()
     torque, load = remainders[:, 0], remainders[:, 1]
@@ -92,16 +92,16 @@ class JointEvidence(NamedTuple):
     report: JointReport
 
     def limits(self) -> tuple[float, float]:
-        """Return the lowest and the highest position, infinite where there is no limit."""
+        """Return the lower and the upper position limit, infinite without a limit."""
         lower, upper = self.coordinate.lower, self.coordinate.upper
         if self.coordinate.continuous:
             lower = upper = None
         return -inf if lower is None else lower, inf if upper is None else upper
 
     def gravity_in_torque(self) -> tuple[float, float]:
-        """Return factor and correlation of the URDF's gravity in the torque; NaN where it is too small to be seen."""
+        """Return factor and correlation of the URDF's gravity in the torque; NaN if gravity is too small."""
         fit = self.report.gravity
-        # Of a joint that gravity hardly loads the factor is chance. On the UR10e, gravity is visible in the torque from
+        # The factor of a joint that gravity hardly loads is undetermined. On the UR10e, gravity is visible in the torque from
         # a fifth of its standard deviation on.
         if fit.factor is None or fit.correlation is None or (fit.relative_deviation or 0.0) < 0.2:
             return nan, nan  # every comparison with NaN is false
@@ -133,7 +133,8 @@ def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
 
 
 def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) -> list[np.ndarray]:
-    """Return factors (n,) that give the torques the size of the URDF's gravity: candidates for another unit.
+    """Return candidates of factors (n,) on the torques, for another unit: they match the magnitude of the URDF's
+    gravity.
 
     One for each joint whose torques are so much too large or too small that wrong inertials do not explain it, and one
     for all joints together. undeclared: joints whose unit no mapping states.
@@ -142,7 +143,7 @@ def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) 
     factors = []
     for k, joint in enumerate(joints):
         factor, correlation = joint.report.gravity.factor, joint.report.gravity.correlation or 0.0
-        # the factor of a joint that gravity hardly loads is chance, unless its torque is only gravity
+        # the factor of a joint that gravity hardly loads is undetermined, unless its torque consists of gravity only
         is_known = joint.gravity_in_torque()[1] > TUNING.seen or correlation > SIGNALS.agreement
         if factor is None or not (is_known and undeclared[k]):
             continue
@@ -157,14 +158,14 @@ def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) 
 
 
 def _rounded(factor: float) -> float:
-    """Return one significant digit if this changes the factor by less than a tenth, else two digits."""
+    """Return the factor with one significant digit if this changes it by less than a tenth, else with two."""
     one = float(f"{factor:.1g}")
     return one if abs(one - factor) < 0.1 * factor else float(f"{factor:.2g}")
 
 
 def find_beyond_drive(joint: JointEvidence) -> str | None:
-    """Find torques that no drive of the joint's effort limit gives."""
-    # URDFs without knowledge of the drive write an effort of 0
+    """Find torques that exceed the joint's effort limit by a factor that no drive and no unit explains."""
+    # in URDFs of unknown drives the effort is 0
     limit, largest = joint.coordinate.effort or 0.0, joint.report.largest("tau")
     # torques in mNm are 1000 times as large, currents at most some times; no drive gives 20 times its limit
     if not 0 < 20.0 * limit < largest:
@@ -173,9 +174,9 @@ def find_beyond_drive(joint: JointEvidence) -> str | None:
 
 
 def find_coarse(joint: JointEvidence) -> str | None:
-    """Find signals that are quantised to steps of their own size."""
+    """Find signals whose quantisation step is a large fraction of their range."""
     for name in QUANTITIES:
-        # a step has to be compared with the range: 0.01 Nm is fine for a shoulder and all there is for a wrist
+        # relative to the range: a step of 0.01 Nm is negligible at a shoulder, and may be the whole torque of a wrist
         step, width = joint.report.steps[name], joint.report.high[name] - joint.report.low[name]
         if step is not None and has_few_levels(step, width):
             return (
@@ -186,7 +187,7 @@ def find_coarse(joint: JointEvidence) -> str | None:
 
 
 def find_stop(joint: JointEvidence) -> str | None:
-    """Find joints that reach a limit: the torque of a stop is none of the drive's."""
+    """Find joints that reach a position limit, at which a stop adds torques to the drive's."""
     for limit, extreme in zip(joint.limits(), (joint.report.low["q"], joint.report.high["q"]), strict=True):
         if abs(extreme - limit) <= TUNING.limit_rounding:
             return f"q reaches its limit {limit:.4g}: contact with the stop changes the torque; remove such motion"
@@ -194,9 +195,9 @@ def find_stop(joint: JointEvidence) -> str | None:
 
 
 def find_one_way(joint: JointEvidence) -> str | None:
-    """Find joints that move one way only: dry friction is then one number with the load of the joint."""
+    """Find joints that move in one direction only: dry friction is then confounded with the load of the joint."""
     slower, faster = sorted((-joint.report.low["qd"], joint.report.high["qd"]))
-    # A tenth of the speed is noise; of a velocity that is not dq/dt nothing follows for the motion.
+    # A tenth of the speed is noise; a velocity that is not dq/dt does not determine the direction of motion.
     if slower >= 0.1 * faster or not (joint.report.velocity_correlation or 0.0) > TUNING.seen:
         return None
     unit = UNITS[joint.coordinate.joint_type].velocity
@@ -207,7 +208,7 @@ def find_one_way(joint: JointEvidence) -> str | None:
 
 
 def find_no_gravity(joint: JointEvidence) -> str | None:
-    """Find torques without gravity in them."""
+    """Find torques that do not contain gravity."""
     correlation = joint.gravity_in_torque()[1]
     if not abs(correlation) < 1 - TUNING.seen:  # NaN included
         return None
@@ -217,7 +218,7 @@ def find_no_gravity(joint: JointEvidence) -> str | None:
     )
 
 
-# these need no torques: of arms under position servos, too
+# checks that need no torques, also for arms under position servos
 POSITION_CHECKS = [Check("beyond-position-limit", "warning", find_beyond_limits)]
 CHECKS: list[Check[JointEvidence]] = [
     Check("torque-beyond-drive", "error", find_beyond_drive, expected="Nm or N at the joint", do=SAY_UNIT),

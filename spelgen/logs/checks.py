@@ -1,7 +1,7 @@
-"""Check logs without the robot: frozen columns, velocities that are no derivative, degrees, gaps. Nothing is repaired.
+"""Checks of logs that need no robot: frozen columns, inconsistent velocities, degrees, gaps. Nothing is repaired.
 
-A check is a code, a severity and a function of a subject, registered in CHECKS. Each trajectory is checked by itself,
-so that logs need not lie in memory together. `log_checks` has the checks that take the robot.
+A check is a code, a severity and a function of a subject, registered in CHECKS. Each trajectory is checked
+individually, so that only one need be in memory. Package `log_checks` has the checks that need the robot.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ Subject = TypeVar("Subject")
 
 @dataclass(frozen=True)
 class Check(Generic[Subject]):
-    """Search for one fault of logs.
+    """Check for one fault of logs.
 
-    find: from the subject to the message; None without a finding. severity: logs with an error cannot be trained on.
-    unless: codes of checks, earlier in the list, whose findings explain this one. everywhere: it is a fault only if
-    all trajectories show it. expected, do: of an error.
+    find: function that returns the message for a subject; None without a finding. severity: logs with an error cannot
+    be trained on. unless: codes of earlier checks whose findings explain this one. everywhere: whether a finding must
+    occur in all trajectories. expected, do: of an error.
     """
 
     code: str
@@ -81,10 +81,10 @@ class Findings:
 def run_checks(
     checks: Iterable[Check[Subject]], subject: Subject, accepted: Collection[str] = ()
 ) -> list[tuple[Check[Subject], str | Advice]]:
-    """Return the checks with a finding, and their findings; accepted: codes that are not checked."""
+    """Return the checks with a finding, and their findings; accepted: codes of checks that are omitted."""
     results: dict[str, tuple[Check[Subject], str | Advice]] = {}
     for check in checks:
-        # one cause, one message: degrees are no derivatives either
+        # one message per cause: velocities in degrees would also fail the check of derivatives
         if check.code in accepted or not results.keys().isdisjoint(check.unless):
             continue
         found = check.find(subject)
@@ -94,7 +94,7 @@ def run_checks(
 
 
 def find_no_torques(signals: JointSignals) -> str | None:
-    """Find recordings in which every joint's torque is 0 all the time."""
+    """Find recordings in which the torques of all joints are always 0."""
     trajectory = signals.trajectory
     # reported once, and not for each joint
     if signals.number or not trajectory.tau.size or trajectory.tau.any() or not np.ptp(trajectory.q):
@@ -118,7 +118,7 @@ def find_rest(signals: JointSignals) -> str | None:
 
 
 def find_gaps(trajectory: Trajectory) -> str | None:
-    """Find holes in time."""
+    """Find gaps in the sample times."""
     gaps = len(gap_ends(trajectory.t)) - 2
     if not gaps:
         return None
@@ -126,7 +126,7 @@ def find_gaps(trajectory: Trajectory) -> str | None:
 
 
 def find_low_rate(trajectory: Trajectory) -> str | None:
-    """Find a sample rate at which accelerations are hardly seen; arms under servos do without."""
+    """Find a sample rate that is too low for accelerations, which arms under position servos do not need."""
     rate = trajectory.sample_rate
     if trajectory.u is not None or rate == 0 or is_dense(rate):
         return None
@@ -143,7 +143,7 @@ CLOCK_CHECKS = [
     Check("gap", "info", find_gaps),
     Check("low-rate", "warning", find_low_rate),
 ]
-# reported when a log is read: each repair is a message of its own
+# reported when a log is read, one message per repair
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
@@ -194,7 +194,7 @@ CHECKS: list[Check[JointSignals]] = [
 
 
 class LogChecks:
-    """Check logs by themselves, one trajectory after another: they need not lie in memory together.
+    """Checks of logs without their robot, one trajectory at a time, so that only one need be in memory.
 
     products: of all velocities and positions, see `velocity_products`.
     """
@@ -206,7 +206,7 @@ class LogChecks:
         self._count = 0
 
     def add(self, trajectory: Trajectory) -> None:
-        """Take in a trajectory."""
+        """Add a trajectory."""
         self._count += 1
         for clock_check, found in run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted):
             self._add(str(found), clock_check, found, trajectory)
@@ -232,7 +232,7 @@ class LogChecks:
         joints_of: dict[Check[Any], list[str]] = {}
         for (group, check), occurrences in self._results.items():
             found, where, file = occurrences[0]
-            # a joint that rests in one motion and moves in another is no oddity
+            # joints at rest are a finding only if they never move
             if check.everywhere and len(occurrences) < self._count:
                 continue
             if check.severity == "error" or isinstance(found, Advice):
@@ -292,8 +292,8 @@ def check(
 ) -> list[Diagnostic]:
     """Return the findings of the checks of logs; nothing is repaired.
 
-    Raises LogError when revolute joints look recorded in degrees, unless units are declared, and when a
-    position or a velocity never changes while the other one does.
+    Raises LogError if revolute joints were probably recorded in degrees, unless units are declared, and if a position
+    or a velocity is constant while the other one changes.
     """
     checks = LogChecks(joints, joint_types)
     for trajectory in trajectories:

@@ -27,13 +27,13 @@ UNITS = {
 
 
 def velocity_products(trajectory: Trajectory) -> np.ndarray:
-    """Return sums of products (2n, 2n) of increments over some steps: of the integrals of qd, then of q."""
-    # loaded where it is called: half a second
+    """Return sums of products (2n, 2n) of increments over several samples: of the integrals of qd, then of q."""
+    # imported here, since it takes half a second
     from scipy.integrate import cumulative_trapezoid
 
     products = np.zeros((2 * trajectory.q.shape[1],) * 2)
     for piece in split_at_gaps(trajectory, shortest=2):
-        # over several steps: from one sample to the next quantisation of q is larger than its change
+        # over several samples: between neighbouring samples the quantisation of q may be larger than its change
         span = min(SIGNALS.increments, len(piece) - 1)
         integral = cumulative_trapezoid(piece.qd, piece.t, axis=0, initial=0)
         positions = np.concatenate([integral, piece.q], axis=1)
@@ -45,7 +45,7 @@ def velocity_products(trajectory: Trajectory) -> np.ndarray:
 def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return factors (n,) by which qd must be multiplied to be dq/dt, and correlations (n, n).
 
-    Correlations are 1 if qd of the row's joint is proportional to dq/dt of the column's; NaN if a joint is at rest.
+    Correlation (i, j) is 1 if qd of joint i is proportional to dq/dt of joint j, and NaN if one of them is at rest.
     products: see `velocity_products`.
     """
     n = len(products) // 2
@@ -113,7 +113,7 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[UnitReading]
 
 
 def find_time_unit(signals: JointSignals) -> str | Advice | None:
-    """Find times that are not in seconds: no arm is sampled more slowly than at 2 Hz, and q changes as fast as qd."""
+    """Find times that are not in seconds: from a sample rate below 2 Hz, or from the ratio of dq/dt to qd."""
     step, is_stated = signals.step, signals.trajectory.mapping.units.t != "s"
     message, unit = f"a sample every {step:.3g} s", time_unit(step)
     if step <= SIGNALS.slowest_step:
@@ -129,7 +129,7 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
 
 
 def time_unit(step: float) -> str | None:
-    """Return the unit in which the step between two samples is one of a robot's log; None if it is none."""
+    """Return the unit of time in which a step between samples is plausible for a robot's log; None if there is none."""
     for unit, size in TIMES.items():
         if SIGNALS.fastest_step <= step * size <= SIGNALS.slowest_step:
             return unit
@@ -139,7 +139,7 @@ def time_unit(step: float) -> str | None:
 def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
     """Find velocities that are not the derivative of the positions, and the columns or the sense that fit better."""
     factor, correlation, tolerance = signals.factor, signals.correlation, 1 - SIGNALS.agreement
-    # times in another unit have been found at the first joint
+    # times in another unit are a finding of the first joint already
     if signals.step > SIGNALS.slowest_step:
         return None
     if np.isnan(correlation) or (correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance):
@@ -148,7 +148,7 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
     if len(signals.q) <= SIGNALS.increments:
         return message  # of two samples every correlation is 1
     if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
-        # the velocity is right up to its sense, so that q differentiated has no more errors than q
+        # the velocity is correct except for its sign, so q is correct, and its derivative can replace qd
         return Advice(f"{message}; its sense is opposite", {"velocity": "differentiated"})
     trajectory, joint, mapping = signals.trajectory, signals.joint, signals.trajectory.mapping
     for other, fit in zip(signals.joints, signals.correlations, strict=True):

@@ -23,7 +23,7 @@ TUNING, SOLVER = ServoLawTuning(), ServoSolverTuning()
 
 
 def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
-    """Return the parameters with the selected dead zones, which further iterations fit."""
+    """Return parameters whose dead zones are active at the selected joints; see the module."""
     problem = problem.reweighted(x)
     without, costs_without = _joint_minima(problem, x)
     with_zones, costs_with = _joint_minima(problem, with_dead_zones(problem, x, TUNING.dead_zone_fraction))
@@ -73,10 +73,10 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
 
 
 def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) -> ServoParameters:
-    """Return parameters in which all joints have a dead zone.
+    """Return parameters in which all joints have a dead zone, and all parameters are active.
 
-    The half dead zone becomes `fraction` of the static error, which is dry friction / kp, and Coulomb friction is
-    reduced by this fraction.
+    The half dead zone is `fraction` of the static error, dry friction / kp, and Coulomb friction is reduced by this
+    fraction, so that the static error remains about the same.
     """
     rollouts, row, joints = problem.rollouts, problem.parameters.row, x.joints.clone()
     model = rollouts.model
@@ -90,7 +90,7 @@ def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) 
 
 
 def sliding_friction(friction: FrictionLaws, qd: torch.Tensor, gravity: torch.Tensor) -> torch.Tensor:
-    """Return the mean dry friction of each joint over the distance that it moves, (n,) [Nm, N].
+    """Return the mean of the dry friction magnitude of each joint over its path, (n,) [Nm, N].
 
     Args:
         friction: friction model.

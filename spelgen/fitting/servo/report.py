@@ -61,10 +61,10 @@ class FitSummary:
 
 @dataclass(frozen=True, eq=False)
 class ServoSolution:
-    """Normal equations and covariance at the end of a fit.
+    """Normal equations and covariance at the end of a fit, with the dead zones of all joints as free parameters.
 
-    blocks: normal equations of the B blocks of the logs, (B, k, k) and (B, k); they contain the dead zones of all
-    joints. precision: of the prior, (k,). covariance: of the parameters, (k, k).
+    blocks: normal equations of the B blocks of the logs, (B, k, k) and (B, k). precision: of the prior, (k,).
+    covariance: of the parameters, (k, k).
     """
 
     blocks: NormalEquations

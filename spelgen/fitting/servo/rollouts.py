@@ -22,7 +22,7 @@ GRAVITY_SAMPLES = 2000
 
 @dataclass(frozen=True, eq=False)
 class ServoRollouts:
-    """Rollouts of windows, in which each joint moves by itself under the load of the bodies along a fixed motion.
+    """Rollouts of windows; each joint is integrated independently, under the load of the bodies along a fixed motion.
 
     The load is computed once, for parameters x0: a change of the body parameters adds regressor (phi(x) - phi(x0)),
     with the inertial parameters phi. Since joints are independent, one rollout in which a parameter is changed at all

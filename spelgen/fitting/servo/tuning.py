@@ -57,11 +57,12 @@ class ServoSolverTuning:
     steps: int = 12
     # [1] Steps of the last outer iteration, on all windows: it starts near the minimum of few windows.
     last_steps: int = 2
-    # [1] Decrease of the cost below which an outer iteration, or the fit of a joint with and without dead zone, ends.
+    # Decrease of the cost below which an outer iteration, or the fit of a joint with and without dead zone, ends.
     min_decrease: float = 0.01
-    # [1] The same, relative to the cost: costs are high if the form of the model is wrong.
+    # [1] Decrease relative to the cost below which an outer iteration ends: costs are high if the form of the model is
+    # wrong.
     min_relative_decrease: float = 1e-4
-    # [1] Damping of the first step of all outer iterations but the first; with 1e-3 kd ends 0.3 % off.
+    # [1] Damping of the first step of all outer iterations but the first; with 1e-3 kd has an error of 0.3 %.
     later_damping: float = 1e-5
     # [1] Finite-difference step of the last derivatives: with shorter steps a joint that is about to slip seems
     # determined.
@@ -74,7 +75,7 @@ class ServoLawTuning:
 
     # [1] Initial dead zone, as a fraction of the static error.
     dead_zone_fraction: float = 0.25
-    # [1] Steps of the fit of a single joint.
+    # [1] Largest number of steps of the fit of a single joint.
     steps: int = 6
     # [1] Standard deviations by which a dead zone must be more probable; other friction effects need 3.
     significance: float = 4.0
@@ -103,12 +104,13 @@ class ServoIntervalTuning:
 class ServoStartTuning:
     """Initial parameters of a servo fit."""
 
-    # [1] Standard deviations of kp from gravity: samples of neighbouring windows are correlated.
+    # [1] Number of standard deviations above which kp is computed from the coefficient of gravity; large, since
+    # neighbouring windows are correlated.
     significance: float = 8.0
-    # [1] Largest factor on the kp of the settings, or on 2 efforts per radian.
+    # [1] Largest factor between the initial and the nominal kp (of the settings, or 2 efforts per radian).
     kp_range: float = 20.0
-    # [1] Smallest dry friction as a fraction of the nominal one; squared the smallest kd/kp, cubed the smallest
-    # armature/kp, so that their logarithms exist.
+    # Smallest dry friction as a fraction of nominal friction [1]. Its square and its cube are the smallest kd/kp [s]
+    # and armature/kp [s^2]: positive, since logarithms are fitted.
     min_friction: float = 0.05
 
 

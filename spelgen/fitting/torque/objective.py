@@ -43,7 +43,7 @@ FITTED = {
 
 
 class TorqueObjective(TorqueLogObjective):
-    """The whole fit is in `begin`, before there is a run folder: a fit to torques takes seconds to minutes."""
+    """Fit to torques, which takes seconds to minutes: `begin` runs all of it, before there is a run folder."""
 
     name: ClassVar[str] = "torque"
     config: TorqueFit

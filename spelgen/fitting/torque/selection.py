@@ -52,7 +52,7 @@ def can_split(count: int, correlation_length: float) -> bool:
 
 
 def split_halves(count: int, correlation_length: float) -> tuple[slice, slice]:
-    """Return the first half of the samples, without a gap before the last half, and the last half."""
+    """Return the first half of the samples, less the gap before the held-out samples, and the last half."""
     middle = count // 2
     return slice(0, max(0, middle - _gap(correlation_length))), slice(middle, count)
 

@@ -151,7 +151,7 @@ class MomentumObjective(TorqueLogObjective):
         optimizer = self._new_optimizer(torch.Generator().manual_seed(self.request.seed))
 
         def loss(windows: Windows) -> torch.Tensor:
-            """Return the loss of the windows, (): momentum steps and regularization."""
+            """Return the momentum loss of the windows plus the regularization loss, ()."""
             return momentum_loss(model, windows, self.scales) + self.penalty()
 
         for start in range(0, steps, call):
