@@ -10,8 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from spelgen.arm.arm import Chain
 from spelgen.identification.log_geometry import GeometryProblem, Hypothesis, HypothesisFit
 from spelgen.identification.tuning import GEOMETRY
+from spelgen.settings.log_mapping import SCALES
 
 RIGHT_ANGLE = np.pi / 2
 # penalties of changes that are rarer than a wrong sense or order, which explain as much
@@ -24,6 +26,16 @@ class Scaling(NamedTuple):
     code: str
     motion: np.ndarray
     torque: np.ndarray
+
+
+ANGLES = {SCALES[unit]: unit for unit in ("turns", "deg")}
+
+
+def angle_scalings(arm: Chain) -> list[Scaling]:
+    """Return the candidates for angles and their rates in revolutions, and in degrees, of all revolute joints."""
+    turning = np.array([x.joint_type == "revolute" for x in arm.coordinates])
+    ones = np.ones(len(turning))
+    return [Scaling("joint-unit", np.where(turning, size, ones), ones) for size in ANGLES if turning.any()]
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,12 +15,13 @@ from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
 from spelgen.logs.checks import Findings, run_checks
 from spelgen.logs.commands import delayed_commands
 from spelgen.logs.filtering import derivative
-from spelgen.logs.joint_signals import is_factor, settings_line
+from spelgen.logs.joint_signals import is_factor, mapping_line
 from spelgen.logs.trajectory import Trajectory, require_commands, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, SIGNALS
 
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
+    from spelgen.settings.log_mapping import LogMapping
 
 MOVING = SAMPLES.moving
 # Delays of positions after commands [s]: negative ones mean shifted rows, those of cheap servos are below 0.2 s.
@@ -136,7 +137,7 @@ class ServoLogs:
                 report = replace(report, following=following.joints[k])
                 # some loggers write measured positions in place of commands
                 is_copy = all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in self._logs)
-                odd = _odd_command(k, names, report, following, is_copy)
+                odd = _odd_command(k, names, report, following, is_copy, self._logs[0].mapping)
             completed.append(report)
             if isinstance(odd, LogError):
                 summary.errors.append(odd)
@@ -154,7 +155,12 @@ class ServoLogs:
 
 
 def _odd_command(
-    k: int, joints: Sequence[str], report: JointReport, following: Following, is_copy: bool
+    k: int,
+    joints: Sequence[str],
+    report: JointReport,
+    following: Following,
+    is_copy: bool,
+    mapping: LogMapping,
 ) -> LogError | Diagnostic | None:
     """Return the finding about a joint's command: an error if it cannot be this joint's command; None without one.
 
@@ -176,8 +182,7 @@ def _odd_command(
     elif correlation > FOLLOWS and (is_factor(gain, 180 / np.pi) or is_factor(gain, np.pi / 180)):
         got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
         units = {"q": "deg", "u": "rad"} if gain > 1 else {"q": "rad", "u": "deg"}
-        line = settings_line({"joints": {joints[k]: {"units": units}}})
-        do = f"write '{line}' under 'logs' in the robot's YAML"
+        do = mapping_line({"joints": {joints[k]: {"units": units}}})
         return LogError(got, element=where, expected="both in radians", do=do)
     elif correlation < -FOLLOWS:
         got = f"positions that move against commands (correlation {correlation:.2g})"
@@ -188,6 +193,10 @@ def _odd_command(
             if following.correlation[k, other] > FOLLOWS:
                 got = f"a command that joint {name!r} follows, and this one does not"
                 do = "check the names of the columns"
+                for source in np.flatnonzero(following.correlation[:, k] > FOLLOWS)[:1].tolist():
+                    do = mapping_line(
+                        {"joints": {joints[k]: {"columns": {"u": mapping.column("u", joints[source])}}}}
+                    )
                 return LogError(got, element=where, expected="its own command", do=do)
         code, message = "not-following", f"it does not follow its command (correlation {correlation:.2g})"
     elif following.delay[k, k] >= 0:

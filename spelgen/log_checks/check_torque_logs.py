@@ -12,14 +12,14 @@ import numpy as np
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic
 from spelgen.identification.drive_hints import Coupling, DriveLog, DriveSamples, drive_problem
-from spelgen.identification.geometry_search import Scaling, compare_readings
+from spelgen.identification.geometry_search import Scaling, angle_scalings, compare_readings
 from spelgen.identification.least_squares import varying
 from spelgen.identification.log_geometry import GeometryProblem, HypothesisFit, MotionSamples
 from spelgen.identification.torque_delay import delay_of
 from spelgen.identification.tuning import GEOMETRY, HINTS
 from spelgen.listing import Listing, number
 from spelgen.log_checks.limits_in_logs import CLIPPED, FlatTops, find_limits
-from spelgen.log_checks.remedies import ANGLES, Remedies, mapped_reading
+from spelgen.log_checks.remedies import Remedies, mapped_reading
 from spelgen.log_checks.report import JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import (
     CHECKS,
@@ -186,10 +186,8 @@ class TorqueLogs:
         scalings = []
         for factors in torque_factors(evidence, [not self._is_declared(name) for name in names]):
             scalings.append(Scaling("torque-unit", ones, factors))
-        turning = np.array([x.joint_type == "revolute" for x in self._arm.chain.coordinates])
-        if not any(self._mapping.unit("q", name) for name in names) and turning.any():
-            for size in ANGLES:
-                scalings.append(Scaling("joint-unit", np.where(turning, size, ones), ones))
+        if not any(self._mapping.unit("q", name) for name in names):
+            scalings += angle_scalings(self._arm.chain)
         return scalings
 
     def _check_drives(self, moving: DriveSamples, summary: Findings) -> None:

@@ -9,13 +9,12 @@ import numpy as np
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Chain
 from spelgen.errors import Diagnostic, LogError
-from spelgen.identification.geometry_search import HypothesisComparison
+from spelgen.identification.geometry_search import ANGLES, HypothesisComparison
 from spelgen.identification.log_geometry import Hypothesis, HypothesisFit
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.joint_signals import joint_keys, plain_number, settings_line
-from spelgen.settings.log_mapping import SCALES, LogMapping
+from spelgen.settings.log_mapping import LogMapping
 
-ANGLES = {SCALES[unit]: unit for unit in ("turns", "deg")}
 GEOMETRY_CODES = (
     "joint-order", "torque-order", "joint-sense", "torque-sense", "joint-zero", "joint-unit", "torque-unit",
     "torque-scale", "gravity", "gravity-compensated",

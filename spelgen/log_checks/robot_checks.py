@@ -101,8 +101,8 @@ class JointEvidence(NamedTuple):
     def gravity_in_torque(self) -> tuple[float, float]:
         """Return factor and correlation of the URDF's gravity in the torque; NaN if gravity is too small."""
         fit = self.report.gravity
-        # The factor of a joint that gravity hardly loads is undetermined. On the UR10e, gravity is visible in the torque from
-        # a fifth of its standard deviation on.
+        # The factor of a joint that gravity hardly loads is undetermined: on the UR10e gravity is visible in the torque
+        # from a fifth of its standard deviation on.
         if fit.factor is None or fit.correlation is None or (fit.relative_deviation or 0.0) < 0.2:
             return nan, nan  # every comparison with NaN is false
         return fit.factor, fit.correlation

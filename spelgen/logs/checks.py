@@ -15,7 +15,7 @@ import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.labels import counted
-from spelgen.logs.joint_signals import Advice, JointSignals, is_factor, joint_keys, settings_line
+from spelgen.logs.joint_signals import Advice, JointSignals, is_factor, joint_keys, mapping_line
 from spelgen.logs.jump_checks import (
     find_dropouts,
     find_frozen,
@@ -70,7 +70,7 @@ class Findings:
         """Add the finding of a check; to an error, how to accept it. A finding with a line is an error."""
         do, message = check.do, found if isinstance(found, str) else found.message
         if isinstance(found, Advice):
-            do = f"write '{settings_line(found.keys)}' under 'logs' in the robot's YAML"
+            do = mapping_line(found.keys)
         elif check.severity != "error":
             self.notes.append(Diagnostic(check.severity, check.code, where, None, message))
             return

@@ -25,6 +25,11 @@ def settings_line(keys: Mapping[str, object]) -> str:
     return text.strip()[1:-1]
 
 
+def mapping_line(keys: Mapping[str, object]) -> str:
+    """Return the advice to write keys of the group `logs`."""
+    return f"write '{settings_line(keys)}' under 'logs' in the robot's YAML"
+
+
 def joint_keys(entries: Mapping[str, Mapping[str, object]], joints: Sequence[str]) -> dict[str, object]:
     """Return the keys of single joints for the group `logs`; units that all joints of an arm share are its units."""
     first = next(iter(entries.values()))
