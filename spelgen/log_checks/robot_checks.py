@@ -158,7 +158,9 @@ def torque_factors(joints: Sequence[JointEvidence], undeclared: Sequence[bool]) 
 
 
 def _rounded(factor: float) -> float:
-    """Return the factor with one significant digit if this changes it by less than a tenth, else with two."""
+    """Return 0.001, that of mNm, or one significant digit if it changes the factor by less than a tenth, else two."""
+    if 1 / 1.5 < factor / 1e-3 < 1.5:
+        return 1e-3  # the factor is only as exact as the masses of the URDF
     one = float(f"{factor:.1g}")
     return one if abs(one - factor) < 0.1 * factor else float(f"{factor:.2g}")
 

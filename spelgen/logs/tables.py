@@ -108,8 +108,6 @@ def table_layout(schema: pa.Schema, joints: Sequence[str], mapping: LogMapping, 
     accepted: tuple[str, ...] = mapping.accept
     if UNITS_KEY in metadata:
         accepted += UNIT_CODES
-    elif all(mapping.unit("q", joint) for joint in joints):
-        accepted += ("degrees",)
     return Layout(file, tuple(columns), labels, tuple(joints), mapping, accepted)
 
 

@@ -71,7 +71,8 @@ def find_units(signals: JointSignals) -> str | Advice | None:
     """Find other units than the mapping states: q is more than two turns, or a multiple of the integral of qd."""
     if signals.step > SIGNALS.slowest_step:
         return None  # the times are in another unit
-    is_far = np.ptp(signals.q) > TURNS and not signals.turns and signals.kind != "prismatic"
+    is_stated = signals.turns or signals.trajectory.mapping.unit("q", signals.joint) is not None
+    is_far = np.ptp(signals.q) > TURNS and not is_stated and signals.kind != "prismatic"
     message = f"q that changes {signals.factor:.3g} times as fast as qd"
     if is_far:
         message = f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
