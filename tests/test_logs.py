@@ -341,7 +341,7 @@ def test_what_never_changes_in_any_trajectory_is_said():
         (scaled(swing(), qd=-1.0), "its sense is opposite", "velocity: differentiated"),
         (
             Trajectory(swing().t, swing().q, swing().qd[:, ::-1], swing().tau, "x"),
-            "it is the derivative of q of joint 'b'",
+            "that of joint 'b' is",
             "joints: {a: {columns: {qd: qd_b}}, b: {columns: {qd: qd_a}}}",
         ),
         (

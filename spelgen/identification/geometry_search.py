@@ -3,9 +3,9 @@ joints, combinations."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +18,14 @@ from spelgen.settings.log_mapping import SCALES
 RIGHT_ANGLE = np.pi / 2
 # penalties of changes that are rarer than a wrong sense or order, which explain as much
 RARE = {"gravity": 1, "joint-zero": 2, "torque-unit": 2, "joint-unit": 2, "gravity-compensated": 3}
+
+
+# columns that another order of joints affects
+ORDERS = {
+    "joint-order": ("motion_source", "torque_source"),
+    "torque-order": ("torque_source",),
+    "motion-order": ("motion_source",),
+}
 
 
 class Scaling(NamedTuple):
@@ -134,14 +142,14 @@ def _senses(base: Hypothesis) -> Iterator[Hypothesis]:
             yield _changed(base, "joint-sense", **motion, **torque)
 
 
-def _swapped(base: Hypothesis) -> Iterator[Hypothesis]:
-    """Yield the readings with the columns of two joints exchanged: all columns, or the torques."""
+def _swapped(base: Hypothesis, codes: Iterable[str] = tuple(ORDERS)) -> Iterator[Hypothesis]:
+    """Yield the hypotheses with the columns of two joints exchanged."""
     for pair in combinations(range(len(base.offset)), 2):
         order = np.arange(len(base.offset))
         order[list(pair)] = pair[::-1]
-        torque = base.torque_source[order]
-        yield _changed(base, "joint-order", motion_source=base.motion_source[order], torque_source=torque)
-        yield _changed(base, "torque-order", torque_source=torque)
+        for code in codes:
+            sources = {"motion_source": base.motion_source[order], "torque_source": base.torque_source[order]}
+            yield _changed(base, code, **{name: sources[name] for name in ORDERS[code]})
 
 
 def _scaled(base: Hypothesis, scalings: Sequence[Scaling]) -> Iterator[Hypothesis]:
@@ -152,7 +160,7 @@ def _scaled(base: Hypothesis, scalings: Sequence[Scaling]) -> Iterator[Hypothesi
 
 
 def reordered(problem: GeometryProblem, unchanged: HypothesisFit) -> list[HypothesisFit]:
-    """Return the best orders of all columns, and of the torques, by exchanging two joints at a time.
+    """Return the best orders of all columns, of the torques and of the motion, by exchanging two joints at a time.
 
     Long arms have local minima: the search starts at random orders, too.
     """
@@ -163,20 +171,17 @@ def reordered(problem: GeometryProblem, unchanged: HypothesisFit) -> list[Hypoth
     rng = np.random.default_rng(0)
     starts += [rng.permutation(len(joints)) for _ in range(6)]
     fits = {}
-    for code in ("joint-order", "torque-order"):
-        for start in starts:
-            order = {"torque_source": start}
-            if code == "joint-order":
-                order["motion_source"] = start
-            fit = problem.fit(_changed(unchanged.hypothesis, code, **order))
-            while True:
-                swaps = [x for x in _swapped(fit.hypothesis) if x.codes == (code,)]
-                best = min(map(problem.fit, swaps), key=_rank)
-                if best.cost > fit.cost - 1.0:
-                    break
-                fit = best
-            fits[code, fit.hypothesis.torque_source.tobytes()] = fit
-    return [fit for fit in fits.values() if not np.array_equal(fit.hypothesis.torque_source, starts[0])]
+    for code, start in product(ORDERS, starts):
+        fit = problem.fit(_changed(unchanged.hypothesis, code, **dict.fromkeys(ORDERS[code], start)))
+        while True:
+            best = min(map(problem.fit, _swapped(fit.hypothesis, [code])), key=_rank)
+            if best.cost > fit.cost - 1.0:
+                break
+            fit = best
+        order = np.array([fit.hypothesis.motion_source, fit.hypothesis.torque_source])
+        if (order != starts[0]).any():
+            fits[code, order.tobytes()] = fit
+    return list(fits.values())
 
 
 def _refined(

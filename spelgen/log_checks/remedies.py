@@ -16,8 +16,8 @@ from spelgen.logs.joint_signals import joint_keys, plain_number, settings_line
 from spelgen.settings.log_mapping import LogMapping
 
 GEOMETRY_CODES = (
-    "joint-order", "torque-order", "joint-sense", "torque-sense", "joint-zero", "joint-unit", "torque-unit",
-    "torque-scale", "gravity", "gravity-compensated",
+    "joint-order", "torque-order", "motion-order", "joint-sense", "torque-sense", "joint-zero", "joint-unit",
+    "torque-unit", "torque-scale", "gravity", "gravity-compensated",
 )  # fmt: skip
 RIGHT = "joints, zeros, units and gravity as the URDF and the settings state them"
 
@@ -51,8 +51,6 @@ class Remedies:
         """Return the finding of a better hypothesis: an error, or a warning for small angles and moderate factors."""
         best, codes = comparison.better[0], comparison.codes
         changes = [self._change(code, best.hypothesis) for code in codes]
-        # an order of all columns and one of torques may be an order of the motion
-        changes = [(joints, text) for joints, text in changes if joints.any()]
         where = " and ".join(dict.fromkeys(self._place(joints) for joints, _ in changes))
         got = f"{' and '.join(text for _, text in changes)} ({_evidence(best, comparison.unchanged)})"
         lines = [self.lines(fit.hypothesis) for fit in comparison.better]
@@ -121,13 +119,9 @@ class Remedies:
         if not (torque[motion < 0] < 0).all():
             sense = "positions and velocities of the opposite sense, and torques of the right one"
         largest = torque[np.abs(np.log(np.abs(torque))).argmax()]
-        moved = (
-            "columns"
-            if np.array_equal(reading.motion_source, reading.torque_source)
-            else "positions, velocities"
-        )
         changes = {
-            "joint-order": (reading.motion_source != order, f"the {moved} of other joints"),
+            "joint-order": (reading.motion_source != order, "the columns of other joints"),
+            "motion-order": (reading.motion_source != order, "the positions and velocities of other joints"),
             "torque-order": (reading.torque_source != order, "the torques of other joints"),
             "joint-sense": (motion < 0, sense),
             "torque-sense": ((torque < 0) & (motion > 0), "torques of the opposite sense"),

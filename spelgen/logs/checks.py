@@ -215,10 +215,12 @@ class LogChecks:
                 self._add(message, result, message, trajectory)
         products = velocity_products(trajectory)
         self.products += products
-        factors, correlations = map(np.ndarray.tolist, velocity_agreement(products))
+        factors, correlations = velocity_agreement(products)
         for k, (joint, kind) in enumerate(zip(self._joints, self._kinds, strict=True)):
             columns = trajectory.q[:, k], trajectory.qd[:, k]
-            signals = JointSignals(trajectory, k, kind, self._joints, *columns, factors[k], correlations[k])
+            signals = JointSignals(
+                trajectory, k, kind, self._joints, *columns, factors[k], correlations[:, k].tolist()
+            )
             for joint_check, found in run_checks(CHECKS, signals, trajectory.accepted):
                 self._add(joint, joint_check, found, trajectory)
 
@@ -262,13 +264,14 @@ class LogChecks:
         first: Mapping[str, Any] = entries.get(joints[0], {})
         if first.keys() != {"units"}:
             return keys
-        # the unit of a joint that rests, or moves little, is that of the others
+        # the unit of a joint that rests, or moves little, is that of most others
         factors, _ = velocity_agreement(self.products)
         ratio = SCALES.get(first["units"].get("qd"), 1.0) / SCALES.get(first["units"].get("q"), 1.0)
         is_linear = self._kinds[self._joints.index(joints[0])] == "prismatic"
-        for joint, kind, factor in zip(self._joints, self._kinds, factors.tolist(), strict=True):
-            if is_linear == (kind == "prismatic") and (np.isnan(factor) or is_factor(factor, ratio)):
-                entries.setdefault(joint, first)
+        kin = [k for k, kind in enumerate(self._kinds) if (kind == "prismatic") == is_linear]
+        for k in kin if 2 * len(joints) > len(kin) else ():
+            if np.isnan(factors[k]) or is_factor(factors[k], ratio):
+                entries.setdefault(self._joints[k], {"units": dict(first["units"])})
         return joint_keys(entries, self._joints)
 
 

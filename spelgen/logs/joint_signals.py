@@ -47,7 +47,7 @@ def plain_number(value: float, digits: int = 5) -> float:
 class JointSignals(NamedTuple):
     """Signals of one joint in one trajectory: the subject of the checks without the robot.
 
-    q, qd: (T,). factor: ratio of dq/dt to qd; NaN for a joint at rest. correlations: of qd with dq/dt of each joint;
+    q, qd: (T,). factor: ratio of dq/dt to qd; NaN for a joint at rest. correlations: of dq/dt with qd of each joint;
     NaN for a joint at rest.
     """
 

@@ -86,15 +86,18 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
 def is_stale(values: np.ndarray, changes: np.ndarray, least: float) -> np.ndarray:
     """Return a mask (T,) of samples that repeat an old value for long, in a signal that otherwise changes.
 
+    The step to the value after them is large: quantised signals, and drives with a dead zone, go on with a typical one.
     changes: (T,), a signal that cannot change by more than `least` while the values are constant.
     """
     stale = np.zeros(len(values), bool)
     starts = np.flatnonzero(np.diff(values, prepend=np.nan))
     lengths = np.diff(np.append(starts, len(values)))
-    fewest = TUNING.stale * max(1.0, float(np.median(lengths)))
-    for start, length in zip(starts[lengths > fewest], lengths[lengths > fewest], strict=True):
+    steps = np.append(np.abs(np.diff(values[starts])), np.inf)
+    is_long = lengths > TUNING.stale * max(1.0, float(np.median(lengths)))
+    is_long &= (steps > TUNING.local_jump * _usual(steps[:-1])) & (len(starts) > 1)
+    for start, length in zip(starts[is_long], lengths[is_long], strict=True):
         rows = slice(start + 1, start + length)
-        if length < len(values) and np.ptp(changes[rows]) > least:
+        if np.ptp(changes[rows]) > least:
             stale[rows] = True
     return stale
 

@@ -122,11 +122,11 @@ def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
 def stale_rows(quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of samples of "q", "qd" or "tau" of a moving joint that repeat an old value for long.
 
-    A torque at its largest or smallest value is not stale, but clipped.
+    A torque at its largest or smallest value is not stale, but clipped, and the last one may be of a motor at rest.
     """
     if quantity == "tau":
         stale = is_stale(values, qd, TUNING.stale_speed * float(np.ptp(qd)))
-        return np.asarray(stale & (values > values.min()) & (values < values.max()))
+        return np.asarray(stale & ~np.isin(values, [values.min(), values.max(), values[-1]]))
     from scipy.integrate import cumulative_trapezoid  # takes long to import
 
     return is_stale(values, cumulative_trapezoid(qd, t, initial=0) - q, TUNING.stale_motion)

@@ -155,7 +155,7 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
     for other, fit in zip(signals.joints, signals.correlations, strict=True):
         if fit > max(SIGNALS.agreement, correlation):
             columns = {"qd": mapping.column("qd", other)}
-            message += f"; it is the derivative of q of joint {other!r}"
+            message += f"; that of joint {other!r} is"
             return Advice(message, {"joints": {joint: {"columns": columns}}})
     exchanged = velocity_products(replace(trajectory, q=trajectory.qd, qd=trajectory.q))
     factors, correlations = velocity_agreement(exchanged)

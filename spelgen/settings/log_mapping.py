@@ -50,9 +50,8 @@ LONGEST_DELAY = 1.0  # s
 
 Accepted = Literal[
     "degrees", "frozen", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign", "no-torques",
-    "velocity-is-no-derivative",
-    "torque-sense", "torque-unit", "torque-beyond-drive", "torque-order", "joint-sense", "joint-order", "joint-zero",
-    "gravity", "gravity-compensated", "torque-clipped",
+    "velocity-is-no-derivative", "torque-sense", "torque-unit", "torque-beyond-drive", "torque-order", "motion-order",
+    "joint-sense", "joint-order", "joint-unit", "joint-zero", "gravity", "gravity-compensated", "torque-clipped",
 ]  # fmt: skip
 """Codes of errors of `spelgen logs` that a user can accept."""
 
